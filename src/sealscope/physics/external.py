@@ -34,7 +34,7 @@ def polytropic_pressure(V_up: float, p_charge: float, V_gas: float, n_gas: float
     """Compute the pressure [Pa gauge] of a gas accumulator whose gas changes its volume polytropically.
 
     The accumulator has delivered the oil volume `V_up` [m^3], < 0 if it has received oil, and has the gas volume
-    `V_gas` [m^3] at `p_charge` [Pa gauge]: p_abs (V_gas + V_up)^n = constant. n = 1 is isothermal
+    `V_gas` [m^3] at `p_charge` [Pa gauge]: p_abs (V_gas + V_up)^n = constant, n = `n_gas`. n = 1 is isothermal
     (`accumulator_pressure`), n = 1.4 is adiabatic nitrogen (Merritt, Hydraulic Control Systems, 1967, accumulators).
     """
     return (p_charge + P_ATM) * math.pow(V_gas / (V_gas + V_up), n_gas) - P_ATM
@@ -44,8 +44,9 @@ def polytropic_pressure(V_up: float, p_charge: float, V_gas: float, n_gas: float
 def gas_volume(p: float, p_pre: float, V_acc: float, n_acc: float) -> float:
     """Compute the gas volume [m^3] of an accumulator on a line at the pressure `p` [Pa gauge].
 
-    It is V_acc (p_pre_abs/p_abs)^(1/n), the inverse of `polytropic_pressure`. Up to the precharge pressure `p_pre`
-    [Pa gauge] the accumulator contains no oil, and its gas fills the whole volume `V_acc` [m^3].
+    It is V_acc (p_pre_abs/p_abs)^(1/n), the inverse of `polytropic_pressure`, with the polytropic exponent n = `n_acc`
+    and absolute pressures. Up to the precharge pressure `p_pre` [Pa gauge] the accumulator contains no oil, and its gas
+    fills the whole volume `V_acc` [m^3].
     """
     return V_acc * math.pow((p_pre + P_ATM) / (max(p, p_pre) + P_ATM), 1.0 / n_acc)
 
@@ -54,15 +55,20 @@ def gas_volume(p: float, p_pre: float, V_acc: float, n_acc: float) -> float:
 def accumulator_compliance(p: float, p_pre: float, V_gas: float, n_acc: float) -> float:
     """Compute the compliance [m^3/Pa] of an accumulator: the oil it takes in per unit rise of the line's pressure.
 
-    It is V_gas/(n p_abs), the slope of `gas_volume`, for the gas volume `V_gas` [m^3] at the pressure `p` [Pa gauge],
-    and 0 below the precharge pressure `p_pre` [Pa gauge].
+    It is V_gas/(n p_abs) = -dV_gas/dp, where dV_gas/dp is the slope of `gas_volume`, for the gas volume `V_gas` [m^3]
+    at the pressure `p` [Pa gauge] and the polytropic exponent n = `n_acc`. It is 0 below the precharge pressure `p_pre`
+    [Pa gauge].
     """
     return select(p > p_pre, V_gas / (n_acc * (max(p, p_pre) + P_ATM)), 0.0)  # type: ignore[no-any-return]
 
 
 @contracted
 def check_valve_flow(dp: float, p_crack: float, G_check: float) -> float:
-    """Compute the flow [m^3/s] through a check valve under dp [Pa]: G_check (dp - p_crack), 0 for dp < p_crack."""
+    """Compute the flow [m^3/s] through a check valve under dp [Pa]: G_check (dp - p_crack), 0 for dp < p_crack.
+
+    `dp`: pressure drop in the free direction; `p_crack` [Pa]: drop at which the valve opens; `G_check` [m^3/(s Pa)]:
+    conductance of the open valve.
+    """
     return G_check * max(dp - p_crack, 0.0)
 
 
@@ -71,9 +77,9 @@ def pilot_opening(dp: float, dp_pilot: float, p_crack: float, k_pilot: float, p_
     """Compute the opening, 0 to 1, of a pilot-operated check valve: (dp + k_pilot dp_pilot - p_crack)/p_open.
 
     `dp` [Pa]: pressure drop across the valve in its free direction; `dp_pilot` [Pa]: pilot pressure minus inlet
-    pressure, which counts only if it is positive; `p_crack` [Pa]: pressure at which the valve begins to open;
-    `p_open` [Pa]: further pressure at which it is fully open. Oil flows backwards (dp < 0) while k_pilot dp_pilot >
-    p_crack - dp.
+    pressure, which counts only if it is positive; `k_pilot`: pilot ratio, the piston area of the pilot over the area of
+    the valve's seat; `p_crack` [Pa]: pressure at which the valve begins to open; `p_open` [Pa]: further pressure at
+    which it is fully open. Oil flows backwards (dp < 0) while k_pilot dp_pilot > p_crack - dp.
 
     Source: the pilot-operated check valve of the Simscape Fluids library (area linear in the pressure on the poppet).
     """

@@ -23,12 +23,13 @@ _MIN_ABSOLUTE_PRESSURE = 100.0
 def effective_bulk_modulus(p: float, K_oil: float, air: float, n_air: float) -> float:
     """Compute the bulk modulus [Pa] of oil with free air at the pressure `p` [Pa gauge].
 
-    K = K_oil (1 + r)/(1 + r K_oil/(n p_abs)), where r is the volume of air over the volume of oil at this pressure
-    (`air_volume_ratio`, with the same `air` and `n_air`). Air does not dissolve. Without air K is exactly K_oil.
+    K = K_oil (1 + r)/(1 + r K_oil/(n p_abs)), with the modulus `K_oil` [Pa] of the oil without air, the polytropic
+    exponent n = `n_air` of the air, and the volume r of air over the volume of oil at this pressure
+    (`air_volume_ratio`). `air` is the same ratio at atmospheric pressure. Air does not dissolve. Without air K is
+    exactly K_oil.
 
-    Source: H. E. Merritt, Hydraulic Control Systems, 1967, effective bulk modulus (1/K is the sum of the compliances
-    of liquid and gas); in this form the hydraulic fluid of the Simscape library, from which the thesis took its
-    friction.
+    Source: H. E. Merritt, Hydraulic Control Systems, 1967, effective bulk modulus (1/K is the sum of the compliances of
+    liquid and gas); in this form the hydraulic fluid of the Simscape library, from which the thesis took its friction.
     """
     if not any_lane(air > 0.0):
         return K_oil + 0.0 * p  # lanes if p is lanes
@@ -41,7 +42,8 @@ def effective_bulk_modulus(p: float, K_oil: float, air: float, n_air: float) -> 
 def oil_density_ratio(dp: float, K_oil: float) -> float:
     """Compute the density ratio rho(p + dp)/rho(p) = exp(dp/K_oil) of oil without air.
 
-    Source: Merritt, Hydraulic Control Systems, 1967, definition of the bulk modulus, K = rho dp/d rho, K constant.
+    `dp` [Pa]: difference of the two pressures; `K_oil` [Pa]: bulk modulus. Source: Merritt, Hydraulic Control Systems,
+    1967, definition of the bulk modulus, K = rho dp/d rho, K constant.
     """
     return exponential(dp / K_oil)  # type: ignore[no-any-return]
 
@@ -60,8 +62,9 @@ def mixture_density_ratio(p: float, p_0: float, K_oil: float, air: float, n_air:
     """Compute the density ratio rho(p)/rho(p_0) of oil with free air, both pressures in Pa gauge.
 
     Its logarithm is the integral of dp/K, with the modulus K of `effective_bulk_modulus`. The air contributes ln((1 +
-    r_0)/(1 + r)) exactly. The liquid contributes the integral of dp/(K_oil (1 + r)), computed by Simpson's rule with
-    an error far below r dp/K_oil. r, r_0: `air_volume_ratio` at p and p_0.
+    r_0)/(1 + r)) exactly. The liquid, of bulk modulus `K_oil` [Pa], contributes the integral of dp/(K_oil (1 + r)),
+    computed by Simpson's rule with an error far below r dp/K_oil. r, r_0: volume of air over volume of oil at p and p_0
+    (`air_volume_ratio`); `air`: this ratio at atmospheric pressure; `n_air`: polytropic exponent of the air.
     """
     r, r_0 = air_volume_ratio(p, air, n_air), air_volume_ratio(p_0, air, n_air)
     r_m = air_volume_ratio(0.5 * (p + p_0), air, n_air)

@@ -16,7 +16,8 @@ from sealscope.physics.lanes import exponential, select
 def coulomb_friction(p_A: float, p_B: float, F_pr: float, F_cfr: float, use_difference: bool) -> float:
     """Compute the Coulomb force F_C = F_pr + F_cfr (p_A + p_B) [N], eq. (4.20).
 
-    `use_difference`: take p_A - p_B instead of the sum, as the equation is printed in the thesis.
+    `p_A`, `p_B` [Pa]: chamber pressures; `F_pr` [N]: preload force of the seals; `F_cfr` [N/Pa]: Coulomb friction per
+    pressure. `use_difference`: take p_A - p_B instead of the sum, as the equation is printed in the thesis.
     """
     return F_pr + F_cfr * ((p_A - p_B) if use_difference else (p_A + p_B))
 
@@ -25,8 +26,9 @@ def coulomb_friction(p_A: float, p_B: float, F_pr: float, F_cfr: float, use_diff
 def stribeck_force(speed: float, F_C: float, K_brk: float, C_c: float) -> float:
     """Compute the Coulomb and Stribeck friction [N] of steady sliding at `speed` >= 0 [m/s], eq. (4.21).
 
-    F_C (1 + (K_brk - 1) exp(-C_c speed)) falls from the breakaway force K_brk F_C at standstill to F_C. The viscous
-    part is not in it.
+    F_C (1 + (K_brk - 1) exp(-C_c speed)) falls from the breakaway force K_brk F_C at standstill to the Coulomb force
+    F_C [N] at high speed. `K_brk` is the ratio of the two, `C_c` [s/m] the transition coefficient. The viscous part is
+    not in it.
     """
     return F_C * (1.0 + (K_brk - 1.0) * exponential(-C_c * speed))  # type: ignore[no-any-return]
 
@@ -35,10 +37,11 @@ def stribeck_force(speed: float, F_C: float, K_brk: float, C_c: float) -> float:
 def karnopp_friction(
     v: float, applied: float, breakaway: float, F_C: float, K_brk: float, C_c: float, F_v: float, v_th: float
 ) -> float:
-    """Compute Karnopp's friction force [N]: the piston sticks for |v| < v_th and slides by eq. (4.21) otherwise.
+    """Compute Karnopp's friction force [N]: the piston sticks at velocities |v| < v_th, and slides otherwise.
 
     While the piston sticks, friction balances the sum of all other forces on it, `applied` [N], up to `breakaway` [N]
-    (see `stuck_velocity`). The other parameters are those of `stribeck_friction`.
+    (see `stuck_velocity`). While it slides at the velocity `v` [m/s], friction is the force of eq. (4.21), F_C (1 +
+    (K_brk - 1) exp(-C_c |v|)) sign(v) + F_v v, with the parameters of `stribeck_friction`.
 
     Source: D. Karnopp, Computer simulation of stick-slip friction in mechanical dynamic systems, ASME Journal of
     Dynamic Systems, Measurement and Control 107 (1985) 100-103.
@@ -73,9 +76,10 @@ def bristle_rate(v: float, z: float, g: float, sigma_0: float) -> float:
 def lugre_friction(v: float, z: float, dz: float, sigma_0: float, sigma_1: float, F_v: float, v_th: float) -> float:
     """Compute LuGre's friction force [N] from the deflection of the contact's bristles and the velocity.
 
-    F = sigma_0 z + sigma_1 exp(-(v/v_th)^2) dz + F_v v, with the bristles' mean deflection z [m] and its rate dz
-    [m/s] (`bristle_rate`) and the velocity v [m/s]. The bristles' damping sigma_1 must vanish at high speed;
-    otherwise the force could drive the motion.
+    F = sigma_0 z + sigma_1 exp(-(v/v_th)^2) dz + F_v v, with the bristles' mean deflection z [m] and its rate dz [m/s]
+    (`bristle_rate`), the velocity v [m/s], the bristles' stiffness sigma_0 [N/m] and damping sigma_1 [N s/m], and the
+    viscous coefficient F_v [N s/m]. The damping decays at speeds above v_th [m/s]; otherwise the force could drive the
+    motion.
 
     Source: as `bristle_rate`, eq. (3); the decay: H. Olsson, Control Systems with Friction, Lund 1996, section 5.
     """
@@ -92,9 +96,12 @@ def stribeck_friction(
     F = F_C (1 + (K_brk - 1) exp(-C_c |v|)) sign(v) + F_v v for |v| > v_th,
     F = v [F_C (1 + (K_brk - 1) exp(-C_c v_th)) + F_v v_th] / v_th for |v| <= v_th, which is continuous at v_th.
 
-    Eq. (4.22) is printed with an unbalanced bracket. `literal_bracket` closes it after F_v v_th instead, F = v F_C [1
-    + (K_brk - 1) exp(-C_c |v|) + F_v v_th] / v_th, so that F jumps at v_th (from 73.2 N to 145 N with Table 4.1 and
-    no pressure).
+    `F_C` [N]: Coulomb force; `K_brk`: breakaway force over Coulomb force; `C_c` [s/m]: transition coefficient; `F_v`
+    [N s/m]: viscous coefficient; `v_th` [m/s]: velocity below which friction is linear.
+
+    Eq. (4.22) is printed with an unbalanced bracket. `literal_bracket` closes it after F_v v_th instead, F = v F_C [1 +
+    (K_brk - 1) exp(-C_c |v|) + F_v v_th] / v_th, so that F jumps at v_th (from 73.2 N to 145 N with Table 4.1 and no
+    pressure).
     """
     speed = abs(v)
     if literal_bracket:

@@ -255,7 +255,8 @@ register_lowering(select, 3, _select_type, _lower_select)
 def any_lane(condition: Any) -> Any:
     """Return True if a condition is true in any lane of a vector.
 
-    The truth value of a single run is returned unchanged.
+    `condition`: a mask, i.e. a truth value for each lane, or the single truth value of a run without lanes, which is
+    returned unchanged.
     """
     return condition
 
@@ -411,12 +412,12 @@ _ROUNDING_DOUBLE, _ROUNDING_SINGLE = 6755399441055744.0, 12582912.0
 def exponential(x: Any) -> Any:
     """Compute exp(x) for a number or for lanes (a vector of numbers), with x limited to -708..709.
 
-    exp(x) is 2^n times a polynomial in r = x - n ln 2. The relative error is below 1e-14, the same for a number and
-    for lanes. In single precision it is below 2e-6 for x in -60..60; beyond -87..88 the result stays at a power of
-    two.
+    exp(x) is 2^n times a polynomial in r = x - n ln 2, where n is the whole number nearest to x/ln 2. The relative
+    error is below 1e-14, the same for a number and for lanes. In single precision it is below 2e-6 for x in -60..60;
+    beyond -87..88 the result stays near 2^-126 or 2^127.
 
-    Source: W. J. Cody, W. Waite, Software Manual for the Elementary Functions, 1980 (reduction by ln 2 in two
-    parts); Taylor's polynomial, whose remainder for |r| <= ln 2/2 is below 7e-15.
+    Source: W. J. Cody, W. Waite, Software Manual for the Elementary Functions, 1980 (reduction by ln 2 in two parts);
+    Taylor's polynomial, whose remainder for |r| <= ln 2/2 is below 7e-15.
     """
     x = min(max(x, -708.0), 709.0)
     n = nearest_integer(x * _LOG2_E)

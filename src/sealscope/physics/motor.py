@@ -25,7 +25,9 @@ def winding_current_rate(
 ) -> float:
     """Compute the rate of change di/dt [A/s] of the winding current, eq. (4.4).
 
-    It is (voltage - R_c i - C_e omega)/L_c, or 0 where the current would leave +-`i_max` [A].
+    It is (voltage - R_c i - C_e omega)/L_c, or 0 where the current would leave +-`i_max` [A]. `voltage` [V]: winding
+    voltage; `i` [A]: current; `omega` [rad/s]: speed; `R_c` [ohm], `L_c` [H]: resistance and inductance of the winding;
+    `C_e` [V s/rad]: back electromotive force constant.
     """
     rate = (voltage - R_c * i - C_e * omega) / L_c
     at_limit = ((i >= i_max) & (rate > 0.0)) | ((i <= -i_max) & (rate < 0.0))
@@ -36,8 +38,9 @@ def winding_current_rate(
 def shaft_acceleration(i: float, omega: float, load_torque: float, C_m: float, B_M: float, J_M: float) -> float:
     """Compute the angular acceleration domega/dt [rad/s^2] of the motor's shaft, eq. (4.5).
 
-    It is (C_m i - B_M omega - load_torque)/J_M, with the current `i` [A], the speed `omega` [rad/s] and the torque
-    `load_torque` [N m] of the pump.
+    It is (C_m i - B_M omega - load_torque)/J_M, with the current `i` [A], the speed `omega` [rad/s], the torque
+    `load_torque` [N m] of the pump, the torque constant `C_m` [N m/A], and the viscous damping `B_M` [N m s/rad] and
+    moment of inertia `J_M` [kg m^2] of motor and pump.
     """
     return (C_m * i - B_M * omega - load_torque) / J_M
 

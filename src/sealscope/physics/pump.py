@@ -49,7 +49,8 @@ def loss_coefficients(q_b: float, C_st: float, C_h: float, rho: float) -> tuple[
 def turbulent_slip(dp: float, c_slip: float, dp_0: float) -> float:
     """Compute the pump's turbulent slip [m^3/s]: the flow that leaks back through its gaps under `dp` [Pa].
 
-    It is the flow of an orifice with the coefficient `c_slip`, laminar below about `dp_0` [Pa] (Schlosser 1961).
+    `dp` is the pressure difference p_1 - p_2 of the ports, and the slip has its sign. It is the flow of an orifice with
+    the coefficient `c_slip` [m^3/(s Pa^0.5)], laminar below about `dp_0` [Pa] (Schlosser 1961).
     """
     return orifice_flow(dp, c_slip, dp_0)
 
@@ -58,9 +59,10 @@ def turbulent_slip(dp: float, c_slip: float, dp_0: float) -> float:
 def friction_torque(omega: float, dp: float, q_b: float, T_f: float, C_f: float, k_h: float, omega_f: float) -> float:
     """Compute the friction torque [N m] of motor and pump at the speed `omega` [rad/s], without viscous drag.
 
-    T = sat(omega/omega_f) (T_f + C_f D |dp|) + k_h omega |omega|: constant friction, friction that grows with the
-    pressure difference `dp` [Pa], and the hydrodynamic torque. D = q_b/(2 pi) [m^3/rad]. sat limits its argument to
-    +-1, so that T is continuous at standstill.
+    T = sat(omega/omega_f) (T_f + C_f D |dp|) + k_h omega |omega|: constant friction `T_f` [N m], friction with the
+    coefficient `C_f` that grows with the pressure difference `dp` [Pa], and the hydrodynamic torque with the
+    coefficient `k_h` [N m s^2]. D = q_b/(2 pi) [m^3/rad] is the displacement. sat limits its argument to +-1, so that T
+    is continuous at standstill: below the speed `omega_f` [rad/s] the friction is linear in the speed.
     """
     smooth_sign = min(max(omega / omega_f, -1.0), 1.0)
     return smooth_sign * (T_f + C_f * abs(pump_torque(dp, q_b))) + k_h * omega * abs(omega)

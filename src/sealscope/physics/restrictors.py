@@ -11,7 +11,10 @@ from sealscope.physics.lanes import any_lane, select
 
 @law
 def orifice_coefficient(C_d: float, area: float, rho: float) -> float:
-    """Compute an orifice's flow coefficient C_d A sqrt(2/rho) [m^3/(s Pa^0.5)], A = `area` [m^2]; eqs. (4.9)-(4.12)."""
+    """Compute an orifice's flow coefficient C_d A sqrt(2/rho) [m^3/(s Pa^0.5)], A = `area` [m^2]; eqs. (4.9)-(4.12).
+
+    `C_d`: discharge coefficient; `rho` [kg/m^3]: density of the oil.
+    """
     return C_d * area * math.sqrt(2.0 / rho)
 
 
@@ -52,7 +55,10 @@ def orifice_flow(dp: float, c: float, dp_0: float) -> float:
 
 @contracted
 def one_way_coefficient(dp: float, c_forward: float, c_reverse: float) -> float:
-    """Choose the flow coefficient of a one-way throttle: `c_forward` if `dp` > 0 [Pa], else `c_reverse`."""
+    """Choose the flow coefficient of a one-way throttle: `c_forward` if `dp` > 0 [Pa], else `c_reverse`.
+
+    `dp`: pressure drop across the throttle in its forward direction; both coefficients are in m^3/(s Pa^0.5).
+    """
     return select(dp > 0.0, c_forward, c_reverse)  # type: ignore[no-any-return]
 
 
@@ -86,9 +92,10 @@ def _solve_scaled_flow(b: float, a: float) -> float:
 def implicit_orifice_flow(total: float, g: float, c_forward: float, c_reverse: float, dp_0: float) -> float:
     """Compute the flow Q [m^3/s] of a one-way throttle at the end of an implicit stage of the solver.
 
-    Q solves d + g Q(d) = total: d [Pa] is the pressure difference at the end of the stage, `total` [Pa] what it would
-    be if nothing flowed, and `g` >= 0 [Pa s/m^3] its fall over the stage per unit flow. The root is unique and has
-    the sign of `total`. `c_forward`, `c_reverse`, `dp_0`: as in `one_way_coefficient` and `orifice_flow`.
+    Q solves d + g Q(d) = total, where Q(d) is the flow of the throttle (`orifice_flow`) under the pressure difference d
+    [Pa] at the end of the stage. `total` [Pa]: what d would be if nothing flowed in the stage; `g` >= 0 [Pa s/m^3]:
+    fall of d over the stage per unit flow. The root is unique and has the sign of `total`. `c_forward`, `c_reverse`,
+    `dp_0`: as in `one_way_coefficient` and `orifice_flow`.
     """
     c = one_way_coefficient(total, c_forward, c_reverse)
     sqrt_dp_0 = math.sqrt(dp_0)

@@ -97,7 +97,11 @@ CHOICES = (*_CHOICES, "made_up", *LAWS)
 if TYPE_CHECKING:
 
     class RigNumbers(tuple[Any, ...]):
-        """A rig's parameters as the compiled laws take them: SI floats, choices as truth values."""
+        """A rig's parameters, and the numbers derived from them, as the compiled laws take them.
+
+        The numbers are SI floats, the choices truth values. Each optional law is a tuple, empty if the rig does not
+        have it.
+        """
 
         _fields: tuple[str, ...]
 
@@ -119,10 +123,10 @@ def throttle_flow_coefficients(v: RigValues, exponent: float, literal: bool) -> 
     They are in m^3/(s Pa^0.5), eqs. (4.7)-(4.12); "in" is the flow towards the cylinder. Each throttle is in series
     with a shut-off valve (`series_coefficient`).
 
-    `exponent`: 1 if a throttle's closed fraction is the fraction of its area (eq. 4.8), 2 if it is the fraction of
-    its diameter (the thesis's text). `literal`: if False, the flow towards the cylinder is free and the return is
-    throttled on both sides (the text and Appendix A); if True, side B is the other way round, as eqs. (4.9)-(4.12)
-    are printed.
+    `v`: the rig's parameters. `exponent`: 1 if a throttle's closed fraction is the fraction of its area (eq. 4.8), 2 if
+    it is the fraction of its diameter (the thesis's text). `literal`: if False, the flow towards the cylinder is free
+    and the return is throttled on both sides (the text and Appendix A); if True, side B is the other way round, as eqs.
+    (4.9)-(4.12) are printed.
     """
     free = restrictors.orifice_coefficient(v.C_d, math.pi / 4.0 * v.d_line**2, v.rho)  # eq. (4.7)
     throttled_A = free * (1.0 - v.closed_A) ** exponent  # eq. (4.8)
@@ -150,7 +154,10 @@ def derived_numbers(v: RigValues, exponent: float, literal: bool) -> tuple[float
 
 
 def parameter_values(rig: Rig) -> RigValues:
-    """Collect the rig's parameters that the compiled model needs, in SI units."""
+    """Collect the rig's parameters that the compiled model needs, in SI units.
+
+    The result is a named tuple, whose fields are the symbols of the parameters (`VALUES`).
+    """
     return RigValues(*(float(attrgetter(name)(rig)) for name in VALUES.values()))
 
 
@@ -236,9 +243,9 @@ def pack_numbers(p: RigNumbers) -> Any:
 def limit_state(y: State, p: RigNumbers) -> State:
     """Limit the motor current and the spool of a servo valve in a state, after a step of the solver.
 
-    Returns the new state. States that the rig does not use are overwritten: without lines p_1 = p_A and p_2 = p_B;
-    with a servo valve p_2 is the return's pressure. States that no law of the rig changes are set to 0, so that the
-    compiler removes them.
+    The current is limited to +-i_max; the spool's position to its stroke, and its speed to +-v_max. Returns the new
+    state. States that the rig does not use are overwritten: without lines p_1 = p_A and p_2 = p_B; with a servo valve
+    p_2 is the return's pressure. States that no law of the rig changes are set to 0, so that the compiler removes them.
     """
     V_up = y[MADE_UP] if len(p.open_circuit) > 0 else 0.0
     bristle = y[BRISTLE] if len(p.bristled) > 0 else 0.0
@@ -278,7 +285,8 @@ def pressures_of(y: State, p: RigNumbers) -> Pressures:
 def speed_error(y: State, u: float, p: RigNumbers) -> float:
     """Compute the motor's speed error [rad/s], set speed minus actual speed.
 
-    The command `u` [V] sets the speed; in a valve-controlled rig the supply's speed `omega_P` does.
+    The command `u` [V] sets the speed omega_per_volt u. In a valve-controlled rig, where the motor drives the pump of
+    the supply, the set speed is `omega_P`.
     """
     if len(p.valved) > 0:
         return p.omega_P - y[OMEGA]  # type: ignore[no-any-return]
@@ -298,9 +306,9 @@ def pump_difference(y: State, p: RigNumbers) -> float:
 def friction_force(y: State, applied: float, p: RigNumbers) -> tuple[float, float]:
     """Compute the friction force [N] on the piston, and the rate [m/s] at which LuGre's bristles deflect.
 
-    The force is that of eqs. (4.20)-(4.22), unless the rig has Karnopp's or LuGre's law instead. The rate is 0
-    unless it has LuGre's. The friction of a motion along -x is multiplied by the rig's parameter `backward`.
-    `applied` [N]: sum of all other forces on the piston.
+    The force is that of eqs. (4.20)-(4.22), unless the rig has Karnopp's or LuGre's law instead. The rate is 0 in a rig
+    without LuGre's law. The friction of a motion along -x is multiplied by the rig's parameter `backward`. `applied`
+    [N]: sum of all other forces on the piston.
     """
     v = y[VELOCITY]
     F_C = friction.coulomb_friction(
@@ -337,10 +345,11 @@ def implicit_flows(
 ) -> tuple[float, float]:
     """Compute the line flows Q_A, Q_B [m^3/s] at the end of an implicit stage of the solver.
 
-    On each side the pressure drop d of the throttle [Pa] solves d + g Q(d) = total: `total` [Pa] is the drop without
-    the flow of the stage, which lowers it by `g` [Pa s/m^3] times the flow (`implicit_orifice_flow`). A filter in
-    series with the throttle, p_1 - p_A = d + R Q at the pump's port 1, adds its resistance R to g.
-    If it has a bypass valve, the flow is that of `filtered_flow`.
+    Q_A flows from line 1 to chamber A, Q_B from chamber B to line 2. On each side the pressure drop d of the throttle
+    [Pa] at the end of the stage solves d + g Q(d) = total. `total` [Pa] is the drop if nothing flowed in the stage, and
+    `g` [Pa s/m^3] its fall over the stage per unit flow (`implicit_orifice_flow`). A filter in series with the
+    throttle, p_1 - p_A = d + R Q at the pump's port 1, adds its resistance R to g. If it has a bypass valve, the flow
+    is that of `filtered_flow`.
     """
     if len(p.filtered) > 0:
         R_A, R_B = filter_resistances(y, p)
@@ -381,7 +390,7 @@ def throttle_flows(y: State, p: RigNumbers) -> tuple[float, float]:
 
 @contracted
 def volumes_at(x: float, p: RigNumbers) -> tuple[float, float]:
-    """Compute the oil volumes [m^3] of chamber and hose on sides A and B at piston position x [m]."""
+    """Compute the oil volumes [m^3] of chamber and hose on sides A and B; `x` [m]: piston position from mid-stroke."""
     return cylinder.chamber_volumes(x, p.V_A, p.V_B, p.A_A, p.A_B, p.position_dependent)
 
 
@@ -446,7 +455,10 @@ def throttle_rates(y: State, Q_A: float, Q_B: float, p: RigNumbers) -> Pressures
 
 @contracted
 def supply_pressure(y: State, p: RigNumbers) -> float:
-    """Compute the pressure [Pa gauge] of the make-up's accumulator, from which lost oil is replaced."""
+    """Compute the pressure [Pa gauge] of the make-up's accumulator, which replaces oil that the circuit has lost.
+
+    It follows from the oil volume V_up in the state `y` that the accumulator has delivered.
+    """
     if len(p.polytropic) > 0:  # empty unless the gas is polytropic, so that the law is chosen at compile time
         return external.polytropic_pressure(y[MADE_UP], p.p_charge, p.V_gas, p.n_gas)
     return external.accumulator_pressure(y[MADE_UP], p.p_charge, p.V_gas)
@@ -557,8 +569,9 @@ def valve_rates(y: State, Q_1: float, p: RigNumbers) -> Pressures:
 def rates_without_throttles(y: State, u: float, G: float, C: float, F: float, p: RigNumbers) -> State:
     """Compute the state's rates dy/dt from all physical laws but the throttles' flows.
 
-    `y`: state in the order of `STATES`; `u`: command [V]; `G` [m^3/(s Pa)] and `C` [m^3/(s Pa^0.5)]: leakage
-    coefficients (`piston_leakage`); `F`: load [N] in addition to the rig's own; `p`: the rig's numbers.
+    `y`: state in the order of `STATES`; `u`: command [V]; `G` [m^3/(s Pa)] and `C` [m^3/(s Pa^0.5)]: conductance and
+    flow coefficient of the leakage past the piston, through a laminar gap and an orifice (`piston_leakage`); `F`: load
+    [N] in addition to the rig's own; `p`: the rig's numbers.
     """
     p_A, p_B, x, v = vapour_floor(y[P_A], p), vapour_floor(y[P_B], p), y[POSITION], y[VELOCITY]
     if len(p.sticking) > 0:
@@ -637,8 +650,8 @@ def rates(y: State, u: float, G: float, C: float, F: float, p: RigNumbers) -> St
 def observe(y: State, u: float, G: float, C: float, p: RigNumbers, row: np.ndarray) -> None:
     """Write all outputs of the rig in one state to `row` (21,), in the order of `OUTPUTS`.
 
-    The outputs are the states with pressures not below the vapour pressure, the flows, and the motor's voltage. The
-    arguments are those of `rates_without_throttles`.
+    The outputs are the states with pressures not below the vapour pressure, the flows, and the motor's voltage. `y`:
+    the state; `u` [V]: command; `G`, `C`: leakage coefficients of the piston, as for `rates_without_throttles`.
     """
     for m in range(len(y)):
         row[m] = y[m]

@@ -22,8 +22,8 @@ _EQUAL_PEAKS = 0.05
 def find_cycle(recording: Recording) -> float | None:
     """Find the period of the duty cycle [s], with which the machine's motion repeats; None if nothing repeats.
 
-    It is estimated from the command if that moves, else from the difference of the chamber pressures, or from the
-    only one recorded. The result is cached with the recording, and shared by its copies with fewer channels
+    It is estimated from the command if that moves, else from the difference of the chamber pressures, or from a single
+    one (`estimate_period`). The result is cached with the recording, and shared by its copies with fewer channels
     (`Recording.only`).
     """
     names = ("u",) if "u" in recording and is_moving(recording["u"]) else chambers_of(recording)
@@ -47,9 +47,9 @@ def duty_signal(channels: Sequence[Array]) -> Array:
 def estimate_period(signal: Array, rate: float) -> float | None:
     """Estimate the period [s] of a signal (n,) sampled at `rate` [Hz]; None if nothing repeats.
 
-    The period is the lag at which the autocorrelation has its first maximum that is nearly as high as the highest
-    one. Maxima before its first negative value do not count. The lag is refined by a parabola. The maximum must reach
-    0.6, and the period must be between 0.2 s and 20 s and at most a fifth of the signal.
+    The period is the lag at which the autocorrelation, which is 1 at lag 0, has its first maximum that is nearly as
+    high as the highest one. Maxima before its first negative value do not count. The lag is refined by a parabola. The
+    maximum must reach 0.6, and the period must be between 0.2 s and 20 s and at most a fifth of the signal.
     """
     stride = max(1, int(rate / _CYCLE.rate))
     n = signal.size // stride
@@ -83,8 +83,9 @@ def estimate_period(signal: Array, rate: float) -> float | None:
 def fundamental_frequency(signal: Array, t: Array, period: float) -> float:
     """Estimate the fundamental frequency [Hz] of a periodic signal (n,) from the slope of its phase over time.
 
-    `t` (n,): times [s] in even steps; `period`: approximate period [s], as from `estimate_period`. The signal must
-    cover at least two periods.
+    The signal, without its mean, is multiplied by exp(-2 pi i t/period) and averaged over each period. The phase of
+    these averages drifts by 2 pi times the difference of the frequency from 1/period. `t` (n,): times [s] in even
+    steps; `period`: approximate period [s], as from `estimate_period`. The signal must cover at least two periods.
     """
     n_period = max(1, round(period / (t[1] - t[0])))
     n_periods = t.size // n_period

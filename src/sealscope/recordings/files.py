@@ -48,7 +48,8 @@ _MAX_NESTING = 3
 def _detect_format(path: Path) -> str:
     """Detect the format of a file, or its kind of archive, from its content.
 
-    Raises UnreadableFile if the file cannot be read, or has a format that is not supported.
+    Returns its name in `formats.toml`, such as "netcdf" or "zip". Raises UnreadableFile if the file cannot be read, or
+    has a format that is not supported.
     """
     try:
         with open_regular(path, "a recording") as file:
@@ -241,8 +242,8 @@ def _unpacked_file(file: Path) -> Iterator[tuple[Path, str]]:
 def _read_unpacked(file: Path, kind: str, request: Request) -> Recording:
     """Read a recording from a file that is not packed in an archive.
 
-    `kind`: format of the file. All formats but text are read in a subprocess, with limits on time, memory and disk
-    space.
+    `kind`: format of the file. Formats that are not marked as `safe` in `formats.toml`, i.e. all but text logs and
+    LabVIEW's .lvm files, are read in a subprocess, with limits on time, memory and disk space.
     """
     with raising_unreadable(f"{_FORMATS[kind]['words']} file", file):
         if kind in _SAFE_FORMATS:
@@ -260,7 +261,7 @@ def _read_unpacked(file: Path, kind: str, request: Request) -> Recording:
 
 
 def check_target(file: Path) -> None:
-    """Raise InputError unless `file` has the suffix of a format in which recordings can be written."""
+    """Raise InputError unless the name of `file` ends in the suffix of a format in which recordings can be written."""
     if file.suffix.lower() not in SUFFIXES:
         raise InputError(f"a recording's file must end in {', '.join(SUFFIXES)}, got {file.name}")
 

@@ -40,8 +40,9 @@ def find_implausibility(recording: Recording) -> str | None:
 def _describe_speed_mismatch(recording: Recording) -> str | None:
     """Describe a motor speed that differs from the rate of the motor angle by a constant factor, as by a wrong unit.
 
-    None if the factor is within 1 / m and m (`readings.misfit` of `priors.toml`), if the two do not correlate, if one
-    of them is absent or in raw counts, or if there are too few samples.
+    The factor is the least-squares ratio of the speed to the rate. None if it is within 1 / m and m (`readings.misfit`
+    of `priors.toml`), if the two do not correlate, if one of them is absent or in raw counts, or if there are too few
+    samples.
     """
     if not {"theta", "omega"} <= {name for name, unit in recording.units.items() if unit != "count"}:
         return None
@@ -62,8 +63,9 @@ def _describe_speed_mismatch(recording: Recording) -> str | None:
 def _is_noise(values: Array) -> bool:
     """Return True if a signal (n,) is mostly white noise.
 
-    The mean square of the third difference of white noise is 20 times its variance. The signal is noise if this mean
-    square exceeds 20 times its variance times `readings.noise` of `priors.toml`, or if samples are missing.
+    The mean square of the third difference of white noise is 20 times the noise's variance. The signal is noise if this
+    mean square exceeds 20 times the signal's variance times `readings.noise` of `priors.toml`, or if samples are
+    missing.
     """
     # `not <=`, so that missing samples count as noise
     return not np.mean(np.diff(values, 3) ** 2) <= 20.0 * _PRIORS.noise * np.var(values)

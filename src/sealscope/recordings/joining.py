@@ -32,9 +32,9 @@ _TWELVE_HOURS = re.compile(
 def start_seconds(recording: Recording, file: str = "") -> float | None:
     """Find the time of a recording's first sample [s since 1970]; None if it is not known.
 
-    It follows from the start in the provenance, else from the date in the name of the file, and from the first time
-    `t`. The name is that in the provenance, else `file`. Dates and times count as UTC; a date without a time of day
-    means midnight.
+    It is the time of t = 0 plus the first time `t`. The time of t = 0 is the start in the provenance, else the date in
+    the name of the file. The name is that in the provenance, else `file`. Dates and times count as UTC; a date without
+    a time of day means midnight.
     """
     start = parse_epoch(str(recording.provenance.get("start", "")))
     if start is None:

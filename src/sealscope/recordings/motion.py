@@ -97,7 +97,7 @@ def find_runs(flags: NDArray[np.bool_]) -> NDArray[np.intp]:
 
 
 def smallest_step(values: Array) -> float:
-    """Find the smallest difference between neighbours in sorted `values` (n,).
+    """Find the smallest difference between neighbours in `values` (n,), which are sorted in increasing order.
 
     Differences up to `ROUNDING` times the range of the values do not count; 0 if there are no others.
     """
@@ -107,7 +107,10 @@ def smallest_step(values: Array) -> float:
 
 
 def estimate_quantum(values: Array) -> float:
-    """Estimate the quantisation step of a channel (n,) from at most `_QUANTUM_SAMPLES` of its samples."""
+    """Estimate the quantisation step of a channel (n,), the smallest difference of two of its values.
+
+    At most `_QUANTUM_SAMPLES` of its samples are compared.
+    """
     return smallest_step(np.unique(values[:: max(1, values.size // _QUANTUM_SAMPLES)]))
 
 
@@ -115,9 +118,10 @@ def find_stuck(values: Array) -> NDArray[np.intp]:
     """Find runs of equal values that are too long for the signal around them: first index and length of each (k, 2).
 
     Let p be the fraction of unchanged samples among the 100 samples before or after a run, whichever is larger. A run
-    of length m then begins at a given sample with the probability p^(m-1). It is too long if fewer than 1e-6 such
-    runs are expected in the channel `values` (n,), and if the value jumps by more than 3.5 quantisation steps at
-    its beginning or end. A slow quantised signal at a turning point does not move either, but leaves in single steps.
+    of length m then begins at a given sample with the probability p^(m-1). It is too long if fewer than 1e-6 such runs
+    are expected in the channel `values` (n,), and if the value jumps by more than 3.5 quantisation steps at its
+    beginning or end. A slow quantised signal at a turning point does not move either, but leaves in single steps. Runs
+    of fewer than 5 samples, and runs near the ends of the channel, are not found.
     """
     no_runs = np.empty((0, 2), dtype=np.intp)
     if values.size < 2 * _NEIGHBOURHOOD:

@@ -10,8 +10,8 @@ from sealscope.recordings.recording import Recording
 def oil_temperature(recording: Recording) -> float | None:
     """Compute the mean oil temperature [deg C] of a recording; None if it is not known.
 
-    The channel T_oil is used, without readings outside the range of oil temperatures (`priors.toml`), else the
-    temperature in the file's header.
+    The channel T_oil is averaged, without readings that no hydraulic oil can have (`oil` in `priors.toml`). Without
+    such a channel the temperature in the file's header is taken.
     """
     if "T_oil" in recording and recording.units["T_oil"] == "K":
         limits = RECORDINGS.oil

@@ -8,12 +8,12 @@ from sealscope.storage.toml_file import PriorTable, read_priors
 class ClockPriors(PriorTable):
     """Assumptions on the sampling times of a data logger.
 
-    - `regular` [sampling steps]: intervals between these numbers are regular; a longer one is a gap.
+    - `regular` [sampling steps]: smallest and largest regular interval; a longer one is a gap.
     - `scatter` [sampling steps]: standard deviation of the intervals above which sampling is irregular.
     - `rate`: largest relative error of the stated rate.
     - `near` [usual intervals]: longest interval in which no sample is missing.
     - `lost`: largest fraction of lost samples in one recording.
-    - `late`: largest fraction of samples with a time before an earlier one.
+    - `late`: largest fraction of samples with a time that is not later than all before.
     """
 
     regular: tuple[float, float]
@@ -152,7 +152,7 @@ class HoldPriors(PriorTable):
 class ReadingPriors(PriorTable):
     """Limits beyond which pressures and speeds cannot come from one hydraulic machine.
 
-    - `noise` [share of the variance]: white noise above which a pressure contains nothing else.
+    - `noise`: white noise over the variance of a pressure, above which the pressure is taken for noise alone.
 
     The motor speed is compared with the rate of the motor angle:
 

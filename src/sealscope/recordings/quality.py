@@ -157,7 +157,9 @@ def _format_repetitions(count: int) -> str:
 def _creep_findings(recording: Recording) -> list[Finding]:
     """Find a steady drift of the mean chamber pressure over a whole recording, which a sealed circuit does not show.
 
-    The list is empty if there is no drift, if the recording is too short, or if a chamber pressure is not in Pa.
+    The means of equal parts of the recording are compared. Their steps from part to part must be alike, and the drift
+    fast enough (`creep` in `priors.toml`). The list is empty if there is no drift, if the recording is too short, or if
+    a chamber pressure is not in Pa.
     """
     duration = len(recording) / recording.rate
     if duration < _CREEP.seconds or any(recording.units.get(name) != "Pa" for name in ("p_A", "p_B")):
@@ -266,9 +268,9 @@ def _report_missing(report: _ChannelReport, values: Array) -> None:
 
 
 def flag_impossible(values: Array, unit: str) -> NDArray[np.bool_]:
-    """Flag the finite samples (n,) whose magnitude no sensor can read (`possible` in `priors.toml`).
+    """Flag the finite samples (n,) whose magnitude no sensor can read, such as over 1e10 Pa.
 
-    `unit`: SI unit of `values`.
+    `unit`: SI unit of `values`, for which the table `possible` of `priors.toml` has the largest magnitude.
     """
     limit: float = _SENSOR_LIMITS.get(unit, _SENSOR_LIMITS["any"])
     return np.asarray(np.isfinite(values) & (np.abs(values) > limit))
@@ -340,13 +342,14 @@ def is_mostly_clipped(values: Array) -> bool:
 
 
 def find_rails(values: Array, stuck: NDArray[np.intp] | None = None, low_end: bool = True) -> list[Rail]:
-    """Find the ends of a channel's range at which its finite values (n,) are clipped; the low end only if `low_end`.
+    """Find the ends of a channel's range at which its finite values (n,) are clipped.
 
-    At a clipped end many samples have the same value: far more than any of the five nearest values has. They form
-    runs which the signal enters or leaves by a jump of more than 3.5 quantisation steps, or 1.5 for a
-    long run. The crest of a slow quantised signal does not count: its neighbours have nearly as many samples, and it
-    is entered step by step. Nor does a square wave, which has as many samples at its other level. An end is also
-    clipped if one of the runs `stuck` (first index and length, as from `find_stuck`) has this value.
+    With `low_end` False only the high end is examined. At a clipped end many samples have the same value: far more than
+    any of the five nearest values has. They form runs which the signal enters or leaves by a jump of more than 3.5
+    quantisation steps, or 1.5 for a long run. The crest of a slow quantised signal does not count: its neighbours have
+    nearly as many samples, and it is entered step by step. Nor does a square wave, which has as many samples at its
+    other level. An end is also clipped if one of the runs `stuck` (first index and length, as from `find_stuck`) has
+    this value.
     """
     if not values.size:
         return []
@@ -378,7 +381,8 @@ def find_rails(values: Array, stuck: NDArray[np.intp] | None = None, low_end: bo
 def fast_length(count: int) -> int:
     """Find the smallest length n >= `count` for which a fast Fourier transform is fast.
 
-    It has no prime factor above 5. Equals `scipy.fft.next_fast_len(count, real=True)`, without loading scipy.fft.
+    It is a product of powers of 2, 3 and 5. Equals `scipy.fft.next_fast_len(count, real=True)`, without loading
+    scipy.fft.
     """
     odd_factors = (3**i * 5**j for i in range(40) for j in range(28) if 3**i * 5**j < 2 * count)
     # times the smallest power of two >= count / factor

@@ -55,7 +55,7 @@ def _freeze(values: Any) -> Array:
 class _CachedResult:
     """A result that one thread computes while others wait for it.
 
-    `known` is True once `value` is computed.
+    `known` is True once `value` is computed; `lock` is held while it is computed.
     """
 
     lock: Lock = field(default_factory=Lock)
@@ -193,7 +193,7 @@ class Recording:
 
     @property
     def unused(self) -> tuple[str, ...]:
-        """Names of the columns with measured pressures, positions, speeds or flows that no channel uses."""
+        """Names of the columns of the file with measured pressures, positions, speeds or flows that no channel uses."""
         names = self.provenance.get("unused", ())
         return tuple(map(str, names)) if isinstance(names, list | tuple) else ()
 
@@ -246,7 +246,7 @@ class Recording:
         return replace(self, t=self.t[rows], channels=channels, history=(*self.history, note), bridged=bridged)
 
     def only(self, names: Iterable[str]) -> Recording:
-        """Return a recording with the named channels only."""
+        """Return a recording with the named channels only; it shares cached results with this one (`compute_once`)."""
         part = replace(self, channels={name: self[name] for name in names})
         object.__setattr__(part, "_results", self._results)  # shared, see `compute_once`
         return part

@@ -180,7 +180,10 @@ def _set_limits(seconds: float, memory: int, disk: int) -> None:
 
 
 def _is_spent() -> bool:
-    """Test whether this process occupies more memory than an idle process may; False if that cannot be found out."""
+    """Test whether this process occupies too much memory to serve another request (`_MAX_IDLE_MEMORY`).
+
+    False if that cannot be found out.
+    """
     try:
         pages = int(Path("/proc/self/statm").read_text().split()[5])  # data pages, which RLIMIT_DATA limits
     except OSError:

@@ -40,7 +40,7 @@ class Details:
     values : array, (levels, n)
         The details; row 0 is d_1.
     approximation : array, (n,)
-        The part of the signal below the deepest level.
+        The low-pass part of the signal that remains after the deepest level.
     edges : array, (levels, 2)
         Number of samples at the beginning and at the end of each level that depend on padding.
     """
@@ -89,9 +89,11 @@ class Details:
 def edge_samples(wavelet: str = "db8", levels: int = 4, transform: Transform = "stationary") -> IntArray:
     """Count the samples at the beginning and at the end of each level that depend on padding, (levels, 2).
 
-    The stationary transform has the filters' reach. The decimated one depends on padding up to sample ``2^j ceil(2
-    before_j / 2^j) - before_j``, where the first coefficient without padding begins. In the reconstructed one
-    analysis and synthesis together reach ``(L - 1)(2^j - 1)`` to both sides, with L taps.
+    The detail of a sample in level j depends on before_j samples before and after_j after it (`reach`). These are the
+    counts for the stationary transform. At the beginning, the decimated one depends on padding up to sample ``2^j
+    ceil(2 before_j / 2^j) - before_j``, where the first coefficient without padding begins; at the end it depends on as
+    many samples as the stationary one. In the reconstructed one analysis and synthesis together reach ``(L - 1)(2^j -
+    1)`` to both sides, with L taps.
     """
     _check_choice(transform, Transform, "transform")
     stationary = reach(wavelet, levels)
@@ -106,9 +108,9 @@ def edge_samples(wavelet: str = "db8", levels: int = 4, transform: Transform = "
 
 
 def min_samples(wavelet: str = "db8", levels: int = 4, transform: Transform = "stationary") -> int:
-    """Compute the length of the shortest signal [samples] that has a sample independent of padding in each level.
+    """Compute the length [samples] of the shortest signal with a sample in each level that does not depend on padding.
 
-    It is 226 for db8 to level 4.
+    It is 226 for db8 to level 4 and the stationary transform.
     """
     return int(edge_samples(wavelet, levels, transform)[-1].sum()) + 1
 
@@ -218,7 +220,8 @@ def _mallat_details(x: Array, wavelet: Any, levels: int, edge: Edge) -> tuple[Ar
 def _inverse_details(x: Array, wavelet: Any, levels: int, edge: Edge) -> tuple[Array, Array]:
     """Compute reconstructed details (levels, n) and approximation (n,) of a signal.
 
-    The transform is inverted with the coefficients of one level at a time.
+    The transform is inverted with the coefficients of one level at a time, so that the details and the approximation
+    sum up to the signal.
     """
     import pywt
 
@@ -227,7 +230,8 @@ def _inverse_details(x: Array, wavelet: Any, levels: int, edge: Edge) -> tuple[A
     def reconstruct_level(index: int) -> Array:
         """Compute the part of the signal that comes from one level of the wavelet transform, (n,).
 
-        The transform is inverted with all coefficients set to zero except those at `index` of the list.
+        The transform is inverted with all coefficients set to zero except those at `index` of PyWavelets' list: 0 is
+        the approximation, 1 the deepest level, and the last one level 1.
         """
         level_coefficients = [c if i == index else np.zeros_like(c) for i, c in enumerate(coefficients)]
         return np.asarray(pywt.waverec(level_coefficients, wavelet, mode=edge), dtype=np.float64)[: x.size]

@@ -33,9 +33,9 @@ def discrete_wavelet(name: str) -> Any:
 def decomposition_filters(wavelet: str = "db8") -> tuple[Array, Array]:
     """Return the low-pass filter h and the high-pass filter g that split a signal, each (taps,).
 
-    The taps are in the order of a causal convolution: ``a_j[n] = sum_k h[k] a_(j-1)[n - 2^(j-1) k]``, and the same
-    with g for d_j. For an orthogonal wavelet both filters have unit l2 norm. Source: Daubechies, Ten Lectures on
-    Wavelets (1992), Table 6.1, in PyWavelets.
+    The taps are in the order of a causal convolution. With a_0 the signal, the approximation of level j is ``a_j[n] =
+    sum_k h[k] a_(j-1)[n - 2^(j-1) k]``, and its detail d_j the same with g. For an orthogonal wavelet both filters have
+    unit l2 norm. Source: Daubechies, Ten Lectures on Wavelets (1992), Table 6.1, in PyWavelets.
     """
     filters = discrete_wavelet(wavelet)
     return np.array(filters.dec_lo, dtype=np.float64), np.array(filters.dec_hi, dtype=np.float64)

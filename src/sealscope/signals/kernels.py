@@ -63,11 +63,11 @@ def split_levels(
 ) -> None:
     """Compute the wavelet details of `n` new samples of one channel for a group of eight signals (WIDTH).
 
-    `low` and `high` (taps, WIDTH) are the low-pass and high-pass filters. `buffers` has a buffer of `capacity` rows
-    for each level of the channel, stacked from row `start` on; the new samples begin at row `first` of the first
-    buffer. High-pass filtering of a level's buffer gives its detail, and low-pass filtering fills the next buffer.
-    Shallow levels are delayed like the deepest one, so that all levels in a row of `details` (levels, CHUNK, WIDTH)
-    belong to one sample.
+    `low` and `high` (taps, WIDTH) are the low-pass and high-pass filters. `buffers` has a buffer of `capacity` rows for
+    each level of the channel, stacked from row `start` on; the new samples begin at row `first` of the first buffer.
+    High-pass filtering of a level's buffer gives its detail, and low-pass filtering fills the buffer of the next level.
+    Lower levels, whose filters are shorter, are delayed like the deepest one, so that all levels in a row of `details`
+    (levels, CHUNK, WIDTH) belong to one sample.
     """
     n_taps = low.shape[0]
     for level in range(levels):
@@ -106,9 +106,9 @@ def advance_details(
 ) -> int:
     """Compute the wavelet details of the next block of all signals.
 
-    Returns the number of rows that are then in use in the buffers. `block` (channels, actuators, n) are the
-    samples, and `out` (channels, actuators, levels, n) receives the details. `groups` are the first and the last +
-    1 of the groups of eight signals to filter. `buffers` (groups, channels, levels, capacity, WIDTH) have `fill`
+    Returns the number of rows that are then in use in the buffers. `block` (channels, actuators, n) are the samples,
+    and `out` (channels, actuators, levels, n) receives the details. Each group has eight actuators; `groups` are the
+    first and the last + 1 of the groups to filter. `buffers` (groups, channels, levels, capacity, WIDTH) have `fill`
     rows in use, the last `history` of which are needed for later outputs. `low` and `high` (taps, WIDTH) are the
     filters, and `details` (levels, CHUNK, WIDTH) is a work array.
     """

@@ -11,9 +11,9 @@ TINY = 1e-300
 
 
 def average_over(seconds: float, values: Array, rate: float) -> Array:
-    """Average the known values (n,) over a time [s] around each sample, which removes noise and the pump's ripple.
+    """Average the known values (n,) over a window of `seconds` [s] around each sample, which removes noise and ripple.
 
-    `rate`: sampling rate [Hz]. The result is NaN where no value within that time is known.
+    `rate`: sampling rate [Hz]. The result (n,) is NaN where no value in the window is known.
     """
     from scipy.ndimage import uniform_filter1d
 

@@ -80,9 +80,9 @@ def advance_closed(
 ) -> int:
     """Integrate a run whose voltage a controller sets; return the number of outputs written.
 
-    The arguments are those of `advance`, with the controller `loop` in place of a command. `start`: index of the
-    output in rows[0], counted from the beginning of the run. If the controller returns a voltage that is not finite,
-    the integration stops there and writes fewer outputs than `rows` has.
+    The arguments are those of `advance`, with the controller `loop` in place of a command. `rows` may receive a later
+    part of the run: rows[0] is output number `start`, counted from the beginning of the run. If the controller returns
+    a voltage that is not finite, the integration stops there and writes fewer outputs than `rows` has.
     """
     spacing, n_rows = loop.counters[SPACING], rows.shape[0]
     u = np.empty((spacing * every, G.shape[1]))

@@ -69,11 +69,11 @@ def _add_stage(z: State, h: float, e: float, f: State, i: float, s: Pressures) -
 
 @contracted
 def _solve_stage(z: State, h: float, p: RigNumbers) -> tuple[State, Pressures]:
-    """Solve one implicit stage of the step; return its state, and the pressure rates [Pa/s] due to the throttles.
+    """Solve one implicit stage of a step; return its state, and the pressure rates [Pa/s] due to the throttles.
 
-    `z`: the state without the implicit rates of this stage. In the body, r [Pa/m^3] is the pressure rate of an oil
-    volume per unit flow, and g [Pa s/m^3] the fall of a throttle's pressure difference over the stage per unit flow.
-    Boiling oil keeps its pressure, so its r is 0.
+    `h` [s]: length of the step; `z`: the state without the implicit rates of this stage. In the body, r [Pa/m^3] is the
+    pressure rate of an oil volume per unit flow, and g [Pa s/m^3] the fall of a throttle's pressure difference over the
+    stage per unit flow. Boiling oil keeps its pressure, so its r is 0.
     """
     V_A, V_B = rig.volumes_at(z[POSITION], p)
     step = GAMMA * h
@@ -146,8 +146,8 @@ def implicit_step(
 ) -> State:
     """Integrate the state `z` over step number `step` by the implicit-explicit method; return the new state.
 
-    Row `step` of `u` [V], `G` and `C` (n, 6) holds the command and the leakage coefficients at the nodes of the step
-    (`imex_step`). `F` (n, 6) [N] is read only if the rig has an additional load.
+    `h` [s]: length of the step. Row `step` of `u` [V], `G` and `C` (n, 6) holds the command and the leakage
+    coefficients at the nodes of the step (`imex_step`). `F` (n, 6) [N] is read only if the rig has an additional load.
     """
     volts = (u[step, 0], u[step, 1], u[step, 2], u[step, 3], u[step, 4], u[step, 5])
     laminar = (G[step, 0], G[step, 1], G[step, 2], G[step, 3], G[step, 4], G[step, 5])

@@ -31,7 +31,9 @@ def _end_volumes(p: RigNumbers) -> tuple[tuple[float, float], ...]:
 def _longest_mode_step(damping: float, stiffness: float) -> float:
     """Compute the longest step [s] that resolves the two modes of s^2 + damping s + stiffness = 0.
 
-    `damping` [1/s], `stiffness` [1/s^2]. Infinite if the modes neither oscillate nor decay.
+    `damping` [1/s], `stiffness` [1/s^2]. An oscillation may advance by one radian a step, 1/sqrt(stiffness). A decay of
+    rate lambda, the faster of the two, must be stable: 2.785/lambda, the limit of the Runge-Kutta method of order four.
+    Infinite if the modes neither oscillate nor decay.
     """
     discriminant = damping * damping - 4.0 * stiffness
     if discriminant < 0.0:
@@ -62,13 +64,13 @@ def stiffest_rate(p: RigNumbers) -> float:
 def longest_step(p: RigNumbers, G: float = 0.0, C: float = 0.0) -> float:
     """Compute the longest step [s] that resolves all of a rig except its throttles and end stops.
 
-    `G` [m^3/(s Pa)], `C` [m^3/(s Pa^0.5)]: leakage coefficients. The result is the minimum over these parts: speed
-    loop (winding and shaft); piston between its oil columns, with the load's spring and damper, both while it slides
-    and within the linear part of the friction (slope F_C/v_th, F_C at the charge pressure); pump and motor between
-    the volumes at the pump's ports; leakage between the chambers; external leakage and make-up; a servo valve and its
-    supply. The stability limit of a decay is that of RK4; the explicit part of ARK4(3)6L[2]SA is stable beyond it.
-    Position-dependent volumes are taken at the end of the stroke where the oil is stiffer. Air is left out because it
-    only makes the oil softer.
+    `G` [m^3/(s Pa)], `C` [m^3/(s Pa^0.5)]: leakage coefficients. The result is the minimum over these parts, each
+    resolved as in `_longest_mode_step`: speed loop (winding and shaft); piston between its oil columns, with the load's
+    spring and damper, both while it slides and within the linear part of the friction (slope F_C/v_th, F_C at the
+    charge pressure); pump and motor between the volumes at the pump's ports; leakage between the chambers; external
+    leakage and make-up; a servo valve and its supply. The stability limit of a decay is that of RK4; the explicit part
+    of ARK4(3)6L[2]SA is stable beyond it. Position-dependent volumes are taken at the end of the stroke where the oil
+    is stiffer. Air is left out because it only makes the oil softer.
     """
     ends = _end_volumes(p)
     chambers = p.K_oil * max(1.0 / V_A + 1.0 / V_B for V_A, V_B in ends)
@@ -108,8 +110,10 @@ def longest_step(p: RigNumbers, G: float = 0.0, C: float = 0.0) -> float:
 def _longest_valve_step(p: RigNumbers, end_volumes: tuple[tuple[float, float], ...]) -> float:
     """Compute the longest step [s] that resolves a servo valve with its supply.
 
-    It is the minimum over the spool, the smallest chamber behind the valve's edges in laminar flow, and the supply
-    line with the pump. `end_volumes`: (V_A, V_B) [m^3] at each end of the stroke.
+    It is the smallest of three steps: for the spool, a second-order lag; for the decay of the pressure in the smallest
+    chamber through two valve edges in laminar flow; and for the pressure of the supply line, which oscillates with the
+    inertia of motor and pump and is damped by slip, relief valve and valve edges. `end_volumes`: (V_A, V_B) [m^3] at
+    each end of the stroke.
     """
     overlaps = (p.o_PA, p.o_AT, p.o_PB, p.o_BT)
     edge_slope = p.Q_N / math.sqrt(p.dp_N * p.dp_lam)  # of one edge at full stroke, laminar

@@ -23,10 +23,10 @@ class Loop(NamedTuple):
 
     `inputs` (samples, 5): time [s], target [m], speed of the target [m/s], noise of p_A and of p_B [Pa]; `volts`
     (samples + delay,): the voltage [V] that acts from each sample on; `compensated` (samples,): leakage flow [m^3/s]
-    that the controller compensates; `measured` (7,): the latest measurements, which the control law reads; `memory`:
-    state of the control law, which begins with the compensated flow, NaN if it reports none; `addresses` (3,): memory
-    addresses of the control law's machine code, of `memory` and of `measured`; `numbers`, `counters`: indexed by the
-    constants above.
+    that the controller compensates; `measured` (7,): the latest time, target, speed of the target, position [m], p_A
+    and p_B [Pa] and motor angle [rad], which the control law reads; `memory`: state of the control law, which begins
+    with the compensated flow, NaN if it reports none; `addresses` (3,): memory addresses of the control law's machine
+    code, of `memory` and of `measured`; `numbers`, `counters`: indexed by the constants above.
     """
 
     inputs: np.ndarray
@@ -41,7 +41,7 @@ class Loop(NamedTuple):
 
 @law
 def quantize(value: float, count: float) -> float:
-    """Round a value down to a multiple of an encoder's count `count`; a count of 0 leaves it unchanged."""
+    """Round a value down to a multiple of an encoder's step `count`, in the value's unit; 0 leaves it unchanged."""
     return np.floor(value / count) * count if count > 0.0 else value  # type: ignore[no-any-return]
 
 
@@ -49,8 +49,9 @@ def quantize(value: float, count: float) -> float:
 def sample_controller(loop: Loop, k: int, y: np.ndarray) -> bool:
     """Measure the state `y` (14,) and call the controller for its sample number k.
 
-    Returns False if the controller's voltage is not finite. A sample that the controller has already taken keeps
-    its first voltage, such as when the solver repeats a part of the run at half the step.
+    The controller's voltage, limited to the largest one, is stored in `loop.volts` at the index k plus the delay
+    [samples]. Returns False if the voltage is not finite. A sample that the controller has already taken, as when the
+    solver repeats a part of the run at half the step, is not taken again and keeps its voltage.
     """
     counters, numbers, measured = loop.counters, loop.numbers, loop.measured
     if k < counters[SAMPLED]:

@@ -20,7 +20,7 @@ Nodes = tuple[float, float, float]
 def freeze_integral(dy: State, euler_integral: bool) -> State:
     """Return the state's rates `dy`, with the rate of the controller's integral set to 0 if `euler_integral`.
 
-    The integral is then updated once per step instead, which is eq. (4.2) taken literally (`rk4_step`).
+    The caller then updates the integral once per step instead, which is eq. (4.2) taken literally (`rk4_step`).
     """
     dI = 0.0 * dy[0] if euler_integral else dy[0]
     return dI, dy[1], dy[2], dy[3], dy[4], dy[5], dy[6], dy[7], dy[8], dy[9], dy[10], dy[11], dy[12], dy[13]
@@ -59,8 +59,9 @@ def explicit_step(
 ) -> State:
     """Integrate the state `z` over step number `step` by the Runge-Kutta method of order four; return the new state.
 
-    Row `step` of `u` [V], `G` and `C` (n, 3) holds the command and the leakage coefficients at the nodes of the step
-    (`rk4_step`). `F` (n, 3) [N] is read only if the rig has an additional load. `euler_integral`: see `rk4_step`.
+    `h` [s]: length of the step. Row `step` of `u` [V], `G` and `C` (n, 3) holds the command and the leakage
+    coefficients at the nodes of the step (`rk4_step`). `F` (n, 3) [N] is read only if the rig has an additional load.
+    `euler_integral`: see `rk4_step`.
     """
     volts = (u[step, 0], u[step, 1], u[step, 2])
     laminar, orifice = (G[step, 0], G[step, 1], G[step, 2]), (C[step, 0], C[step, 1], C[step, 2])

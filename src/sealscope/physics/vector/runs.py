@@ -47,7 +47,7 @@ def _compile(text: str, **scope: Any) -> Any:
 def _row_loader(count: int) -> Any:
     """Compile a function (array, row) that loads `count` successive rows of an array as a tuple, from row `row` on.
 
-    Each row holds one number for each run of a group.
+    Each row holds one number for each run of a group, and is loaded as lanes.
     """
     return _compile(f"def law(array, row):\n    return ({', '.join(f'load(array, row + {k})' for k in range(count))})")
 
@@ -71,10 +71,10 @@ def leak_opening(leak: Leak, t: float) -> float:
 def _build_inputs_law(count: int) -> Any:
     """Compile the function that computes the inputs of the rig for a group of runs in step k of the solver.
 
-    The inputs are the command u [V], the leakage coefficients G and C, and the load F [N], each at the `count`
-    times within a step (nodes) that the method needs. The function's arguments are (t, nodes, shape, k, drive,
-    leak, p): `t` [s] is the start of the step, `drive` and `leak` belong to the group, the others are those of
-    `advance`.
+    The inputs are the command u [V], the leakage coefficients G and C, and the load F [N], each at the `count` times
+    within a step (nodes) that the method needs. The function's arguments are (t, nodes, shape, k, drive, leak, p): `t`
+    [s] is the start of the step, `drive` the gain and the offset [V] of the command of each run, `leak` the numbers of
+    each run's leak (`LEAK_ROWS`); the others are those of `advance`.
     """
 
     def for_nodes(text: str) -> str:

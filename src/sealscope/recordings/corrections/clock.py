@@ -26,9 +26,10 @@ MAX_GAP_FRACTION, MAX_LATE_FRACTION = _PRIORS.lost, _PRIORS.late
 def resample_evenly(recording: Recording) -> Recording:
     """Resample a recording to evenly spaced times, with NaN in rows that the logger has lost.
 
-    A recording with even spacing is returned unchanged. Rows without a time are dropped, and so are rows that are not
-    later than all rows before. If the times step back or leap because the file contains several recordings, only the
-    longest recording is used.
+    A recording with even spacing is returned unchanged. If the intervals are whole numbers of sampling steps, to an rms
+    deviation of `clock.scatter` of `priors.toml`, the samples stay, and rows of NaN are inserted; else the samples are
+    interpolated linearly. Rows without a time are dropped, and so are rows that are not later than all rows before. If
+    the times step back or leap because the file contains several recordings, only the longest recording is used.
     """
     rows = _ordered_rows(recording.t)
     rows = rows[_longest_dense_stretch(recording.t[rows], recording.rate)]
@@ -47,8 +48,8 @@ def resample_evenly(recording: Recording) -> Recording:
 def _ordered_rows(t: Array) -> NDArray[np.intp]:
     """Find the indices of the rows that are later than all rows before.
 
-    `t` (n,): times [s], NaN where unknown. If more than `MAX_LATE_FRACTION` of the rows are not later, only the
-    longest run of rows without a step back in time is used.
+    `t` (n,): times [s], NaN where unknown, in which case the row is left out. If more than the fraction
+    `MAX_LATE_FRACTION` of the rows is not later, only the longest run of rows without a step back in time is used.
     """
     timed = np.flatnonzero(np.isfinite(t))
     if timed.size < 2:
@@ -80,7 +81,7 @@ def _longest_dense_stretch(t: Array, rate: float) -> slice:
 def _insert_lost_rows(recording: Recording, rows: NDArray[np.intp], steps: NDArray[np.int64]) -> Recording:
     """Insert rows of NaN for the samples that were lost between recorded ones.
 
-    `rows` (k,): indices of the recorded rows; `steps` (k - 1,): number of sampling steps between them.
+    `rows` (k,): indices of the recorded rows; `steps` (k - 1,): number of sampling steps from each of them to the next.
     """
     row_index = np.concatenate([[0], np.cumsum(steps)])
     n = int(row_index[-1]) + 1

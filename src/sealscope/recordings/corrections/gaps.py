@@ -59,10 +59,9 @@ def remove_dropouts(recording: Recording) -> Recording:
 
 
 def remove_impossible(recording: Recording) -> Recording:
-    """Set samples that no sensor can read (`quality.flag_impossible`) to NaN.
+    """Set samples to NaN whose magnitude no sensor can read, such as over 1e10 Pa (`quality.flag_impossible`).
 
-    A channel with many of them, over a tenth, has a wrong unit and stays. Returns the same recording if there are
-    none.
+    A channel with many of them, over a tenth, has a wrong unit and stays. Returns the same recording if there are none.
     """
     flags = {name: flag_impossible(values, recording.units[name]) for name, values in recording.channels.items()}
     is_removed = {name: mask & (np.mean(mask) <= _MAX_IMPOSSIBLE_FRACTION) for name, mask in flags.items() if len(mask)}
@@ -112,9 +111,10 @@ def interpolate_short_gaps(recording: Recording, needed: Sequence[str]) -> Recor
     """Interpolate short gaps linearly in all channels except those in `needed`, and except at the ends.
 
     `needed`: channels that every sample must have, i.e. the chamber pressures and the command; their gaps are filled by
-    `bridge` instead. A gap is short up to `SPLINE` samples in a pressure, and up to `gaps.motion` [s] of `priors.toml`
-    in other channels, because a moving mass moves evenly over that time. A slow sensor leaves such gaps between its
-    samples. Returns the same recording if these channels have no missing values.
+    `bridge` instead. A gap is a run of missing samples, as a sensor that is slower than the logger leaves between its
+    samples. It is short up to `SPLINE` samples in a pressure, and up to `gaps.motion` [s] of `priors.toml` in other
+    channels, because a moving mass moves evenly over that time. Returns the same recording if these channels have no
+    missing values.
     """
     max_motion_gap = _GAPS.motion * recording.rate
     channels: dict[str, Array] = {}
@@ -166,9 +166,9 @@ def _finite_mean(values: Array) -> float:
 def _copy_other_cycle(channels: dict[str, Array], needed: Sequence[str], first: int, stop: int, period: float) -> bool:
     """Fill a gap in all channels, in place, from a nearby cycle of motion; return True if there is a similar one.
 
-    The gap has the samples `first` to `stop` - 1. `period`: length of a cycle [samples], known to within `_SLACK`.
-    The nearest two cycles on either side of the gap are tried. A cycle is similar if its `_cycle_mismatch` in the
-    `needed` channels is at most `_MAX_MISMATCH`.
+    The gap has the samples `first` to `stop` - 1. `period`: length of a cycle [samples], known to within `_SLACK`. The
+    nearest two cycles on either side of the gap are tried. A cycle is similar if the motion around the gap differs from
+    it, in relative rms, by at most `_MAX_MISMATCH` (`_cycle_mismatch`). Without a similar cycle nothing is filled.
     """
     half_cycle = round(0.5 * period)
     min_cycles = math.ceil((stop - first + half_cycle) / period)
@@ -211,9 +211,10 @@ def _cycle_mismatch(
 
 
 def _copy_shifted(values: Array, first: int, stop: int, shift: int) -> None:
-    """Fill the missing values from index `first` to `stop` - 1, in place, by the values `shift` samples away.
+    """Fill the missing values from index `first` to `stop` - 1, in place, by the values `shift` samples later.
 
-    A linear offset is added, with which both ends meet the values around the gap.
+    `shift` is negative for earlier values. A linear offset is added, with which both ends meet the values around the
+    gap.
     """
     ends = (slice(first - _N_END, first), slice(stop, stop + _N_END))
     offset_before, offset_after = (

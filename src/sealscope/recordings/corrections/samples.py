@@ -51,8 +51,9 @@ class CorrectedSamples(NamedTuple):
 def correct_samples(recording: Recording) -> CorrectedSamples:
     """Correct the samples of a recording for the defects of loggers, and report each correction as a finding.
 
-    The defects are treated in this order: impossible values, dropouts, rows and pressures that repeat one value for a
-    long time, spikes, repeated samples, uneven sampling times, speeds without a sign, gaps.
+    The defects are treated in this order: impossible values; dropouts, i.e. rows of zeros; rows, and then single
+    pressures, that repeat one value for a long time; spikes; samples that repeat the previous one; uneven sampling
+    times; speeds without a sign; gaps.
     """
     part, findings = remove_dropouts(remove_impossible(recording)), list[Finding]()
     is_frozen = flag_frozen_rows(part)
@@ -98,7 +99,7 @@ def _cut_to_complete(recording: Recording, needed: Sequence[str]) -> Recording:
 
 
 def remove_holes(recording: Recording) -> Recording:
-    """Set long gaps to NaN again that have been filled, for detectors that cannot give them a lower weight.
+    """Set long gaps that were filled to NaN again, for detectors that cannot give filled samples a lower weight.
 
     The gaps are those of `flag_holes`. The result has no `bridged` flags. Returns the same recording if there are no
     long gaps.

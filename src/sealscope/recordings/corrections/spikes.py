@@ -50,8 +50,9 @@ def remove_spikes(recording: Recording) -> tuple[Recording, list[Finding]]:
 def find_spikes(values: Array) -> NDArray[np.intp]:
     """Find the indices of the samples at which a channel (n,) leaps and returns at once.
 
-    The smaller of the two changes must be several times larger than usual changes, other leaps nearby and the local
-    slope. The result is empty if there are so many such samples that the signal itself leaps.
+    Such a sample lies above both neighbours, or below both. The smaller of the two changes must be several times
+    (`spike.times` of `priors.toml`) larger than usual changes, other leaps nearby and the local slope. The result is
+    empty if there are so many such samples that the signal itself leaps.
     """
     known = np.flatnonzero(np.isfinite(values))
     if known.size < _MIN_SAMPLES:

@@ -61,11 +61,12 @@ def interpolate_stale_samples(recording: Recording) -> tuple[Recording, list[Fin
 
 
 def flag_stuck_rows(recording: Recording, name: str) -> NDArray[np.bool_]:
-    """Flag the rows (n,) in which the chamber pressure `name` repeats one value while the machine moves.
+    """Flag the rows (n,) in which the chamber pressure `name` repeats one value for too long while the machine moves.
 
-    Motion is seen in the position, else in the pump's angle. Without both, a change of the other chamber pressure
-    counts as motion, though it may change while valves hold the cylinder. If none of them is recorded, all such rows
-    are flagged. Rows at the smallest or largest value of the channel are clipped, and not flagged.
+    The time is too long for the way in which the pressure changes around it (`motion.find_stuck`). Motion is seen in
+    the position, else in the pump's angle. Without both, a change of the other chamber pressure counts as motion,
+    though it may change while valves hold the cylinder. If none of them is recorded, all such rows are flagged. Rows at
+    the smallest or largest value of the channel are clipped, and not flagged.
     """
     values, flags = recording[name], np.zeros(len(recording), dtype=bool)
     known = np.flatnonzero(np.isfinite(values))
@@ -117,8 +118,8 @@ def _is_constant_or_missing(values: Array) -> bool:
 def _jumps_at(values: Array, row: int) -> bool:
     """Return True if a channel (n,) changes across the index `row` by more than it usually does.
 
-    The change is taken over `2 * _MAX_REPEAT + 1` samples. The usual change is a high quantile (`stale.leap` of
-    `priors.toml`) of all changes of the channel over as many samples.
+    The change is that over `2 * _MAX_REPEAT + 1` samples around the row. The usual change is a high quantile
+    (`stale.leap` of `priors.toml`) of the absolute changes of the channel over as many samples.
     """
     change = np.abs(values[min(row + _MAX_REPEAT, len(values) - 1)] - values[max(row - _MAX_REPEAT - 1, 0)])
     usual_change = np.nanquantile(np.abs(values[2 * _MAX_REPEAT + 1 :] - values[: -2 * _MAX_REPEAT - 1]), _PRIORS.leap)
@@ -172,7 +173,8 @@ def estimate_holding_period(t: Array, values: Array) -> float | None:
 def _flag_held(t: Array, values: Array, period: float) -> NDArray[np.bool_]:
     """Flag the samples (n,) that repeat the previous one, in a channel with a new reading every `period` [s].
 
-    `t` (n,): times [s]; `values` (n,): samples of the channel, NaN where missing.
+    A sample is flagged if it equals the one before, and both are in the same period since the run of equal values
+    began. `t` (n,): times [s]; `values` (n,): samples of the channel, NaN where missing.
     """
     known = np.flatnonzero(np.isfinite(values))
     starts, _ = _find_equal_runs(values[known])
@@ -186,10 +188,10 @@ def _flag_held(t: Array, values: Array, period: float) -> NDArray[np.bool_]:
 
 
 def _flag_repeated_rows(channels: list[Array]) -> NDArray[np.bool_]:
-    """Flag the rows (n,) in which a logger repeats the previous row in all channels that move.
+    """Flag the rows (n,) in which a logger repeats the previous row in all channels that vary.
 
     Fewer than `_MAX_REPEAT` such rows follow each other, and a channel jumps before and after them. No row is flagged
-    if there are not many more of them than would occur by chance.
+    if there are not many more of them than would occur by chance, if the channels repeated samples independently.
     """
     moving = [values for values in channels if np.isfinite(values).any() and np.nanmax(values) > np.nanmin(values)]
     if not moving or moving[0].size < _PRIORS.runs:

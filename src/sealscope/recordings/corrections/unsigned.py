@@ -30,7 +30,8 @@ _NAMES = {"omega": "speed", "q_pump": "flow"}
 def restore_speed_sign(recording: Recording) -> tuple[Recording, list[Finding]]:
     """Restore the missing sign of a motor speed or of a flow meter, positive for flow into chamber A.
 
-    Returns the recording, and a finding for each channel that was changed.
+    A sign is missing if the channel stays on one side of zero while the position, or without a position the command,
+    shows motion in both directions. Returns the recording, and a finding for each channel that was changed.
     """
     channels, findings = dict(recording.channels), list[Finding]()
     for name, quantity in _NAMES.items():
@@ -46,7 +47,11 @@ def restore_speed_sign(recording: Recording) -> tuple[Recording, list[Finding]]:
 
 
 def _has_one_sign(values: Array) -> bool:
-    """Return True if a channel (n,) stays on one side of zero, to within its noise."""
+    """Return True if a channel (n,) stays on one side of zero, to within its noise.
+
+    The largest magnitude on the other side may be at most the fraction `unsigned.noise` of `priors.toml` of the largest
+    on this side.
+    """
     finite = values[np.isfinite(values)]
     if not finite.size:
         return False
@@ -57,8 +62,9 @@ def _has_one_sign(values: Array) -> bool:
 def _find_sign(recording: Recording, magnitude: Array) -> tuple[Array | None, str]:
     """Find the signs (n,), +1 or -1, of the flow into chamber A; also return the source of the signs, in words.
 
-    `magnitude` (n,): absolute speed or flow. Returns (None, "") if neither position nor command determines the signs,
-    or if the motion is in one direction only.
+    `magnitude` (n,): absolute speed or flow. The signs are fitted to the position (`_fit_signs`); in a recording
+    without one they are those of the command. Returns (None, "") if there is neither, if the magnitude of the piston
+    speed or command does not correlate with `magnitude`, or if the motion is in one direction only.
     """
     if "x" in recording:
         speed = _piston_speed(recording["x"], recording.rate)
@@ -88,8 +94,8 @@ def _piston_speed(x: Array, rate: float) -> Array:
 def _moves_both_ways(values: Array) -> bool:
     """Return True if a signal (n,) has enough motion in both directions.
 
-    Its positive and its negative values are summed. The smaller sum must exceed the larger one times `unsigned.least`
-    of `priors.toml`.
+    Its positive values are summed, and so are the magnitudes of its negative ones. The smaller sum must exceed the
+    larger one times `unsigned.least` of `priors.toml`.
     """
     smaller, larger = sorted(float(np.nansum(np.maximum(signed, 0.0))) for signed in (values, -values))
     return smaller > _PRIORS.least * larger > 0.0
@@ -147,8 +153,9 @@ def _fit_signs(recording: Recording, speed: Array, magnitude: Array) -> Array:
 def _noise_variance(speed: Array, rate: float) -> float:
     """Estimate the noise variance [(m/s)^2] of a piston speed (n,) sampled at `rate` [Hz].
 
-    It follows from differences of speeds that are computed from different positions; the median makes the estimate
-    robust to motion.
+    It is half the mean square of the difference of two speeds that are computed from different positions, i.e. of
+    speeds a window apart (`_piston_speed`). The mean square is taken over a short time around each sample, and the
+    median of these values makes the estimate robust to motion.
     """
     n_lag = max(1, round(2.0 * _PRIORS.half * rate))
     steps = speed[n_lag:] - speed[:-n_lag]
@@ -167,9 +174,10 @@ def _average_nearby(values: Array, rate: float) -> Array:
 def _most_likely_signs(log_odds: Array, cost_of_change: Array) -> Array:
     """Find the most likely sequence of signs (n,), +1 or -1, by the Viterbi algorithm.
 
-    `log_odds` (n,): log odds of a positive sign, from each sample alone; `cost_of_change` (n - 1,): log odds against
-    a change of sign after each sample. The log odds accumulate from sample to sample, limited to the cost of a
-    change.
+    `log_odds` l (n,): log odds of a positive over a negative sign, from each sample alone; `cost_of_change` c (n - 1,):
+    log odds against a change of sign after each sample. The log odds of the best path up to sample k are o_k = l_k +
+    min(max(o_(k-1), -c_(k-1)), c_(k-1)). From the end backwards, the sign of sample k is that of o_k if |o_k| > c_k,
+    else that of sample k + 1.
     """
     path_odds, odds = np.empty(log_odds.size), 0.0
     for k, (evidence, cost) in enumerate(zip(log_odds.tolist(), [0.0, *cost_of_change.tolist()], strict=True)):

@@ -71,9 +71,9 @@ def is_value(cell: str, decimal: str) -> bool:
 def parse_numbers(cells: Sequence[str], decimal: str, where: Callable[[int], str]) -> tuple[Array, list[int]]:
     """Parse the cells of a column to an array of doubles (n,), and find the cells that contain words.
 
-    A word is neither a number nor a mark of a missing sample; both words and missing samples become NaN. `decimal`:
-    decimal separator; `where`: function that describes the place of the cell with a given index, for messages.
-    Returns the numbers and the indices of the words. Raises InputError for an infinite number.
+    A word is any text that is neither a number nor a mark of a missing sample; both words and missing samples become
+    NaN. `decimal`: decimal separator; `where`: function from the index of a cell to its place, for messages. Returns
+    the numbers and the indices of the words. Raises InputError for an infinite number.
     """
     # with a decimal comma a point is no decimal separator: `?` makes `float` refuse the cell
     texts = [cell.replace(".", "?").replace(",", ".") for cell in cells] if decimal == "," else cells
@@ -134,7 +134,7 @@ def expand_prefixes(line: str) -> str:
 def _trailing_unit(cell: str) -> str | None:
     """Find the text after the number in a cell such as `20 bar`, whether it is a known unit or not.
 
-    None if the cell is no number with a short text after it.
+    None if the cell is not a number with a short text after it.
     """
     cell = cell.strip()
     match = _QUANTITY.fullmatch(cell) if len(cell) <= _MAX_QUANTITY else None

@@ -44,8 +44,8 @@ REST = "*"
 class Request:
     """Choices of a user for reading a file; invalid values raise InputError.
 
-    `map`: column of each channel; `rate`: sampling rate [Hz] in place of a time column, or None; `file`: name of the
-    file for the provenance.
+    `map`: channel -> column, or "auto" to choose by the columns' names; `rate`: sampling rate [Hz] in place of a time
+    column, or None; `file`: name of the file for the provenance.
     """
 
     map: ChannelMap
@@ -74,8 +74,8 @@ class ColumnMap:
     - `time`: the time column, or None; `time_label`: name and unit used for it.
     - `channels`: channel -> formula of columns.
     - `parts`: part of the time, such as "hour" -> its column, if several columns form the time.
-    - `date`: column of the date if the time column may be a time of day, or the time column itself if it is called a
-      date.
+    - `date`: column of the date, which is needed if the time column contains times of day only; the time column itself
+      if its name means a date, because it may then contain dates alone.
     - `names`: channel -> its name in the file, if that differs.
     - `unused`: names of columns with measured pressures, positions, speeds and flows that are in no channel.
     - `notes`: lines for the history of the recording.
@@ -144,7 +144,7 @@ def check_request(channel_map: ChannelMap, rate: float | None) -> None:
 
 
 def uses_names(channel_map: ChannelMap) -> bool:
-    """Return True if a map from channels to columns contains "auto", and so lets names of columns decide."""
+    """Return True if a map from channels to columns contains "auto", i.e. if the columns' names choose channels."""
     return isinstance(channel_map, str) or REST in channel_map
 
 
@@ -158,7 +158,8 @@ def explicit_columns(channel_map: ChannelMap) -> dict[str, str]:
 def reconstruct_map(provenance: Mapping[str, object]) -> dict[str, str]:
     """Reconstruct the map, channel -> column, with which a recording was read, from its provenance.
 
-    Empty if the provenance names no columns.
+    The provenance has the heading of each channel's column, where that differs from the channel's name. The map adds a
+    unit that a heading has at the end of its name, as in `PA_bar`. Empty if the provenance names no columns.
     """
     names = provenance.get("columns")
     columns = {str(channel): str(heading) for channel, heading in names.items()} if isinstance(names, Mapping) else {}
@@ -184,8 +185,8 @@ def _format_columns(labels: Sequence[Label]) -> str:
 def _find_column(labels: Sequence[Label], name: str, description: str, mapped: bool = False) -> int | None:
     """Find the index of the column with a name, or with a number such as `#4`, counted from 1.
 
-    None if there is none. If `mapped`, the last words of a column's name are enough, such as `ch2`. Raises InputError
-    if several columns match; `description` begins the message.
+    The index itself counts from 0. None if there is no such column. If `mapped`, the last words of a column's name are
+    enough, such as `ch2`. Raises InputError if several columns match; `description` begins the message.
     """
     folded = name.casefold()
     for matches_name in (  # strict criteria first
@@ -391,9 +392,10 @@ def choose_columns(labels: Sequence[Label], request: Request, stated_rate: float
     """Choose the columns of a table to read, and the channel of each.
 
     Without a time column the sampling rate is the requested one, else the `stated_rate` [Hz] of the file. "auto" in a
-    map stands for `proposed_map` of the columns that the map does not use. A column in the map takes precedence over
-    a column with the channel's name. Raises InputError if a column in the map does not exist, if no column is a
-    channel, if there is neither time nor rate, and for a unit of the wrong dimension.
+    map stands for the channels that are guessed from the names and units of the columns that the map does not use
+    (`proposed_map`). A column in the map takes precedence over a column with the channel's name. Raises InputError if a
+    column in the map does not exist, if no column is a channel, if there is neither time nor rate, and for a unit of
+    the wrong dimension.
     """
     choice, columns, rate = ColumnMap(labels, stated_rate), explicit_columns(request.map), request.rate
     if uses_names(request.map):

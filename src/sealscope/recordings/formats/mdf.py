@@ -70,7 +70,8 @@ def _open_file(MDF: Any, path: Path) -> Any:
 def _read_values(file: Any, group: int, index: int) -> NDArray[Any]:
     """Read the samples (n,) of a channel, given the number of its group in the file and its index in the group.
 
-    A conversion may give a few texts among the numbers, such as `SNA`; these become NaN.
+    A conversion may give a few texts among the numbers, such as `SNA`; these become NaN. With more than 1 % of texts
+    the samples are returned as texts.
     """
     values = np.asarray(file.get(group=group, index=index).samples)
     if values.dtype.kind not in "OSU":

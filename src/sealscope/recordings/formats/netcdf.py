@@ -84,7 +84,10 @@ def _read_field(data: Any, name: str, field: str) -> NDArray[Any]:
 
 
 def _is_series(item: Any) -> bool:
-    """Return True if an item of a file is a one-dimensional data set, but no NetCDF dimension without values."""
+    """Return True if an item of a file is a one-dimensional data set with samples.
+
+    The placeholder that NetCDF writes for a dimension without values does not count.
+    """
     import h5py
 
     if not isinstance(item, h5py.Dataset) or item.ndim != 1:

@@ -117,7 +117,7 @@ def uniform_clock(
 
 
 class RecordingFields(NamedTuple):
-    """The arguments of `Recording` in their order, followed by `kind`, the format of the file in words."""
+    """The arguments of `Recording` in their order, without `bridged`; then `kind`, the format of the file in words."""
 
     t: Array
     channels: dict[str, Array]
@@ -145,10 +145,11 @@ def build_fields(
 ) -> RecordingFields:
     """Build the fields of a recording from the series in a file; raise InputError if they do not fit together.
 
-    - `request`: choice of the series.
+    - `series`: named columns of samples.
+    - `request`: the user's choice of the columns.
     - `kind`: format of the file in words.
     - `remarks`: entries in the file's header.
-    - `rate` [Hz]: sampling rate stated by the file, for series without a clock.
+    - `rate` [Hz]: sampling rate stated by the file, for series without sampling times (`Series.clock`).
     - `description`: rate, provenance and history in a file that Sealscope has written.
     - `prepare`: function that reads all used columns together, before their values are needed.
     - `size`: size of a file that may be compressed [bytes], for `check_size`.
@@ -199,7 +200,7 @@ def convert_columns(
 
     - `choice`: meaning of the columns.
     - `columns`: column -> values (n,), doubles or, for the time, datetime64.
-    - `kind`, `remarks`, `description`: as for `build_fields`.
+    - `kind`, `request`, `remarks`, `description`: as for `build_fields`.
     - `notes`: lines for the history.
     - `state`: state of the time column after the previous part of a text log, which is updated; None for a whole log.
     """
@@ -323,8 +324,9 @@ def _assign_clocks(series: Sequence[Series]) -> list[Series]:
 def read_times(time: Series, start: np.datetime64 | None = None) -> tuple[Array, np.datetime64 | None]:
     """Read the times (n,) [s] of a series that contains times, and the time stamp of 0 s.
 
-    Date stamps count from the first of them, which is returned, or None for a series in a group. For other times the
-    returned stamp is `start`. Raises InputError if no row has a time.
+    If the series has date stamps, the times count from the first one. It is also the returned stamp, unless the series
+    is in a group; then that is None. For other times the returned stamp is `start`. Raises InputError if no row has a
+    time.
     """
     values = time.values()
     if values.dtype.kind == "m":
@@ -347,8 +349,8 @@ def timedelta_seconds(times: Any) -> Array:
 def _make_names_unique(series: Sequence[Series]) -> tuple[list[Series], list[str]]:
     """Give each series of a file a unique name; return the series, and lines for the history.
 
-    If several groups have series of one name, the group with most channels, or else with most samples, keeps it. The
-    others are called by their paths, `group/name`. A file without groups is returned unchanged.
+    If several groups have series of one name, the group with most series named like channels, or else with most
+    samples, keeps it. The others are called by their paths, `group/name`. A file without groups is returned unchanged.
     """
     if all(member.group == "" for member in series):
         return list(series), []
@@ -377,8 +379,8 @@ def _make_names_unique(series: Sequence[Series]) -> tuple[list[Series], list[str
 def _read_samples(series: Series, *, as_time: bool = False) -> NDArray[Any]:
     """Read the samples (n,) of a series as doubles.
 
-    With `as_time`, date stamps are read as datetime64. A few words in a column of texts become NaN; raises InputError
-    for more, and for other types.
+    With `as_time`, date stamps are read as datetime64. Words in a column of texts become NaN if they are few, at most 1
+    % of the cells; raises InputError for more, and for other types.
     """
     values = series.values()
     if values.dtype.kind in "OSU":
@@ -439,9 +441,9 @@ def _align_clocks(choice: ColumnMap, used: dict[int, Series]) -> tuple[dict[int,
 def _resample(values: Array, member: Series, t: Array, start: np.datetime64 | None) -> tuple[Array, str]:
     """Resample the samples `values` of the series `member` to the times `t` (n,) [s] after `start`.
 
-    Also returns a note for the history, which is empty if the series is sampled at these times already. Slower series
-    are interpolated, except over long intervals, and faster ones are averaged. Raises InputError if the times of the
-    series do not increase.
+    Also returns a note for the history, which is empty if the series is sampled at these times already. A series with a
+    lower sampling rate is interpolated linearly, except over long intervals, where the result is NaN. One with a higher
+    rate is averaged over the intervals around the times. Raises InputError if the times of the series do not increase.
     """
     assert member.clock is not None
     times, member_start = member.clock.read()
@@ -482,7 +484,8 @@ def _average(values: Array, times: Array, t: Array, step: float) -> Array:
 def _find_long_columns(labels: Sequence[Label]) -> dict[str, int] | None:
     """Find the columns of a long table, in which each row has one sample of one channel; None for other tables.
 
-    Returns a mapping from their meanings, "name", "value" and, if they exist, "unit" and "valid", to the columns.
+    Returns a mapping from the meaning of a column to its number: "name" and "value", and "unit" and "valid" if they
+    exist.
     """
     names = [label.name.strip().casefold() for label in labels]
     columns_of_kind = {
@@ -599,7 +602,8 @@ def _pivot_long_table(
 def check_size(n_rows: int, n_columns: int, file_size: int | None = None) -> None:
     """Raise InputError if a table has more than `MAX_VALUES` values, or more than its file can hold.
 
-    `file_size`: size of the file [bytes]; with None only the number of values is checked.
+    A file can hold as many doubles as fit into `_MAX_EXPANSION` times its size `file_size` [bytes], or into
+    `_MIN_LIMIT` bytes if these are more; with None only the number of values is checked.
     """
     if n_rows * n_columns > MAX_VALUES:
         raise InputError(
@@ -615,7 +619,8 @@ def check_size(n_rows: int, n_columns: int, file_size: int | None = None) -> Non
 def check_texts(count: int, width: int, name: str) -> None:
     """Raise InputError if a column has too many texts, or too long ones.
 
-    `count`: number of texts; `width`: length of the longest one [bytes]; `name`: the column in messages.
+    `count`: number of texts; `width`: length of the longest one [bytes]; `name`: the column in messages. The limits are
+    `_MAX_TEXTS` texts, `_MAX_TEXT_WIDTH` bytes for each, and `_MAX_TEXT_BYTES` for count times width.
     """
     if count > _MAX_TEXTS or width > _MAX_TEXT_WIDTH or count * width > _MAX_TEXT_BYTES:
         raise InputError(

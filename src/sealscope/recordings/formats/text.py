@@ -184,7 +184,7 @@ def _read_several_clocks(path: Path, layout: Layout, time_columns: Sequence[int]
 def _find_channel_times(labels: Sequence[Label]) -> list[int]:
     """Find the time columns of a log in which each channel, or group of channels, follows a time column of its own.
 
-    Empty for other logs.
+    Returns their numbers; empty for other logs. The names of the time columns may differ only in a number at the end.
     """
     # the time columns differ only in a number at the end of their names
     names = [_NUMBER_SUFFIX.sub("", label.name.casefold()) for label in labels]
@@ -253,10 +253,10 @@ class _Block:
 class _Log:
     """Reader of the rows of a text log, block by block.
 
-    - `kinds`: column to read -> kind of its values; `date`: column of the date, or None, both as for `table.Prepare`.
+    - `kinds`: column to read -> kind of its values: "numbers"; "any", numbers with words as inf; "time"; or "texts".
+      `date`: column of the date that belongs to the time, or None.
     - `min_cells`: number of cells that a row needs.
-    - `n_rows`, `n_repeated`, `n_text_lines`: numbers of rows, repeated heading lines and lines of text read until
-      now.
+    - `n_rows`, `n_repeated`, `n_text_lines`: numbers of rows, repeated heading lines and lines of text read until now.
     - `has_stamps`: True if the time column contains date stamps, None before its first cell is read.
     - `has_date`: True if a date column completes these stamps.
     - `day_first`: True if the day precedes the month in dates, None before the first date that leaves this open.

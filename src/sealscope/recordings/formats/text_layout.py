@@ -179,7 +179,7 @@ def _split_heading(line: str, delimiter: str, width: int = 0) -> list[str]:
 def _parse_unit_row(cells: Sequence[str]) -> list[str | None] | None:
     """Parse a row of units below or above the names of columns: the unit of each cell, None for an empty one.
 
-    At least 60 % of the cells must be known units; the result is None for any other row.
+    At least 60 % of the cells that are not empty must be known units; the result is None for any other row.
     """
     texts = [cell.strip().strip("[]()<>'").strip() for cell in cells]
     units = [text if text and text != "-" else None for text in texts]
@@ -254,9 +254,10 @@ def _parse_keyed_rows(rows: Sequence[Sequence[str]]) -> tuple[list[Label], int] 
 
 
 def _parse_stacked_rows(rows: Sequence[Sequence[str]]) -> tuple[list[Label], int]:
-    """Parse heading rows of names, and possibly of units, groups and rulers such as `----`.
+    """Parse heading rows of names, and possibly of units, of groups of columns, and of rulers such as `----`.
 
-    `rows`: cells of the rows, from the lowest up. Returns (labels of the columns, number of rows).
+    `rows`: cells of the rows, from the lowest up. Returns (labels of the columns, number of rows). The name of a group
+    is put before the names of its columns.
     """
     n_skipped = next((i for i, row in enumerate(rows[:-1]) if not _is_ruler(row)), len(rows) - 1)
     row, *rows_above = rows[n_skipped:]
@@ -381,7 +382,8 @@ def _is_content(line: str) -> bool:
 def _find_first_row(lines: Sequence[str], body: Sequence[str], delimiter: str, decimal: str, width: int) -> int | None:
     """Find the index of the first line with samples in over half of the numeric columns; None if there is none.
 
-    `body`: lines of samples that show which columns are numeric; `width`: number of cells in a row.
+    `lines`: lines of the log; `body`: lines of samples that show which columns are numeric; `width`: number of cells in
+    a row; `delimiter`, `decimal`: separators of cells and of decimals.
     """
     rows = [row for row in (split_cells(line, delimiter) for line in body) if len(row) == width]
     is_value_cell = [[is_value(cell, decimal) for cell in row] for row in rows]

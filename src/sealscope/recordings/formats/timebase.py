@@ -140,17 +140,19 @@ def parse_stamps(cells: Sequence[str], day_first: bool | None = None) -> NDArray
 
 
 def ambiguous_dates(cells: Iterable[str]) -> dict[str, None]:
-    """Collect the dates in which either the day or the month may come first, such as 05/06/2024.
+    """Collect the dates written like 05/06/2024 or 05-06-24, a form in which the day or the month may come first.
 
-    The result is a dict without values, whose keys are the dates, each once and in order.
+    `cells`: texts that may begin with such a date. The result is a dict without values, whose keys are the dates, each
+    once and in order.
     """
     return {match["date"]: None for cell in cells if (match := _EITHER_DATE.match(cell))}
 
 
 def explicit_order(dates: Iterable[str]) -> bool | None:
-    """Decide from dates if the day precedes the month, by the first date with a day or month over 12.
+    """Decide from dates such as 05/06/2024 if the day precedes the month.
 
-    None if there is no such date.
+    The first date of which exactly one of the two numbers is over 12 decides: True if it is the first number, as in
+    31/12/2024, else False. None if there is no such date.
     """
     over_12 = ((first > _LAST_MONTH, second > _LAST_MONTH) for first, second, _ in map(_date_numbers, dates))
     return next((first for first, second in over_12 if first != second), None)
@@ -204,7 +206,10 @@ def _is_datetime(text: str) -> bool:
 
 
 def counts_from_1970(clock: float) -> bool:
-    """Test whether a clock reading [s] counts from 1970, rather than from the start of a machine."""
+    """Test whether a clock reading [s] counts from 1970, rather than from the start of a machine.
+
+    It then lies between March 1973 and the year 5138.
+    """
     return _MIN_EPOCH < clock < _MAX_EPOCH
 
 
@@ -257,8 +262,9 @@ def _iso_date(parts: Mapping[str, str | None], day_first: bool) -> str:
 def nominal_rate(t: Array) -> float:
     """Estimate the nominal sampling rate [Hz] of times `t` (n,) [s].
 
-    It is the shortest decimal number that agrees with them, computed from the mean interval if the times are uniform,
-    else from the median interval. Raises InputError if no interval is positive.
+    It is the decimal number with the fewest digits that agrees with the reciprocal of the mean interval, to within the
+    rounding of the times. If the times do not increase throughout, or deviate from an even spacing by 0.6 intervals or
+    more, the median interval takes the place of the mean. Raises InputError if no interval is positive.
     """
     steps = np.diff(t)
     span = float(t[-1] - t[0])
@@ -287,9 +293,9 @@ def is_falling(times: NDArray[Any]) -> bool:
 def _convert_stamps(values: NDArray[np.datetime64], name: str, state: TimeState) -> _Seconds:
     """Convert date stamps (n,) of a time column to seconds from the first of them.
 
-    Returns (times (n,) [s], provenance of the start, lines for the history). Times of day without a date continue
-    from part to part of a log. Jumps back at midnight or at the full hour, and those of daylight saving time, are
-    removed. `name`: the column in messages. Raises InputError if no row has a stamp.
+    Returns (times (n,) [s], provenance of the start, lines for the history). Times of day without a date continue from
+    part to part of a log, from the last time in `state`. Jumps back at midnight or at the full hour, and those of
+    daylight saving time, are removed. `name`: the column in messages. Raises InputError if no row has a stamp.
     """
     nanoseconds = values.astype("datetime64[ns]")
     known = ~np.isnat(nanoseconds)
@@ -321,7 +327,9 @@ def _convert_stamps(values: NDArray[np.datetime64], name: str, state: TimeState)
 def _remove_jumps(t: Array, step: float, single: bool) -> Array | None:
     """Remove clock jumps of `step` [s], such as -86400 s at midnight, from times (n,).
 
-    None if there is no jump, or if there are several although `single` permits only one.
+    An interval is a jump if it differs from `step` plus the median interval by at most `_TOLERANCE` median intervals.
+    None if there is no jump, if there are several although `single` permits only one, or if intervals are so long that
+    ordinary ones could look like jumps.
     """
     steps = np.diff(t)
     positive_steps = steps[np.isfinite(steps) & (steps > 0)]
@@ -338,8 +346,10 @@ def _remove_jumps(t: Array, step: float, single: bool) -> Array | None:
 def _convert_numbers(values: Array, unit: str | None, name: str, state: TimeState) -> _Seconds:
     """Convert a time column of numbers (n,) to seconds.
 
-    Returns (times (n,) [s], provenance of the start, lines for the history). `unit`: unit of the column; without one
-    the magnitude of the numbers decides. `name`: the column in messages. Raises InputError if no row has a number.
+    Returns (times (n,) [s], provenance of the start, lines for the history). `unit`: unit of the column, which may also
+    state an origin, as in `days since 1899-12-30`; without one the magnitude of the numbers decides. `name`: the column
+    in messages; `state`: state of the column after the previous part of the log, which is updated. Raises InputError if
+    no row has a number.
     """
     finite = values[np.isfinite(values)]
     if not finite.size:
@@ -366,7 +376,8 @@ def _convert_without_unit(values: Array, finite: Array, name: str, state: TimeSt
     """Convert a time column of numbers (n,) without a unit to seconds.
 
     Returns (times (n,) [s], provenance of the start, lines for the history). The size and the steps of the `finite`
-    numbers show if they are days or seconds, and since when. Raises InputError if they count rows.
+    numbers show if they are days or seconds, and since when. `name`: the column in messages; `state`: state of the
+    column after the previous part of the log, which is updated. Raises InputError if the numbers count rows.
     """
     first, is_first_part = float(finite[0]), state.head is None
     state.head = head = finite if state.head is None else state.head
@@ -396,8 +407,9 @@ def _convert_without_unit(values: Array, finite: Array, name: str, state: TimeSt
 def _detect_days(values: Array) -> tuple[np.datetime64 | None, str] | None:
     """Find out if the numbers (n,) of a time column without a unit count days.
 
-    Returns (origin, meaning in words), or None if they count seconds. They count days if their steps, taken as
-    seconds, would be shorter than those of any logger. The origin is None for fractions of a day.
+    Returns (origin, meaning in words), or None if they do not. Numbers count days if the steps between them, taken as
+    seconds, would be shorter than those of any logger, and if the first is a date from 1982 to 2078 as spreadsheets or
+    MATLAB count days. They are fractions of a day if they lie between 0 and 1; the origin is then None.
     """
     steps = np.diff(values)
     steps = steps[steps > 0]
@@ -446,10 +458,10 @@ def time_base(
 
 
 def _space_shared_times(t: Array, state: TimeState) -> tuple[float, Array] | None:
-    """Spread samples that share a coarse time evenly over the step of that time.
+    """Spread samples that share a time, because the times of the log have coarse steps, evenly over these steps.
 
     `t` (n,): times [s]. Returns (step [s], new times (n,)), or None if no samples share times regularly. A part of a
-    log that is too short for estimating the step uses that of `state`, and its rate, unless it has a gap.
+    log that is too short for estimating the step uses the step and the rate in `state`, unless it has a gap.
     """
     steps = np.diff(t)
     changes = np.flatnonzero(steps)

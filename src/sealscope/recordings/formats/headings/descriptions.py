@@ -67,8 +67,9 @@ def _rename_label(label: Label, name: str) -> Label:
 def parse_scope_heading(lines: Sequence[str], delimiter: str) -> tuple[list[Label], int] | None:
     """Parse the heading of a TwinCAT Scope export to (labels of the columns, number of its lines).
 
-    None for any other text. `lines`: the lines above the first sample. In an export each row of a property, such as
-    the units, repeats its name above the time columns, which are in milliseconds since the start of the export.
+    None for any other text. `lines`: the lines above the first sample. An export has a row for each property, such as
+    the names and the units. The name of the property stands above each time column, and the channel's value above the
+    channel. Times are in milliseconds since the start of the export.
     """
     rows = [[cell.strip() for cell in line.split(delimiter)] for line in lines]
     begin = max((index for index, row in enumerate(rows) if row[0] == "Name" and len(row) > 2), default=None)

@@ -35,8 +35,8 @@ _MAX_NAME = 80
 class _Guess(NamedTuple):
     """Guessed meaning of a column, from its name and its unit.
 
-    `kind`: the quantity, such as "pressure"; `side`: chamber or pump port, as from `_find_side`; `unit`: the unit, or
-    None.
+    `kind`: the quantity, such as "pressure"; `side`: "A" or "B" for a chamber, "pump", "pump 1" or "pump 2" for a port
+    of the pump, "1" or "2" if only this number is known, or "" (`_find_side`); `unit`: the unit, or None.
     """
 
     kind: str
@@ -198,7 +198,8 @@ def _strip_accents(text: str) -> str:
 def _split_words(name: str) -> set[str]:
     """Split a name into its words, in lower case.
 
-    Added are the last parts of German compounds (`weg` of `kolbenweg`), and `p` and `a` for `pa`.
+    Added are the last parts of German compounds (`weg` of `kolbenweg`), and the two letters of `pa` and of `pb`, i.e.
+    `p` and the side.
     """
     words = {word for word in _UNSPACED if word in name}
     for token in (token.casefold() for token in _TOKEN.findall(_strip_accents(name))):

@@ -82,7 +82,8 @@ def combine_time_parts(base: NDArray[Any], parts: Mapping[str, Array], unit: str
 def _restarts_each_second(base: NDArray[Any], offset: Array) -> bool:
     """Return True if parts of a second grow within each second and fall at the next one, as they should.
 
-    `base` (n,): whole seconds or stamps; `offset` (n,): the parts of a second. A tenth of the steps may differ.
+    `base` (n,): whole seconds or stamps; `offset` (n,): the parts of a second. A tenth of the steps may differ. False
+    if fewer than half of the steps are within a second.
     """
     steps = np.diff(base) / (np.timedelta64(1, "s") if base.dtype.kind == "M" else 1.0)
     is_same_second, is_next_second, change = steps == 0, steps == 1, np.diff(offset)

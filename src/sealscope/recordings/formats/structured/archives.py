@@ -45,7 +45,7 @@ def is_workbook(path: Path) -> bool:
 def _run_limited(work: Callable[..., T], path: Path, *arguments: Any) -> T:
     """Run `work(path, *arguments)` in a subprocess and return its result.
 
-    The time limit grows with the size of the file.
+    The time limit grows with the size of the file, as `_BASE_TIME` + size / `_MIN_SPEED`.
     """
     limit = _BASE_TIME + path.stat().st_size / _MIN_SPEED
     return run_on_file(work, path, *arguments, limit=limit, memory=_MEMORY)

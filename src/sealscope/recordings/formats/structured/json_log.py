@@ -82,9 +82,10 @@ def read_json(path: Path, request: Request) -> RecordingFields:
 
 
 def _read_members(text: str, place: str) -> tuple[list[Any], bool]:
-    """Read the values in a JSON text; also return True if a truncated last one was left out.
+    """Read the values that stand one after the other in a JSON text (`_iter_members`).
 
-    `place`: the file, for messages. Raises InputError for damaged JSON.
+    Also returns True if the last value is truncated and was left out. `place`: the file, for messages. Raises
+    InputError for damaged JSON.
     """
     members, is_cut = list[Any](), False
     try:
@@ -103,7 +104,11 @@ def _read_members(text: str, place: str) -> tuple[list[Any], bool]:
 
 
 def _iter_members(text: str) -> Iterator[Any]:
-    """Yield the values of a JSON text one after the other; for an array of arrays or objects, its members."""
+    """Yield the values that stand one after the other in a JSON text, such as one record on each line.
+
+    If a value is an array of arrays or objects, its members are yielded in its place. Raises json.JSONDecodeError where
+    the text is damaged.
+    """
     position, in_array = 0, False
     while (position := _SEPARATORS.match(text, position).end()) < len(text):  # type: ignore[union-attr]
         if in_array and text[position] == "]":
@@ -121,10 +126,12 @@ def _is_cell(value: object) -> bool:
 
 
 def _iter_cells(group: str, name: str, value: Any, depth: int) -> Iterator[tuple[str, str, Any, str | None]]:
-    """Yield the single values in an entry of a JSON record, as (group, name, cell, unit); the unit may be None.
+    """Yield the single values in an entry of a JSON record, as (group, name, cell, unit).
 
-    `value` is such a cell itself, a vector, or a record of further values, whose name then belongs to the group.
-    `depth`: number of records and vectors around it. Raises InputError for other values.
+    `group`, `name`: names of the records around the entry, and of the entry. `value`: a single value (text, number or
+    null); a record `{"value": ..., "unit": ...}`, which states the unit, else None; a vector, whose members are called
+    `name(1)`, `name(2)`, ...; or a record of further values, whose name then belongs to the group. `depth`: number of
+    records and vectors around it. Raises InputError for other values.
     """
     if isinstance(value, Mapping) and depth < _MAX_DEPTH:
         unit = value.get("unit")
@@ -145,8 +152,9 @@ def _iter_cells(group: str, name: str, value: Any, depth: int) -> Iterator[tuple
 def _parse_records(members: Sequence[Any], place: str) -> list[Series]:
     """Make a series of samples for each name in a sequence of JSON values.
 
-    The values are records, rows after a row of names, or blocks of columns. `place`: the file, for messages. Raises
-    InputError for other values, and for a name with several units.
+    The values are records (objects with the values of one row by their names), rows (arrays, the first of which may
+    have the names), or blocks of columns (objects of arrays). `place`: the file, for messages. Raises InputError for
+    other values, and for a name with several units.
     """
     columns: dict[tuple[str, str], dict[int, Any]] = {}
     units: dict[tuple[str, str], str] = {}

@@ -61,7 +61,7 @@ class _Packet:
             return None
 
     def column(self, index: int) -> Array:
-        """Return the samples (n,) of the packet's column with the number `index`."""
+        """Return the samples (rows,) in the packet's column with the number `index`, from 0."""
         return np.array([row[index] for row in self.rows])
 
 
@@ -186,8 +186,9 @@ def _compute_times(packet: _Packet, index: int, count: int) -> Array:
 def _packet_offsets(packets: Sequence[_Packet], day_first: bool) -> list[float]:
     """Compute the time [s] from the first packet of samples to each packet.
 
-    All are 0 if the times continue from packet to packet, or if the date of a packet is not known. `day_first`: True
-    if the day precedes the month in dates.
+    It is the difference of the date stamps in their headers. All are 0 if the start times `X0` increase from packet to
+    packet, so that the times continue, or if the date of a packet is not known. `day_first`: True if the day precedes
+    the month in dates.
     """
     moments = [packet.moment(0, day_first) for packet in packets]
     first_times = [packet.number("x0", 0) for packet in packets]

@@ -69,8 +69,9 @@ def _struct_fields(value: Any) -> Mapping[str, Any] | None:
 
 
 def _iter_struct(group: str, name: str, fields: Mapping[str, Any], clock: Clock | None, depth: int) -> Iterator[Series]:
-    """Yield the series of samples in a struct: a time series, a signal with a unit, or a group of other values.
+    """Yield the series of samples in a struct.
 
+    The struct is a time series, i.e. samples with their times; a signal with a unit; or a group of other values.
     `fields`: the fields of the struct by name; other arguments as for `_iter_value`.
     """
     by_name = {key.rstrip("_").casefold(): value for key, value in fields.items()}
