@@ -24,8 +24,8 @@ _LAST_STEP, _MAX_SECANTS = 1e-9, 12
 def find_root(function: Callable[[float], float], low: float, high: float) -> float:
     """Find a zero of a continuous function between `low` and `high` by Chandrupatla's method.
 
-    The result is accurate to four units in the last place. Raises ValueError if the function has the same sign at both
-    ends, or is NaN there.
+    The search ends when the zero is enclosed to a relative width of 8 machine epsilons, or after 200 steps. Raises
+    ValueError if the function has the same sign at both ends, or is NaN there.
     """
     a, b, f_a, f_b = high, low, function(high), function(low)  # a: the newest point; the root is between a and b
     if not f_a * f_b <= 0.0:

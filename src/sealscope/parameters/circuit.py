@@ -60,7 +60,7 @@ class HydraulicCircuit(NamedTuple):
 
     @property
     def size_parameters(self) -> tuple[str, ...]:
-        """Names of the parameters that state `flow_size`."""
+        """Dotted names of the parameters that `flow_size` stands for: both piston areas, or the displacement."""
         return ("cylinder.A_A", "cylinder.A_B") if self.flow_size == "area" else ("pump.q_b",)
 
 
@@ -97,9 +97,10 @@ CIRCUITS = (PUMP_CIRCUIT, VALVE_CIRCUIT)
 
 
 def check_circuit_property(subject: str, rig: str, circuit: HydraulicCircuit, flag: str) -> None:
-    """Check that a circuit has a property, which is an attribute `flag` of type bool.
+    """Check that the bool attribute `flag` of a rig's circuit is True, such as "pump_is_measured".
 
-    `subject`: thing that needs it, such as "a unit"; `rig`: name of the rig. Raises InputError otherwise.
+    Raises InputError otherwise. For its message, `subject` names what needs the property, such as "a unit", and `rig`
+    is the name of the rig.
     """
     if not getattr(circuit, flag):
         suitable = " or ".join(str(candidate) for candidate in CIRCUITS if getattr(candidate, flag))
