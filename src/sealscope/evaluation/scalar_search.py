@@ -59,9 +59,10 @@ def find_near_root(
 ) -> float | None:
     """Find a zero of a smooth rising function near `start` by the secant method; None if it does not converge.
 
-    `slope` is the approximate slope of the function at `start`, and the argument should have a scale of about one. If
-    `start` is within a few per cent of the zero, this takes a third of the evaluations of `find_root`. The result is
-    also None if the iteration leaves the range from `low` to `high`, or meets a slope that is not positive.
+    `slope` is the approximate slope of the function at `start`. The iteration has converged at x if the next step is
+    at most 1e-9 max(1, |x|), so x should be of the order of one. If `start` is within a few per cent of the zero, this
+    takes a third of the evaluations of `find_root`. The result is also None if the iteration leaves the range from
+    `low` to `high`, or meets a slope that is not positive.
     """
     x, f_x = start, function(start)
     for _ in range(_MAX_SECANTS):

@@ -138,9 +138,10 @@ def detail_label(name: str) -> str:
 
 
 def channel_charts(recording: Recording, pressure_unit: str) -> list[Chart]:
-    """Build the charts of all channels with samples; channels of one kind and unit share a chart.
+    """Build the charts of all channels with samples, over the time of the recording.
 
-    `pressure_unit`: display unit of pressures.
+    The two chamber pressures share a chart, and so do the two pressures at the pump's ports, unless their display units
+    differ. `pressure_unit`: display unit of pressures.
     """
     charts = []
     for key, title, height, members in _CHANNELS:

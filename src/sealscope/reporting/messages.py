@@ -286,8 +286,8 @@ def _format_percent(fraction: float | None) -> str:
 def how_sure(diagnosis: Diagnosis) -> str:
     """Format the strength of the evidence for the verdict.
 
-    It states the odds that a healthy recording looks like this one, the score, the threshold, and the false-alarm
-    probability.
+    It states the odds that a healthy recording looks like this one, the score and threshold of the deciding detector,
+    and the false-alarm probability. Without a score, the text says so.
     """
     if diagnosis.score is None or diagnosis.threshold is None:
         return say("how_sure.no_score")

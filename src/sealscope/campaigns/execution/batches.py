@@ -55,7 +55,12 @@ def scored_bounds(plan: SimulatedPlan) -> IntArray:
 
 
 def check_plan(plan: SimulatedPlan, cases: Sequence[CampaignCase]) -> None:
-    """Check that batches can simulate and score all cases of a plan; raise InputError otherwise."""
+    """Check that batches can simulate and score all cases of a plan; raise InputError otherwise.
+
+    All detectors must be scorers, which need only the RMS of wavelet details before and after the onset. The plan may
+    not keep recordings, and its leaks must have one law each. There must be usable samples on both sides of the onset,
+    no fault of a sensor, one sampling rate, and only runs that can be simulated side by side (`refuse_unbatchable`).
+    """
 
     def refusal(rule: str) -> InputError:
         """Build the error for a plan that batches cannot run; `rule`: the rule that it breaks."""

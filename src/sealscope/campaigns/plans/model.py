@@ -124,8 +124,8 @@ class RecordGroup(_TomlTable):
 class _Plan(_TomlTable):
     """The entries that plans of all types have.
 
-    `name`: name of the plan and of its files; `title`: by default the name; `confidence`: probability of all
-    confidence intervals; `note`: remark of the author; `place`: path of the plan's file.
+    `name`: name of the plan and of its files; `title`: by default the name; `confidence`: confidence level of
+    all intervals, such as 0.95; `note`: remark of the author; `place`: path of the plan's file.
     """
 
     name: FileName
@@ -173,12 +173,12 @@ class _JudgedPlan(_Plan):
 class SimulatedPlan(_JudgedPlan):
     """The plan of a simulated campaign.
 
-    `rig_name`: name of the rig; `rig_set`: values that replace some of its parameters; `rate`: sampling rate
-    of its data acquisition, a number in Hz or a text with a unit, None for the rig's own;
-    `profile`: name of the profile (a distribution of machines) from which the machine of each record is drawn, "" for
-    the rig itself; `duration_s` [s]: length of a record; `onset_s` [s]: start of the leaks, nan for half of the
-    duration; `records`: groups of records; `seed`: number from which the seeds of all records derive;
-    `keep_recordings`: True to store the recordings; `part`: purpose of the plan, such as development or judging.
+    `rig_name`: name or file of the rig; `rig_set`: values that replace some of its parameters; `rate`: sampling rate of
+    its data acquisition, a number in Hz or a text with a unit, None for the rig's own; `profile`: name of the profile
+    (a distribution of machines) from which the machine of each record is drawn, "" for the rig itself; `duration_s`
+    [s]: length of a record; `onset_s` [s]: start of the leaks, nan for half of the duration; `records`: groups of
+    records; `seed`: number from which the seeds of all records derive; `keep_recordings`: True to store the
+    recordings; `part`: purpose of the plan, such as development or judging.
 
     `factors`: by name, the levels (values) of each factor; records are made for every combination of levels. The
     factors `command`, `controller`, `load` and `closed` set how the machine is moved and loaded, `family` selects

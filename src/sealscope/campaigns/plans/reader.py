@@ -126,7 +126,10 @@ def _path_in_plan_folder(name: str, place: str) -> str:
 
 
 def _complete_simulated_plan(plan: SimulatedPlan) -> SimulatedPlan:
-    """Fill in the paths and default onset of a simulated plan, and check it; raise InputError if it is invalid."""
+    """Fill in the paths and default onset of a simulated plan, and check it; raise InputError if it is invalid.
+
+    Paths of the plan's rig and profile are completed by its folder; the default onset is half of the duration.
+    """
     place = plan.place
     profile = "" if plan.profile == "none" else _path_in_plan_folder(plan.profile, place)
     onset = plan.duration_s / 2 if math.isnan(plan.onset_s) else plan.onset_s

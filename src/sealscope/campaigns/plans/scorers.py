@@ -110,8 +110,8 @@ class Scorer:
 
     `parts`: one condition or several, each with a quantity, a chamber and a direction, such as ("d3", "p_A", "fell").
     The score of a condition is the change of the log RMS of the quantity from the first to the second part of the
-    record: as it is for "rose", negative for "fell", absolute for "changed". For "high" and "low" it is the log RMS
-    over the whole record, and its negative. The rule's score is the smallest score of its conditions. `threshold`:
+    record: as it is for "rose", negative for "fell", absolute for "changed". For "high" it is the log RMS over both
+    parts, for "low" its negative. The rule's score is the smallest score of its conditions. `threshold`:
     fixed threshold, None if it is to be set from leak-free records.
     """
 

@@ -55,8 +55,9 @@ def main_table(result: CampaignResult) -> tuple[list[str], list[list[str]]]:
     """Build the main table of a campaign as text: the headings of its columns, and a row for each detector.
 
     A row has the information that the detector was given, if any was, the fractions of false alarms and of detected
-    leaks of each size, the area under the ROC curve, and the sizes a90 and a90/95. The detectors of the plan come
-    first, then two that always or never raise an alarm.
+    leaks of each size, the area under the ROC curve, a90, the leak size that is detected with a probability of 90 %,
+    and a90/95, its upper 95 % confidence bound. The detectors of the plan come first, then two for comparison that
+    always or never raise an alarm.
     """
     judgement = result.judgement
     sizes = column_sizes(judgement)

@@ -104,7 +104,7 @@ def history_pictures(ordered: Sequence[Judged]) -> dict[str, Picture] | None:
     def format_day(day: float) -> str:
         """Format a value of the time axis as a date, or if there are no dates, as the number of a recording.
 
-        `day`: time [d], or the number, for which the text is "" between two recordings.
+        `day`: time in days since 1970 or, without dates, the number of a recording; "" for a number that is not whole.
         """
         if has_dates:
             return stamp(day * DAY, days[-1] - days[0])

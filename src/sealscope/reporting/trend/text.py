@@ -131,8 +131,9 @@ def _format_estimate(interval: Interval, unit: str) -> str:
 def _format_reach(trend: Trend, limit: float, reach: Interval) -> str:
     """Format the repair limit, and the predicted date at which the leakage reaches it.
 
-    `limit`: in the unit of the trend; `reach` [d]: time from the last recording until then, with its interval. No
-    date is predicted if the recordings are too few or the date is too far away.
+    `limit`: in the unit of the trend; `reach` [d]: time from the last recording until then, with its interval. After an
+    alarm the date is stated with its interval, without one only the earliest date (95 %). No date is stated if the
+    recordings are too few or the date is too far away.
     """
     limit_text, first, last = f"{number(limit, 2)} {trend.unit} in all", trend.points[0].day, trend.points[-1].day
     max_days = TREND.history.furthest
@@ -210,8 +211,8 @@ def trend_text(trend: Trend, *, whole: bool = False) -> str:
 def trend_csv(trend: Trend) -> str:
     """Format a trend as CSV text, with a row for each recording.
 
-    The columns are file, time, day since the first recording, level with its interval, group of comparable
-    recordings, oil temperature [degC] and note.
+    The columns are file, time, days since the first recording, leakage with its interval in the unit of the trend,
+    number of the group of comparable recordings, oil temperature [degC] and note.
     """
     unit, time = trend.unit, "time" if trend.dated else "time [d]"
     levels = (f"level [{unit}]", f"low [{unit}]", f"high [{unit}]")
