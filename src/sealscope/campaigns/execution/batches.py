@@ -48,7 +48,7 @@ def scored_bounds(plan: SimulatedPlan) -> IntArray:
     """Compute the usable samples before and after the planned onset, whose wavelet details scorers compare.
 
     Returns an array (2, 2) with [begin, end) of the range before the onset and of that after it. Samples whose details
-    depend on the other side of the onset or on padding are left out.
+    depend on the other side of the onset or on padding are left out, and so is the machine's start.
     """
     rate = plan.rig.daq.sample_rate
     return split_bounds(round(plan.duration_s * rate), rate, round(plan.onset_s * rate))
