@@ -222,8 +222,8 @@ def large_law(function: _F) -> _F:
 def contracted(function: _F) -> _F:
     """Compile a small function for use in other compiled functions, with fused multiply-adds allowed.
 
-    Besides, divisions may become products with the reciprocal. The last digits of the results then depend on the
-    processor, but not on the division of the data into blocks or lanes (`physics.lanes`).
+    A division may also become a product with the reciprocal. The last digits of the results then depend on the
+    processor, but not on how the data are split into blocks or lanes (`physics.lanes`).
     """
     return _compile_law(function, {"contract", "arcp"})
 

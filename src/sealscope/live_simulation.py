@@ -68,8 +68,8 @@ def make_simulated_sources(settings: MonitorSettings, say: Callable[[str], None]
 def _make_experiment(actuator: ActuatorSettings, settings: SimulateSettings) -> Experiment:
     """Build the experiment that simulates an actuator.
 
-    Raises InputError, with the actuator's name, for invalid settings. So it does for an experiment of more than
-    `MAX_IDENTITIES` blocks of 1 s, the most that the monitor's database can recognise as stored.
+    Raises InputError, with the actuator's name, for invalid settings, and for an experiment longer than
+    `MAX_IDENTITIES` blocks of 1 s, the largest number of blocks that the monitor's database can recognise as stored.
     """
     try:
         experiment = Experiment.of(rig=actuator.rig, **settings.model_dump(exclude={"speed"}))

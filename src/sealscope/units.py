@@ -214,7 +214,7 @@ def _parse_marked_pressure(text: str) -> Unit | None:
 
 @lru_cache(maxsize=1024)
 def parse_unit(text: str) -> Unit:
-    """Parse the text of a unit, such as `L/min`, `m^3/(s Pa)` or `bar abs`; raise InputError if it is none."""
+    """Parse the text of a unit, such as `L/min`, `m^3/(s Pa)` or `bar abs`; raise InputError for any other text."""
     text = text.strip()
     text = _SPELLINGS.get(text, text)
     if text in _ATOMS:
@@ -291,7 +291,8 @@ def _find_conversion(unit: str, si_unit: str, name: str, place: str | None) -> _
 def _convert_exactly(value: Fraction, conversion: _Conversion) -> float:
     """Convert one number exactly and round it once; infinite if it exceeds the range of doubles.
 
-    `conversion`: (factor, power of pi, first offset, second offset), as from `_conversion`.
+    `conversion`: (factor, power of pi, first offset, second offset), as `_conversion` returns it. The result is
+    (value + first offset) * factor * pi^power - second offset.
     """
     factor, pi_power, offset_before, offset_after = conversion
     exact = (value + offset_before) * factor

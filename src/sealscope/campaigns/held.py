@@ -65,7 +65,7 @@ class PlannedHold(NamedTuple):
         return self.pressure_A - self.pressure_B
 
     def as_dict(self) -> dict[str, Any]:
-        """Convert the hold to plain JSON values, with the leak as a flow [L/min] at the pressures of the hold."""
+        """Convert the hold to plain JSON values, with the leak as a flow [L/min] at the hold's initial p_A - p_B."""
         return {
             "duration_s": self.duration,
             "pressure_A_Pa": self.pressure_A,
@@ -76,7 +76,7 @@ class PlannedHold(NamedTuple):
         }
 
     def text(self, stated_pressure: float) -> str:
-        """Format the hold as lines of text, with the leak as a flow at the pressure `stated_pressure` [Pa]."""
+        """Format the hold as text, with the leak as a flow at the pressure difference `stated_pressure` [Pa]."""
         flow = self.conductance * stated_pressure / LITRE_PER_MINUTE
         high, low = self.pressure_A / 1e6, self.pressure_B / 1e6
         return (
@@ -138,11 +138,15 @@ class _HoldDraws:
 
     @cached_property
     def _healthy(self) -> list[RecordingSums]:
-        """The results of `N_HEALTHY` simulated holds without a leak, with which other holds are compared."""
+        """Summaries (`RecordingSums`) of `N_HEALTHY` simulated holds without a leak, for comparison with others."""
         return [draw_hold(self._rig, self._hold, 0.0, self._flow, seed) for seed in range(N_HEALTHY)]
 
     def detects(self, conductance: float) -> bool:
-        """Return True if a leak of this conductance [m^3/(s Pa)] is found in the fraction `detection` of the holds."""
+        """Return True if a leak of this conductance [m^3/(s Pa)] is detected in enough of `_N_DRAWS` simulated holds.
+
+        A hold detects it if the probability that a leak-free hold leaks as much, compared with the healthy holds, is
+        below the allowed false-alarm probability. Enough is the fraction `detection` of the holds.
+        """
         n_missed = 0
         for seed in range(N_HEALTHY, N_HEALTHY + _N_DRAWS):
             rise = held_rise(draw_hold(self._rig, self._hold, conductance, self._flow, seed), self._healthy)
@@ -169,7 +173,8 @@ class _HoldDraws:
 def _decay_per_conductance(rig: Rig) -> float:
     """Compute the decay rate of p_A - p_B [1/s] per unit of leak conductance, in Pa/m^3, for a piston at mid-stroke.
 
-    It is K (1/V_A + 1/V_B), with the dead volumes included in V.
+    It is K (1/V_A + 1/V_B), with the oil's usual bulk modulus K and the chambers' volumes V at mid-stroke, which
+    include an assumed dead volume.
     """
     oil, cylinder = INFERENCE.held_oil, rig.cylinder
     length = cylinder.L * (0.5 + oil.dead)

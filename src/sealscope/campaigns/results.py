@@ -76,7 +76,7 @@ def _judge(
 
 
 def judge_simulated_campaign(plan: SimulatedPlan, folder: Path) -> CampaignResult:
-    """Judge a simulated campaign from the rows in its folder.
+    """Judge a simulated campaign from the rows, the stored results of its records, in its folder.
 
     Raises InputError if there are too few rows to judge or to set thresholds.
     """

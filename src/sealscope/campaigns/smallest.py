@@ -63,12 +63,12 @@ USUAL = PlannedDuty(COMMANDS[0])
 
 
 class DetectableLeak(NamedTuple):
-    """The smallest leaks that recordings with one command and load, and of one duration, detect.
+    """The smallest leaks that are detected with the wanted probability in recordings of one duty and duration.
 
-    `duty`: command and load; `duration` [s]; `conductance` [m^3/(s Pa)]: smallest step of the leak that is detected,
-    inf if there is none; `separable` [m^3/(s Pa)]: smallest step that can also be told from a step of the pump's
-    leakage, inf if there is none; `pressure` [Pa]: mean |p_A - p_B|; `note`: reason if the numbers could not be
-    computed, else ""; `flow` [m^3/s]: mean flow of the pump.
+    `duty`: command and load; `duration` [s]; `conductance` [m^3/(s Pa)]: smallest step (sudden increase) of the leak's
+    conductance that is detected, inf if there is none; `separable` [m^3/(s Pa)]: smallest step that can also be told
+    from a step of the pump's leakage, inf if there is none; `pressure` [Pa]: mean |p_A - p_B|; `note`: reason if the
+    numbers could not be computed, else ""; `flow` [m^3/s]: mean flow of the pump.
     """
 
     duty: PlannedDuty
@@ -171,8 +171,8 @@ class RecordingPlan(NamedTuple):
 def duty_experiment(rig: Rig, duty: PlannedDuty, duration: float, seed: int = 0) -> Experiment:
     """Build a leak-free experiment with the command and load of a duty; the piston's motion is centred in the stroke.
 
-    `duration` [s]. `seed`: of the sensor noise. Raises InputError if the command is a target of the position and not a
-    voltage.
+    `duration`: length of the recording [s]; `seed`: of the sensor noise. Raises InputError if the command is a target
+    of the position and not a voltage.
     """
     command = command_or_target(duty.command)
     if isinstance(command, Position):
@@ -218,9 +218,9 @@ class _DetectableSteps(NamedTuple):
 def _detectable_steps(recording: Recording, rig: Rig, false_alarm: float, detection: float) -> _DetectableSteps:
     """Compute from a leak-free recording the smallest sudden increase (step) of the leak that would be detected.
 
-    Also computes the smallest step that can be told from a leak of the pump. `false_alarm`: probability of an alarm
-    without a leak; `detection`: probability of an alarm with it. Raises InputError if the volume balance cannot be
-    computed from the recording.
+    Also computes the smallest step that can be told from a step of the pump's leakage. `false_alarm`: probability of
+    an alarm without a leak; `detection`: probability of an alarm with it. Raises InputError if the volume balance
+    cannot be computed from the recording.
     """
     detector = VolumeBalance(rig)
     if reason := detector.usable(recording):
@@ -240,10 +240,11 @@ def _detectable_steps(recording: Recording, rig: Rig, false_alarm: float, detect
 def _separation_ratio(blocks: Blocks, columns: Sequence[ColumnRoles]) -> float:
     """Compute the factor by which an unknown step of the pump's leakage raises the standard error of the leak's step.
 
-    `blocks`: parts of the recording, reduced to Gram matrices of the volume balance's columns; `columns`: for each
-    equation, the indices of the columns with leak and pump. Both steps are in the middle of the recording. The factor
-    is inf if the balance has several equations or no column for the pump's leakage, or if the two steps cannot be told
-    apart.
+    With I the Fisher information (2, 2) of both steps, the leak's first, the factor is sqrt(I_11 / (I_11 - I_12^2 /
+    I_22)). Both steps are at the middle block of the recording; the constant coefficients of the volume balance are
+    unknown, too. `blocks`: Gram matrices of the balance's columns, one for each part of the recording; `columns`: for
+    each equation of the balance, the roles of its columns. The factor is inf if the balance has several equations or
+    no column for the pump's leakage, or if the two steps cannot be told apart.
     """
     column = columns[0]
     if PUMP not in column.names or len(columns) > 1:

@@ -170,9 +170,10 @@ def _iter_diagnoses(
 ) -> Iterator[DiagnosedRecording | None]:
     """Yield each recording with its diagnosis, or None for an unreadable file or baseline.
 
-    A file never serves as its own baseline. `joined`: the files are parts of a single recording; `settings`:
-    further arguments of `sealscope.diagnose`. Raises InputError if a file is its only baseline, and UnreadableFile if
-    no baseline can be read.
+    `machine`: the machine that the options describe, with its baseline, i.e. leak-free recordings for comparison. A
+    file never serves as its own baseline. `joined`: the files are parts of a single recording; `settings`: further
+    arguments of `sealscope.diagnose`. Raises InputError if the baseline of a file is only the file itself, and
+    UnreadableFile if no baseline can be read.
     """
     baseline = machine.baseline
     for file in files if baseline else ():

@@ -74,8 +74,8 @@ def reproduce(
 def _list_items(patterns: Sequence[str], sheet: Path | None) -> None:
     """Print the tables and figures whose ids match `patterns`.
 
-    Those that need the thesis's missing data sheet are marked. `sheet`: folder of the data sheet, None for the
-    default one.
+    If the thesis's data sheet is missing, those that need it are marked. `sheet`: folder of the data sheet, None for
+    the default one.
     """
     from sealscope.thesis.engine.items import load_items, select_items
     from sealscope.thesis.sheet import MISSING, find_sheet

@@ -92,9 +92,9 @@ def trend(
 
 
 def _count_known(readings: Sequence[LeakReading], machine: CommissionedMachine) -> int:
-    """Count the recordings from the earliest on, until one is not stated as healthy in the machine's file.
+    """Count the recordings before the first one, by date, that the machine's file does not list as healthy.
 
-    Copies of a recording count once. Recordings without a date count as the earliest.
+    Copies of a recording count once. Recordings without a date come before all others.
     """
     known = {recording.digest for recording in machine.healthy}
     by_date = sorted(readings, key=lambda reading: -math.inf if reading.start is None else reading.start)

@@ -24,8 +24,8 @@ _LAST_STEP, _MAX_SECANTS = 1e-9, 12
 def find_root(function: Callable[[float], float], low: float, high: float) -> float:
     """Find a zero of a continuous function between `low` and `high` by Chandrupatla's method.
 
-    The result is accurate to four units in the last place. Raises ValueError if the function has the same sign at both
-    ends, or is NaN there.
+    The search ends when the zero is enclosed to a relative width of 8 machine epsilons, or after 200 steps. Raises
+    ValueError if the function has the same sign at both ends, or is NaN there.
     """
     a, b, f_a, f_b = high, low, function(high), function(low)  # a: the newest point; the root is between a and b
     if not f_a * f_b <= 0.0:
@@ -59,9 +59,10 @@ def find_near_root(
 ) -> float | None:
     """Find a zero of a smooth rising function near `start` by the secant method; None if it does not converge.
 
-    `slope` is the approximate slope of the function at `start`, and the argument should have a scale of about one. If
-    `start` is within a few per cent of the zero, this takes a third of the evaluations of `find_root`. The result is
-    also None if the iteration leaves the range from `low` to `high`, or meets a slope that is not positive.
+    `slope` is the approximate slope of the function at `start`. The iteration has converged at x if the next step is
+    at most 1e-9 max(1, |x|), so x should be of the order of one. If `start` is within a few per cent of the zero, this
+    takes a third of the evaluations of `find_root`. The result is also None if the iteration leaves the range from
+    `low` to `high`, or meets a slope that is not positive.
     """
     x, f_x = start, function(start)
     for _ in range(_MAX_SECANTS):

@@ -11,8 +11,8 @@ from sealscope.errors import InputError
 class HydraulicCircuit(NamedTuple):
     """Connection of pump and cylinder chambers: one of `CIRCUITS`, chosen by a parameter of the rig (`Rig.circuit`).
 
-    A further circuit is a further value of this type. Other modules ask for the properties below and do not compare
-    circuits. `valve_controlled` chooses the laws of `physics/rig.py` and `physics/standstill.py`, the longest step of
+    Other modules read the properties below instead of comparing circuits, so that another circuit can be added.
+    `valve_controlled` chooses the laws of `physics/rig.py` and `physics/standstill.py`, the longest step of
     `physics/solvers/limits.py` (as `valved`), the volume balance of `diagnosis/inference/terms.py`, and the drawing of
     `reporting/schematic.py`. `pump_feeds_chambers` chooses the controller's model of the drive (`control/drive.py`:
     `drive_of`).
@@ -28,15 +28,16 @@ class HydraulicCircuit(NamedTuple):
     valve_controlled : bool
         A servo valve on a supply of constant pressure meters the flow into each chamber; else the pump's speed does.
     pump_feeds_chambers : bool
-        The pump delivers into chamber A and draws from B, or the reverse: one balance of volumes holds for both, the
-        pump's leakage cannot be told from that past the piston, and equal areas need no position.
+        The pump delivers into chamber A and draws from B, or the reverse. One balance of volumes then holds for both
+        chambers; in it the pump's leakage cannot be told from that past the piston. If the piston areas are equal, the
+        balance does not need the piston's position.
     pump_is_measured : bool
         An encoder on the pump's motor records its angle and speed.
     holds_load : bool
         Both chambers are shut while the command rests at zero, so that a load creeps by leakage alone.
     flow_size : {"area", "displacement"}
-        Piston area or pump displacement, by which the balance of volumes gives L/min; its uncertainty is that key of
-        the table ``[size]`` in ``diagnosis/inference/priors.toml``.
+        The machine's size, piston area or pump displacement, to which flows in L/min from the balance of volumes are
+        proportional. Its uncertainty is in ``diagnosis/inference/priors.toml``, table ``[size]``, under the same name.
     watched_by : tuple of tuple of str
         Sets of channels from which the balance of volumes watches a running machine, the best set first.
     needed_channels : str
@@ -60,7 +61,7 @@ class HydraulicCircuit(NamedTuple):
 
     @property
     def size_parameters(self) -> tuple[str, ...]:
-        """Names of the parameters that state `flow_size`."""
+        """Dotted names of the parameters that `flow_size` stands for: both piston areas, or the displacement."""
         return ("cylinder.A_A", "cylinder.A_B") if self.flow_size == "area" else ("pump.q_b",)
 
 
@@ -97,9 +98,10 @@ CIRCUITS = (PUMP_CIRCUIT, VALVE_CIRCUIT)
 
 
 def check_circuit_property(subject: str, rig: str, circuit: HydraulicCircuit, flag: str) -> None:
-    """Check that a circuit has a property, which is an attribute `flag` of type bool.
+    """Check that the bool attribute `flag` of a rig's circuit is True, such as "pump_is_measured".
 
-    `subject`: thing that needs it, such as "a unit"; `rig`: name of the rig. Raises InputError otherwise.
+    Raises InputError otherwise. For its message, `subject` names what needs the property, such as "a unit", and `rig`
+    is the name of the rig.
     """
     if not getattr(circuit, flag):
         suitable = " or ".join(str(candidate) for candidate in CIRCUITS if getattr(candidate, flag))

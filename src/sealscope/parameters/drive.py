@@ -104,11 +104,11 @@ class Fluid(Part):
 
 
 class MakeUp(Part):
-    """Accumulator of the closed circuit, with check and relief valves between it and each side.
+    """Accumulator of the closed circuit, with check and relief valves between it and both sides of the circuit.
 
-    With `check_valves = "absent"` there is none. The accumulator is at the charge pressure at the start. Check valves
-    feed the circuit. Pilot-operated ones, which the pressure of the other side opens, also return the oil that the
-    rod of a single-rod cylinder displaces.
+    With `check_valves = "absent"` the rig has neither accumulator nor valves. The accumulator is at the charge pressure
+    at the start. Check valves feed oil into the circuit. Pilot-operated ones, which the pressure of the other side
+    opens, also return the oil that the rod of a single-rod cylinder displaces.
     """
 
     check_valves: Literal["absent", "present", "pilot-operated"] = choice("make-up from an accumulator in the model")

@@ -12,7 +12,8 @@ from sealscope.parameters.fields import Part, quantity, with_unit
 class PressureTransducer(Part):
     """A pressure transducer with the errors of its reading: noise, offset, drift, mains hum, delay and failures.
 
-    Its white noise is independent of that of other channels and of `sensors.common_noise`.
+    Its white noise `noise` is independent of that of other channels. `sensors.common_noise`, which is equal in all
+    pressure channels, is added to it.
     """
 
     range_lo: float = quantity("lower end of the range", "Pa", ge=-1e9, le=1e9)
@@ -33,7 +34,7 @@ class PressureTransducer(Part):
 
     @model_validator(mode="after")
     def _check_range(self) -> Self:
-        """Check that the range of the transducer is not empty, and return the transducer unchanged.
+        """Check that range_lo < range_hi, and return the transducer unchanged.
 
         Raises ValueError otherwise, as pydantic requires.
         """
@@ -94,9 +95,10 @@ class Daq(Part):
 
     @model_validator(mode="after")
     def _check_output_volts(self) -> Self:
-        """Check that the transducers' outputs are within the board's input range, and return the board unchanged.
+        """Check that -range <= sensor_volts_lo < sensor_volts_hi <= range, and return the board unchanged.
 
-        Raises ValueError otherwise, as pydantic requires.
+        The transducers' outputs are then within the board's input range. Raises ValueError otherwise, as pydantic
+        requires.
         """
         lo, hi = self.sensor_volts_lo, self.sensor_volts_hi
         if lo >= hi:

@@ -123,9 +123,10 @@ class Rig(Part):
 
     @model_validator(mode="after")
     def _check_parts(self) -> Self:
-        """Check the rules that relate several parameters.
+        """Check the rules that relate several parameters, and return the rig unchanged.
 
-        Raises ValueError, as pydantic requires, if one is broken.
+        Examples are that the chamber volumes exceed what the piston sweeps, and that the gas of an accumulator exceeds
+        the oil that the rod displaces. Raises ValueError, as pydantic requires, if a rule is broken.
         """
         cylinder, makeup, friction = self.cylinder, self.makeup, self.friction
         V, V_rod = cylinder.V, cylinder.V_rod
@@ -158,10 +159,10 @@ class Rig(Part):
         return self
 
     def _check_circuit(self) -> None:
-        """Check the parameters that the circuit requires, and those by which a supply, if any, holds its pressure.
+        """Check the parameter values that the rig's circuit requires, and those of a servo valve's supply.
 
-        The speed loop of a supply's motor has an integral gain, and its accumulator a precharge below the supply's
-        pressure. Raises ValueError otherwise.
+        If the rig has a supply, the speed loop of its motor must have an integral gain > 0, and the precharge of its
+        accumulator, if any, must be below the supply's pressure. Raises ValueError otherwise.
         """
         supply, circuit = self.supply, self.circuit
         for name, required in circuit.required.items():
@@ -308,9 +309,10 @@ class Rig(Part):
     def with_areas(self, A_A: float, A_B: float, *, source: str) -> Rig:
         """Return the same rig with other piston areas [m^2], and with volumes that suit them.
 
-        The areas have the source `source`. If the volumes depend on the position, the dead volume, which the piston
-        does not sweep, is scaled with the larger area. So is the gas of the accumulator, which is also at least in
-        proportion to the rod's volume. Scaled values are marked as assumed.
+        The areas have the source `source`. If the chamber volumes depend on the position, the dead volume, which the
+        piston does not sweep, is scaled with the larger area. The gas of a make-up accumulator is scaled likewise, and
+        is at least `GAS_OVER_ROD` times the oil that the rod displaces in a stroke. Scaled values are marked as
+        assumed.
         """
         entries, cylinder = self._stated_entries(), self.cylinder
         scale = max(A_A, A_B) / max(cylinder.A_A, cylinder.A_B)
@@ -347,10 +349,11 @@ class Rig(Part):
         ]
 
     def present_values(self) -> dict[str, Value]:
-        """Return the SI values of the parameters by dotted name, without those of parts that the rig lacks.
+        """Return the SI values of the parameters by dotted name, without those that equal their `absent` value.
 
-        They identify a machine across versions of the package: older rigs lack the parts that a later version adds,
-        so these do not change their values.
+        The `absent` value of a parameter means that the part or effect which it describes is not in the model. The
+        result identifies a machine across versions of the package: a parameter that a later version adds is absent
+        from older rigs, and so does not change it.
         """
         return {name: self[name] for name, field in declared_fields().items() if self[name] != absent_of(field)}
 
@@ -495,9 +498,11 @@ def _si_value(full_name: str, field: FieldInfo, entry: ParameterEntry) -> Value:
 
 
 def _parse_value(full_name: str, value: Any, place: str) -> tuple[Value, str]:
-    """Parse an override, a number in SI or a text, to an SI value or the value of a choice; also return the unit.
+    """Parse the new value of a parameter, and return it with the parameter's SI unit.
 
-    The unit is "" for a choice. `place`: where the override comes from, for messages.
+    `value`: a number in SI, or a text with a unit such as "50[cm^3]", which is converted to SI; for a choice, one of
+    its options, which is not checked here. The unit is "" for a choice. `place`: where the value comes from, for
+    messages.
     """
     field = declared_fields()[full_name]
     if choices_of(field):

@@ -19,8 +19,8 @@ def _overlap(edge: str) -> Any:
 class ServoValve(Part):
     """Servo valve with four metering edges between supply (P), return (T) and the chambers A and B.
 
-    With `spool = "absent"` there is none. The spool follows the command as a second-order system with limited speed.
-    An edge is an orifice whose area grows linearly with the spool's travel beyond the overlap.
+    With `spool = "absent"` the rig has no servo valve. The spool follows the command as a second-order system with
+    limited speed. An edge is an orifice whose area grows linearly with the spool's travel beyond the overlap.
     """
 
     spool: Literal["absent", "present"] = choice("servo valve between supply and cylinder", absent="absent")
@@ -41,7 +41,7 @@ class ServoValve(Part):
 
     @model_validator(mode="after")
     def _check_overlaps(self) -> Self:
-        """Check that each edge opens or closes within the spool's stroke, and return the valve unchanged.
+        """Check that every edge opens or closes within the spool's stroke, |overlap| < x_max; return the valve.
 
         Raises ValueError otherwise, as pydantic requires.
         """
@@ -58,8 +58,8 @@ class ServoValve(Part):
 class Supply(Part):
     """Supply of a servo valve: a pump driven at constant speed, with a relief valve that limits the pressure.
 
-    With `drive = "absent"` there is none. The rig's motor turns the pump, which draws from the return line and feeds
-    the line of volume V_1, to which an accumulator is connected.
+    With `drive = "absent"` the rig has no such supply. The rig's motor turns the pump, which draws from the return
+    line and feeds the line of volume V_1, to which an accumulator is connected.
     """
 
     drive: Literal["absent", "constant-speed"] = choice(

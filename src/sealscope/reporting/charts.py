@@ -138,9 +138,10 @@ def detail_label(name: str) -> str:
 
 
 def channel_charts(recording: Recording, pressure_unit: str) -> list[Chart]:
-    """Build the charts of all channels with samples; channels of one kind and unit share a chart.
+    """Build the charts of all channels with samples, over the time of the recording.
 
-    `pressure_unit`: display unit of pressures.
+    The two chamber pressures share a chart, and so do the two pressures at the pump's ports, unless their display units
+    differ. `pressure_unit`: display unit of pressures.
     """
     charts = []
     for key, title, height, members in _CHANNELS:
@@ -196,9 +197,10 @@ _MAX_LIMIT_RATIO = 4.0
 
 
 def course_charts(diagnosis: Diagnosis, *, height: int = 190) -> list[Chart]:
-    """Build the chart of the leak over the time of the recording, with its interval and the repair limit.
+    """Build the chart of the leak flow [L/min] over the time of the recording, with its interval and the repair limit.
 
-    Returns a list with this chart, empty if the leak over time is not known. `height`: height of the chart in pixels.
+    If only the total leakage of pump and piston is known over time, the chart shows that. Returns a list with this
+    chart, empty if neither is known. `height`: height of the chart in pixels.
     """
     course = diagnosis.course
     if course is None or not np.isfinite(course.lpm).any():
@@ -229,8 +231,9 @@ def course_charts(diagnosis: Diagnosis, *, height: int = 190) -> list[Chart]:
 def _y_limits(values: Array, low: Array, high: Array) -> tuple[float, float]:
     """Compute the limits of the y axis, which include zero, all estimates `values` and their intervals.
 
-    `low`, `high`: ends of the intervals, not finite if unknown. If the intervals more than double the range, the
-    outermost 10 % of their ends are left out, because a few wide intervals would flatten the curve.
+    `low`, `high`: ends of the intervals, not finite if unknown. The lowest 10 % of the lower ends and the highest 10 %
+    of the upper ends are left out if this more than halves the range, because a few wide intervals would flatten the
+    curve.
     """
     required_values = [0.0, float(np.nanmin(values)), float(np.nanmax(values))]
     low_ends, high_ends = low[np.isfinite(low)], high[np.isfinite(high)]
@@ -332,9 +335,9 @@ def _clip_values(values: Array) -> Array:
 
 
 def _clip_onset(diagnosis: Diagnosis, span: tuple[float, float]) -> tuple[float | None, tuple[float, float] | None]:
-    """Return the onset of the leak [s], and its confidence interval limited to the time `span` [s] of the chart.
+    """Return the onset of the leak [s], and its confidence interval (low, high) cut off at the ends of `span` [s].
 
-    Each is None if it is not known.
+    `span`: first and last time on the charts. The onset itself is not cut off. Each is None if it is not known.
     """
     onset, interval = diagnosis.onset_s, diagnosis.onset_interval_s
     if onset is None or not isfinite(onset):

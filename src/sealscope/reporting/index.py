@@ -18,8 +18,9 @@ _ORDER = ("leak", "cannot tell", "no leak")
 def severity_key(diagnosis: Diagnosis) -> tuple[int, float, float, str]:
     """Compute a sort key that puts the most severe diagnosis first.
 
-    It consists of the number of the verdict (leak, cannot tell, no leak), the negative leak as a fraction of the
-    repair limit, the negative flow [L/min], and the name of the file. Unknown numbers are 0.
+    It consists of the number of the verdict (0 leak, 1 cannot tell, 2 no leak), minus the leak as a fraction of the
+    repair limit, minus the flow of the leak [L/min] or else of the total leakage, and the name of the file. Unknown
+    numbers are 0.
     """
     severity = diagnosis.severity
     limit_ratio = 0.0 if severity is None or severity.of_limit is None else severity.of_limit[0]

@@ -88,9 +88,9 @@ def cause(diagnosis: Diagnosis) -> str | None:
 
 
 def shows_reason(diagnosis: Diagnosis) -> bool:
-    """Return True if the reason is to be shown with the verdict.
+    """Return True if the short text of a diagnosis must show the reason of its verdict.
 
-    This is so for `cannot tell`, and for a change with a named cause that is no leak.
+    This is so for the verdict `cannot tell`, and for a change whose named cause is no leak.
     """
     return diagnosis.verdict == "cannot tell" or (diagnosis.verdict != "leak" and cause(diagnosis) is not None)
 
@@ -105,7 +105,7 @@ def since(diagnosis: Diagnosis) -> str | None:
     """Format the time since which the machine leaks, with its interval.
 
     If the onset is not known, the text says that the leak is older than the recording or rises within it. Returns
-    None if the verdict is no leak.
+    None if the verdict is not "leak".
     """
     if diagnosis.verdict != "leak":
         return None
@@ -158,7 +158,7 @@ def _why_no_flow(diagnosis: Diagnosis) -> str:
 
 
 def flow_basis(diagnosis: Diagnosis) -> str | None:
-    """Format the machine data on which all flows [L/min] of a diagnosis are based; return None if unknown."""
+    """Format the piston area and pump displacement that a diagnosis needs for flows [L/min]; None if unknown."""
     return None if diagnosis.machine is None else machine_text(diagnosis.machine)
 
 
@@ -179,7 +179,12 @@ def machine_text(machine: AssumedMachine) -> str:
 
 
 def how_bad(diagnosis: Diagnosis) -> str | None:
-    """Format the leak as a fraction of the repair limit, or else of the pump's flow; return None if unknown."""
+    """Format the severity of the leak: its flow or creep speed as a percentage or multiple of the repair limit.
+
+    If this is not known but the user stated a limit, the text says that the comparison needs the piston area. Without
+    a stated limit the leak is given as a fraction of the pump's flow. Returns None if that is not known either, or if
+    there is no leak.
+    """
     severity, limit = diagnosis.severity, diagnosis.limit
     if severity is None:
         return None
@@ -281,8 +286,8 @@ def _format_percent(fraction: float | None) -> str:
 def how_sure(diagnosis: Diagnosis) -> str:
     """Format the strength of the evidence for the verdict.
 
-    It states the odds that a healthy recording looks like this one, the score, the threshold, and the false-alarm
-    probability.
+    It states the odds that a healthy recording looks like this one, the score and threshold of the deciding detector,
+    and the false-alarm probability. Without a score, the text says so.
     """
     if diagnosis.score is None or diagnosis.threshold is None:
         return say("how_sure.no_score")
@@ -307,8 +312,8 @@ def odds_or_false_alarms(diagnosis: Diagnosis) -> str:
 def _odds(diagnosis: Diagnosis) -> str | None:
     """Format the odds that a healthy recording looks like this one; return None if they are not known.
 
-    If the verdict is `no leak` and no detector raised an alarm, the text says "shows as much change" in place of
-    "looks like this".
+    They are a text such as "1 in 200 healthy recordings looks like this". If the verdict is `no leak` and no detector
+    raised an alarm, "shows as much change" stands in place of "looks like this".
     """
     odds = diagnosis.odds
     if odds is None or diagnosis.verdict != "no leak" or diagnosis.alarmed:
@@ -437,7 +442,10 @@ def _format_lines(diagnosis: Diagnosis, rows: list[tuple[str, str | None]], widt
 
 
 def format_leak_flow(diagnosis: Diagnosis) -> str:
-    """Format the leak flow with its interval, or its upper bound if the verdict is no leak."""
+    """Format the leak flow with its interval or, if the verdict is not "leak", the upper bound of a leak.
+
+    If this is not known, the text says that no flow is stated.
+    """
     if diagnosis.verdict == "leak" and diagnosis.leak_lpm is not None:
         low, high = diagnosis.leak_interval_lpm or (diagnosis.leak_lpm,) * 2
         return f"{number(diagnosis.leak_lpm, 2)} L/min ({number(low, 2)} to {number(high, 2)})"
@@ -458,7 +466,7 @@ _FILE_COLUMNS = 22
 def table_line(diagnosis: Diagnosis, start_s: float | None = None) -> str:
     """Format a diagnosis as a line of a table: file, date, verdict and leak flow in L/min.
 
-    A second line states the cause and the next step, unless the verdict is no leak without a named cause. The name of
+    A second line states the named cause and the next step; it is left out for `no leak` without a cause. The name of
     a file longer than its column stands on a line of its own. `start_s`: start of the recording [s since 1970], None
     to leave the date blank.
     """

@@ -32,7 +32,7 @@ class SvgPath(NamedTuple):
 class SvgText(NamedTuple):
     """A text at the position `x`, `y` of a picture, from its frame's top left corner.
 
-    `anchor`: part of the text at this position, as in SVG; `turned`: True if the text reads upwards.
+    `anchor`: the "start", "middle" or "end" of the text is at this position; `turned`: True if the text reads upwards.
     """
 
     x: float
@@ -46,9 +46,9 @@ class SvgText(NamedTuple):
 class Picture:
     """A chart as SVG shapes and texts, in a frame of `width` x `height` pixels.
 
-    `shapes` are drawn in their order, then the `labels`.
-    `x_ends`, `y_ends`: values at the ends of the axes; `log`: True for a logarithmic x axis, whose ends are then
-    powers of ten, such as (-2, 1); `margins`: free space left of the frame, above, right of it and below.
+    `shapes` are drawn in their order, then the `labels`. `x_ends`, `y_ends`: values at the ends of the axes; `log`:
+    True for a logarithmic x axis, for which `x_ends` are decimal logarithms, such as (-2, 1) for 0.01 to 10;
+    `margins`: free space in pixels left of the frame, above, right of it and below.
     """
 
     width: float
@@ -161,7 +161,7 @@ class Picture:
     def below(self, x: float, text: str, anchor: str = "middle") -> None:
         """Write a text below the frame at the value `x` of the x axis.
 
-        `anchor`: part of the text that is placed at `x`, as in SVG.
+        `anchor`: the "start", "middle" or "end" of the text is placed at `x`.
         """
         self.labels.append(SvgText(float(self.x(x)), self.height + 16.0, text, anchor))
 

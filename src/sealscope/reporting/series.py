@@ -38,9 +38,9 @@ class DrawnTimes:
     def reduce(self, values: Array) -> Array:
         """Reduce the values (n,) of a channel to the points (m,) that are drawn at the times `t`.
 
-        Each bucket, a group of successive samples, gives its minimum and its maximum, the minimum first if its values
-        rise. A bucket of one sample gives one point. A bucket without finite samples gives NaN, as does a gap in
-        time, which interrupts the line.
+        Each bucket, a group of successive samples, gives two points: its minimum and its maximum. The minimum is first
+        if the bucket's last value is not below its first one. A bucket of one sample gives one point. A bucket without
+        finite samples gives NaN, and a NaN is inserted at each gap in time, which interrupts the line.
         """
         values = np.where(np.isfinite(values), values, np.nan)
         low = np.fmin.reduceat(values, self.starts)

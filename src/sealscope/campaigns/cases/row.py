@@ -34,8 +34,8 @@ class Statement:
 
     `verdict`: `leak`, `no leak` or `cannot tell`; `score`, `threshold`: the detector's statistic, and the value above
     which it reports a leak; `onset_s` [s]: time at which the leak began; `leak_lpm` [L/min]: flow of the leak;
-    `onset_interval_s`, `leak_interval_lpm`: confidence intervals of both; `cause`: named cause. A number is None if it
-    is not stated or not finite.
+    `onset_interval_s`, `leak_interval_lpm`: their 95 % intervals; `cause`: cause that the detector names, a kind of
+    leak or another fault. A number is None if it is not stated or not finite.
     """
 
     verdict: Verdict
@@ -92,8 +92,9 @@ def finite_or_none(value: float | None) -> float | None:
 def named_cause(evidence: Evidence | Statement) -> str:
     """Determine the cause that a detector names: a kind of leak, another fault, "none" or "cannot tell".
 
-    A kind of leak is named only with the verdict `leak`; without one, this verdict means a piston leak. With other
-    verdicts, "none" means that there is neither a leak nor another fault.
+    With the verdict `leak` it is the kind of leak in `evidence.cause`, or "piston leak" if this names no kind of leak.
+    With the verdicts `no leak` and `cannot tell` it is the fault in `evidence.cause` if that is no leak. Without such a
+    fault it is "none" for `no leak`, and "cannot tell" for `cannot tell`.
     """
     if evidence.verdict == "leak":
         return evidence.cause if evidence.cause in LEAKS else PISTON_LEAK

@@ -84,10 +84,11 @@ def score_details(
 
 
 def _score_over_threshold(statement: Statement) -> float | None:
-    """Compute a score of `diagnose` that can be compared between records: its score over its threshold.
+    """Compute a score of `diagnose` that can be compared between records: its score divided by its threshold.
 
-    A different detector may decide each record, and scores of different detectors cannot be compared. If the
-    threshold is not > 0, it is subtracted instead. Returns None if the score or the threshold is missing.
+    The score alone cannot be compared, because another detector of `diagnose` may decide each record. If the threshold
+    is not > 0, the result is the score minus the threshold. Returns None if one of them is missing, if the verdict is
+    `cannot tell`, or if the named cause is no leak.
     """
     score, threshold = ranking_score(statement), statement.threshold
     if score is None or threshold is None:

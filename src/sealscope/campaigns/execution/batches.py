@@ -45,16 +45,22 @@ N_SCOUT_MACHINES, SCOUT_SECONDS = 4, 4.0
 
 
 def scored_bounds(plan: SimulatedPlan) -> IntArray:
-    """Compute the ranges of samples before and after the onset of the leak that scorers compare.
+    """Compute the usable samples before and after the planned onset, whose wavelet details scorers compare.
 
-    A scorer computes a score from wavelet details. Returns an array (2, 2) with [begin, end) of each range.
+    Returns an array (2, 2) with [begin, end) of the range before the onset and of that after it. Samples whose details
+    depend on the other side of the onset or on padding are left out, and so is the machine's start.
     """
     rate = plan.rig.daq.sample_rate
     return split_bounds(round(plan.duration_s * rate), rate, round(plan.onset_s * rate))
 
 
 def check_plan(plan: SimulatedPlan, cases: Sequence[CampaignCase]) -> None:
-    """Check that batches can simulate and score all cases of a plan; raise InputError otherwise."""
+    """Check that batches can simulate and score all cases of a plan; raise InputError otherwise.
+
+    All detectors must be scorers, which need only the RMS of wavelet details before and after the onset. The plan may
+    not keep recordings, and its leaks must have one law each. There must be usable samples on both sides of the onset,
+    no fault of a sensor, one sampling rate, and only runs that can be simulated side by side (`refuse_unbatchable`).
+    """
 
     def refusal(rule: str) -> InputError:
         """Build the error for a plan that batches cannot run; `rule`: the rule that it breaks."""
@@ -170,9 +176,10 @@ def make_step_chooser(
 ) -> Callable[[CampaignCase, Experiment], float]:
     """Build the function that chooses the solver's step [s] of a case from the case and its experiment.
 
-    For each cell, a combination of the factors' levels, `integrate_run` chooses steps by its error on
-    `N_SCOUT_MACHINES` machines that are drawn for it. The step of a case is the shortest of these with the same
-    solver, limited to the longest step that the case's machine allows. It does not depend on the other cases.
+    Finding the step for each case alone would take too long, so cases of a cell, i.e. a combination of the factors'
+    levels, share it. `N_SCOUT_MACHINES` machines are drawn for a cell; on short runs of each, `integrate_run` chooses
+    the longest step that passes its check of the error. The step of a case is the shortest of those found with the
+    case's solver, limited to the longest stable step of the case's machine. It does not depend on the other cases.
     """
     shared = digest(shared_inputs(plan))
 
@@ -180,7 +187,8 @@ def make_step_chooser(
     def cell_steps(*levels: tuple[str, str | float]) -> dict[str, float]:
         """Compute the shortest step [s] that `integrate_run` chooses on machines drawn for a cell, by solver.
 
-        `levels`: (factor, level) of each factor, which define the cell.
+        `levels`: pairs (factor, level), which define the cell. Machines that cannot be simulated are left out, so the
+        mapping may lack a solver or be empty.
         """
         steps: dict[str, float] = {}
         for number in range(N_SCOUT_MACHINES):
@@ -211,7 +219,7 @@ def make_step_chooser(
 
 
 def dividing_step(rate: float, limit: float) -> float:
-    """Compute the longest step [s], up to `limit` [s], that divides the interval between outputs at `rate` [Hz]."""
+    """Compute the longest step 1/(n rate) [s] with a whole number n that is at most `limit` [s]; `rate` in Hz."""
     return 1.0 / (rate * steps_per_output(rate, limit))
 
 

@@ -26,10 +26,13 @@ class AlarmFractions:
     The group is defined by `leak_lpm` (0: no leak, nan: any size), `law`, `fault`, `family` and `levels`. `alarms`:
     fraction with the verdict `leak`; `cannot_tell`: fraction with the verdict `cannot tell`, which includes the
     records without a result; `failed`: number of records without a result. `coverage`: of the intervals stated for
-    the leak flow, fraction that contains the true flow. `false_alarm`: fraction of false alarms among the leak-free
-    records, None if there are none; `per_hour`: false alarms per hour, None if the hours are not known either.
-    `named`: fraction of records with an alarm that names the true cause (`matches_cause`), None if the detector names
-    no causes.
+    the leak flow, fraction that contains the true flow. `named`: fraction of all records of the group on which the
+    detector raises an alarm and names the cause of the fault (`matches_cause`), None if it states no causes; it has a
+    meaning only for a group with a `fault`.
+
+    Results by size of the leak also have `false_alarm`, the fraction of leak-free records with an alarm, and
+    `per_hour`, the false alarms per operating hour. Both are None in other results and if there are no leak-free
+    records; `per_hour` is also None if the operating time is not known.
     """
 
     detector: str
@@ -53,9 +56,9 @@ class AlarmFractions:
 
     @property
     def informedness(self) -> float:
-        """Fraction of leaks with an alarm minus fraction of false alarms (Youden's J), which is 0 for guesses.
+        """Fraction of alarms in the group minus `false_alarm` (Youden's J): 1 if perfect, 0 for mere guesses.
 
-        nan if the fraction of false alarms is not known.
+        It is meant for a group of records with a leak, and nan if `false_alarm` is None.
         """
         return self.alarms.value - self.false_alarm.value if self.false_alarm else math.nan
 
@@ -81,8 +84,8 @@ class Alarms:
         """Yield the fractions of alarms of each detector for each size of leak; if `pooled`, for all sizes together.
 
         The size is the planned mean flow, in the unit of the plan. Records with other faults are left out. Two
-        reference detectors, which always or never raise an alarm, come last. `hours`: operating time of a record, None
-        to omit false alarms per hour. If there are no records with a leak, each detector has one result of size 0, with
+        reference detectors, which always or never raise an alarm, come last. `hours`: operating time of one record [h],
+        None to omit false alarms per hour. If there are no records with a leak, each detector has one result, with
         alarms in 0 of 0 records.
         """
         for name, records in drop_other_faults(self._with_references()).items():

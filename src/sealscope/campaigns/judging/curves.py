@@ -17,8 +17,8 @@ class DetectorPod:
     """One detector's probability of detection (POD) over the size of the leak, i.e. over its planned mean flow.
 
     `sizes`: detections at each size; `curve`: logistic curve fitted to hits and misses, None if it cannot be fitted;
-    `why`: reason why there is no curve. `proven`: smallest size from which on counted detections alone prove a
-    detection probability of 90 % at all tested sizes, inf if none.
+    `why`: reason why there is no curve. `proven`: smallest tested size from which on, at this and all larger tested
+    sizes, the lower confidence bound of the counted detections is at least 90 %; inf if there is none.
     """
 
     detector: str

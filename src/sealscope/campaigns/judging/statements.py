@@ -101,7 +101,8 @@ def iter_cause_confusions(verdicts: Verdicts, confidence: float) -> Iterator[Nam
     """Yield the confusion matrix of true and named causes for each detector that names causes.
 
     `verdicts`: by detector, its verdict on each record. Nothing is yielded if no record has a fault other than a leak.
-    A record with both has two true causes and is left out; a record without a result counts as `cannot tell`.
+    A record with a leak and another fault has two true causes and is left out. A record without a result counts as
+    `cannot tell`.
     `confidence`: that of the fractions' intervals.
     """
     for name, records in verdicts.items():
@@ -121,7 +122,7 @@ def iter_cause_confusions(verdicts: Verdicts, confidence: float) -> Iterator[Nam
 
 
 def _true_cause(record: JudgedRow) -> str:
-    """Return the true cause of a record: "piston leak", the cause that stands for its fault, or "none"."""
+    """Return the true cause of a record: "piston leak", else the cause to be named for its fault, else "none"."""
     if record.size > 0:
         return PISTON_LEAK
     return expected_cause(record.row.fault) if record.row.fault else NO_CAUSE

@@ -42,7 +42,8 @@ class PriorKnowledge:
 def _table_layouts() -> dict[str, dict[str, str]]:
     """Load the layouts of all tables from `tables.toml`, by name of the table.
 
-    A layout gives the content of each column, by name of the column: flags and the path of a value (`_build_cells`).
+    A layout maps the heading of each column to a text that says how the column is filled: flags, such as "share" for
+    a proportion, and the dotted path of an attribute of the object that a row shows, as in "share alarms".
     """
     return tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 

@@ -32,9 +32,10 @@ ALL_CHANNELS = tuple(name for name in CHANNEL_UNITS if name != "q_leak")
 class PlanDetector:
     """A detector that a plan names, such as "diagnose @ pressures", split into its parts.
 
-    `name`: the full name; `base`: the part before "@", which is a scorer, a detector, `diagnose` or `watch`; `view`:
-    the part after "@", which names the set of channels that it uses, "" if there is none; `scorer`: the rule that
-    computes its score, None for a detector that states verdicts itself.
+    `name`: the full name; `base`: the part before "@", which is the name of a scorer or of a registered detector,
+    `diagnose`, or `watch` for the continuous watch of a machine; `view`: the part after "@", which names the set of
+    channels that the detector may use, "" if there is none; `scorer`: the scorer, a rule that computes only a score to
+    be compared with a threshold; None for a detector that states verdicts itself.
     """
 
     name: str
@@ -44,7 +45,7 @@ class PlanDetector:
 
     @property
     def needs_threshold(self) -> bool:
-        """True for a scorer whose threshold must be set from leak-free records."""
+        """True if the detector states only a score, whose threshold must be set from leak-free records."""
         return self.scorer is not None and self.scorer.threshold is None
 
 
@@ -52,7 +53,7 @@ class PlanDetector:
 def parse_detector_name(name: str) -> PlanDetector:
     """Split a detector name of a plan, such as "diagnose @ pressures", into detector and view (set of channels).
 
-    It is not checked that they exist; `check_detector` does that.
+    Names of detectors or views that do not exist are accepted; `check_detector` refuses them.
     """
     base, _, view = name.partition(_VIEW)
     if base in SCORERS:
@@ -61,7 +62,11 @@ def parse_detector_name(name: str) -> PlanDetector:
 
 
 def check_detector(name: str, views: Views) -> None:
-    """Check that a detector name of a plan is known and its view is one of `views`; raise InputError otherwise."""
+    """Check that a plan's detector exists and that the plan defines its view; raise InputError otherwise.
+
+    `name`: name of the detector, such as "diagnose @ pressures", whose view is the set of channels named after "@";
+    `views`: channels of each view of the plan, by its name. A name without "@" needs no view.
+    """
     parsed = parse_detector_name(name)
     if parsed.view and parsed.view not in views:
         known_views = ", ".join(view for view in views if view) or "none"

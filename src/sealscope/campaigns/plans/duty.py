@@ -27,8 +27,9 @@ _TARGET_CHECK_RATE = 50.0
 def check_duty(name: str, level: str | float, rig: Rig, duration: float) -> None:
     """Check a level (value) of a plan's factor `command`, `controller` or `load`; raise InputError if it is invalid.
 
-    `name`: the factor. A target of the position must be one that the rig's piston can reach within `duration` [s]; a
-    built-in controller must fit the rig.
+    `name`: the factor. A command that is a target of the piston's position must stay within the rig's stroke during
+    the `duration` [s] of a record. A built-in controller must be one that can be built for the rig; of others, only
+    the form of the name is checked.
     """
     examples = {COMMAND: "'3 sin(4t)' or 'position 50 mm sin(2t)'", CONTROLLER: "'pi'", LOAD: "'2 kN'"}
     if not isinstance(level, str):

@@ -41,7 +41,7 @@ def _validate_file_name(name: str) -> str:
 def _validate_pattern(files: str) -> str:
     """Check a pattern of file names, and return it; raise ValueError if it is invalid.
 
-    It must stay within its folder, and may have one `**`, as a whole name.
+    It must be relative and without "..", and may have one `**`, which must be a whole part of the path.
     """
     parts = Path(files).parts
     if not parts or Path(files).is_absolute() or ".." in parts:
@@ -100,8 +100,9 @@ class _TomlTable:
 
 @dataclass(frozen=True, kw_only=True)
 class RecordGroup(_TomlTable):
-    """A group of simulated records with the same leak and fault, spread evenly over all combinations of the factors.
+    """A group of simulated records with the same leak and fault, spread evenly over the conditions of the plan.
 
+    The conditions are all combinations of the levels (values) of the plan's factors, such as command and load.
     `count`: number of records; `use`: `calibrate` for leak-free records from which thresholds are set, `judge` for
     records on which verdicts are given; `leak_lpm` [L/min]: mean flow of the leak after the plan's onset, 0 for none;
     `law`: its relation of flow and pressure, `mixture` for half of the flow by each of the other laws; `fault`:
@@ -123,8 +124,8 @@ class RecordGroup(_TomlTable):
 class _Plan(_TomlTable):
     """The entries that plans of all types have.
 
-    `name`: name of the plan and of its files; `title`: by default the name; `confidence`: probability of all
-    confidence intervals; `note`: remark of the author; `place`: path of the plan's file.
+    `name`: name of the plan and of its files; `title`: by default the name; `confidence`: confidence level of
+    all intervals, such as 0.95; `note`: remark of the author; `place`: path of the plan's file.
     """
 
     name: FileName
@@ -138,11 +139,13 @@ class _Plan(_TomlTable):
 class _JudgedPlan(_Plan):
     """The fields that plans of simulated records and plans of recordings have in common.
 
-    `false_alarm`: wanted false-alarm probability; `promise`: "average" if thresholds keep it on average, "bound" if
-    they keep it with the probability `confidence` (`quantile_threshold`); `detectors`: names, as in "diagnose @
-    pressures"; `unit`: unit of the leaks' sizes; `views`: sets of channels, by the name that follows the "@";
-    `channels`: channels of the detectors without a view; `assume`: name of the rig that detectors may assume;
-    `assume_set`: values that replace some of its parameters.
+    `false_alarm`: wanted false-alarm probability of each detector; `promise`: "average" if a threshold set from
+    leak-free records keeps it on average over sets of such records, "bound" if it keeps it with the probability
+    `confidence` (`quantile_threshold`); `detectors`: names of the detectors to evaluate, such as "diagnose @
+    pressures"; `unit`: unit of the leaks' sizes; `views`: sets of channels, by the name that follows the "@" in a
+    detector's name; `channels`: channels of the detectors without "@", None for the usual ones; `assume`: name or file
+    of the rig that detectors may assume, None for the default of the plan's type; `assume_set`: values that replace
+    some parameters of this rig.
     """
 
     false_alarm: Fraction = 0.01
@@ -157,8 +160,8 @@ class _JudgedPlan(_Plan):
     def _load_assumed(self, rig: Rig | None) -> Rig | None:
         """Load the rig that detectors may assume, with the parameter values `assume_set` of the plan.
 
-        It is the rig named by `assume`, else `rig`. If there are values but neither of these, it is the rig `thesis`.
-        Returns None if there is no rig and there are no values.
+        It is the rig named by `assume` or, without this entry, the argument `rig`. If both are None, it is the packaged
+        rig `thesis` where `assume_set` has values, and otherwise None.
         """
         rig = rig if self.assume is None else load_rig(self.assume)
         if not self.assume_set:
@@ -170,11 +173,12 @@ class _JudgedPlan(_Plan):
 class SimulatedPlan(_JudgedPlan):
     """The plan of a simulated campaign.
 
-    `rig_name`: name of the rig; `rig_set`: values that replace some of its parameters; `rate`: its sampling rate;
-    `profile`: name of the profile (a distribution of machines) from which the machine of each record is drawn, "" for
-    the rig itself; `duration_s` [s]: length of a record; `onset_s` [s]: start of the leaks, nan for half of the
-    duration; `records`: groups of records; `seed`: number from which the seeds of all records derive;
-    `keep_recordings`: True to store the recordings; `part`: purpose of the plan, such as development or judging.
+    `rig_name`: name or file of the rig; `rig_set`: values that replace some of its parameters; `rate`: sampling rate of
+    its data acquisition, a number in Hz or a text with a unit, None for the rig's own; `profile`: name of the profile
+    (a distribution of machines) from which the machine of each record is drawn, "" for the rig itself; `duration_s`
+    [s]: length of a record; `onset_s` [s]: start of the leaks, nan for half of the duration; `records`: groups of
+    records; `seed`: number from which the seeds of all records derive; `keep_recordings`: True to store the
+    recordings; `part`: purpose of the plan, such as development or judging.
 
     `factors`: by name, the levels (values) of each factor; records are made for every combination of levels. The
     factors `command`, `controller`, `load` and `closed` set how the machine is moved and loaded, `family` selects

@@ -126,7 +126,10 @@ def _path_in_plan_folder(name: str, place: str) -> str:
 
 
 def _complete_simulated_plan(plan: SimulatedPlan) -> SimulatedPlan:
-    """Fill in the paths and default onset of a simulated plan, and check it; raise InputError if it is invalid."""
+    """Fill in the paths and default onset of a simulated plan, and check it; raise InputError if it is invalid.
+
+    Paths of the plan's rig and profile are completed by its folder; the default onset is half of the duration.
+    """
     place = plan.place
     profile = "" if plan.profile == "none" else _path_in_plan_folder(plan.profile, place)
     onset = plan.duration_s / 2 if math.isnan(plan.onset_s) else plan.onset_s
@@ -148,8 +151,8 @@ def _complete_simulated_plan(plan: SimulatedPlan) -> SimulatedPlan:
 def _check_factors(plan: SimulatedPlan) -> None:
     """Check the factors of a plan and their levels (values); raise InputError if one is invalid.
 
-    Each level must be valid and occur once, their combinations must not be too many, and controllers need commands
-    that are targets of the position.
+    Each level must be valid and occur once in its factor. There may be at most `MAX_CELLS` combinations of levels. If
+    the plan varies the controller, all its commands must be targets of the piston's position, not voltages.
     """
     for name, levels in plan.factors.items():
         if len({repr(level) for level in levels}) < len(levels):
@@ -192,8 +195,9 @@ def _check_level(plan: SimulatedPlan, name: str, level: str | float) -> None:
 def _check_records(plan: SimulatedPlan) -> None:
     """Check the groups of records of a plan; raise InputError if one is invalid.
 
-    No group may occur twice, each fault must be known, and there must be enough records to judge and enough leak-free
-    ones to set thresholds.
+    No two groups may agree in use, leak, law and fault; each fault must be known; and at least one group must be
+    judged. If a detector needs a threshold, there must be enough leak-free records for the plan's false-alarm
+    probability (`records_needed`), times the number of commands, as each command has thresholds of its own.
     """
     kinds = [(group.use, group.leak_lpm, group.law, group.fault) for group in plan.records]
     for number, (kind, group) in enumerate(zip(kinds, plan.records, strict=True), 1):

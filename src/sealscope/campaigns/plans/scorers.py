@@ -47,10 +47,10 @@ def split_bounds(n: int, rate: float, split: int) -> IntArray:
 
 @dataclass(frozen=True)
 class SplitRms:
-    """The logarithms of the RMS of the pressures' wavelet details, before and after the split of a record.
+    """The natural logarithms of the RMS of the pressures' wavelet details, before and after the split of a record.
 
-    `log_rms`: by chamber, three arrays (5,) for d1, d2, d3, d4 and d3d4: before the split, after it, and over both
-    parts.
+    `log_rms`: by chamber, "p_A" or "p_B", three arrays (5,): before the split, after it, and over both parts. Their
+    entries are those of d1, d2, d3, d4, in Pa before the logarithm, and of the product d3d4, in Pa^2.
     """
 
     log_rms: Mapping[str, tuple[Array, Array, Array]]
@@ -91,10 +91,11 @@ class SplitRms:
         return SplitRms({chamber: values for chamber, values in self.log_rms.items() if chamber in visible})
 
     def value(self, chamber: str, quantity: str, statistic: str) -> float | None:
-        """Return the change of a wavelet detail's log RMS from the first to the second part, or its value over both.
+        """Return one statistic of a wavelet detail's natural log RMS: its change at the split, or its overall value.
 
-        `chamber`: "p_A" or "p_B"; `quantity`: "d1" to "d4" or "d3d4"; `statistic`: "change" or "level". Returns None
-        if the chamber is missing or the number is not finite.
+        `chamber`: "p_A" or "p_B"; `quantity`: "d1" to "d4" or "d3d4"; `statistic`: "change" for the log RMS after the
+        split minus that before it, "level" for the log RMS over both parts. Returns None if the chamber is missing or
+        the number is not finite.
         """
         if chamber not in self.log_rms:
             return None
@@ -107,9 +108,11 @@ class SplitRms:
 class Scorer:
     """A decision rule of the thesis that computes a score of a record, to be compared with a threshold.
 
-    `parts`: one condition or several, each with a quantity, a chamber and a direction, such as ("d3", "p_A", "fell");
-    the rule's score is the smallest score of its conditions. `threshold`: fixed threshold, None if it is to be set
-    from leak-free records.
+    `parts`: one condition or several, each with a quantity, a chamber and a direction, such as ("d3", "p_A", "fell").
+    The score of a condition is the change of the log RMS of the quantity from the first to the second part of the
+    record: as it is for "rose", negative for "fell", absolute for "changed". For "high" it is the log RMS over both
+    parts, for "low" its negative. The rule's score is the smallest score of its conditions. `threshold`:
+    fixed threshold, None if it is to be set from leak-free records.
     """
 
     name: str

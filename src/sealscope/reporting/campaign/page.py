@@ -55,8 +55,9 @@ def main_table(result: CampaignResult) -> tuple[list[str], list[list[str]]]:
     """Build the main table of a campaign as text: the headings of its columns, and a row for each detector.
 
     A row has the information that the detector was given, if any was, the fractions of false alarms and of detected
-    leaks of each size, the area under the ROC curve, and the sizes a90 and a90/95. The detectors of the plan come
-    first, then two that always or never raise an alarm.
+    leaks of each size, the area under the ROC curve, a90, the leak size that is detected with a probability of 90 %,
+    and a90/95, its upper 95 % confidence bound. The detectors of the plan come first, then two for comparison that
+    always or never raise an alarm.
     """
     judgement = result.judgement
     sizes = column_sizes(judgement)
@@ -102,7 +103,12 @@ def _format_a90(pod: DetectorPod | None) -> tuple[str, str]:
 
 
 def result_text(result: CampaignResult) -> str:
-    """Summarise a campaign in a few sentences: the leaks that the best detectors find, and their false alarms."""
+    """Summarise a campaign in a few sentences: the leaks that the best detectors find, and their false alarms.
+
+    The best detectors, up to `_MAX_NAMED`, are those with the smallest a90, the leak size that is detected with a
+    probability of 90 %. Detectors whose a90 is unknown or above the largest tested size come last, in the order of the
+    fraction of the largest leaks that they find.
+    """
     judgement, unit = result.judgement, result.plan.unit
     ranked_findings: list[tuple[float, float, str]] = []
     for pod in judgement.pods:
@@ -221,7 +227,11 @@ def render_campaign_page(result: CampaignResult, files: Sequence[str] = ()) -> s
 
 
 def _facts(result: CampaignResult) -> list[tuple[str, str]]:
-    """List the facts of a campaign for the head of its page, as pairs of label and text."""
+    """List the conditions of a campaign for the head of its page, as pairs of label and text.
+
+    For simulated records they are rig, length and sampling rate, levels of the factors, seed, channels, the rig that
+    detectors assume, and the simulated leak flows. For recordings of machines they are use and leak size of each set.
+    """
     plan, judgement = result.plan, result.judgement
     if isinstance(plan, RecordedPlan):
         return [(group.label or group.files, f"{group.use}, size {group.size:g} {plan.unit}") for group in plan.sets]
@@ -293,7 +303,10 @@ def _size_text(roc: SizeRoc, unit: str) -> str:
 
 
 def _describe_score(name: str) -> str:
-    """Describe the score of a detector in words; return "" for a detector that is not installed."""
+    """Describe in words which score the ROC curve of a detector is computed from; "" if it is not installed.
+
+    `name`: name of the detector in the plan, such as "diagnose @ pressures".
+    """
     detector = parse_detector_name(name)
     through = f", given the channels of {detector.view} alone" if detector.view else ""
     if detector.scorer is not None:

@@ -22,7 +22,10 @@ def percent(proportion: Proportion | None) -> str:
 
 
 def _format_percent(fraction: float) -> str:
-    """Format a fraction in percent, without the sign, with more decimals if it is small."""
+    """Format a fraction as a percentage without the sign %.
+
+    It has two decimals below 9.95 %; from there on none if it is a whole number or above 99.95 %, otherwise one.
+    """
     value = 100.0 * fraction
     digits = 2 if value < 9.95 else 0 if value > 99.95 or value == round(value) else 1
     return f"{value:.{digits}f}"

@@ -81,10 +81,11 @@ def render_history_page(judged: Sequence[Judged], title: str, left_out: int = 0)
 
 
 def history_pictures(ordered: Sequence[Judged]) -> dict[str, Picture] | None:
-    """Draw the leak of each recording over time, as a picture for each of the `SIZES`, "wide" and "narrow".
+    """Draw each recording's leak flow [L/min] over time, as a picture for each of the `SIZES`, "wide" and "narrow".
 
-    `ordered`: recordings in order of their starts; if one has no date, all are drawn over their numbers, from 1.
-    Returns None if no recording states an estimate or a bound.
+    `ordered`: recordings in order of their starts; if one has no date, all are drawn over their numbers, from 1. A
+    diagnosis that finds no leak is drawn with the upper bound of a leak. Returns None if no recording has a leak flow
+    or a bound.
     """
     levels = [_leak_level(entry.diagnosis) for entry in ordered]
     known_levels = [level for level in levels if level is not None]
@@ -103,7 +104,7 @@ def history_pictures(ordered: Sequence[Judged]) -> dict[str, Picture] | None:
     def format_day(day: float) -> str:
         """Format a value of the time axis as a date, or if there are no dates, as the number of a recording.
 
-        `day`: time [d], or the number, for which the text is "" between two recordings.
+        `day`: time in days since 1970 or, without dates, the number of a recording; "" for a number that is not whole.
         """
         if has_dates:
             return stamp(day * DAY, days[-1] - days[0])
@@ -145,7 +146,10 @@ def _leak_level(diagnosis: Diagnosis) -> _Level | None:
 
 
 def _dates(ordered: Sequence[Judged]) -> list[str]:
-    """Format the start of each recording as a date, with the time of day if they are close; a dash if unknown."""
+    """Format the start of each recording as a date; a dash if it is unknown.
+
+    The time of day is added if all recordings start within less than three days.
+    """
     starts = [entry.start_s for entry in ordered if entry.start_s is not None]
     span_days = (max(starts) - min(starts)) / DAY if starts else 0.0
     return [messages.ABSENT if entry.start_s is None else stamp(entry.start_s, span_days) for entry in ordered]

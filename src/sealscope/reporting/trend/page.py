@@ -80,9 +80,9 @@ def level_pictures(
 
 
 def trend_pictures(trend: Trend) -> dict[str, Picture] | None:
-    """Draw a trend as a picture for each of the `SIZES`, "wide" and "narrow".
+    """Draw the leakage in a trend's recordings over time, as a picture for each of the `SIZES`, "wide" and "narrow".
 
-    Returns None if no recording has a level of leakage.
+    Returns None if the leakage could not be estimated from any recording.
     """
     if trend.wear is None or all(point.value is None for point in trend.points):
         return None
@@ -91,7 +91,12 @@ def trend_pictures(trend: Trend) -> dict[str, Picture] | None:
 
 
 def _draw_trend(trend: Trend, picture: Picture) -> None:
-    """Draw a trend into a picture: the healthy range, the recordings, the fitted line, alarms and repairs."""
+    """Draw a trend into a picture, in the trend's unit of leakage over days since the first recording.
+
+    There are the range of healthy recordings and the fitted line of each period between repairs, each recording as a
+    point with its interval, and a vertical mark at each alarm and repair. A recording without an estimate of the
+    leakage has a symbol at the bottom.
+    """
     days = [trend.points[row].day for row in trend.rows]
     for episode in trend.episodes:
         healthy = episode.wear.healthy
@@ -115,8 +120,8 @@ def _draw_trend(trend: Trend, picture: Picture) -> None:
 def _y_limits(trend: Trend) -> tuple[float, float]:
     """Compute the limits (low, high) of the leakage axis in a trend's picture, in the trend's unit.
 
-    They include all intervals of recordings and healthy ranges, and zero for levels in L/min. The repair limit is
-    included if it is below 2.5 times the largest of these.
+    They include the intervals of all recordings, the healthy ranges and, if the unit is L/min, zero. The repair limit
+    is included if it is below 2.5 times the largest of these values.
     """
     ends = [value for point in trend.points for value in (point.low, point.high) if value is not None]
     ends += [end for episode in trend.episodes for end in (episode.wear.healthy.low, episode.wear.healthy.high)]
@@ -130,10 +135,11 @@ def _y_limits(trend: Trend) -> tuple[float, float]:
 
 
 def _fitted_line(days: list[float], episode: Episode) -> list[tuple[float, float]]:
-    """Compute the vertices (day, level) of the line fitted to an episode, the recordings from one repair to the next.
+    """Compute the vertices (day, leakage) of the line fitted to an episode, the recordings from one repair to the next.
 
-    The line is straight. If there is an alarm with an onset, it is constant until then, and rises to the present
-    level afterwards, at once if the change is a step. `days`: times of all recordings [d].
+    The leakage is in the unit of the trend. Without an alarm or an onset, the line is straight, with the fitted growth,
+    and ends at the present leakage. Otherwise it is at the healthy level until the onset, and then rises to the present
+    leakage: linearly up to the last recording, or at once if the change is a step. `days`: times of all recordings [d].
     """
     first, last, wear = days[episode.begin], days[episode.end - 1], episode.wear
     if episode.alarm is None or wear.onset is None:

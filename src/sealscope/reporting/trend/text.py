@@ -19,16 +19,16 @@ from sealscope.units import BAR, DAY, DAYS_PER_YEAR
 
 
 def level_name(trend: Trend) -> str:
-    """Return the label, "total" or "now", of the present leakage level in a trend.
+    """Return the label of a trend's present state: "total" or "now".
 
-    It is "total" for the leakage of pump and piston, and "now" if the level is the damping of the pressures' ringing
-    (the RMS of their wavelet details).
+    It is "total" if the trend follows the leakage of pump and piston together, and "now" if it follows the damping of
+    the pressures' ringing instead, which is measured by the RMS of their wavelet details.
     """
     return "now" if trend.basis == "ringing" else "total"
 
 
 def moment(trend: Trend, day: float) -> str:
-    """Format a time of a trend, in days, as a date, or as "day N" if the recordings have no dates."""
+    """Format a time of a trend, `day` days after its first recording, as a date; as "day N" without dates."""
     if not trend.dated or not trend.points:
         return f"day {day:.3g}"
     first, last = trend.points[0], trend.points[-1]
@@ -48,7 +48,10 @@ def recordings_text(trend: Trend) -> str:
 
 
 def headline(trend: Trend) -> str:
-    """Format a trend in one line: the verdict, the onset of the leak or the last repair, and the recordings."""
+    """Format a trend in one line: the verdict, the onset of the leak, and the number and dates of the recordings.
+
+    If a repair ended an earlier leak and the verdict is `no leak`, the date of the last repair replaces the onset.
+    """
     wear, key, since = trend.wear, "trend", ""
     if trend.verdict == "no leak" and trend.repairs:  # a repair ended the earlier leak
         key, since = "trend_fell", moment(trend, trend.repairs[-1].day)
@@ -72,11 +75,11 @@ def verdict_sentence(trend: Trend) -> str:
 
 
 def figures(trend: Trend) -> dict[str, str]:
-    """Format the numbers of a trend as text, by name; "" for a number that is not known.
+    """Format the numbers of a trend as text, by name; the text is "" or a remark if a number is not known.
 
     They are `total`, the present leakage of pump and piston together; `leak`, its rise above the healthy level;
-    `healthy`, the range of healthy recordings; `since`, the onset; `growth`, the rise in a month or in a step; and
-    `limit`, the time until the repair limit is reached.
+    `healthy`, the range of 95 % of the healthy recordings; `since`, the onset of the rise; `growth`, the rise in a
+    month or in a sudden step; and `limit`, the date at which the leakage reaches the repair limit.
     """
     wear = trend.wear
     if wear is None:
@@ -108,7 +111,7 @@ def figures(trend: Trend) -> dict[str, str]:
 def healthy_end(wear: Wear) -> float:
     """Compute the upper end of the healthy range for display, cut off at the repair limit.
 
-    It is at least the healthy level itself, even if that exceeds the limit.
+    It is at least the mean level of healthy recordings, even if that exceeds the limit.
     """
     high = wear.healthy.high
     return high if wear.limit is None else min(high, max(wear.limit, wear.healthy.value))
@@ -128,8 +131,9 @@ def _format_estimate(interval: Interval, unit: str) -> str:
 def _format_reach(trend: Trend, limit: float, reach: Interval) -> str:
     """Format the repair limit, and the predicted date at which the leakage reaches it.
 
-    `limit`: in the unit of the trend; `reach` [d]: time from the last recording until then, with its interval. No
-    date is predicted if the recordings are too few or the date is too far away.
+    `limit`: in the unit of the trend; `reach` [d]: time from the last recording until then, with its interval. After an
+    alarm the date is stated with its interval, without one only the earliest date (95 %). No date is stated if the
+    recordings are too few or the date is too far away.
     """
     limit_text, first, last = f"{number(limit, 2)} {trend.unit} in all", trend.points[0].day, trend.points[-1].day
     max_days = TREND.history.furthest
@@ -207,8 +211,8 @@ def trend_text(trend: Trend, *, whole: bool = False) -> str:
 def trend_csv(trend: Trend) -> str:
     """Format a trend as CSV text, with a row for each recording.
 
-    The columns are file, time, day since the first recording, level with its interval, group of comparable
-    recordings, oil temperature [degC] and note.
+    The columns are file, time, days since the first recording, leakage with its interval in the unit of the trend,
+    number of the group of comparable recordings, oil temperature [degC] and note.
     """
     unit, time = trend.unit, "time" if trend.dated else "time [d]"
     levels = (f"level [{unit}]", f"low [{unit}]", f"high [{unit}]")
