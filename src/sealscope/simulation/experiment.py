@@ -85,8 +85,8 @@ def check_circuit(rig: Rig) -> None:
     if cylinder.A_A != cylinder.A_B and not (makeup.check_valves == "pilot-operated" or makeup.G_relief > 0):
         raise InputError(
             f"a single-rod cylinder (A_A = {1e6 * cylinder.A_A:g} mm^2, A_B = {1e6 * cylinder.A_B:g} mm^2) must "
-            "have makeup.check_valves = pilot-operated, through which its rod displaces oil, got "
-            f"makeup.check_valves = {makeup.check_valves}"
+            "have makeup.check_valves = pilot-operated or makeup.G_relief > 0, through which its rod displaces oil, "
+            f"got makeup.check_valves = {makeup.check_valves}, makeup.G_relief = {makeup.G_relief:g}"
         )
 
 

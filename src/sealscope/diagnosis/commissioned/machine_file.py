@@ -365,7 +365,7 @@ def _build_tree(machine: CommissionedMachine, path: Path) -> dict[str, Any]:
             "mark": alarm.mark,
             "date": datetime.fromtimestamp(alarm.date_s, UTC).isoformat(),
             "onset": datetime.fromtimestamp(alarm.onset_s, UTC).isoformat(),
-            "leak_lpm": alarm.leak_lpm or None,
+            "leak_lpm": alarm.leak_lpm,
             "reason": alarm.reason or None,
         }
         for alarm in machine.alarms

@@ -187,7 +187,7 @@ class Trend:
     def as_dict(self) -> dict[str, Any]:
         """Return the trend as plain values for JSON; a number that is not finite becomes None."""
         wear, total = self.wear, self.decision.total_leakage
-        alarm, days = self.alarm, [point.day for point in self.points] or [math.nan]
+        alarm, days = self.alarm, [point.day for point in self.points if point.group >= 0] or [math.nan]
         limit_day = wear and wear.reach and Interval(*(days[-1] + wait for wait in wear.reach))
         points = [
             {

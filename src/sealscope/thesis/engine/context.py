@@ -108,6 +108,9 @@ class Context:
 def first_table(context: Context, item: str) -> ThesisTable:
     """Return the first table among the products of the item with the id `item`, which the item to be made needs.
 
-    Raises InputError if that item failed.
+    Raises InputError if that item failed or made no table.
     """
-    return next(product for product in context.product(item) if isinstance(product, ThesisTable))
+    table = next((product for product in context.product(item) if isinstance(product, ThesisTable)), None)
+    if table is None:
+        raise InputError(f"{item} must make a table, which another item needs, got none")
+    return table
