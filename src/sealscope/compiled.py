@@ -260,10 +260,10 @@ def call_at(context: Any, address: Any, memory: Any, sample: Any) -> Any:
     """
 
     def emit_call(target: Any, builder: Any, signature: Any, values: Any) -> Any:
-        """Emit the LLVM instructions that call the function at the address.
+        """Emit the LLVM instructions that call the function at the address; return the double that it returns.
 
         Numba passes the arguments: `values` are the addresses of the function and of the two arrays that it takes,
-        `memory` and `sample`.
+        `memory` and `sample`, as 64-bit integers, which are converted to pointers.
         """
         double = target.get_value_type(numba.float64)
         pointer = double.as_pointer()
@@ -281,7 +281,7 @@ def address_of(context: Any, pointer: Any) -> Any:
     """
 
     def emit_conversion(target: Any, builder: Any, signature: Any, values: Any) -> Any:
-        """Emit the LLVM instruction that converts the pointer to a 64-bit integer.
+        """Emit the LLVM instruction that converts the pointer to a 64-bit integer; return its result.
 
         Numba passes the arguments; the only item of `values` is the pointer.
         """
@@ -326,9 +326,10 @@ def record_view(layout: Any) -> Callable[[Any], Any]:
         """
 
         def emit_cast(target: Any, builder: Any, signature: Any, values: Any) -> Any:
-            """Emit the LLVM instruction that casts the pointer.
+            """Emit the LLVM instruction that casts the pointer to doubles to one to the record; return its result.
 
-            Numba passes the arguments; the only item of `values` is the pointer.
+            Numba passes the arguments: the instruction is added to `builder`, and the only item of `values` is the
+            pointer.
             """
             return builder.bitcast(values[0], target.get_value_type(kind))
 

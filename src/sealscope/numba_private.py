@@ -189,8 +189,9 @@ class _LawCompiler(_ShortCompiler):
 class _Law(CPUDispatcher):  # type: ignore[misc]
     """A law, i.e. a function for other compiled functions, without numba's wrapper for calls from Python.
 
-    The wrapper, which unpacks and checks each argument, takes longer to compile than the law. If Python calls a small
-    law, the uncompiled function runs; a large one is compiled a second time, as a kernel, and cached in `folder`.
+    The wrapper, which unpacks and checks each argument, takes longer to compile than the law. Its compiled code can
+    therefore not be called from Python. If Python calls a small law, i.e. one that is inlined, its Python source runs
+    uncompiled. A large one is compiled a second time, as a kernel with the wrapper, and cached in `folder`.
     """
 
     folder: Path | None = None
@@ -206,12 +207,15 @@ class _Law(CPUDispatcher):  # type: ignore[misc]
 
     @cached_property
     def _for_python(self) -> Any:
-        """Function that runs when Python calls this one: uncompiled if small, else compiled anew for Python."""
+        """Function that runs if Python calls the law, whose own compiled code only compiled functions can call.
+
+        It is the Python source of the law if the law is inlined (small), else a kernel that is compiled from it.
+        """
         inlined = self.targetoptions["forceinline"]
         return self.py_func if inlined else compile_kernel(self.py_func, self.targetoptions["fastmath"], self.folder)
 
     def __call__(self, *arguments: Any, **named: Any) -> Any:
-        """Run the function for a call from Python: uncompiled if small, else compiled anew for Python."""
+        """Run the law for a call from Python (`_for_python`)."""
         return self._for_python(*arguments, **named)
 
 

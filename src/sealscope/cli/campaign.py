@@ -145,6 +145,7 @@ def _show_progress() -> Iterator[ProgressCallback]:
 def _write_report(plan: AnyPlan, folder: Path, data: Path | None) -> int:
     """Write the tables and the page of a campaign, print its main table, and return the number of failed records.
 
+    `folder`: folder of the campaign, to which the files are written and which has the results of simulated records;
     `data`: folder of the recordings for a plan over recordings, else None.
     """
     from sealscope.campaigns.results import write_result

@@ -382,8 +382,9 @@ def load_rig_with(name: str, overrides: Sequence[str] | None) -> Rig:
 def parse_channel_map(options: Sequence[str] | None) -> ChannelMap:
     """Parse the `--map` options to a channel map, which states the column of each channel.
 
-    With `auto` the remaining channels are found by the names of the columns; if it is the only option, the result is
-    "auto". Without options the map is empty. Raises InputError for a channel that is given twice.
+    An option is `CHANNEL=COLUMN`, such as `p_A=PG_1` or `p_A=PG_1[psi]`, or the word `auto`. With `auto` the remaining
+    channels are found by the names of the columns; if it is the only option, the result is "auto". Without options the
+    map is empty. Raises InputError for an option of another form, an unknown channel, or a channel that is given twice.
     """
     from sealscope.recordings import split_map_option
     from sealscope.recordings.formats.columns import REST

@@ -283,8 +283,9 @@ def fit_hit_miss(leaks: npt.ArrayLike, hits: npt.ArrayLike) -> HitMiss:
 
     `leaks` (n,) are positive sizes in any unit; `hits` (n,) are True for the detected leaks. The fit is by maximum
     likelihood. If hits and misses are separated by size, the likelihood has no finite maximum, and Firth's penalised
-    likelihood is used (`HitMiss.estimator`), also for the bound. The curve goes to 0 for small leaks, as it does not
-    include the false-alarm rate. Raises InputError for a single size, only hits or only misses. Source:
+    likelihood is used instead (`HitMiss.estimator`), both for the curve and for the confidence bound of a size, such as
+    a90/95 (`HitMiss.size_bound`). The curve goes to 0 for small leaks, as it does not include the false-alarm rate.
+    Raises InputError for a single size, only hits or only misses. Source:
     MIL-HDBK-1823A (2009), appendix G; Firth, Biometrika 80 (1993) 27-38, doi 10.1093/biomet/80.1.27; Heinze and
     Schemper, Stat. Med. 21 (2002) 2409-2419, doi 10.1002/sim.1047.
     """

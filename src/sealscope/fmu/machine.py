@@ -163,7 +163,8 @@ def build_functions(choice: RigChoice) -> dict[str, Callable[..., Any]]:
     def start(values: Any, inputs: Any, x_0: float, y: Any) -> int:
         """Set the state `y` to standstill at the piston position x_0 [m], under the load [N] among the inputs.
 
-        Returns 0, or a code of `FAILURES`.
+        `values`: the FMU's parameters in the order of `variables.VALUES`; `inputs`: its inputs; `y`: the rig's state,
+        overwritten. Returns 0, or a code of `FAILURES`.
         """
         v, input_values, state = carray(values, _N_VALUES), carray(inputs, _N_INPUTS), carray(y, _N_STATES)
         p = model_parameters(v, input_values)
@@ -173,7 +174,8 @@ def build_functions(choice: RigChoice) -> dict[str, Callable[..., Any]]:
     def report(values: Any, inputs: Any, y: Any, results: Any) -> int:
         """Write the outputs of the rig to `results`, and after them the electric, hydraulic and mechanical power [W].
 
-        Returns 0.
+        `values`: the FMU's parameters in the order of `variables.VALUES`; `inputs`: its inputs; `y`: the rig's state,
+        which stays as it is. Returns 0.
         """
         v, input_values, state = carray(values, _N_VALUES), carray(inputs, _N_INPUTS), carray(y, _N_STATES)
         out = carray(results, _N_RESULTS)
@@ -209,10 +211,12 @@ def build_functions(choice: RigChoice) -> dict[str, Callable[..., Any]]:
             return rk4_step(z, h, u, G, C, F, p, euler)
 
     def advance(values: Any, inputs: Any, slopes: Any, y: Any, span: float, steps: int) -> int:
-        """Integrate the state `y` over `span` [s] in equal steps, while the inputs change linearly.
+        """Integrate the state of the rig over `span` [s] in equal steps, while the inputs change linearly.
 
-        `inputs`: their values at the start; `slopes`: their change per second; `steps`: number of steps. Returns 0, or
-        a code of `FAILURES` if the state is not finite or a pressure is below vacuum at the end.
+        `values`: the FMU's parameters in the order of `variables.VALUES`; `inputs`: the inputs at the start; `slopes`:
+        their change per second; `y`: the state at the start, which is replaced by that at the end, also after a
+        failure; `steps`: number of steps. Returns 0, or a code of `FAILURES` if the state at the end is not finite or
+        has a pressure below vacuum.
         """
         v, state = carray(values, _N_VALUES), carray(y, _N_STATES)
         a, b = carray(inputs, _N_INPUTS), carray(slopes, _N_INPUTS)

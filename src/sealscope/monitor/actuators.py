@@ -198,10 +198,18 @@ class _Actuator:
     def summary(self) -> dict[str, Any]:
         """Build the summary of the actuator for the page, the metrics and messages, as plain values by name.
 
-        It has the number of blocks that the leak detector has seen, the end of the last one or of the last recording
-        [s], the state by NAMUR NE 107, the total leakage and the leak [L/min] with their 95 % intervals, the bound of a
-        leak that is not found [L/min], the oil temperature [deg C], facts of the healthy baseline and of the last
-        recording's verdict, id and status word of the open alarm, and the detector's counters. Unknown values are None.
+        If whole recordings are judged, status and time are those of the last verdict, and the flows too if it decides
+        (`RecordingVerdict.decides`). Otherwise they are those of the detector's last block. Unknown values are None.
+        The names are:
+
+        - `blocks`: number of blocks of samples that the detector has seen; `counters`: its counters; `by`: its method;
+        - `t`: end of the last block or recording [s since 1970]; `status`: its result in words;
+        - `state`: state of the machine by NAMUR NE 107;
+        - `total_lpm`, `leak_lpm` [L/min]: total leakage and the leak, with their 95 % intervals (`_interval_lpm`);
+          `bound_lpm` [L/min]: upper bound of a leak that is not found;
+        - `recording`: texts of the last verdict; `why_no_litres`: reason why no L/min are stated, else "";
+        - `oil_celsius`: oil temperature [deg C]; `baseline`: version, hours and leakage of the healthy baseline;
+        - `alarm`: id of the open alarm; `status_word`: its status word, 0 without an alarm.
         """
         baseline, alarm, verdict = self.watch.baseline, self.judge.alarm, self.verdict
         last = self.last or BlockEstimate(0, math.nan, "waits for samples")

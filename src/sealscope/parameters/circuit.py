@@ -61,7 +61,11 @@ class HydraulicCircuit(NamedTuple):
 
     @property
     def size_parameters(self) -> tuple[str, ...]:
-        """Dotted names of the parameters that `flow_size` stands for: both piston areas, or the displacement."""
+        """Dotted names of the parameters to which flows of the volume balance are proportional (`flow_size`).
+
+        They are both piston areas if `flow_size` is "area", as in a valve-controlled rig, and the pump's displacement
+        if it is "displacement", as in a pump-controlled one.
+        """
         return ("cylinder.A_A", "cylinder.A_B") if self.flow_size == "area" else ("pump.q_b",)
 
 

@@ -498,11 +498,12 @@ def _si_value(full_name: str, field: FieldInfo, entry: ParameterEntry) -> Value:
 
 
 def _parse_value(full_name: str, value: Any, place: str) -> tuple[Value, str]:
-    """Parse the new value of a parameter, and return it with the parameter's SI unit.
+    """Parse a value that replaces that of a parameter; return it in SI, and the SI unit, "" for a choice.
 
-    `value`: a number in SI, or a text with a unit such as "50[cm^3]", which is converted to SI; for a choice, one of
-    its options, which is not checked here. The unit is "" for a choice. `place`: where the value comes from, for
-    messages.
+    For a number, `value` is a number in SI or a text with a unit such as "50[cm^3]", which is converted. For a choice
+    it is an option, of which only blanks at its ends are removed. Whether the parameter allows the value is checked
+    later (`_si_value`). `full_name`: dotted name of the parameter; `place`: where the value comes from, for messages.
+    Raises InputError for a text that is no quantity of the parameter's dimension.
     """
     field = declared_fields()[full_name]
     if choices_of(field):

@@ -64,7 +64,7 @@ def accumulator_compliance(p: float, p_pre: float, V_gas: float, n_acc: float) -
 
 @contracted
 def check_valve_flow(dp: float, p_crack: float, G_check: float) -> float:
-    """Compute the flow [m^3/s] through a check valve under dp [Pa]: G_check (dp - p_crack), 0 for dp < p_crack.
+    """Compute the flow [m^3/s] >= 0 through a check valve under dp [Pa]: G_check (dp - p_crack), 0 for dp < p_crack.
 
     `dp`: pressure drop in the free direction; `p_crack` [Pa]: drop at which the valve opens; `G_check` [m^3/(s Pa)]:
     conductance of the open valve.
@@ -90,9 +90,13 @@ def pilot_opening(dp: float, dp_pilot: float, p_crack: float, k_pilot: float, p_
 def pilot_valve_flow(
     dp: float, dp_pilot: float, p_crack: float, G_check: float, k_pilot: float, p_open: float
 ) -> float:
-    """Compute the flow [m^3/s] through a pilot-operated check valve, negative if it flows backwards.
+    """Compute the flow [m^3/s] through a pilot-operated check valve, positive in the free direction.
 
-    It is G_check dp times the opening of the valve. `dp` [Pa]: pressure drop in the free direction; `G_check`
-    [m^3/(s Pa)]: conductance of the fully open valve; for the other parameters see `pilot_opening`.
+    It is G_check dp times the opening of the valve (`pilot_opening`), 0 while it is shut. The flow is negative while
+    the pilot holds the valve open against a negative dp. `dp` [Pa]: pressure drop in the free direction, inlet minus
+    outlet; `dp_pilot` [Pa]: pilot pressure minus inlet pressure, which counts only if it is positive; `p_crack` [Pa]:
+    pressure at which the valve begins to open; `G_check` [m^3/(s Pa)]: conductance of the fully open valve; `k_pilot`:
+    pilot ratio, area of the pilot's piston over that of the seat; `p_open` [Pa]: further pressure at which the valve is
+    fully open.
     """
     return G_check * dp * pilot_opening(dp, dp_pilot, p_crack, k_pilot, p_open)

@@ -1,4 +1,4 @@
-"""Friction of piston and rod: Coulomb, Stribeck and viscous, linear near standstill (eqs. 4.20-4.22).
+"""Friction of piston and rod: Coulomb, Stribeck and viscous, linear near standstill (eqs. 4.20-4.22 of the thesis).
 
 A rig may have one of two other laws instead: in Karnopp's the piston sticks at standstill; in LuGre's the contact is an
 elastic bristle that deflects before it slides.
@@ -14,7 +14,7 @@ from sealscope.physics.lanes import exponential, select
 
 @contracted
 def coulomb_friction(p_A: float, p_B: float, F_pr: float, F_cfr: float, use_difference: bool) -> float:
-    """Compute the Coulomb force F_C = F_pr + F_cfr (p_A + p_B) [N], eq. (4.20).
+    """Compute the Coulomb force F_C = F_pr + F_cfr (p_A + p_B) [N], eq. (4.20) of the thesis.
 
     `p_A`, `p_B` [Pa]: chamber pressures; `F_pr` [N]: preload force of the seals; `F_cfr` [N/Pa]: Coulomb friction per
     pressure. `use_difference`: take p_A - p_B instead of the sum, as the equation is printed in the thesis.
@@ -24,7 +24,7 @@ def coulomb_friction(p_A: float, p_B: float, F_pr: float, F_cfr: float, use_diff
 
 @contracted
 def stribeck_force(speed: float, F_C: float, K_brk: float, C_c: float) -> float:
-    """Compute the Coulomb and Stribeck friction [N] of steady sliding at `speed` >= 0 [m/s], eq. (4.21).
+    """Compute the Coulomb and Stribeck friction [N] of steady sliding at `speed` >= 0 [m/s], eq. (4.21) of the thesis.
 
     F_C (1 + (K_brk - 1) exp(-C_c speed)) falls from the breakaway force K_brk F_C at standstill to the Coulomb force
     F_C [N] at high speed. `K_brk` is the ratio of the two, `C_c` [s/m] the transition coefficient. The viscous part is

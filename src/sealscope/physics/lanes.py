@@ -75,7 +75,10 @@ class _MaskModel(models.PrimitiveModel):  # type: ignore[misc]
 
 
 def _broadcast(builder: Any, scalar: Any, lanes: Lanes) -> Any:
-    """Build the LLVM instructions that copy one number into every lane of a vector."""
+    """Build the LLVM instructions that copy one number into every lane of a vector; return the vector.
+
+    `lanes`: type of the vector.
+    """
     zero = ir.Constant(ir.IntType(32), 0)
     first_lane = builder.insert_element(ir.Constant(_vector_type(lanes), ir.Undefined), scalar, zero)
     zeros = ir.Constant(ir.VectorType(ir.IntType(32), lanes.width), [0] * lanes.width)
@@ -115,8 +118,9 @@ def _common_lanes_type(arg_types: tuple[Any, ...]) -> Lanes | None:
 def _define_on_lanes(function: Any, build: Any, *, is_test: bool = False) -> None:
     """Define a Python function or operator on lanes (vectors of numbers) for compiled code.
 
-    Its arguments may mix lanes with single numbers. `build(builder, *values)` writes the LLVM instructions. The
-    result is lanes, or a mask of truth values if `is_test`.
+    Its arguments may mix lanes with single numbers. `build(builder, *values)` adds the LLVM instructions to LLVM's
+    `builder` and returns their result; its `values` are lanes of one type. The result is lanes, or a mask of truth
+    values if `is_test`.
     """
 
     @infer_global(function)
@@ -163,9 +167,11 @@ _define_on_lanes(operator.neg, lambda builder, a: builder.fneg(a))
 
 
 def _intrinsic_builder(name: str) -> Any:
-    """Build the function that writes the call of an LLVM intrinsic on lanes, that is on vectors of numbers.
+    """Return a function build(builder, *values) that adds the call of an LLVM intrinsic to compiled code.
 
-    `name`: name of the intrinsic without type, such as "sqrt".
+    It adds the call to LLVM's `builder`, and returns the result of the call, a vector. The `values` are the arguments
+    of the intrinsic, vectors (lanes) of one type. `name`: name of the intrinsic without type, such as "sqrt". It serves
+    as `build` of `_define_on_lanes`.
     """
 
     def build(builder: Any, *values: Any) -> Any:

@@ -184,7 +184,11 @@ def _check_choice(value: object, choices: Any, name: str) -> None:
 
 
 def _atrous_details(x: Array, wavelet: Any, levels: int, edge: Edge) -> tuple[Array, Array]:
-    """Compute stationary details (levels, n) and approximation (n,) of a signal by the a trous transform."""
+    """Compute stationary details (levels, n) and approximation (n,) of a signal x (n,) by the a trous transform.
+
+    Row 0 of the details is d_1. `wavelet`: a `pywt.Wavelet`; `edge`: mode of `pywt.pad` by which the signal is extended
+    beyond its ends before the transform.
+    """
     import pywt
 
     before, after = (int(samples) for samples in reach(wavelet.name, levels)[-1])
@@ -197,9 +201,10 @@ def _atrous_details(x: Array, wavelet: Any, levels: int, edge: Edge) -> tuple[Ar
 
 
 def _mallat_details(x: Array, wavelet: Any, levels: int, edge: Edge) -> tuple[Array, Array]:
-    """Compute decimated details (levels, n) and approximation (n,) of a signal by Mallat's transform.
+    """Compute decimated details (levels, n) and approximation (n,) of a signal x (n,) by Mallat's transform.
 
-    Each coefficient is repeated to the length of the signal.
+    Each coefficient of level j is repeated 2^j times, so that all levels have the length of the signal. Row 0 of the
+    details is d_1. `wavelet`: a `pywt.Wavelet`; `edge`: mode of `pywt.wavedec` at the ends of the signal.
     """
     import pywt
 
@@ -218,10 +223,11 @@ def _mallat_details(x: Array, wavelet: Any, levels: int, edge: Edge) -> tuple[Ar
 
 
 def _inverse_details(x: Array, wavelet: Any, levels: int, edge: Edge) -> tuple[Array, Array]:
-    """Compute reconstructed details (levels, n) and approximation (n,) of a signal.
+    """Compute reconstructed details (levels, n) and approximation (n,) of a signal x (n,).
 
-    The transform is inverted with the coefficients of one level at a time, so that the details and the approximation
-    sum up to the signal.
+    Mallat's transform is inverted with the coefficients of one level at a time, so that the details and the
+    approximation sum up to the signal. Row 0 of the details is d_1. `wavelet`: a `pywt.Wavelet`; `edge`: mode of
+    `pywt.wavedec` and `pywt.waverec` at the ends of the signal.
     """
     import pywt
 

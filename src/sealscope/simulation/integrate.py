@@ -390,8 +390,9 @@ class _Integration:
     def refuse_unresolved(self, n_steps: int) -> None:
         """Raise SimulationFailed if `n_steps` solver steps per output are too few to resolve the rig without its leaks.
 
-        The step must be short enough for the rig's fastest oscillation and decay at all times of the run (function
-        `refuse_unresolved`). Nothing is checked if the experiment allows unresolved runs.
+        The step, 1/(rate n_steps), is checked with the rig's parameters at all times of the run, as these may change
+        (function `refuse_unresolved`). Leaks and end stops are checked during the run (`advance`). Nothing is checked
+        if the experiment allows unresolved runs.
         """
         if not self.allow_unresolved:
             for p in self.schedule.numbers:
@@ -481,9 +482,10 @@ def refuse_long(h: float, limit: float, what: str) -> None:
 def refuse_unresolved(p: RigNumbers, h: float, method: str) -> None:
     """Raise SimulationFailed if solver steps of h [s] are too long to resolve a rig without its leaks.
 
-    The step is too long if h exceeds 1/|lambda| of the rig's fastest oscillation or the stability limit of its fastest
-    decay (`longest_step`), throttles and end stops left out. With throttles and rk4, h must also stay below 2.785 /
-    (decay rate of the pressures across a throttle). `p`: the rig's parameters; `method`: rk4 or imex.
+    There are two limits. `longest_step` is that of all parts except leaks, throttles and end stops: an oscillation may
+    advance by one radian per step, and a decay must be stable. If the rig has throttles and the `method` is "rk4", not
+    "imex", h must also be at most 2.785/lambda, with the decay rate lambda [1/s] of the pressures across a throttle
+    (`stiffest_rate`). `p`: the rig's parameters.
     """
     from sealscope.physics.solvers.limits import DECAY_LIMIT, longest_step, stiffest_rate
 

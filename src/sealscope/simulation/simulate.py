@@ -347,8 +347,8 @@ def _describe_drift(drift: ParameterDrift, t: Array) -> dict[str, Any]:
 def simulate(arguments: Arguments) -> Recording:
     """Simulate a rig under a command, and record it with its instruments.
 
-    A quantity is a number in the SI unit stated below, or a text with a unit ("3 min", "20[Pa]"), as on the command
-    line.
+    A quantity is a number in SI, in the unit stated with the argument (a field of `Arguments`), or a text with a unit
+    ("3 min", "20[Pa]"), as on the command line.
 
     Returns
     -------

@@ -90,11 +90,12 @@ def finite_or_none(value: float | None) -> float | None:
 
 
 def named_cause(evidence: Evidence | Statement) -> str:
-    """Determine the cause that a detector names: a kind of leak, another fault, "none" or "cannot tell".
+    """Determine the cause that a detector names: a leak of `LEAKS`, another fault, "none" or "cannot tell".
 
-    With the verdict `leak` it is the kind of leak in `evidence.cause`, or "piston leak" if this names no kind of leak.
-    With the verdicts `no leak` and `cannot tell` it is the fault in `evidence.cause` if that is no leak. Without such a
-    fault it is "none" for `no leak`, and "cannot tell" for `cannot tell`.
+    `LEAKS` has the causes for which the verdict is `leak`; an external leak alone is another fault. With the verdict
+    `leak` the result is `evidence.cause` if that is in `LEAKS`, else "piston leak". With the verdicts `no leak` and
+    `cannot tell` it is `evidence.cause` if that is another fault. Without such a fault it is "none" for `no leak`, and
+    "cannot tell" for `cannot tell`.
     """
     if evidence.verdict == "leak":
         return evidence.cause if evidence.cause in LEAKS else PISTON_LEAK
@@ -106,7 +107,8 @@ def named_cause(evidence: Evidence | Statement) -> str:
 def ranking_score(evidence: Evidence | Statement) -> float | None:
     """Return a detector's score of a record if a higher score means more evidence of a leak, else None.
 
-    It is None if the verdict is `cannot tell` or the detector names a cause other than a leak.
+    It is None if the verdict is `cannot tell`, or if the detector names a cause that is not in `LEAKS`, such as a
+    sensor fault or an external leak.
     """
     return evidence.score if named_cause(evidence) in (*LEAKS, NO_CAUSE) else None
 

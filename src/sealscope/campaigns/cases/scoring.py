@@ -88,7 +88,8 @@ def _score_over_threshold(statement: Statement) -> float | None:
 
     The score alone cannot be compared, because another detector of `diagnose` may decide each record. If the threshold
     is not > 0, the result is the score minus the threshold. Returns None if one of them is missing, if the verdict is
-    `cannot tell`, or if the named cause is no leak.
+    `cannot tell`, or if the detector explains the record by a cause that is not in `LEAKS`, such as a sensor fault or
+    an external leak. A record for which it names no cause has a score.
     """
     score, threshold = ranking_score(statement), statement.threshold
     if score is None or threshold is None:

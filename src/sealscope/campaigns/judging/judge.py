@@ -73,14 +73,15 @@ def judge(
 ) -> Judgement:
     """Collect the verdicts of all detectors on the rows with `use` "judge", and compute their statistics.
 
-    A detector states its verdict itself, or its score is compared with a threshold. The thresholds are `limits`, by
-    detector, if given; otherwise a scorer's fixed threshold, or one set from the leak-free rows with the same command
-    and stroke direction (`compute_thresholds`).
+    A detector states its verdict itself, or is a scorer: it computes a score only, which is compared with a threshold.
+    The thresholds are `limits`, by detector, if given; otherwise a scorer's fixed threshold, or one set from the
+    leak-free rows with the same command and stroke direction (`compute_thresholds`).
 
-    `false_alarm`: wanted false-alarm probability; `promise`: "average" or "bound", the sense in which it is kept
-    (`quantile_threshold`); `confidence`: of all intervals; `onset_s` [s]: true onset of the leaks, None to compute no
-    errors of onsets; `hours`: operating time of a record, None to compute no false alarms per hour. Raises InputError
-    if there is no row to judge, or too few leak-free rows to set a threshold.
+    `false_alarm`: wanted false-alarm probability; `promise`: "average" if that is kept on average over sets of
+    leak-free records, "bound" if the true one is at most `false_alarm` with the probability `confidence`
+    (`quantile_threshold`); `confidence`: also of all intervals; `onset_s` [s]: true onset of the leaks, None to compute
+    no errors of onsets; `hours`: operating time of a record, None to compute no false alarms per hour. Raises
+    InputError if there is no row to judge, or too few leak-free rows to set a threshold.
     """
     judged = sorted((row for row in rows if row.use == "judge"), key=lambda row: row.id)
     if not judged:

@@ -224,9 +224,13 @@ def step_key(provider: str) -> str:
 def _change_tests(case: Case) -> tuple[LeakTest, ...]:
     """Make the test for a leak from the report of a detector that does not measure leakage.
 
-    The detector has a test for each of its observables. Of the tests of observables that a leak changes, the one with
-    the smallest p-value is taken; the result is empty if a leak changes none of them. The threshold is the score that
-    would have the allowed p-value if the score were proportional to log p.
+    The detector tests each of its observables. Of those that a leak changes, the one with the smallest p-value
+    (`Observable.chance`) gives the test for a leak, with its score and its calibrated p-value (`HealthyNull.chance`).
+    The result is empty if a leak changes none of them.
+
+    The detector states no threshold. It is estimated as the score at which the calibrated p-value would equal the
+    allowed false-alarm probability, from the score and the p-value of this observable, with the score taken as
+    proportional to the logarithm of the p-value.
     """
     leak = next(event for event in load_events() if event.name == LEAK_EVENTS[0])
     affected = [observable for observable in case.judge.observables if leak.affects(observable)]

@@ -93,9 +93,9 @@ def _bound_text(case: Case, evidence: Evidence, bound: float) -> str:
 def _ringing_text(evidence: Evidence, ringing: Ringing | None, provider: str) -> str:
     """Describe in words the largest drop of the pressures' ringing that the data allow.
 
-    The ringing is an oscillation of the pressures, measured by the RMS of their wavelet details. If a leak may be
-    hidden, the reason is added. `ringing`: precision of the measured ringing, None if it was not measured; `provider`:
-    name of the detector.
+    The ringing is an oscillation of the pressures, measured by the RMS of their wavelet details. If the verdict is
+    `cannot tell`, or if the sampling rate is too low for the ringing, the text says so. `ringing`: facts on the
+    comparison (`Ringing`), None if the ringing was not measured; `provider`: name of the detector.
     """
     if ringing is None:
         return text_of("bound", "unseen", provider=provider)
@@ -112,10 +112,11 @@ def _ringing_text(evidence: Evidence, ringing: Ringing | None, provider: str) ->
 
 
 def _changed_ringing_text(case: Case, ringing: Ringing) -> str:
-    """Describe in words a change of the pressures' ringing, and the probability that a leak caused it.
+    """Describe in words the rarest change of the pressures' ringing, and the probability that a leak caused it.
 
-    The ringing is an oscillation of the pressures, measured by the RMS of their wavelet details. `ringing`: precision
-    with which it was compared.
+    The ringing is an oscillation of the pressures, measured by the RMS of their wavelet details. The text names the
+    detail, its change [%], and the onset of the change. If it has no onset, the healthy recordings are named with which
+    the ringing was compared; `ringing` states their number, 0 for none.
     """
     rarest = case.rarest_observable
     percent = 100.0 * abs(np.expm1(rarest.size))
@@ -127,7 +128,7 @@ def _changed_ringing_text(case: Case, ringing: Ringing) -> str:
 def _against_text(ringing: Ringing | None) -> str:
     """State in words how many healthy recordings the pressures' oscillation (ringing) was compared with.
 
-    "" if there are none.
+    "" if there are none, or if the ringing was not measured (`ringing` is None).
     """
     if ringing is None or not ringing.healthy:
         return ""

@@ -44,8 +44,9 @@ def law_shapes(blocks: Blocks, columns: Sequence[ColumnRoles]) -> dict[float, Ar
 
     It is the regression coefficient of this flow on p_A - p_B within the block. For an orifice, e = 1/2, it is r from
     the Gram matrices; for the other exponents it is taken as r^(2 (1 - e)), which is 1 for laminar flow, e = 1. The
-    result maps each exponent e of `EXPONENTS` to an array (K,) [Pa^(e - 1)]. `columns`: for each equation the indices
-    of its columns by role (leak, motion, left side).
+    result maps each exponent e of `EXPONENTS` to an array (K,) [Pa^(e - 1)]. `blocks`: the K blocks, with the Gram
+    matrices of the volume balance; `columns`: for each equation the indices of the columns of these matrices by role
+    (leak, motion, left side).
     """
     leak, orifice = columns[0].leak, columns[0].names.index(ORIFICE)
     gram = blocks.gram.sum(axis=1)
@@ -80,8 +81,9 @@ def find_leak_step(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Informa
 
     There is one test for each exponent of `EXPONENTS`. Its p-value (`chance`) is divided by the prior probability of
     the law, and the test with the smallest p-value is returned. The step's size is the mean change of the conductance.
-    `columns`: for each equation the indices of its columns by role (leak, motion, left side); `leak`: likelihood of the
-    leak's coefficient in the blocks. Return None if too few blocks have information.
+    `blocks`: the K blocks, with the Gram matrices of the volume balance; `columns`: for each equation the indices of
+    the columns of these matrices by role (leak, motion, left side); `leak`: likelihood of the leak's coefficient in the
+    K blocks. Return None if too few blocks have information.
     """
     weights = np.maximum(leak.precision.sum(axis=0), 0.0)
     tests = []
@@ -110,12 +112,15 @@ def _onset_positions(leak: Information, onsets: NDArray[np.intp]) -> Array:
 
 
 def estimate_step_flow(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Information, test: StepTest) -> Flow:
-    """Estimate the mean flow [m^3/s] of a leak that begins within a recording, averaged from its onset to the end.
+    """Estimate the mean flow [m^3/s] of a leak that begins within a recording, over the time from its onset to the end.
 
-    The flow is averaged over the leak's laws (exponents of |p_A - p_B|, `EXPONENTS`), growths (fractions by which it
-    increases from its onset to the end) and onsets, weighted by their probabilities. `columns`: for each equation the
-    indices of its columns by role (leak, motion, left side); `leak`: likelihood of the leak's coefficient in the
-    blocks; `test`: test for a step of it.
+    This mean over time is computed for each hypothesis on the leak: its law (exponent of |p_A - p_B|, `EXPONENTS`), its
+    growth (fraction by which it increases from the onset to the end) and its onset. The result is the mean over the
+    hypotheses, weighted by their probabilities, and the standard deviation of their mixture.
+
+    `blocks`: the K blocks, with the pressures and the Gram matrices of the volume balance; `columns`: for each equation
+    the indices of the columns of these matrices by role (leak, motion, left side); `leak`: likelihood of the leak's
+    coefficient in the K blocks; `test`: test for a step of it, which gives the onsets; improbable ones are omitted.
     """
     onsets = np.flatnonzero(test.weights > NEGLIGIBLE * test.weights.max())
     positions, rows = _onset_positions(leak, onsets), np.maximum(blocks.rows, 1e-9)

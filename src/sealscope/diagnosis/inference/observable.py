@@ -250,11 +250,12 @@ class LeakMeasure(Protocol):
 
 
 class Ringing(NamedTuple):
-    """Precision of the comparison of the pressures' ringing, for a recording whose leakage cannot be measured.
+    """Facts on the comparison of the pressures' ringing, for a recording whose leakage cannot be measured.
 
-    The ringing is an oscillation, measured by the RMS of wavelet details. `bound`: 95 % upper bound of a change of the
-    logarithm of this RMS; `rate`: sampling rate [Hz]; `healthy`: number of healthy recordings it was compared with;
-    `is_dated`: true if their dates are known; `unused`: recorded columns that are not assigned to a channel.
+    The ringing is an oscillation, measured by the RMS of wavelet details. `bound`: 95 % upper bound of an undetected
+    change of the logarithm of this RMS; `rate`: sampling rate [Hz]; `healthy`: number of healthy recordings that it was
+    compared with; `is_dated`: true if their dates are known; `unused`: recorded columns that are not assigned to a
+    channel.
     """
 
     bound: float
@@ -277,7 +278,7 @@ class Observed:
     leak : LeakMeasure, optional
         The leakage, if the detector measures it.
     ringing : Ringing, optional
-        Precision of the comparison of the ringing, the oscillation of the pressures, if the detector makes one.
+        Facts on the comparison of the ringing, the oscillation of the pressures, if the detector makes one.
     lack : str
         Reason for an empty report, else "".
     share : float

@@ -746,14 +746,17 @@ def _leak_level(gram: Array, columns: Sequence[ColumnRoles]) -> tuple[float, flo
 def motion_change(judged: Array, healthy: Array, roles: ColumnRoles) -> tuple[float, float]:
     """Estimate the log ratio of a recording's motion coefficient (area of the piston) to that of healthy recordings.
 
-    Returns the logarithm and its standard error from the recording alone. The ratio differs from 1 if area over
-    displacement changed: another machine, or another scale of a sensor.
+    Returns the logarithm and its standard error, which contains the error of the recording's fit but not that of the
+    healthy ones. The ratio differs from 1 if area over displacement changed: another machine, or another scale of a
+    sensor.
 
-    `judged`, `healthy`: Gram matrices (m, m) of the recording and of the sum of the healthy ones; `roles`: indices of
-    their columns by role (leak, motion, left side). The ratio is (mean coefficient of motion [m^2] in the recording) /
-    (mean coefficient in the healthy ones), with the sums of squares of the columns in the recording as weights. The
-    leak is fitted together with the motion, which would otherwise absorb leakage in proportion to the speed. The other
-    coefficients differ from the healthy ones by a normal prior (`between` in `priors.toml`).
+    The regression is the volume balance. `judged`, `healthy`: its Gram matrices (m, m) of the recording and of the sum
+    of the healthy ones; `roles`: indices of their columns by role (leak, motion, left side). Each of the two fits gives
+    a coefficient for every column with the role motion: one for each direction and loaded side, and the delay
+    (`terms.LAG`). Their mean, weighted by the sums of squares of these columns in the recording, is the motion
+    coefficient [m^2]. In the recording's fit the motion and the leak are free; without the leak, the motion would
+    absorb leakage in proportion to the speed. The other coefficients differ from the healthy ones by a normal prior
+    (`between` in `priors.toml`).
     """
     motion = list(roles.motion)
     fitted = [k for k in roles.compared if k == roles.leak or np.isfinite(roles.between_deviation[k])]

@@ -480,19 +480,28 @@ def _metering_edge_terms(edge: str, upstream: str, downstream: str, sign: float)
     """
 
     def unit_flow(s: Signals) -> Array:
-        """Compute the signed root of the pressure drop over the edge [Pa^0.5], shape (n - 1,)."""
+        """Compute sign(dp) sqrt(abs(dp)) [Pa^0.5] of the pressure drop dp over the edge, shape (n - 1,)."""
         return _signed_root(s.mean(upstream) - s.mean(downstream))
 
     def proportional_flow(s: Signals) -> Array:
-        """Compute the increments abs(u) times the root times dt [V Pa^0.5 s] while the edge is open, (n - 1,)."""
+        """Compute the increments abs(u) sign(dp) sqrt(abs(dp)) dt [V Pa^0.5 s] of the term "edge", shape (n - 1,).
+
+        dp is the pressure drop over the metering edge, dt the sampling interval. An increment times the gain of the
+        edge, the unknown coefficient [m^3/(s V Pa^0.5)], is the volume [m^3] that flows over an edge without delay and
+        overlap. It is 0 unless u has the sign that opens the edge.
+        """
         return np.asarray(np.maximum(sign * s.mean("u"), 0.0) * unit_flow(s) * s.dt)
 
     def overlap_flow(s: Signals) -> Array:
-        """Compute the increments of the root times dt [Pa^0.5 s] while the edge is open, shape (n - 1,)."""
+        """Compute the increments sign(dp) sqrt(abs(dp)) dt [Pa^0.5 s] of the term "overlap", shape (n - 1,).
+
+        dp is the pressure drop over the metering edge, dt the sampling interval. They are 0 unless u has the sign that
+        opens the edge.
+        """
         return np.asarray((sign * s.mean("u") > 0.0) * unit_flow(s) * s.dt)
 
     def make_term(name: str, unit: str, increments: Callable[[Signals], Array]) -> Term:
-        """Make a term of the flow over the edge: an unknown coefficient, in `unit`, times `increments`."""
+        """Make a term of the flow over the metering edge: a coefficient, in `unit`, times `increments` (`Term`)."""
         return Term(f"{name} {edge}", unit, increments, "sensor fault", "edge", ("u", upstream, downstream))
 
     return (

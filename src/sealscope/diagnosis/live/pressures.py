@@ -88,7 +88,7 @@ class PressureEstimator:
         self.litres = states_flow(rig) if litres is None else litres
         self._samples = np.empty((1 + len(_READ), 0))  # times and channels since the last whole block
         self._follower: Follower | None = None
-        self._held = np.full(len(_PRESSURES), math.nan)  # values that hanging pressure readings repeat, nan for none
+        self._held = np.full(len(_PRESSURES), math.nan)  # values that stuck pressure readings repeat, nan for none
         self._end = math.nan  # of the last block that was followed [s]
         self._settling = _SETTLING  # number of blocks until the simulated states have forgotten where they began
         self._misfits = 0  # number of successive blocks that the model does not describe
@@ -167,12 +167,16 @@ class PressureEstimator:
         return [BlockConductance(begin, end, g, sd, total=g, offset=_MAX_SD, pressure=pressure, pump_flow=pump_flow)]
 
     def _reject(self, follower: Follower, end: float, is_settling: bool, restarts: bool) -> NotJudged:
-        """Report a block that the model of the pressures does not describe; several such blocks restart the fit.
+        """Report a block that the model of the pressures does not describe, and restart the fit if it is lost.
 
-        `follower`: fit of the model; `end`: end of the block [s]; `is_settling`: True if the fit has not yet settled
-        after a start or a gap; `restarts`: True if this and later blocks cannot be compared with earlier ones. The
-        fit restarts after `lost` (a setting in `priors.toml`) such blocks in succession, or at once if its parameters
-        are not finite.
+        The fit is lost after `response.lost` (`priors.toml`) such blocks in succession, or at once if a parameter is
+        not finite. The uncertainty of its parameters is then widened, it must settle anew, and the report states that
+        later blocks cannot be compared with earlier ones.
+
+        Otherwise the report states `restarts`, which `_resume` returned for this block. If `is_settling`, i.e. the fit
+        had not yet settled after a start or a gap, the reason is "settling". If not, the reason is "not described by
+        the model", and the next `_RESUMING` blocks are left to settle. `follower`: the fit; `end`: end of the block
+        [s].
         """
         self._misfits += 1
         if self._misfits >= _PRIORS.lost or not np.isfinite(follower.theta).all():

@@ -118,8 +118,10 @@ def estimate_reading(
 ) -> LeakReading:
     """Estimate the leakage of a recording.
 
-    `rig` states the sizes of the machine. If it is None, L/min are stated only for a known machine, as in `diagnose`.
-    `file` is the name of the recording, by default the name of the file it was read from.
+    `rig` states the sizes of the machine: a Rig, the name of a packaged rig, or the path of its file. If it is None,
+    the thesis's rig is assumed. The leakage can then be stated in L/min only if the recording was simulated with a rig
+    of the same sizes, or if a flow meter was recorded (`LeakReading.states_flow`). `file` is the name of the recording,
+    by default the name of the file it was read from. A defect that rules out an estimate is stated as `problem`.
     """
     used_rig, machine = assumed_rig(rig, recording)
     inspection = inspect_recording(recording)

@@ -169,11 +169,12 @@ def _round_to_json(values: Array, digits: int = 3) -> list[float | None]:
 
 
 def _envelope(t: Array, series: dict[str, Array]) -> dict[str, list[float | None]]:
-    """Reduce long series to the minimum and maximum in each of at most `_BINS` bins, in the order in which they occur.
+    """Reduce long series to the minimum and maximum in each bin, in the order in which they occur.
 
-    `series`: values by name, over the times `t` (n,). Returns the times of the bins' starts and middles as "t", and the
-    reduced series by name, rounded. Samples before the first full bin are left out. Series of at most two samples per
-    bin are not reduced.
+    A bin is a group of successive samples; there are at most `_BINS` bins of equal size. The last one ends with the
+    last sample, and earlier samples that fill no bin are left out. Series with at most two samples per bin are not
+    reduced. `series`: values (n,) by name, at the times `t` (n,) [s]. Returns the times of the bins' first and middle
+    samples as "t", and the reduced series by name, rounded.
     """
     bin_size = -(-t.size // _BINS)  # rounded up
     if bin_size <= 2:
@@ -219,8 +220,9 @@ def _detail_curves(t: Array, signal: Array | None, pressure: str, detail_form: s
 def _motion_curves(t: Array, channels: dict[str, Array], rate: float) -> dict[str, Any]:
     """Compute the curves of motion: pressures [bar], position [mm], speeds of piston [mm/s] and pump [rpm].
 
-    The channels, over the times `t` [s], are averaged over bins of 1/`_MOTION_HZ`, and the speeds computed from the
-    means. `rate` [Hz]: sampling rate. Returns plain values by name.
+    The last `_MOTION_S` seconds of the channels (n,), sampled at the times `t` (n,) [s], are averaged over bins, i.e.
+    groups of successive samples 1/`_MOTION_HZ` s long. The speeds are computed from the means. `rate` [Hz]: sampling
+    rate. Returns plain values by name, with only an empty "t" if there are fewer than two bins.
     """
     bin_size = max(1, round(rate / _MOTION_HZ))
     n_bins = min(t.size // bin_size, round(_MOTION_S * rate / bin_size))
@@ -228,7 +230,10 @@ def _motion_curves(t: Array, channels: dict[str, Array], rate: float) -> dict[st
         return {"t": []}
 
     def bin_means(values: Array) -> Array:
-        """Average values (n,) over each of the last `n_bins` bins; return the means (n_bins,)."""
+        """Average samples (n,) over bins of `bin_size` successive samples; return the means (n_bins,).
+
+        The last bin ends with the last sample. Samples before the first of the `n_bins` bins are left out.
+        """
         return np.asarray(values[values.size - n_bins * bin_size :].reshape(n_bins, bin_size).mean(axis=1))
 
     times = bin_means(t)

@@ -108,12 +108,16 @@ def longest_step(p: RigNumbers, G: float = 0.0, C: float = 0.0) -> float:
 
 
 def _longest_valve_step(p: RigNumbers, end_volumes: tuple[tuple[float, float], ...]) -> float:
-    """Compute the longest step [s] that resolves a servo valve with its supply.
+    """Compute the longest step [s] that resolves a servo valve with its supply, the smallest of three limits.
 
-    It is the smallest of three steps: for the spool, a second-order lag; for the decay of the pressure in the smallest
-    chamber through two valve edges in laminar flow; and for the pressure of the supply line, which oscillates with the
-    inertia of motor and pump and is damped by slip, relief valve and valve edges. `end_volumes`: (V_A, V_B) [m^3] at
-    each end of the stroke.
+    - The spool: a second-order lag with the natural frequency omega_s and the damping ratio zeta_s.
+    - A chamber: its pressure decays through the two metering edges that connect it with supply and return. Their slope
+      dQ/dp is taken at full stroke and at a small pressure drop, where the flow is laminar and the slope largest. An
+      underlap adds to the opening. The volume is the smallest of both chambers over the stroke.
+    - The supply line: its oil oscillates with the inertia of motor and pump, and is damped by the pump's leakage, the
+      relief valve and the edges of both chambers.
+
+    Each is resolved as in `_longest_mode_step`. `end_volumes`: (V_A, V_B) [m^3] at each end of the stroke.
     """
     overlaps = (p.o_PA, p.o_AT, p.o_PB, p.o_BT)
     edge_slope = p.Q_N / math.sqrt(p.dp_N * p.dp_lam)  # of one edge at full stroke, laminar

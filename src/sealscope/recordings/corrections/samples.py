@@ -99,10 +99,10 @@ def _cut_to_complete(recording: Recording, needed: Sequence[str]) -> Recording:
 
 
 def remove_holes(recording: Recording) -> Recording:
-    """Set long gaps that were filled to NaN again, for detectors that cannot give filled samples a lower weight.
+    """Replace the filled samples of long gaps by NaN, for detectors that cannot give filled samples a lower weight.
 
-    The gaps are those of `flag_holes`. The result has no `bridged` flags. Returns the same recording if there are no
-    long gaps.
+    All channels become NaN in the rows of `flag_holes`. Short gaps stay filled, and the result has no `bridged` flags.
+    Returns the same recording if there are no long gaps.
     """
     rows = flag_holes(recording)
     if not rows.any():

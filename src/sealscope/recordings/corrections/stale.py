@@ -27,16 +27,17 @@ MAX_STUCK_FRACTION: float = _PRIORS.stuck
 _MIN_JUMP = 1.5
 #: Samples from the beginning from which the holding period is estimated.
 _N_ESTIMATE = 2**18
-#: Longest run of repeated rows.
+#: Largest number of equal rows in succession, i.e. a reading and its repeats, for the repeats to be left out; also the
+#: tolerance [rows] of the ends of a long repeat (`flag_frozen_rows`).
 _MAX_REPEAT = 3
 
 
 def interpolate_stale_samples(recording: Recording) -> tuple[Recording, list[Finding]]:
     """Replace samples that repeat the previous one by linear interpolation between new readings.
 
-    Two kinds are found: a channel that repeats each sample for a fixed time (`estimate_holding_period`), and single
-    rows in which all channels repeat the row before (`_flag_repeated_rows`). Slow channels and the command stay as
-    they are. Returns the recording and the findings.
+    Two kinds are found: a channel that repeats each sample for a fixed time (`estimate_holding_period`), and one or two
+    successive rows in which all channels repeat the row before (`_flag_repeated_rows`). Slow channels and the command
+    are neither tested nor changed. Returns the recording and the findings.
     """
     names = [name for name in recording.channels if name not in SLOW and name != "u"]
     channels, findings = dict(recording.channels), list[Finding]()
@@ -150,9 +151,10 @@ def _find_equal_runs(values: Array) -> tuple[NDArray[np.intp], NDArray[np.bool_]
 def estimate_holding_period(t: Array, values: Array) -> float | None:
     """Estimate the time [s] for which a channel (n,) repeats each reading; None if it does not.
 
-    A sensor that is slower than the logger causes this. `t` (n,): times [s]. Most runs of equal values between jumps
-    must last equally long; their mean duration is the result. None, too, if there are too few runs, or if the time is
-    too short to matter.
+    A sensor that is slower than the logger causes this. `t` (n,): times [s]. The runs of equal values that begin and
+    end with a jump (`_find_equal_runs`) are used. The period is the mean duration of those near the median duration,
+    within a relative `stale.spread` (`priors.toml`). None if fewer than the fraction `stale.share` is near it, if the
+    median run has one sample, if there are fewer than `stale.runs` runs, or if the period is below `stale.shortest`.
     """
     t, values = t[:_N_ESTIMATE], values[:_N_ESTIMATE]
     known = np.isfinite(values) & np.isfinite(t)
@@ -188,10 +190,13 @@ def _flag_held(t: Array, values: Array, period: float) -> NDArray[np.bool_]:
 
 
 def _flag_repeated_rows(channels: list[Array]) -> NDArray[np.bool_]:
-    """Flag the rows (n,) in which a logger repeats the previous row in all channels that vary.
+    """Flag the rows (n,) in which a logger got no new readings and repeated the previous row.
 
-    Fewer than `_MAX_REPEAT` such rows follow each other, and a channel jumps before and after them. No row is flagged
-    if there are not many more of them than would occur by chance, if the channels repeated samples independently.
+    Each of `channels` (n,) that varies must repeat its sample there. A run of such rows is flagged if three conditions
+    are met. It has at most two rows. One channel jumps by more than `_MIN_JUMP` quantisation steps both to the repeated
+    reading and to the row after the run. The number of runs that meet these two is at least `stale.repeats`
+    (`priors.toml`) times the number of repeated rows that chance would make, if channels repeated samples
+    independently, and at least that factor times the fraction `stale.fewest` of all rows.
     """
     moving = [values for values in channels if np.isfinite(values).any() and np.nanmax(values) > np.nanmin(values)]
     if not moving or moving[0].size < _PRIORS.runs:

@@ -242,10 +242,12 @@ def _parse_mapping(labels: Sequence[Label], channel: str, column_text: str) -> F
 
 
 def _choose_unit(channel: str, unit: str | None, description: str) -> tuple[str, str | None]:
-    """Choose the unit in which a channel is read; also return a note for the history, or None.
+    """Choose the unit in which the values of a column are read as a channel; return it with a note for the history.
 
-    `unit`: unit of the column, None if it has none, which means raw counts; `description`: the column in the note.
-    Raises InputError for a unit of the wrong dimension.
+    It is the column's `unit`, with three exceptions. A column without a unit (None) is read as raw counts, i.e. numbers
+    of an unknown scale, and so is a command u in a unit of current or in per cent; the note says so. A speed omega in a
+    unit of rotation, such as "1/min", is read in rpm. Without a remark the note is None. `description`: the column in
+    words, with which the note begins. Raises InputError for a unit of the wrong dimension.
     """
     if unit is None:
         return COUNTS, f"{description} has no unit: taken as raw counts"

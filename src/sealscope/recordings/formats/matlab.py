@@ -119,5 +119,5 @@ def _decode_utf16(characters: Any) -> str:
 
 
 def _read_doubles(data: Any, count: int) -> Array:
-    """Read the first `count` doubles (count,) from a data set of bytes."""
+    """Read the first `count` doubles (count,) from `data`, an HDF5 data set of bytes."""
     return np.frombuffer(data[: count * np.dtype(np.float64).itemsize].tobytes(), dtype=np.float64, count=count)

@@ -132,7 +132,8 @@ def _parse_label(name: str, data: Any) -> Label:
 def _read_values(data: Any, name: str, file_size: int) -> NDArray[Any]:
     """Read a data set as texts (n,), or as doubles (n,) with scale, offset and fill values of the CF conventions.
 
-    `name`: the data set in messages; `file_size` [bytes]. Raises InputError for other types.
+    `name`: the data set in messages; `file_size`: size of the file [bytes], by which texts are read in chunks
+    (`_read_texts`). Raises InputError for other types.
     """
     check_internal(name, data)
     if data.dtype.kind in "OSU":
@@ -154,10 +155,11 @@ def _read_values(data: Any, name: str, file_size: int) -> NDArray[Any]:
 
 
 def _read_texts(data: Any, name: str, file_size: int) -> list[str]:
-    """Read a data set of texts in chunks, to bound the memory.
+    """Read a data set of texts (n,), in chunks if their length varies, to bound the memory.
 
-    Many cells may refer to one text, which may be as long as the file, `file_size` [bytes]. `name`: the data set in
-    messages.
+    Many cells may refer to one text of the file, and a text can be as long as the file. The number of cells in a chunk
+    is therefore `_CHUNK_BYTES` over `file_size` [bytes], at least 1 and at most `_CHUNK_TEXTS`. `name`: the data set in
+    messages. Raises InputError for too many or too long texts, and for lists or references.
     """
     import h5py
 

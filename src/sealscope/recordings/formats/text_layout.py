@@ -120,7 +120,11 @@ def split_at_blanks(line: str) -> list[str]:
 
 
 def split_cells(line: str, delimiter: str) -> list[str]:
-    """Split a line into cells and remove the quotation marks around them."""
+    """Split a line into cells at the `delimiter`; a blank stands for any number of blanks and tabs.
+
+    Unless the delimiter is a blank, a cell may stand in double quotation marks. They are removed, and a delimiter
+    between them does not split the cell.
+    """
     if delimiter == " ":
         return split_at_blanks(line)
     if '"' in line:

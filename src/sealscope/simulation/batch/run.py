@@ -271,9 +271,10 @@ def with_leak_coefficient(experiment: Experiment, coefficient: float) -> Experim
 def build_instrument_rows(members: Sequence[Member], first: int, last: int) -> Array:
     """Build the table of the parameters of the instruments of p_A and p_B, for a span of samples.
 
-    Returns (runs, 2, INSTRUMENT_ROWS) for compiled code; the last axis has the quantities whose indices are constants
-    of `signals` (`GAIN` to `MAX_CODE`). Parameters that change within the run are taken as linear from sample `first`
-    to sample `last`.
+    The span has the samples first <= sample < last. Returns (runs, 2, INSTRUMENT_ROWS) for compiled code; the last axis
+    has the quantities whose indices are constants of `signals` (`GAIN` to `MAX_CODE`). Gain, offset and noises may
+    change within a run. They are stored as the value at sample `first` (such as `GAIN`) and the change per sample
+    (`GAIN_RISE`), so that they are linear and reach their true value again at sample `last`.
     """
     from sealscope.simulation.batch.signals import HUM, HUM_PHASE
 
@@ -290,9 +291,9 @@ def build_instrument_rows(members: Sequence[Member], first: int, last: int) -> A
 def _pressure_instruments(rig: Rig, readings: Readings, ends: Array, samples: int) -> Array:
     """Build the parameters (2, INSTRUMENT_ROWS) of one run's pressure instruments for a span of time.
 
-    `ends` (2,): begin and end of the span [s]; `samples`: number of samples in it, over which changing parameters
-    are taken as linear; `readings`: changes of the instruments. The first axis is p_A and p_B; the second has the
-    quantities whose indices are constants of `signals` (`GAIN` to `MAX_CODE`).
+    `ends` (2,): begin and end of the span [s]; `samples`: number of samples in it; `readings`: changes of the
+    instruments. The first axis is p_A and p_B; the second has the quantities whose indices are constants of `signals`
+    (`GAIN` to `MAX_CODE`). A parameter that changes is stored as its value at the begin and its mean change per sample.
     """
     from sealscope.simulation.batch import signals
 
@@ -546,7 +547,7 @@ class SetRun:
     def _sensors(self, groups: tuple[int, int], first: int, last: int) -> Array:
         """Build the parameters of the pressure instruments for some groups of runs and a span of samples.
 
-        The span is from sample `first` to sample `last`. Returns (groups, 2, INSTRUMENT_ROWS, width) for the groups
+        The span has the samples first <= sample < last. Returns (groups, 2, INSTRUMENT_ROWS, width) for the groups
         groups[0] <= g < groups[1] of `width` runs; the second axis is p_A and p_B, the third has the quantities of
         `build_instrument_rows`.
         """

@@ -205,13 +205,14 @@ def change_design(sheet: DataSheet) -> Array:
 
 
 def classify_without_baseline(sheet: DataSheet, leave_out: Literal["test", "condition"]) -> tuple[float, float]:
-    """Classify the halves of the tests as leaking or not by their RMS alone, without a baseline.
+    """Classify the halves of the tests as leaking or not by the RMS of wavelet details, without a healthy baseline.
 
-    A test has a half without and a half with the leak. The inputs are the log RMS of d1..d4 of both chambers in one
-    half. A logistic regression with an L2 penalty (C = 1 of scikit-learn) on standardised columns is cross-validated:
-    each time both halves of one test, or of all tests of one operating condition, are left out and then classified
-    (`leave_out`). Returns the fraction of halves classified correctly, and the area under the ROC. Raises MissingExtra
-    if scikit-learn is not installed.
+    A test has a half without and a half with the leak. The eight inputs of a half are the logarithms of the RMS of the
+    wavelet details d1 to d4 of p_A and of p_B. A logistic regression with an L2 penalty (C = 1 of scikit-learn) on
+    standardised columns is cross-validated: each time both halves of one test, or of all tests of one operating
+    condition (command and closing of the throttles), are left out of the fit and then classified (`leave_out`). Returns
+    the fraction of halves classified correctly, and the area under the ROC curve. Raises MissingExtra if scikit-learn
+    is not installed.
     """
     try:
         from sklearn.linear_model import LogisticRegression

@@ -3,7 +3,7 @@
 In a closed circuit an accumulator keeps the chamber that carries no load at the charge pressure. A leak past the piston
 returns its oil to the circuit; an external leak empties the accumulator, so that its pressure falls through the whole
 recording. A sensor whose offset drifts moves the low values of its own chamber alone. Of each pressure, the samples
-near its lowest values are fitted by
+near its lowest values, the "low pressure" of the chamber, are fitted by
 
     p = level + k x + r_+ max(q, 0) + r_- min(q, 0) + drift t,
 
@@ -60,9 +60,9 @@ class LowDrifts(NamedTuple):
     low_B_error: float
 
     def estimate(self, side: str) -> Estimate | None:
-        """Return the drift of the low pressures of chamber `side`, "A" or "B" [Pa/s], with its standard error.
+        """Return the drift [Pa/s] of the pressure of chamber `side`, "A" or "B", near the charge pressure.
 
-        The result is None if the drift is unknown.
+        It is an estimate with its standard error, or None if the drift is unknown.
         """
         estimate = Estimate(self.low_A, self.low_A_error) if side == "A" else Estimate(self.low_B, self.low_B_error)
         return estimate if np.isfinite(estimate).all() else None
@@ -145,10 +145,11 @@ def estimate_charge_trend(recording: Recording) -> ChargeTrend | None:
 
 
 def _regressors(recording: Recording, source: str) -> Array:
-    """Compute the regressors of a low pressure, (n, 2 or 3): positive and negative flow of the pump, and the position.
+    """Compute what moves a chamber pressure near the charge pressure (n, 2 or 3): flow of the pump, and position.
 
-    The flow is relative to its largest magnitude, the position, if recorded, to its mean. `source`: channel of the
-    pump, "theta" or "omega".
+    The first column is the positive part of the flow, the second its negative part, over the largest magnitude of the
+    flow. The third is the position [m] minus its mean, if it is recorded. `source`: channel of the pump from which the
+    flow is computed, "theta" or "omega". All are averaged over `charge.seconds` of `priors.toml`.
     """
     drive = average_over(CHANGES.charge.seconds, recording[source], recording.rate)
     flow = np.gradient(drive) if source == "theta" else drive
@@ -201,10 +202,11 @@ def _envelope_error(time: Array, residual: Array) -> float:
 
 
 def compare_low_drifts(judged: LowDrifts, healthy: Sequence[LowDrifts]) -> Iterator[Observable]:
-    """Compare the drifts of the low pressures with those of healthy recordings; yield a test for each explanation.
+    """Compare the drifts of p_A and p_B near the charge pressure with those of healthy recordings.
 
-    The explanations are a drift of the sensor of p_A, one of p_B, and a fall of the charge pressure, which lowers both
-    alike. A fall does not explain a difference of the drifts, so its p-value (`chance`) is
+    Yields a test for each explanation of a change that can be compared: a drift of the sensor of p_A, one of the
+    sensor of p_B, and a fall of the charge pressure, which lowers both pressures alike. A fall does not explain a
+    difference of the two drifts. If both are known, its p-value (`chance`) is therefore
 
         chance = min(1, chance of the weighted mean of both drifts / chance of their difference).
     """
@@ -236,10 +238,10 @@ def compare_low_drifts(judged: LowDrifts, healthy: Sequence[LowDrifts]) -> Itera
 
 
 def _mean_fall(drifts: LowDrifts, variances: Mapping[str, float]) -> Estimate | None:
-    """Compute the mean fall of the low pressures of both chambers [Pa/s], with its standard error.
+    """Compute the rate at which the charge pressure falls [Pa/s], the mean of both chambers, with its standard error.
 
-    It is -sum(drift / variance) / sum(1 / variance), with the `variances` [Pa^2/s^2] of the sides "A" and "B". None if
-    the recording has no drift of these sides.
+    It is -sum(drift / variance) / sum(1 / variance) over the chambers with a known drift, weighted by the `variances`
+    [Pa^2/s^2] of the sides "A" and "B". None if `drifts` has none of the sides in `variances`.
     """
     known = [
         (drift, 1.0 / variance) for side, variance in variances.items() if (drift := drifts.estimate(side)) is not None
@@ -252,7 +254,10 @@ def _mean_fall(drifts: LowDrifts, variances: Mapping[str, float]) -> Estimate | 
 
 
 def _difference(drifts: LowDrifts) -> Estimate:
-    """Compute the drift of low p_A minus that of low p_B [Pa/s], with its standard error."""
+    """Compute the drift of p_A near the charge pressure minus that of p_B [Pa/s], with its standard error.
+
+    NaN if one of the two drifts is unknown.
+    """
     error = float(np.hypot(drifts.low_A_error, drifts.low_B_error))
     return Estimate(drifts.low_A - drifts.low_B, error)
 

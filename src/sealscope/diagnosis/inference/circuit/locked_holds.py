@@ -363,9 +363,10 @@ class HeldChambers:
         )
 
     def _is_closed(self, hold: LockedHold, p: Array) -> NDArray[np.bool_]:
-        """Flag the samples (n,) with a pressure above the charge pressure, where no check valve feeds the chamber.
+        """Flag the samples (n,) of a hold in which the check valve of a chamber is closed and does not refill it.
 
-        `p` (n,): pressure of the chamber in the `hold` [Pa], which is averaged over a time to remove the noise.
+        There the chamber's pressure, averaged here over `held_oil.steady` (`priors.toml`) to remove noise, exceeds the
+        charge pressure by a margin. `p` (n,): absolute pressure of the chamber in the `hold` [Pa].
         """
         prior = INFERENCE.held_oil
         steady_pressure = average_over(prior.steady, p, 1.0 / float(np.diff(hold.t).mean()))

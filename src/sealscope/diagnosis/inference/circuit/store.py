@@ -63,9 +63,15 @@ def recorded_oil_loss_tests(recording: Recording, rig: Rig, offset: float) -> di
 def oil_loss_tests(signals: Signals, rig: Rig, cycle: float | None, begin: float) -> dict[str, StepTest]:
     """Test for an external leak of chamber A or B that begins within a recording, by the volume of the accumulator.
 
-    `signals`: both pressures and, if recorded, the position; `cycle`: duration of a cycle of the machine [s], None if
-    there is none; `begin`: time of the first sample [s]. The result maps "external leak A" and "external leak B" to
-    their tests. It lacks sides that cannot be tested, and is empty without an accumulator.
+    The volume of oil that the accumulator has delivered follows from the pressure of the unloaded side, to which it is
+    connected, by the polytropic law of its gas. If the position is recorded, the oil that the rod displaces is
+    subtracted. The volume and the pressure of a side are averaged over blocks, and the leak's conductance is tested for
+    a step between them (`step_test`). Blocks are whole multiples of `cycle`, the duration of the machine's cycle [s],
+    so that motion within a cycle averages out; None if there is no cycle, for blocks of any whole number of samples.
+
+    `signals`: both pressures and, if recorded, the position; `begin`: time of the first sample [s]. The result maps
+    "external leak A" and "external leak B" to their tests. It lacks sides that cannot be tested, and is empty without
+    an accumulator (`makeup.check_valves` = "absent") or for fewer than `MIN_BLOCKS` blocks.
     """
     if rig.makeup.check_valves == "absent":
         return {}

@@ -167,8 +167,9 @@ class ResponseLeak:
     def total(self, detectable_flow: float | None) -> TotalLeakage:
         """Return the smallest detectable leak, without the total leakage, which pressures alone do not show.
 
-        `detectable_flow`: flow [m^3/s] of the smallest leak that would be detected if it began within the recording;
-        None if that was not tested.
+        `detectable_flow`: flow [m^3/s] of the smallest leak that would be detected if it began within the recording,
+        None if that was not tested. It is stated in L/min and as a fraction of the pump's flow (`findable_lpm`,
+        `findable_share`).
         """
         pump_flow, lpm_per_flow = self.pump_flow[0], self.lpm_per_flow
         return TotalLeakage(

@@ -187,9 +187,11 @@ def simulate_response(
 
 
 def response_priors(rig: Rig, law: str = STRIBECK) -> Priors:
-    """Compute the priors on the parameters `PARAMETERS` of the pressure response from the rig's file.
+    """Compute the priors on the parameters `PARAMETERS` of the pressure response from the parameters of a rig.
 
-    `law`: law of friction, one of `LAWS`. The Coulomb friction is taken at the charge pressure.
+    The rig's values scale the numbers `[response]` of `priors.toml`; parameters that it does not have are priors on
+    their own. `law`: law of friction, one of `LAWS`. The Coulomb friction is taken with both chambers at the charge
+    pressure.
     """
     friction, gain = rig.friction, rig.motor.omega_per_volt
     of_difference = friction.coulomb_pressure == "difference"

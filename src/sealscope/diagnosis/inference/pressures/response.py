@@ -216,8 +216,9 @@ class Segment:
     def block_sums(self, fit: Linearisation) -> Block:
         """Reduce a linearised fit of these samples to the sums for the joint fit of all blocks (`fit.Joint`).
 
-        They include the scores: the products of the residual, and of the model's derivatives by all parameters, with
-        its derivative by the conductance, summed over each second.
+        With the derivative d_G of the model by the leakage conductance G, the scores of a second are the sums over its
+        samples of d_G times the residual, and of d_G times the derivative by each parameter. Their shape is (s, 1 + p)
+        for s seconds, of which the last may be incomplete, and p parameters. The mains hum is projected out.
         """
         rows = fit.rows - (fit.rows @ self.waves.T) @ self._wave_gram_inverse @ self.waves
         first = np.arange(0, self.dp.size, round(self.machine.rate))
@@ -455,11 +456,12 @@ def measure_leak(recording: Recording, rig: Rig) -> ResponseLeak | None:
 
 
 def parameter_information(joint: Joint, time: Array, seconds: float) -> dict[str, Information]:
-    """Compute the likelihood of each parameter of the pressure response in K blocks, by the name of the parameter.
+    """Compute how well the fit of K blocks determines each parameter of the pressure response in each block.
 
-    It is Gaussian in the K values of the parameter, stated by precision matrix and information vector (`Information`),
-    with all other parameters eliminated. `joint`: fit of all blocks; `time` (K,): middles of the blocks [s]; `seconds`:
-    length of the recording [s].
+    Returns, by the name of the parameter, the Gaussian likelihood of its K values (`Information`), from which all other
+    parameters are eliminated. It has priors on a linear change and on a random walk of the parameter, whose standard
+    deviations over a recording grow with the root of its length. Those of the leakage conductance G are of a healthy
+    machine. `joint`: fit of all blocks; `time` (K,): middles of the blocks [s]; `seconds`: length of the recording [s].
     """
     growth = math.sqrt(seconds / PRESSURE.blocks.wander)  # of a random walk since the time that the priors state
     wander = growth * joint.priors.wander

@@ -397,8 +397,9 @@ class BalanceLeak:
     def total(self, detectable_flow: float | None) -> TotalLeakage:
         """Return the total leakage of pump and piston, with its interval and the limit for a healthy machine.
 
-        `detectable_flow`: flow [m^3/s] of the smallest leak that would be detected if it began within the recording;
-        None if that was not tested.
+        `detectable_flow`: flow [m^3/s] of the smallest leak that would be detected if it began within the recording,
+        None if that was not tested. It does not change the total; it is only stated beside it, in L/min and as a
+        fraction of the pump's flow (`findable_lpm`, `findable_share`).
         """
         balance = self.balance
         size, pressure, pump_flow = balance.size, balance.mean_pressure(), balance.mean_flow

@@ -100,7 +100,8 @@ def held_rivals(
     """Test for external leaks of chambers A and B, while shut valves hold the load, above those of healthy recordings.
 
     Such a time is a hold. Return one observable for each chamber that can be compared, or None if the recording
-    `judged` has no holds or fewer than `MIN_WITH_HOLDS` healthy recordings have any. `unit_flows` as in `rival_rises`.
+    `judged` has no holds or fewer than `MIN_WITH_HOLDS` healthy recordings have any. `unit_flows`: mean flow [m^3/s]
+    of an external leak with a conductance of 1 m^3/(s Pa), by its name, as in `rival_rises`.
     """
     healthy_leaks = [recording.held for recording in healthy if recording.held is not None]
     if judged.held is None or len(healthy_leaks) < MIN_WITH_HOLDS:
@@ -119,12 +120,15 @@ def held_rivals(
 
 
 def _penalise_size(observable: Observable, judged: RecordingSums, unit_flows: Mapping[str, float] | None) -> Observable:
-    """Return the observable of an external leak with an `advantage` that falls with its flow, from 0 for usual sizes.
+    """Return the observable of an external leak with its `advantage` set by the prior on the size of such leaks.
 
-    A large external leak is improbable, since oil outside is seen. The advantage is 2 log(prior density / largest prior
-    density) of the flow, and 0 for flows below the centre of the prior (`outside` in `priors.toml`). The flow [m^3/s]
-    is the conductance of the observable times the flow for a conductance of 1 (`unit_flows`), or without that, times
-    the mean of abs(p_A - p_B) of the recording `judged`.
+    The advantage is what counts for this explanation besides the score (`Observable.advantage`). A large external leak
+    is improbable, since oil outside is seen: the advantage is 2 log(prior density / largest prior density) of the flow,
+    and 0 for flows below the centre of the prior (`outside` in `priors.toml`).
+
+    The flow [m^3/s] is the size of the observable, a conductance, times the flow for a conductance of 1 m^3/(s Pa).
+    `unit_flows` states the latter by the name of the observable, "external leak A" or "external leak B". Without an
+    entry it is the mean of abs(p_A - p_B) in the recording `judged`.
     """
     flow = observable.size * (unit_flows or {}).get(observable.name, judged.pressure)
     return replace(observable, advantage=-size_penalty(INFERENCE.outside, flow, above=True))

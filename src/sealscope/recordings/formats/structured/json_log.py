@@ -106,8 +106,10 @@ def _read_members(text: str, place: str) -> tuple[list[Any], bool]:
 def _iter_members(text: str) -> Iterator[Any]:
     """Yield the values that stand one after the other in a JSON text, such as one record on each line.
 
-    If a value is an array of arrays or objects, its members are yielded in its place. Raises json.JSONDecodeError where
-    the text is damaged.
+    Between them may be white space, commas and record separators. An array of arrays or objects is not yielded as a
+    whole: its members are, one by one, so that those before a truncated one are still read. Arrays within these
+    members stay whole, and so does any other array, such as a row of numbers. Raises json.JSONDecodeError where the
+    text is damaged or truncated.
     """
     position, in_array = 0, False
     while (position := _SEPARATORS.match(text, position).end()) < len(text):  # type: ignore[union-attr]

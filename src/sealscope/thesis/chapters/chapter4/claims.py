@@ -285,9 +285,9 @@ def _judge_opening(context: Context) -> Iterator[Claim]:
 def _judge_larger_closings(context: Context) -> Iterator[Claim]:
     """Judge claims 4.14 to 4.16 and 4.21 on larger commands and closings of the orifices.
 
-    4.14: the pressures' ranges grow with the amplitude of the command. 4.15: tighter orifices raise the chamber
-    pressures' peaks. 4.16: they raise the ranges of all four pressures. 4.21: the drop at the orifices is large. Each
-    change or drop must exceed a transducer's noise (`visible_pressure`).
+    4.14: the pressures' ranges (maximum minus minimum) grow with the amplitude of the command. 4.15: tighter orifices
+    raise the chamber pressures' peaks (maxima). 4.16: they raise the ranges of all four pressures. 4.21: the drop at
+    the orifices is large. Each change or drop must exceed a transducer's noise (`visible_pressure`).
     """
     min_visible = cases.visible_pressure()
     by_command = _run_cases(context, *((command, 50.0) for command in COMMANDS))
@@ -295,23 +295,24 @@ def _judge_larger_closings(context: Context) -> Iterator[Claim]:
     slow_by_closing = _run_cases(context, *((COMMAND, closed) for closed in CLOSINGS))
 
     def range_changes_to_last(rows: Rows) -> list[float]:
-        """Compute the changes of all pressures' ranges [Pa] from the first run to the last.
+        """Compute the changes of all pressures' ranges (maximum minus minimum) [Pa] from the first run to the last.
 
         `rows`: summaries of the runs.
         """
         return _changes([rows[0], rows[-1]], "range")
 
     def ranges_grow(rows: Rows) -> Iterator[bool]:
-        """Yield for each pressure True if its range grows with the closing, and visibly so from 25 to 75 % closed.
+        """Yield for each pressure True if its range grows with the closing of the orifices.
 
-        `rows`: summaries of the runs with 25, 50 and 75 % closed. Visible is more than a transducer's noise.
+        The range is the pressure's maximum minus minimum. It must grow from 25 to 50 and to 75 % closed orifices, and
+        from 25 to 75 % by more than a transducer's noise. `rows`: summaries of these three runs, in this order.
         """
         for name in PRESSURES:
             at_25, at_50, at_75 = (row[f"range of {name}"] for row in rows)
             yield at_25 < at_50 < at_75 and at_75 - at_25 > min_visible
 
     def chamber_peak_changes(rows: Rows) -> list[float]:
-        """Compute the changes of the chamber pressures' peaks [Pa] from the first run to each later one.
+        """Compute the changes of the chamber pressures' peaks (maxima) [Pa] from the first run to each later one.
 
         `rows`: summaries of the runs.
         """

@@ -27,10 +27,11 @@ def thesis_rig() -> Rig:
 
 
 def stribeck_force(v: Array, F_C: float, *, literal_bracket: bool = False) -> Array:
-    """Compute the friction [N] of the thesis's rig at the velocities `v` (n,) [m/s], eqs. (4.21), (4.22).
+    """Compute the friction [N] of the thesis's rig at the velocities `v` (n,) [m/s], eqs. (4.21), (4.22) of the thesis.
 
-    `F_C` [N]: Coulomb force; `literal_bracket`: True to close the unbalanced bracket of eq. (4.22) as printed, which
-    makes the friction jump at the threshold velocity v_th.
+    It has a Coulomb, a Stribeck and a viscous part (`stribeck_friction`). `F_C` [N]: Coulomb force; `literal_bracket`:
+    True to close the unbalanced bracket of eq. (4.22) at its end, so that the friction jumps at the threshold velocity
+    v_th.
     """
     f = thesis_rig().friction
     friction = getattr(stribeck_friction, "py_func", stribeck_friction)  # uncompiled: a few hundred points
