@@ -18,7 +18,7 @@ from sealscope.diagnosis.inference.scatter import (
     motion_change,
     rise,
 )
-from sealscope.diagnosis.inference.terms import LEAK, Equation, Term
+from sealscope.diagnosis.inference.terms import LAG, LEAK, Equation, Term
 from sealscope.diagnosis.inference.volumes.detector import compare_motion
 from sealscope.diagnosis.priors.inference import INFERENCE
 
@@ -400,16 +400,10 @@ def test_the_viscous_drop_tells_thin_oil_from_a_leak_where_no_thermometer_is_log
     assert found < 0.01 and found < 0.2 * doubted
 
 
+MOTION_TERM = Term("motion", "", nothing, "sensor fault", "motion")
+LEAK_TERM = Term(LEAK, "", nothing, "piston or pump leak", "leak")
 MOVING = ColumnRoles(
-    Equation(
-        "test",
-        nothing,
-        (
-            Term("motion", "", nothing, "sensor fault", "motion"),
-            Term("oil", "", nothing, "air in the oil", "compliance"),
-            Term(LEAK, "", nothing, "piston or pump leak", "leak"),
-        ),
-    )
+    Equation("test", nothing, (MOTION_TERM, Term("oil", "", nothing, "air in the oil", "compliance"), LEAK_TERM))
 )
 
 
@@ -436,6 +430,20 @@ def test_the_flow_that_motion_takes_does_not_depend_on_what_leaks() -> None:
         assert np.ptp(changes[:-1]) < 10.0 * max(deviations)
         errors.append((changes[-1] - np.mean(changes[:-1]) - np.log(scale)) / deviations[-1])
     assert np.std(errors) == pytest.approx(np.sqrt(1.0 + 1.0 / 3.0), rel=0.3)
+
+
+def test_the_flow_that_motion_takes_does_not_depend_on_the_delay_of_the_position() -> None:
+    """The column of the delay is in another unit than those of the motion, here with numbers ten times as large."""
+    lag = Term(LAG, "", nothing, "sensor fault", "motion")
+    roles = ColumnRoles(Equation("test", nothing, (MOTION_TERM, lag, LEAK_TERM)))
+    random, days = np.random.default_rng(5), []
+    for delay, scale in ((0.01, 1.0), (0.03, 1.0), (-0.02, 1.0), (0.02, 1.03)):
+        x = random.standard_normal((400, 3)) * [1.0, 10.0, PRESSURE]
+        y = FLOW * (scale * x[:, 0] + delay * x[:, 1] + 0.04 * x[:, 2] / PRESSURE + 1e-3 * random.standard_normal(400))
+        values = np.column_stack([x, y]) / (1e-3 * FLOW)
+        days.append(values.T @ values)
+    changes = [motion_change(day, np.sum(days[:3], axis=0), roles)[0] for day in days]
+    assert changes == pytest.approx([0.0, 0.0, 0.0, np.log(1.03)], abs=1e-3)
 
 
 def test_a_scale_is_another_machine_only_at_speeds_that_are_known() -> None:

@@ -39,7 +39,7 @@ import numpy as np
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, solve, sum_blocks
 from sealscope.diagnosis.inference.onset import BOUND_PROBABILITY
 from sealscope.diagnosis.inference.rows.weak_form import MAX_READING
-from sealscope.diagnosis.inference.terms import ORIFICE
+from sealscope.diagnosis.inference.terms import LAG, ORIFICE
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.evaluation.scalar_search import find_near_root, find_root
 from sealscope.recordings.recording import Array
@@ -752,16 +752,15 @@ def motion_change(judged: Array, healthy: Array, roles: ColumnRoles) -> tuple[fl
 
     The regression is the volume balance. `judged`, `healthy`: its Gram matrices (m, m) of the recording and of the sum
     of the healthy ones; `roles`: indices of their columns by role (leak, motion, left side). Each of the two fits gives
-    a coefficient for every column with the role motion: one for each direction and loaded side, and the delay
-    (`terms.LAG`). Their mean, weighted by the sums of squares of these columns in the recording, is the motion
-    coefficient [m^2]. In the recording's fit the motion and the leak are free; without the leak, the motion would
-    absorb leakage in proportion to the speed. The other coefficients differ from the healthy ones by a normal prior
-    (`between` in `priors.toml`).
+    a coefficient for each direction of the motion and each loaded side. Their mean, weighted by the sums of squares of
+    these columns in the recording, is the motion coefficient [m^2]. In the recording's fit the motion, its delay
+    (`terms.LAG`) and the leak are free; without the leak, the motion would absorb leakage in proportion to the speed.
+    The other coefficients differ from the healthy ones by a normal prior (`between` in `priors.toml`).
     """
-    motion = list(roles.motion)
+    motion = [k for k in roles.motion if roles.names[k] != LAG]
     fitted = [k for k in roles.compared if k == roles.leak or np.isfinite(roles.between_deviation[k])]
     reference = solve(healthy[np.ix_(fitted, fitted)], healthy[fitted, roles.left])
-    is_free = np.isin(fitted, [*motion, roles.leak])
+    is_free = np.isin(fitted, [*roles.motion, roles.leak])
     with np.errstate(divide="ignore", over="ignore"):
         precision = 1.0 / (np.abs(reference) * roles.between_deviation[fitted]) ** 2
     gram = judged[np.ix_(fitted, fitted)]
