@@ -74,6 +74,7 @@ def test_the_shortest_recording_that_finds_it_is_planned(
     assert json.loads(json.dumps(tree, allow_nan=False)) == tree and tree["finds"] is True
 
 
+@pytest.mark.slow
 def test_a_leak_that_no_recording_finds_is_said_so(monkeypatch: pytest.MonkeyPatch, rig: Rig) -> None:
     monkeypatch.setattr(smallest, "DURATIONS", (20.0,))
     plan = plan_recording(rig, 1e-12, usual=DUTY, duties=[PlannedDuty("11 sin(4t)")])
