@@ -49,7 +49,7 @@ pytest.approx = approx  # type: ignore[assignment]
 
 # no deadline: the first example of a test may have to compile; tests/fuzz draws many more examples of what comes from
 # outside; a CI run judges a commit by the same examples each time
-settings.register_profile("sealscope", max_examples=40, deadline=None, derandomize=bool(os.environ.get("CI")))
+settings.register_profile("sealscope", max_examples=20, deadline=None, derandomize=bool(os.environ.get("CI")))
 settings.load_profile("sealscope")
 
 
@@ -95,6 +95,12 @@ def two_methods(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let diagnoses in this process run the volume balance and `rms change` alone: for what does not ask who judges."""
     kept = {name: registry.DETECTORS[name] for name in ("volume balance", "rms change")}
     monkeypatch.setattr(registry, "DETECTORS", kept)
+
+
+@pytest.fixture
+def rms_change_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let diagnoses in this process run the detector `rms change` and no other."""
+    monkeypatch.setattr(registry, "DETECTORS", {"rms change": registry.DETECTORS["rms change"]})
 
 
 @pytest.fixture(scope="session")
