@@ -51,6 +51,7 @@ def test_what_is_planned_is_found(rig: Rig, minute: DetectableLeak) -> None:
     assert result[0] >= 3 and result[1] == 0
 
 
+@pytest.mark.slow
 def test_what_is_separable_from_the_pump_is_no_smaller_than_what_is_found(rig: Rig, minute: DetectableLeak) -> None:
     assert minute.conductance <= minute.separable
     rarer, surer = (detectable_leak(rig, DUTY, 20.0, **of) for of in ({"false_alarm": 1e-3}, {"detection": 0.99}))

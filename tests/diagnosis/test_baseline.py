@@ -34,6 +34,7 @@ def test_a_leak_from_the_start_needs_a_baseline(records, sound_ones: list[Record
         assert says(result.reason, "bound.against", count=count)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("count", "seeds"), [(2, 2), *(pytest.param(n, 4, marks=pytest.mark.slow) for n in (2, 7))])
 def test_a_sound_one_is_no_leak_beside_sound_ones(count: int, seeds: int, records, sound_ones: list[Recording]) -> None:  # type: ignore[no-untyped-def]
     result = [diagnose(records(seed, duration=60.0, throttled=True), sound_ones[:count]) for seed in range(seeds)]

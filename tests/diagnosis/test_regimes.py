@@ -111,6 +111,7 @@ def test_rests_are_no_step_and_hide_none(shut: bool) -> None:
         assert leaking.onset().low < 50.0 < leaking.onset().high
 
 
+@pytest.mark.slow
 def test_a_drive_that_no_longer_turns_in_holds_is_no_leak_that_ends() -> None:
     """Neither past the piston nor to the outside; a leak that begins shows beside it."""
     for seed in range(3):

@@ -76,6 +76,7 @@ def test_the_smallest_step_is_found_and_half_of_it_is_not() -> None:
         assert judge(detector, machine(seed, G=step(0.0, 0.4 * G))).verdict == "no leak"
 
 
+@pytest.mark.slow
 def test_against_what_a_healthy_machine_passes() -> None:
     unworn, worn = machine(1), machine(1, G=WORN)
     known = VolumeBalance(rig(2.0 * PUMP))

@@ -150,6 +150,7 @@ def test_a_leak_of_a_machine_by_the_balance_stays(kind: str, two_methods: None) 
     check_leak(BY_BALANCE, kind)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", few(KINDS, 1))
 def test_a_healthy_machine_by_the_balance_stays_healthy(kind: str, two_methods: None) -> None:
     check_healthy(BY_BALANCE, kind)
