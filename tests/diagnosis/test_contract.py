@@ -52,7 +52,7 @@ def every_second_missing(recording: Recording) -> Recording:
 #: Recordings that a detector must be able to judge ...
 GOOD: dict[str, Change] = {
     "whole": lambda r: r,
-    "one gap near the end": lambda r: with_channels(r, p_A=np.where(np.arange(len(r)) == 25000, np.nan, r["p_A"])),
+    "one gap near the end": lambda r: with_channels(r, p_A=np.where(np.arange(len(r)) == 30000, np.nan, r["p_A"])),
     "every second value missing": every_second_missing,
     "command without a value": lambda r: with_channels(r, u=np.full(len(r), np.nan)),
 }
@@ -96,8 +96,8 @@ EVERY = {**detectors(), "ringing energy": example}
 
 @pytest.fixture(scope="module")
 def leaky(records) -> Recording:  # type: ignore[no-untyped-def]
-    """60 s with a leak of 0.02 L/min from second 30, which each detector finds."""
-    return records(1, leak="0.02 L/min from 30 s", duration=60.0, throttled=True)
+    """72 s with a leak of 0.02 L/min from second 36, which each detector finds."""
+    return records(1, leak="0.02 L/min from 36 s", duration=72.0, throttled=True)
 
 
 @pytest.fixture(autouse=True)
