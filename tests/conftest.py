@@ -26,9 +26,10 @@ CHECK_RIG = {"omega_per_volt": 26.7, "p_charge": 0.25e6, "V_1": 50e-6, "V_2": 50
 HALF_CLOSED = {"orifices": "present", "closed_A": "50 %", "closed_B": "50 %"}
 #: Files and folders that come first and last, in this order. Two processes take file after file. The first file
 #: compiles the simulator for lanes, which takes half a minute; meanwhile the other process runs what needs none of it,
-#: and what is compiled later is loaded. At the end come folders of short files, so that neither process waits long.
+#: and what is compiled later is loaded. Last come a file that would compile what the other process compiles at that
+#: moment, and folders of short files, so that neither process waits long.
 FIRST = ("campaigns/test_batches.py", "recordings", "reporting")
-LAST = ("parameters", "evaluation", "signals", "storage")
+LAST = ("control/test_margins.py", "parameters", "evaluation", "signals", "storage")
 
 
 _approx = pytest.approx

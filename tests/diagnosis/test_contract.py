@@ -96,8 +96,8 @@ EVERY = {**detectors(), "ringing energy": example}
 
 @pytest.fixture(scope="module")
 def leaky(records) -> Recording:  # type: ignore[no-untyped-def]
-    """72 s with a leak of 0.02 L/min from second 36, which each detector finds."""
-    return records(1, leak="0.02 L/min from 36 s", duration=72.0, throttled=True)
+    """80 s with a leak of 0.02 L/min from second 40, which each detector finds."""
+    return records(1, leak="0.02 L/min from 40 s", duration=80.0, throttled=True)
 
 
 @pytest.fixture(autouse=True)

@@ -220,6 +220,7 @@ def test_what_leaks_from_the_first_sample_began_after_the_last_healthy_recording
     assert (alarm.onset_s, alarm.onset_interval_s) == (500.0, (60.0, 500.0))
 
 
+@pytest.mark.slow
 def test_recordings_that_cannot_tell_are_watched_block_by_block(commissioned, tmp_path):
     """As of a logger that begins a file every 10 s; a recording without a leak takes the blocks' leak back."""
     service = Service(watching(tmp_path, commissioned), once=True)

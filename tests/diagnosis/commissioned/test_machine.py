@@ -107,6 +107,7 @@ def test_a_zero_below_vacuum_and_glitches_are_named(folder, tmp_path):
     assert "omega has glitches" in problems
 
 
+@pytest.mark.slow
 def test_the_summary_has_the_units_of_the_log(folder, tmp_path):
     """Pressures in psi, rounded and repeated; a speed without a sign is named once, and no fault of a recording."""
     for path in sorted(folder.iterdir())[:2]:
