@@ -26,6 +26,7 @@ def test_names_of_the_release_before_say_what_is_used_instead(name, instead):
     assert name not in ss.__all__ and instead in ss.__all__
 
 
+@pytest.mark.slow
 def test_files_of_each_kind_are_read_and_written_alike(recording, tmp_path):
     ss.write(recording, tmp_path / "healthy.nc")
     machine = ss.commission([tmp_path / "healthy.nc"], name="press")
@@ -33,6 +34,7 @@ def test_files_of_each_kind_are_read_and_written_alike(recording, tmp_path):
     assert len(ss.read(tmp_path / "healthy.nc")) == len(recording)
 
 
+@pytest.mark.slow
 def test_a_report_needs_the_recording_alone(recording, tmp_path):
     page = ss.report(recording, tmp_path / "report.html")
     assert page == tmp_path / "report.html"

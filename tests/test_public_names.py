@@ -13,6 +13,8 @@ import pytest
 
 import sealscope as ss
 
+from .representatives import SLOW, other
+
 
 def public() -> dict[str, object]:
     """Public names and their values."""
@@ -61,7 +63,11 @@ def test_every_public_member_of_a_class_is_documented(name):
     assert [member for member, text in members.items() if not text] == []
 
 
-@pytest.mark.parametrize("name", PUBLIC)
+#: Names whose examples simulate or commission for seconds.
+LONG = ("Trend", "Watch", "commission", "trend", "write_machine", "Diagnosis")
+
+
+@pytest.mark.parametrize("name", [other(name, SLOW) if name in LONG else name for name in PUBLIC])
 def test_the_examples_are_true(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     value = VALUES[name]

@@ -11,6 +11,8 @@ import pytest
 import sealscope as ss
 from sealscope.monitor.alarms import Alarm
 
+from .representatives import other
+
 jsonschema = pytest.importorskip("jsonschema")
 REFERENCE = Path(__file__).parents[1] / "docs" / "reference"
 
@@ -25,7 +27,7 @@ def validator(name):
     ("options", "channels"),
     [
         ({"leak": "0.02 L/min from 15 s"}, ("p_A", "p_B", "x", "theta", "u")),
-        ({}, ("p_A", "p_B", "x", "theta", "u")),
+        other(({}, ("p_A", "p_B", "x", "theta", "u"))),
         ({}, ("p_A", "p_B")),
     ],
 )

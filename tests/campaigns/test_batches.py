@@ -121,6 +121,7 @@ def test_a_row_is_the_same_in_any_batch(plan_with, monkeypatch, machines):
     assert rows_of(plan, cases[3:4]) == {cases[3].id: whole[cases[3].id]}
 
 
+@pytest.mark.slow
 def test_interrupted_it_goes_on_to_the_same_bytes(plan_with, finished_in_batches, monkeypatch, tmp_path):
     plan = plan_with()
     expected = {
@@ -149,6 +150,7 @@ def test_interrupted_it_goes_on_to_the_same_bytes(plan_with, finished_in_batches
     assert len(ids) == len(set(ids)) == plan.size
 
 
+@pytest.mark.slow
 def test_rows_of_both_ways_are_not_mixed(plan_with, finished_tiny, finished_in_batches):
     plan = plan_with()
     for folder, batch in ((finished_in_batches, False), (finished_tiny, True)):

@@ -52,15 +52,15 @@ use = "calibrate"
 count = 5
 
 [[records]]
-count = 2
+count = 1
 
 [[records]]
 leak = "0.02 L/min"
-count = 3
+count = 2
 
 [[records]]
 fault = "friction +20 %"
-count = 2
+count = 1
 """
 examined: list[tuple[str, ...]] = []
 
@@ -183,7 +183,7 @@ def test_what_it_adds_up_to(plan, done):
     assert flows["watcher", 0.02].errors.coverage.value == 1.0
     onsets = {(one.detector, one.leak_lpm): one.errors for one in result.judgement.onsets}
     assert onsets["watcher", 0.02].median_size.value == 1.0
-    assert onsets["watcher", 0.02].coverage.count == 3
+    assert onsets["watcher", 0.02].coverage.count == 2
     named = {one.detector: one.confusion for one in result.judgement.causes}
     assert recall(named["watcher @ pressures"], "friction change") == 1.0
     assert recall(named["watcher"], "piston leak") == 1.0

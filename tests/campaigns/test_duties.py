@@ -138,6 +138,7 @@ def test_an_installed_controller_is_run(tmp_path, monkeypatch):
     assert isinstance(case_experiment(plan, list_cases(plan)[0]).active_controller, Flatness)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", [PROFILES[0], *(pytest.param(name, marks=[pytest.mark.slow, pytest.mark.long]) for name in PROFILES[1:])]
 )

@@ -73,6 +73,7 @@ def test_rows_survive_being_stored():
     assert [CaseRow.from_dict(one.as_dict()).law for one in ROWS] == [one.law for one in ROWS]
 
 
+@pytest.mark.slow
 def test_a_mixture_is_half_of_each_law():
     plan = load_plan("bench-unmodelled")
     case = next(case for case in list_cases(plan) if case.law == "mixture")

@@ -7,6 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+from sealscope.campaigns import held
 from sealscope.campaigns.held import BEFORE, N_HEALTHY, PlannedHold, has_shut_off, plan_hold
 from sealscope.campaigns.smallest import DetectableLeak, PlannedDuty, RecordingPlan
 from sealscope.diagnosis.inference.circuit.locked_holds import MAX_RATE, CylinderSides, HeldChambers, find_locked_holds
@@ -73,9 +74,13 @@ def test_a_leak_as_planned_is_found_in_simulated_holds(rig: Rig, hold: PlannedHo
     assert count_leaks(rig, hold, 0.0, 8) <= 1
 
 
-def test_a_smaller_leak_takes_a_longer_hold(rig: Rig, hold: PlannedHold) -> None:
-    smaller = plan_hold(rig, LOAD, FLOW, 0.85 * hold.conductance, false_alarm=ALLOWED)
-    assert smaller.duration > hold.duration and smaller.conductance < 0.85 * hold.conductance
+def test_a_smaller_leak_takes_a_longer_hold(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(held, "_N_DRAWS", 2)
+    monkeypatch.setattr(held, "_N_BISECTIONS", 4)
+    hold = plan_hold(rig, LOAD, FLOW, 1e-14, false_alarm=ALLOWED)
+    assert hold.duration == SECONDS and hold.conductance <= 1e-14
+    smaller = plan_hold(rig, LOAD, FLOW, 0.5 * hold.conductance, false_alarm=ALLOWED)
+    assert smaller.duration > hold.duration and smaller.conductance < 0.5 * hold.conductance
     with pytest.raises(InputError, match="load > 0 N"):
         plan_hold(rig, 0.0, FLOW)
 

@@ -77,6 +77,11 @@ def test_recordings_are_calibrated_and_judged(folder):
     assert table["d3 of p_A changed"].false_alarm.n == 2
     files = write_result(result, folder / "out")
     assert {path.name for path in files} >= {"table.csv", "records.csv", "thresholds.csv"}
+
+
+@pytest.mark.slow
+def test_the_same_recordings_give_the_same_files(folder):
+    files = write_result(judge_recorded_campaign(plan_of(folder), folder), folder / "out")
     before = {path.name: path.read_bytes() for path in files}
     again = write_result(judge_recorded_campaign(plan_of(folder), folder), folder / "out")
     assert {path.name: path.read_bytes() for path in again} == before

@@ -236,13 +236,18 @@ def test_rows_of_another_campaign_are_not_mixed_in(finished_tiny, text, tmp_path
         campaign.run(load_plan(other), finished_tiny, jobs=1)
 
 
-def test_more_records_and_detectors_are_added_to_what_is_there(finished_tiny, text, tmp_path):
+def test_more_records_are_added_to_what_is_there(finished_tiny, text, tmp_path):
     folder = finished_tiny
     more = tmp_path / "more.toml"
     more.write_text(text.replace("count = 6", "count = 8"), encoding="utf-8")
     reported = []
     campaign.run(load_plan(more), folder, jobs=1, progress=lambda *words: reported.append(words))
     assert reported[0] == (26, 28, 0)
+
+
+@pytest.mark.slow
+def test_another_detector_is_added_to_what_is_there(finished_tiny, text, tmp_path):
+    folder, more = finished_tiny, tmp_path / "more.toml"
     more.write_text(text.replace('"d3 of p_A changed"', '"d4 of p_A changed"'), encoding="utf-8")
     assert store.read_progress(load_plan(more), folder).done == 0
     campaign.run(load_plan(more), folder, jobs=1)

@@ -51,6 +51,7 @@ def test_what_is_planned_is_found(rig: Rig, minute: DetectableLeak) -> None:
     assert result[0] >= 3 and result[1] == 0
 
 
+@pytest.mark.slow
 def test_what_is_separable_from_the_pump_is_no_smaller_than_what_is_found(rig: Rig, minute: DetectableLeak) -> None:
     assert minute.conductance <= minute.separable
     rarer, surer = (detectable_leak(rig, DUTY, 20.0, **of) for of in ({"false_alarm": 1e-3}, {"detection": 0.99}))
@@ -74,6 +75,7 @@ def test_the_shortest_recording_that_finds_it_is_planned(
     assert json.loads(json.dumps(tree, allow_nan=False)) == tree and tree["finds"] is True
 
 
+@pytest.mark.slow
 def test_a_leak_that_no_recording_finds_is_said_so(monkeypatch: pytest.MonkeyPatch, rig: Rig) -> None:
     monkeypatch.setattr(smallest, "DURATIONS", (20.0,))
     plan = plan_recording(rig, 1e-12, usual=DUTY, duties=[PlannedDuty("11 sin(4t)")])

@@ -62,6 +62,7 @@ def cluster(request):
         yield opened.scheduler_address
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cluster", [False], indirect=True, ids=["threads"])
 def test_what_a_task_raises_on_a_cluster_is_raised(cluster):
     with pytest.raises(ValueError, match="math domain error"):

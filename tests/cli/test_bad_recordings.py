@@ -78,6 +78,7 @@ def test_what_cannot_be_read(kind, call, untouched, tmp_path):
         assert done.out == ""
 
 
+@pytest.mark.slow
 def test_what_cannot_be_read_in_a_process_of_its_own(shell, untouched, tmp_path):
     make("2 GB of nothing", tmp_path / "log.csv")
     untouched()
@@ -86,6 +87,7 @@ def test_what_cannot_be_read_in_a_process_of_its_own(shell, untouched, tmp_path)
     assert done.out == ""
 
 
+@pytest.mark.slow
 def test_each_bad_file_among_good_ones_has_its_line(call, recordings, tmp_path, untouched):
     kinds = ("wrong unit", "binary")
     for kind in kinds:

@@ -25,9 +25,9 @@ def whole(shell, folder):
 
 
 def of_few(folder):
-    """The command within this process, with three healthy recordings in place of five."""
+    """The command within this process, with two healthy recordings in place of five."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("sealscope.demo.N_HEALTHY", 3)
+        patch.setattr("sealscope.demo.N_HEALTHY", 2)
         done = CliRunner().invoke(app, ["demo", "--output", str(folder / "few")])
     return Call(done.exit_code, done.stdout, done.stderr)
 

@@ -121,10 +121,9 @@ def test_a_process_of_its_own_prints_the_same(shell, call, recordings):
 def test_the_false_alarm_probability_sets_the_threshold(call, recordings):
     thresholds = [
         call("diagnose", recordings / "leak.nc", "--format", "jsonl", "--false-alarm", p).objects[0]["threshold"]
-        for p in (0.2, 0.01, 0.001)
+        for p in (0.2, 0.001)
     ]
-    assert thresholds == sorted(thresholds)
-    assert len(set(thresholds)) == 3
+    assert thresholds[0] < thresholds[1]
 
 
 @pytest.mark.long
@@ -142,6 +141,14 @@ def test_baselines_after_one_flag_or_one_flag_each(call, recordings):
     assert "3 comparable leak-free recordings" in said(result, "rms change")
 
 
+def test_a_call_with_a_file_that_is_its_own_baseline_is_refused(call, recordings):
+    file = recordings / "healthy_1.nc"
+    alone = call("diagnose", recordings / "leak.nc", file, "--baseline", file)
+    assert "a baseline must be another recording than the file itself" in alone.refused(2)
+    assert alone.out == ""  # a wrong call gives no verdict at all
+
+
+@pytest.mark.slow
 @pytest.mark.usefixtures("two_methods")
 def test_a_baseline_is_not_its_own_baseline(call, recordings):
     files = [recordings / f"healthy_{k}.nc" for k in (1, 2)]
@@ -150,9 +157,6 @@ def test_a_baseline_is_not_its_own_baseline(call, recordings):
     assert [item["file"] for item in done.objects] == [str(file) for file in files]
     for item in done.objects:
         assert "1 comparable leak-free recording" in said(item, "rms change")
-    alone = call("diagnose", recordings / "leak.nc", files[0], "--baseline", files[0])
-    assert "a baseline must be another recording than the file itself" in alone.refused(2)
-    assert alone.out == ""  # a wrong call gives no verdict at all
 
 
 @pytest.mark.usefixtures("two_methods")
@@ -195,6 +199,14 @@ def test_a_missing_file_among_good_ones_costs_the_others_nothing(call, recording
     assert [item["verdict"] for item in done.objects] == ["leak", "no leak"]
 
 
+def test_without_a_baseline_that_can_be_read_nothing_is_diagnosed(call, recordings, untouched):
+    done = call("diagnose", recordings / "leak.nc", "--baseline", "absent.csv")
+    assert done.status == 1
+    assert done.out == ""
+    assert done.err.splitlines()[1] == "sealscope: no baseline could be read, so nothing is diagnosed"
+
+
+@pytest.mark.slow
 @pytest.mark.usefixtures("two_methods")
 def test_a_missing_baseline_among_good_ones(call, recordings, untouched):
     healthy = recordings / "healthy_1.nc"
@@ -206,10 +218,6 @@ def test_a_missing_baseline_among_good_ones(call, recordings, untouched):
     assert [item["file"] for item in done.objects] == [str(recordings / "leak.nc")]
     assert len(done.err.splitlines()) == 2
     assert str(healthy) in done.err.splitlines()[1]
-    done = call("diagnose", recordings / "leak.nc", "--baseline", "absent.csv")
-    assert done.status == 1
-    assert done.out == ""
-    assert done.err.splitlines()[1] == "sealscope: no baseline could be read, so nothing is diagnosed"
 
 
 def in_one_session(strokes: Path, folder: Path) -> tuple[list[Path], list[Path]]:
@@ -231,7 +239,8 @@ def test_foreign_logs_without_times_may_be_of_another_day(call, strokes):
         assert "of which the sessions are not known" in item["reason"]
 
 
-@pytest.mark.parametrize("count", [1, pytest.param(4, marks=[pytest.mark.slow, pytest.mark.long])])
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [1, pytest.param(4, marks=pytest.mark.long)])
 def test_foreign_logs_with_a_map_and_a_rate(call, strokes, tmp_path, count):
     """Ringing alone proves no leak: oil, load and duty change it more often; what fell is stated."""
     leaking, healthy = in_one_session(strokes, tmp_path)
@@ -247,6 +256,7 @@ def test_foreign_logs_with_a_map_and_a_rate(call, strokes, tmp_path, count):
         assert f"{others} comparable leak-free recordings" in item["reason"]  # of both directions
 
 
+@pytest.mark.slow
 def test_a_stroke_beside_strokes_of_the_opposite_direction_is_no_leak(call, strokes):
     other_way = sorted(strokes.glob("healthy_*"))[1::2]
     done = call("diagnose", strokes / "leak_00.txt", "--baseline", *other_way, *FOREIGN, "--format", "jsonl")
@@ -327,12 +337,13 @@ def test_five_lines_by_default_all_with_v_one_when_quiet(call, recordings):
     assert line.out == short.out.splitlines()[0] + "\n" == f"{recordings / 'leak.nc'}: leak\n"
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("two_methods")
 def test_scripts_may_fail_on_a_verdict(call, recordings):
-    files = (recordings / "leak.nc", recordings / "healthy_1.nc")
-    assert call("diagnose", *files, "--quiet", "--fail-on", "leak").status == 3
-    assert call("diagnose", files[1], "--quiet", "--fail-on", "leak").status == 0
-    assert call("diagnose", files[1], "--quiet", "--fail-on", "leak", "--fail-on", "no leak").status == 3
+    leak, healthy = recordings / "leak.nc", recordings / "healthy_1.nc"
+    assert call("diagnose", leak, "--quiet", "--fail-on", "leak").status == 3
+    assert call("diagnose", healthy, "--quiet", "--fail-on", "leak").status == 0
+    assert call("diagnose", healthy, "--quiet", "--fail-on", "leak", "--fail-on", "no leak").status == 3
 
 
 @pytest.mark.slow

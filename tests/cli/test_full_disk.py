@@ -78,6 +78,7 @@ def test_a_recording_is_whole_or_absent(size: int, suffix: str, shell, call, rec
     assert target.read_text() == "what was there before"
 
 
+@pytest.mark.slow
 def test_a_page_is_whole_or_absent(call, recordings: Path, tmp_path: Path) -> None:
     with room(60_000):
         done = call("report", recordings / "healthy_1.nc", "-o", tmp_path / "page.html")
@@ -135,6 +136,7 @@ def test_a_clock_that_runs_backwards_changes_no_byte(
     assert result_of(plan, tmp_path / "back") == expected
 
 
+@pytest.mark.slow
 def test_a_home_and_a_cache_that_cannot_be_written(call, shell, recordings: Path) -> None:
     """The folders lie below a file, which root cannot write either."""
     nowhere = "/dev/null/home"

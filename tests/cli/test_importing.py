@@ -79,7 +79,7 @@ def run_files(tmp_path_factory):
 
 
 #: Commands that load what another one here loads, and little else: they are slow.
-SIMILAR = ("inspect run.nc", "trend . --every 1d")
+SIMILAR = ("inspect run.nc", "trend . --every 1d", "diagnose run.csv")
 #: ... and by hand alone.
 ALIKE = ("parameters", "convert run.csv run2.nc", "report run.nc -o page.html")
 

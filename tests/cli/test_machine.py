@@ -58,6 +58,7 @@ def test_a_folder_is_judged_a_line_a_recording(call, healthy, tmp_path):
     assert max(map(len, done.out.splitlines())) <= 90
 
 
+@pytest.mark.slow
 def test_a_folder_gets_a_page_of_its_machine(call, file, tmp_path):
     page, suspect = tmp_path / "page.html", tmp_path / "suspect"
     suspect.mkdir()

@@ -29,6 +29,7 @@ def test_files_of_a_folder_end_in_one_alarm(call, tmp_path, monkeypatch):
     assert (tmp_path / "monitor.db").exists()
 
 
+@pytest.mark.slow
 def test_a_machine_s_file_beside_the_settings_says_how_its_logs_are_read(call, tmp_path):
     """Wherever the monitor is started: a log with headers of its own is taken in by the machine's file alone."""
     logs = tmp_path / "logs"

@@ -68,6 +68,7 @@ def test_the_original_error_is_logged_on_demand(batch, call):
         assert loud.err.splitlines()[-1] == quiet.err.splitlines()[-1]
 
 
+@pytest.mark.slow
 def test_report_goes_on_after_a_page_that_cannot_be_written(batch, call):
     (batch / "pages" / "good.html").mkdir(parents=True)
     done = call("report", "-o", batch / "pages", batch / "good.nc", batch / "other.nc")

@@ -32,8 +32,6 @@ def test_convert_round_and_back_is_the_same_to_the_bit(call, recordings, tmp_pat
     for name in first.channels:
         assert np.array_equal(last[name], first[name]), name
     assert np.array_equal(last.t, first.t)
-    verdicts = [call("diagnose", file, "--format", "jsonl").objects[0] for file in (recordings / "healthy_1.nc", path)]
-    assert verdicts[0]["score"] == verdicts[1]["score"]
 
 
 def test_convert_gives_a_foreign_log_its_names_units_and_findings(call, tmp_path):
@@ -95,6 +93,7 @@ def test_report_for_one_file(call, recordings, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["page.html"]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("two_methods")
 def test_report_for_several_files_makes_a_folder_and_skips_what_cannot_be_read(call, recordings, tmp_path):
     files = [recordings / "leak.nc", tmp_path / "absent.csv", recordings / "healthy_1.nc"]
@@ -110,6 +109,7 @@ def test_report_for_several_files_makes_a_folder_and_skips_what_cannot_be_read(c
     assert len(done.out.splitlines()) == 2
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("two_methods")
 def test_report_of_one_file_into_a_folder(call, recordings, tmp_path):
     assert call("report", recordings / "healthy_1.nc", "-o", tmp_path).status == 0
@@ -223,19 +223,29 @@ def test_inspect_shows_what_a_foreign_file_holds_and_what_is_wrong(call, tmp_pat
     assert "columns not used: PB_bar" in again.out
 
 
-@pytest.mark.usefixtures("two_methods")
-def test_parts_of_a_run_are_joined(call, recordings, tmp_path):
-    whole = sealscope.read(recordings / "healthy_1.nc")
+@pytest.fixture
+def parts(recordings, tmp_path):
+    """The two halves of a run, as files."""
+    whole, paths = sealscope.read(recordings / "healthy_1.nc"), [tmp_path / "part_1.csv", tmp_path / "part_2.csv"]
     half = len(whole) // 2
-    sealscope.write(whole.samples(slice(0, half)), tmp_path / "part_1.csv")
-    sealscope.write(whole.samples(slice(half, None)), tmp_path / "part_2.csv")
-    done = call("inspect", "--join", tmp_path / "part_2.csv", tmp_path / "part_1.csv")
+    sealscope.write(whole.samples(slice(0, half)), paths[0])
+    sealscope.write(whole.samples(slice(half, None)), paths[1])
+    return paths
+
+
+def test_parts_of_a_run_are_joined(call, parts):
+    done = call("inspect", "--join", *reversed(parts))
     assert (done.status, done.err) == (0, "")
     assert "10000 samples at 500 Hz, 20 s" in " ".join(done.out.split())
     assert "joined from 2 files: part_1.csv, part_2.csv" in done.out
-    alone = call("diagnose", recordings / "healthy_1.nc", "--format", "jsonl").objects[0]
-    joined = call("diagnose", "--join", tmp_path / "part_1.csv", tmp_path / "part_2.csv", "--format", "jsonl")
-    assert [result["score"] for result in joined.objects] == [alone["score"]]
-    done = call("diagnose", "--join", tmp_path / "part_1.csv", tmp_path / "part_1.csv")
+    done = call("diagnose", "--join", parts[0], parts[0])
     assert (done.status, done.err.count("\n")) == (2, 1)
     assert "must go on from file to file" in done.err
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("two_methods")
+def test_joined_parts_are_diagnosed_as_the_run(call, recordings, parts):
+    alone = call("diagnose", recordings / "healthy_1.nc", "--format", "jsonl").objects[0]
+    joined = call("diagnose", "--join", *parts, "--format", "jsonl")
+    assert [result["score"] for result in joined.objects] == [alone["score"]]

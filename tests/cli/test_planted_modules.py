@@ -94,6 +94,7 @@ def test_none_runs_where_files_are_read_apart(planted: Path, run: Ran) -> None:
     assert all(name in done.stdout for name in names)
 
 
+@pytest.mark.slow
 def test_no_library_runs_where_python_itself_begins_in_the_folder(planted: Path, tmp_path: Path) -> None:
     """`python -m` puts the working folder first, until the program has begun."""
     t = np.arange(900) / 500
@@ -107,6 +108,7 @@ def test_no_library_runs_where_python_itself_begins_in_the_folder(planted: Path,
     assert not (tmp_path / "ran").exists(), (tmp_path / "ran").read_text()
 
 
+@pytest.mark.slow
 def test_none_runs_in_worker_processes(run: Ran) -> None:
     ((_, loaded),) = iter_results_in_order(2, eval, [LOADED])
     assert loaded is not None
@@ -133,6 +135,7 @@ def test_none_runs_in_a_campaign(planted: Path, run: Ran) -> None:
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 def test_settings_of_compiled_code_are_not_taken_from_the_working_folder(planted: Path, run: Ran) -> None:
     """numba reads them there: `cuda_driver` names a library that it loads."""
     (planted / ".numba_config.yaml").write_text("disable_jit: 1\ncuda_driver: ./evil.so\n")

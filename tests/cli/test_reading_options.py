@@ -150,17 +150,17 @@ def test_a_log_whose_pressures_bear_other_names_says_which_map_would_read_them(c
 
 def test_a_long_log_is_cut_into_parts_which_the_trend_follows(call, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    run = sealscope.simulate(command="3 sin(4t)", duration="60 s", leak="0.0042 L/min from 30 s", seed=1)
+    run = sealscope.simulate(command="3 sin(4t)", duration="30 s", leak="0.0042 L/min from 15 s", seed=1)
     sealscope.write(run, "long.csv")
-    done = call("convert", "long.csv", "parts", "--every", "20 s")
+    done = call("convert", "long.csv", "parts", "--every", "10 s")
     assert done.status == 0
-    assert done.out.splitlines()[-1] == "parts: 3 parts, 30000 samples"
+    assert done.out.splitlines()[-1] == "parts: 3 parts, 15000 samples"
     names = sorted(path.name for path in (tmp_path / "parts").iterdir())
     assert names == [f"long_{k:04d}.nc" for k in (1, 2, 3)]
     second = sealscope.read("parts/long_0002.nc")
-    assert second.t[0] == 20.0
-    assert (second["p_A"] == run["p_A"][10000:20000]).all()
-    done = call("convert", "long.csv", "parts", "--every", "20 s")
+    assert second.t[0] == 10.0
+    assert (second["p_A"] == run["p_A"][5000:10000]).all()
+    done = call("convert", "long.csv", "parts", "--every", "10 s")
     assert done.status == 2
     assert "TARGET must be a new or empty folder" in done.err
-    assert call("trend", "parts", "--every", "40 s", "-o", "trend.html").status == 0
+    assert call("trend", "parts", "--every", "20 s", "-o", "trend.html").status == 0

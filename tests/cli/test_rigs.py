@@ -117,6 +117,11 @@ def test_a_file_that_exists_is_kept(call, tmp_path):
     assert "name of a rig must be of letters" in call("rigs", "new", 'a"b', *words).refused()
 
 
+def test_margins_of_an_unknown_controller_are_refused(call):
+    assert "controller must be one of pi" in call("rigs", "margins", "--controller", "pid").refused()
+
+
+@pytest.mark.slow
 def test_margins_of_a_loop_are_printed(call):
     done = call("rigs", "margins", "thesis-closed-loop", "--controller", "pi")
     assert (done.status, done.err) == (0, "")
@@ -127,4 +132,3 @@ def test_margins_of_a_loop_are_printed(call):
         assert peak > 0.9 / (2.0 * math.sin(0.5 * phase))  # |1 + L| where |L| = 1
         assert peak < 1.2 or phase < math.radians(20.0)  # the resonance of piston and oil
     assert max(map(len, done.out.splitlines())) <= 80
-    assert "controller must be one of pi" in call("rigs", "margins", "--controller", "pid").refused()

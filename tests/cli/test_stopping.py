@@ -107,6 +107,7 @@ def test_a_reader_that_goes_away_is_no_error(shell, words, reader):
     assert len(done.out.splitlines()) == (reader != "true")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="this system has no /dev/full")  # noqa: PTH110
 @pytest.mark.parametrize("words", few(["parameters --format csv", "--version"], 1))
 def test_a_full_disk_behind_the_output_is_one_line(shell, words):

@@ -17,7 +17,7 @@ CALLS = [
     "simulate -o run.nc --duration 20 --leak 0.01[L/min] --fault", "campaign status bench-thesis",
 ]  # fmt: skip
 #: Calls that simulate, judge or draw more than one recording.
-LONG = (CALLS[4], CALLS[7], CALLS[9], CALLS[10])
+LONG = (CALLS[4], CALLS[6], CALLS[7], CALLS[9], CALLS[10], CALLS[13], CALLS[14])
 
 
 @pytest.fixture

@@ -76,6 +76,7 @@ def test_the_observer_returns_the_conductance_of_a_balance_that_holds(sign):
     assert blocks > 30
 
 
+@pytest.mark.slow
 def test_a_leak_that_opens_at_once_is_followed_within_three_blocks_and_an_outlier_is_not():
     balance = FaultTolerant.from_rig(RIG).balance
     (observer,), rate = make_observer(balance, 500.0), 500.0

@@ -78,6 +78,7 @@ def test_phase_and_delay_margin_are_the_least_of_all_crossings():
     assert found.crossover == pytest.approx(omega[2] / (2.0 * math.pi), rel=1e-5)
 
 
+@pytest.mark.slow
 def test_a_loop_turned_or_late_by_its_margin_passes_through_minus_one_and_by_less_it_does_not():
     """At 0.05 m/s the gain rises above 1 once more, at the resonance of piston and oil."""
     f = np.concatenate([np.geomspace(0.05, 60.0, 1500), np.linspace(60.1, 80.0, 2000), np.geomspace(81.0, 249.0, 200)])

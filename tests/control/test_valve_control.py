@@ -95,6 +95,7 @@ def test_an_overlap_is_crossed():
     assert errors[0] < 0.5 * errors[1]
 
 
+@pytest.mark.slow
 def test_the_loop_has_margins():
     """A stiff supply: more phase than at a pump, whose drive lags; 50 degrees and a factor of two at all speeds."""
     controller = PositionPI.from_rig(RIG)

@@ -8,7 +8,6 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.detectors import registry
 from sealscope.recordings.recording import Recording
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.instruments import record
@@ -16,12 +15,6 @@ from sealscope.simulation.integrate import oversampling, run_with_sized_leaks
 
 THROTTLED = {"orifices": "present", "closed_A": 0.5, "closed_B": 0.5}
 Records = Callable[..., Recording]
-
-
-@pytest.fixture
-def rms_change_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let `diagnose` run the detector `rms change` and no other."""
-    monkeypatch.setattr(registry, "DETECTORS", {"rms change": registry.DETECTORS["rms change"]})
 
 
 @pytest.fixture(scope="session")

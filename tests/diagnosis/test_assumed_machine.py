@@ -89,6 +89,7 @@ def test_area_or_displacement_alone_gives_the_flow_whatever_the_other_is(ratio: 
     assert diagnose(recording).leak_lpm is None
 
 
+@pytest.mark.slow
 def test_pressures_alone_state_no_flow_without_a_rig() -> None:
     own = simulate(command="3 sin(4t)", leak="0.02 L/min from 20 s", duration="40 s", seed=1)
     pressures = own.only(["u", "p_A", "p_B"])
@@ -205,6 +206,7 @@ def test_a_rig_is_loaded_once(foreign: Recording, monkeypatch: pytest.MonkeyPatc
     assert not hasattr(observation, "load_rig")
 
 
+@pytest.mark.slow
 def test_the_verdict_reads_remarks_of_the_recording(foreign: Recording) -> None:
     remarked = replace(foreign, provenance={"about": {"Operator": "N. N."}})
     assert remarked.remarks == {"Operator": "N. N."}

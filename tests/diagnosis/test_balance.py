@@ -20,6 +20,7 @@ from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
 from sealscope.parameters import load_rig
 from sealscope.recordings.recording import Recording
 
+from ..representatives import few
 from .balance_machine import DISPLACEMENT, irregular, machine, step
 
 RIG = load_rig("thesis")
@@ -55,7 +56,7 @@ def same(first: StepTest, second: StepTest, rel: float) -> None:
     assert second.onsets[second.best] == pytest.approx(first.onsets[first.best])
 
 
-@settings(deadline=None, max_examples=20)
+@settings(deadline=None, max_examples=8)
 @given(st.lists(st.integers(1, 3000), min_size=1, max_size=12), st.sampled_from([1, 3, 5]))
 def test_pieces_of_any_size_make_the_same_blocks(sizes: list[int], support: int) -> None:
     recording = leaking(duration=20.0)
@@ -156,7 +157,9 @@ def test_units_of_a_file_change_nothing(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("load", [0.0, 3e5])
-@pytest.mark.parametrize(("side", "shift"), [("p_A", -6e5), ("p_A", 1e5), ("p_A", 3e5), ("p_B", -1e5), ("p_B", 6e5)])
+@pytest.mark.parametrize(
+    ("side", "shift"), few([("p_A", -6e5), ("p_B", 6e5), ("p_A", 1e5), ("p_A", 3e5), ("p_B", -1e5)])
+)
 def test_a_shifted_zero_leaves_score_and_size(side: str, shift: float, load: float) -> None:
     recording = leaking(5e-13, load=load)
     test, blocks = judged(recording)

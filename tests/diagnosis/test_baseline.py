@@ -11,7 +11,7 @@ from sealscope.diagnosis.diagnose import diagnose
 from sealscope.diagnosis.rms_change.detector import RmsChange
 from sealscope.recordings.recording import Recording
 
-from ..representatives import SLOW, few
+from ..representatives import SLOW, other
 from ..wording import says
 from .judging import judge
 
@@ -34,6 +34,7 @@ def test_a_leak_from_the_start_needs_a_baseline(records, sound_ones: list[Record
         assert says(result.reason, "bound.against", count=count)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("count", "seeds"), [(2, 2), *(pytest.param(n, 4, marks=pytest.mark.slow) for n in (2, 7))])
 def test_a_sound_one_is_no_leak_beside_sound_ones(count: int, seeds: int, records, sound_ones: list[Recording]) -> None:  # type: ignore[no-untyped-def]
     result = [diagnose(records(seed, duration=60.0, throttled=True), sound_ones[:count]) for seed in range(seeds)]
@@ -57,7 +58,7 @@ def test_more_noise_than_in_the_baseline_is_no_leak(count: int, records, sound_o
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        ("half the rate", "no baseline recording has the same chambers at 250 Hz"),
+        other(("half the rate", "no baseline recording has the same chambers at 250 Hz"), SLOW),
         ("one chamber", None),
         ("counts", "other channels or units"),
     ],
@@ -79,7 +80,8 @@ def test_what_may_not_be_compared_is_not(
     assert reason is None or reason in result.reason
 
 
-@pytest.mark.parametrize("change", few(["other duty", "other level"], 1, SLOW))
+@pytest.mark.slow
+@pytest.mark.parametrize("change", ["other duty", "other level"])
 def test_another_duty_or_load_is_no_leak(change: str, records, sound_ones: list[Recording]) -> None:  # type: ignore[no-untyped-def]
     """What it does to the details is not known from recordings of a single duty, and counts as uncertain."""
     one = records(1, duration=60.0, throttled=True)
@@ -90,6 +92,7 @@ def test_another_duty_or_load_is_no_leak(change: str, records, sound_ones: list[
     assert diagnose(other, sound_ones).verdict != "leak"
 
 
+@pytest.mark.slow
 def test_a_baseline_given_twice_counts_once(records, sound_ones: list[Recording]) -> None:  # type: ignore[no-untyped-def]
     recording = records(1, duration=60.0, throttled=True)
     for many, single in ((sound_ones[:1] * 3, sound_ones[:1]), ([*sound_ones[:4], sound_ones[2]], sound_ones[:4])):

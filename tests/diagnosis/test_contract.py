@@ -19,6 +19,8 @@ from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.recording import COUNTS, Recording
 
+from ..representatives import SLOW, few
+
 P = 0.01
 VERDICTS = {"leak", "no leak", "cannot tell"}
 Change = Callable[[Recording], Recording]
@@ -50,7 +52,7 @@ def every_second_missing(recording: Recording) -> Recording:
 #: Recordings that a detector must be able to judge ...
 GOOD: dict[str, Change] = {
     "whole": lambda r: r,
-    "one gap near the end": lambda r: with_channels(r, p_A=np.where(np.arange(len(r)) == 40000, np.nan, r["p_A"])),
+    "one gap near the end": lambda r: with_channels(r, p_A=np.where(np.arange(len(r)) == 30000, np.nan, r["p_A"])),
     "every second value missing": every_second_missing,
     "command without a value": lambda r: with_channels(r, u=np.full(len(r), np.nan)),
 }
@@ -94,8 +96,8 @@ EVERY = {**detectors(), "ringing energy": example}
 
 @pytest.fixture(scope="module")
 def leaky(records) -> Recording:  # type: ignore[no-untyped-def]
-    """96 s with a leak of 0.02 L/min from second 48, which each detector finds."""
-    return records(1, leak="0.02 L/min from 48 s", duration=96.0, throttled=True)
+    """80 s with a leak of 0.02 L/min from second 40, which each detector finds."""
+    return records(1, leak="0.02 L/min from 40 s", duration=80.0, throttled=True)
 
 
 @pytest.fixture(autouse=True)
@@ -150,7 +152,7 @@ def alike(one: Evidence, other: Evidence) -> bool:
     return followed and replace(one, course=None) == replace(other, course=None)
 
 
-@pytest.mark.parametrize("change", GOOD)
+@pytest.mark.parametrize("change", few(GOOD, 2, SLOW))
 def test_judges_what_it_can(change: str, leaky: Recording) -> None:
     result = diagnose(GOOD[change](leaky))
     assert result.verdict in ("leak", "no leak"), result.reason
@@ -187,12 +189,13 @@ def test_unusable_is_one_line(detector, leaky: Recording) -> None:  # type: igno
         assert "\n" not in reason
 
 
+@pytest.mark.slow
 def test_deterministic(detector, leaky: Recording) -> None:  # type: ignore[no-untyped-def]
     assert alike(first_examined(detector, leaky), examined(detector, leaky))
 
 
 @pytest.mark.parametrize("case", ["leaky", pytest.param("healthy", marks=[pytest.mark.slow, pytest.mark.long])])
-@pytest.mark.parametrize("factor, offset", [(3.0, 0.0), (1.0, 1.0e5), (1.0 / 6894.757, -50.0)])
+@pytest.mark.parametrize("factor, offset", few([(1.0, 1.0e5), (1.0 / 6894.757, -50.0), (3.0, 0.0)]))
 def test_neither_unit_nor_zero_matters(  # type: ignore[no-untyped-def]
     detector, factor: float, offset: float, case: str, request: pytest.FixtureRequest
 ) -> None:
@@ -218,6 +221,10 @@ def test_never_sees_the_flow_meter_or_where_the_data_come_from(detector, leaky: 
     metered = with_channels(leaky, q_leak=np.linspace(0.0, 1.0, len(leaky)))
     disclosed = replace(metered, provenance={"experiment": {"leak": "none"}}, history=("no leak",))
     assert alike(examined(detector, disclosed), first_examined(detector, leaky))
+
+
+@pytest.mark.slow
+def test_needs_no_flow_meter(detector, leaky: Recording) -> None:  # type: ignore[no-untyped-def]
     assert alike(examined(detector, leaky.only(set(leaky.channels) - {"q_leak"})), first_examined(detector, leaky))
 
 
@@ -234,6 +241,7 @@ def test_onset_is_on_the_recordings_own_clock(detector, leaky: Recording) -> Non
     assert later.onset_interval_s == pytest.approx([one + 1000.0 for one in here.onset_interval_s], abs=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "names",
     [
@@ -252,9 +260,8 @@ def test_holes_in_other_channels_are_no_fault(detector, names: list[str], leaky:
 
 
 def test_a_smaller_false_alarm_probability_asks_for_more(detector, leaky: Recording) -> None:  # type: ignore[no-untyped-def]
-    thresholds = [first_examined(detector, leaky, p).threshold for p in (0.2, 0.05, 0.01)]
-    assert thresholds == sorted(thresholds)
-    assert len(set(thresholds)) == 3
+    thresholds = [first_examined(detector, leaky, p).threshold for p in (0.2, 0.01)]
+    assert thresholds[0] < thresholds[1]
 
 
 def test_reports_hold_numbers_alone(detector, leaky: Recording) -> None:  # type: ignore[no-untyped-def]

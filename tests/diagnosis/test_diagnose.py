@@ -137,6 +137,7 @@ def test_no_part_of_a_diagnosis_spreads_small_matrices_over_threads(
     assert threads == {name: {1} for name in ("inspect_recording", "decide")}
 
 
+@pytest.mark.slow
 def test_no_part_of_a_summary_spreads_small_matrices_over_threads(
     healthy: Recording, monkeypatch: pytest.MonkeyPatch
 ) -> None:

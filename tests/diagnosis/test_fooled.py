@@ -91,6 +91,7 @@ def test_a_leak_is_still_found_from_pressures_and_command(records) -> None:  # t
     assert diagnose(leaking.only(("u", *CHAMBERS))).verdict == "leak"
 
 
+@pytest.mark.slow
 def test_a_leak_is_still_found_from_the_ringing_by_its_own_rule(records) -> None:  # type: ignore[no-untyped-def]
     """Weighed against all else that makes the ringing fall it is an alarm that is not explained."""
     leaking = records(1, leak="0.05 L/min from 61 s", duration=120.0, throttled=True).only(CHAMBERS)

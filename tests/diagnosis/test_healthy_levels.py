@@ -78,6 +78,7 @@ def test_less_friction_is_no_wear() -> None:
     assert chances(record(1e5))["friction"] > 0.9
 
 
+@pytest.mark.slow
 def test_friction_has_the_sign_of_most_healthy_days_and_a_day_that_shows_none_says_nothing() -> None:
     """Position counted the other way: friction and speed change their signs together, on every day."""
 
@@ -193,6 +194,7 @@ def test_a_filter_is_told_by_the_position_where_the_other_chamber_rests() -> Non
     assert chance(press(seed=9), list(PAIRS))[1] > 0.03
 
 
+@pytest.mark.slow
 def test_healthy_spectra_seldom_favour_a_filter() -> None:
     """The mean Bayes factor over healthy recordings is 1."""
     octaves = [{"octaves": compute_octaves(ring(seed=seed))} for seed in range(24)]

@@ -105,7 +105,8 @@ def test_zero_errors_of_the_transducers_do_not_bend_the_law(laws: tuple[str, ...
     assert evidence.leak_interval_lpm[0] <= true <= evidence.leak_interval_lpm[1]
 
 
-@pytest.mark.parametrize("law", few(["laminar", "orifice"], 1))
+@pytest.mark.slow
+@pytest.mark.parametrize("law", few(["laminar", "orifice"], 1, (pytest.mark.long,)))
 def test_mean_flow_from_pressures_and_command(law: str) -> None:
     """The flow of an orifice damps the ringing half as much as a laminar one: the interval holds both."""
     leak = f"0.015 L/min {'orifice ' if law == 'orifice' else ''}from {ONSET} s"

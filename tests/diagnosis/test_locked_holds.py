@@ -80,6 +80,7 @@ def held_press(
     return HeldChambers(holds, sides, float(t[0]), float(t[-1]), found)
 
 
+@pytest.mark.slow
 def test_a_hold_of_twelve_seconds_sees_no_leak_where_there_is_none() -> None:
     for seed in range(3):
         chambers = held_press(seed)
@@ -90,7 +91,7 @@ def test_a_hold_of_twelve_seconds_sees_no_leak_where_there_is_none() -> None:
 
 
 @pytest.mark.parametrize(
-    ("size", "zero"), few([(0.1, -2e5), (1.0, 2e5), (0.1, 0.0), (1.0, 0.0), (0.1, 2e5), (1.0, -2e5)], 3)
+    ("size", "zero"), few([(0.1, -2e5), (1.0, 2e5), (0.1, 0.0), (1.0, 0.0), (0.1, 2e5), (1.0, -2e5)])
 )
 def test_the_piston_takes_from_one_side_what_it_brings_to_the_other(size: float, zero: float) -> None:
     """The zero of p_A - p_B shows where the pressures have become equal."""
@@ -101,7 +102,7 @@ def test_the_piston_takes_from_one_side_what_it_brings_to_the_other(size: float,
         assert chambers.piston_fit.offset == pytest.approx(zero, abs=6e4)
 
 
-@pytest.mark.parametrize(("charge", "noise_level"), [(CHARGE, 3e3), (CHARGE, 1e5), (0.0, 1e5)])
+@pytest.mark.parametrize(("charge", "noise_level"), few([(CHARGE, 3e3), (0.0, 1e5), (CHARGE, 1e5)]))
 def test_a_rod_seal_takes_from_one_side_alone(charge: float, noise_level: float) -> None:
     """Side B stays at the charge pressure: a check valve feeds it as the piston gives way, whatever a sample's noise.
 
@@ -128,7 +129,7 @@ def test_a_large_leak_that_equalises_the_pressures_at_once_is_found() -> None:
     assert chambers.piston_leak.probability > 0.99
 
 
-@pytest.mark.parametrize("gain", [0.995, 1.0, 1.005])
+@pytest.mark.parametrize("gain", few([0.995, 1.0, 1.005], 1))
 def test_equalised_pressures_tell_a_leak_though_the_gains_of_the_sensors_differ(gain: float) -> None:
     """A difference of gains of half a percent is another zero in each hold, as the load falls from cycle to cycle."""
     chambers = held_press(piston=10.0 * SEAL, gain=gain, loads=(1.0, 0.8, 0.6, 0.4))

@@ -11,6 +11,8 @@ from scipy.stats import binom
 
 from sealscope.diagnosis.inference.onset import MIN_BLOCKS, Information, NullLaw, StepTest, fit_history, step_test
 
+from ..representatives import few
+
 SPACING = 3.0
 
 
@@ -95,7 +97,7 @@ def largest(information: Information, onset: float | None) -> float:
     return max(-float(fitted.fun), restricted(information, onset, 0.0))
 
 
-@pytest.mark.parametrize(("count", "walk", "size"), [(5, 0.0, 0.0), (9, 0.5, 0.0), (9, 0.0, 6.0), (14, 3.0, 6.0)])
+@pytest.mark.parametrize(("count", "walk", "size"), few([(9, 0.5, 0.0), (9, 0.0, 6.0), (5, 0.0, 0.0), (14, 3.0, 6.0)]))
 def test_score_and_onset_equal_the_brute_force_likelihood(count: int, walk: float, size: float) -> None:
     random = np.random.default_rng(count)
     precision = precision_of(random, count, eliminated=2 if count > 9 else 0)
@@ -162,8 +164,8 @@ def rejected(random: np.random.Generator, count: int, walk: float, draws: int, l
     return made
 
 
-@pytest.mark.parametrize("count", [5, 12, 40])
-@pytest.mark.parametrize("walk", [0.0, 3.0, 100.0])
+@pytest.mark.parametrize("count", few([5, 40, 12]))
+@pytest.mark.parametrize("walk", few([0.0, 100.0, 3.0]))
 def test_the_chance_is_uniform_or_larger_in_healthy_machines(count: int, walk: float) -> None:
     draws = 60
     made = rejected(np.random.default_rng(count), count, walk, draws, 0.05)
@@ -209,7 +211,7 @@ def coverage(random: np.random.Generator, count: int, walk: float, size: float, 
     return held, bounded
 
 
-@pytest.mark.parametrize(("count", "walk"), [(10, 0.0), (25, 0.0), (25, 3.0), (60, 1.0)])
+@pytest.mark.parametrize(("count", "walk"), few([(10, 0.0), (25, 3.0), (25, 0.0), (60, 1.0)]))
 @pytest.mark.parametrize(
     "size", [*(pytest.param(size, marks=[pytest.mark.slow, pytest.mark.long]) for size in (1.0, 8.0)), 3.0]
 )

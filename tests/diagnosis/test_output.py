@@ -86,6 +86,7 @@ def test_numbers_that_json_does_not_know_become_null() -> None:
     assert tree["onset_interval_s"] == [None, 3.0]
 
 
+@pytest.mark.slow
 def test_a_part_analysed_is_told(leaky: Recording) -> None:
     p_A = np.array(leaky["p_A"])
     p_A[:1001] = np.nan

@@ -16,6 +16,8 @@ from sealscope.diagnosis.detectors.registry import DETECTORS, detectors
 from sealscope.diagnosis.diagnose import Examination, diagnose
 from sealscope.recordings.recording import Recording
 
+from ..representatives import SLOW, few
+
 EXAMPLE = Path(__file__).resolve().parents[2] / "docs" / "examples" / "ringing-energy"
 GOOD = """
 from sealscope.diagnosis.inference.observable import Observed
@@ -150,7 +152,7 @@ BROKEN = {
 }
 
 
-@pytest.mark.parametrize("case", BROKEN)
+@pytest.mark.parametrize("case", few(BROKEN, 8, SLOW))
 def test_a_broken_one_costs_one_line_that_names_the_distribution(
     case: str, install: Install, short: Recording, caplog: pytest.LogCaptureFixture
 ) -> None:

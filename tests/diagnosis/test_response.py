@@ -86,6 +86,7 @@ def leaking() -> tuple[ss.Recording, float]:
     return recording.only(("u", "p_A", "p_B")), 0.02
 
 
+@pytest.mark.slow
 def test_a_leak_of_a_simulated_rig_is_found_where_it_began_and_its_interval_holds(
     leaking: tuple[ss.Recording, float],
 ) -> None:

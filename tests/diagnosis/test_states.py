@@ -65,6 +65,7 @@ def test_every_cause_says_what_to_do():
     assert state_of("cannot tell").action not in actions.values()
 
 
+@pytest.mark.slow
 def test_a_recording_has_the_state_of_its_leak_against_the_limit():
     worn = machine(1, G=step(0.0, 3.0e-13, at=100.0), duration=200.0, rate=100.0)
     over = diagnose(worn, rig="thesis", limit="1e-6 L/min")

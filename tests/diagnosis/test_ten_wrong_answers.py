@@ -117,7 +117,7 @@ DIALECTS: dict[str, Callable[[Recording, Path], Path]] = {
 }
 
 
-@pytest.mark.parametrize("case", few(DIALECTS, 4, SLOW))
+@pytest.mark.parametrize("case", few(DIALECTS, 2, SLOW))
 def test_a_log_of_a_test_bench(case: str, own: Recording, tmp_path: Path) -> None:
     recording = read(DIALECTS[case](own, tmp_path))
     assert recording.rate == pytest.approx(own.rate, rel=1e-3)
@@ -148,6 +148,7 @@ def test_8_a_leak_from_the_start_was_kept_as_the_baseline() -> None:
     assert says(stated.reason, "leak.level_flow")
 
 
+@pytest.mark.slow
 def test_9_no_leak_stood_beside_a_score_far_over_its_threshold() -> None:
     """Side A loses what its pressure drives out; half of that is a motion that no pressure difference explains."""
     healthy = machine(8)

@@ -33,7 +33,7 @@ def altered(recording: Recording, p_A: np.ndarray, p_B: np.ndarray) -> Recording
     return replace(recording, channels={**recording.channels, "p_A": p_A, "p_B": p_B})
 
 
-@few_and_all(4, 10)
+@few_and_all(2, 10)
 def test_smallest_leak_with_throttles_half_closed(count: int, records) -> None:  # type: ignore[no-untyped-def]
     """0.0042 L/min, the thesis's smallest, from second 90: found in ten of ten, nine within 10 s."""
     result = [judge_ringing(records(seed, leak="0.0042 L/min from 90 s", throttled=True)) for seed in range(count)]
@@ -109,6 +109,7 @@ def test_a_slow_drift_is_no_leak(end: float, count: int, records) -> None:  # ty
     assert alarms <= (end < 0.8)
 
 
+@pytest.mark.slow
 def test_a_duty_without_cycle_is_judged_too(records) -> None:  # type: ignore[no-untyped-def]
     result = diagnose(records(1, command="prbs 0.8 every 0.5 s seed 1", duration=120.0, throttled=True))
     assert result.verdict != "leak" and says(result.reason, "bound.ringing")

@@ -241,6 +241,7 @@ def test_a_rise_that_another_event_explains_is_no_leak(monkeypatch: pytest.Monke
     assert "the external leakage on side A changed" in trend.reason
 
 
+@pytest.mark.slow
 def test_a_worn_pump_and_a_seal_are_one_cause_and_the_balance_names_its_rivals(simulated: Trend) -> None:
     points = [simulated.points[row] for row in simulated.rows]
     assert simulated.wear is not None and simulated.decision.cause == "piston or pump leak"
@@ -297,6 +298,7 @@ def test_a_repair_begins_a_new_stretch() -> None:
     assert trend.wear is not None and trend.wear.total.high < 1.2 * flow(HEALTHY)
 
 
+@pytest.mark.slow
 def test_other_sensors_are_compared_among_themselves() -> None:
     days = life(60)
     sensor = [replace(own, scale=1.03, level=0.8 * own.level) for own in days[30:40]]

@@ -150,6 +150,7 @@ def test_under_a_weight_that_is_held_a_leak_inside_is_none_to_the_outside() -> N
     assert result.leak_interval_lpm[0] <= leaks.truth.mean_leak_lpm <= result.leak_interval_lpm[1]
 
 
+@pytest.mark.slow
 def test_an_encoder_that_slips_is_no_leak(detector: VolumeBalance) -> None:
     healthy = machine(7)
     for factor in (1.01, 0.99):

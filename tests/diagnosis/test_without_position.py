@@ -106,6 +106,7 @@ def simulated(rig: str, command: str, load: str = "0 N", leak: str = "") -> Run:
     return simulate_experiment(Experiment.of(**words, leak=leak or ()))
 
 
+@pytest.mark.slow
 def test_an_open_loop_delivers_nothing_of_what_leaks() -> None:
     """The command stands whatever leaks; what the drive makes good of the load's droop fades."""
     recording = simulated(DOUBLE, "3 sin(4t)", "600 N", "0.05 L/min from 60 s").recording

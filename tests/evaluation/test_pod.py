@@ -81,7 +81,7 @@ def test_the_bound_covers():
     assert 0.90 <= above / 200 <= 0.99
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(st.integers(0, 10**6), st.floats(1e-3, 1e3))
 def test_another_unit_of_size_changes_nothing_else(seed, unit):
     size, hit = drawn(seed, n=10)
@@ -91,7 +91,7 @@ def test_another_unit_of_size_changes_nothing_else(seed, unit):
     assert other.slope == pytest.approx(fit.slope, rel=1e-6)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(st.integers(0, 10**6))
 def test_sizes_rise_with_probability_and_confidence(seed):
     fit = fit_hit_miss(*drawn(seed, n=12))

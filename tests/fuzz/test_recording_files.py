@@ -12,8 +12,8 @@ from .runs import attack
 
 @pytest.mark.parametrize("kind", RECORDINGS)
 def test_mutated_recordings(kind: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    count = attack(kind, tmp_path, range(16))
-    assert count.taken + count.refused == 16
+    count = attack(kind, tmp_path, range(8))
+    assert count.taken + count.refused == 8
     output = capfd.readouterr()
     assert output.out == output.err == ""
 

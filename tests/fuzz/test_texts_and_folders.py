@@ -13,14 +13,14 @@ from .targets import TARGETS
 
 FEW = {
     "options": 150,
-    "rigs": 30,
+    "rigs": 20,
     "machines": 20,
-    "profiles": 60,
+    "profiles": 30,
     "plans": 60,
     "campaign folders": 8,
     "kept files": 30,
 }
-FEW |= {"machines": 6, "monitor messages": 100, "CBOR messages": 700, "Sparkplug messages": 150}
+FEW |= {"machines": 6, "monitor messages": 100, "CBOR messages": 300, "Sparkplug messages": 150}
 #: Kinds of which even a few take seconds.
 LONG = ("campaign folders", "machines")
 MANY = {

@@ -14,6 +14,7 @@ from sealscope.recordings.motion import find_holds
 from sealscope.recordings.recording import Recording
 
 from ..diagnosis.balance_machine import machine
+from ..representatives import SLOW, few
 
 VOLUMES, PRESSURES = ("p_A", "p_B", "x", "theta"), ("p_A", "p_B", "u")
 
@@ -43,7 +44,7 @@ def watched(recording: Recording, size: int = 10**9) -> tuple[ss.Watch, list[obj
         *(pytest.param(k, marks=[pytest.mark.slow, pytest.mark.long]) for k in (4, 5, 6, 7)),
     ],
 )
-@pytest.mark.parametrize("seconds", [0.1, 15.0])
+@pytest.mark.parametrize("seconds", few([0.1, 15.0], 1, SLOW))
 def test_zeros_in_all_channels_are_no_leak(seed: int, seconds: float):
     recording = machine(seed, duration=240.0, rate=200.0).only(VOLUMES)
     watch, _ = watched(dropped(recording, 150.0 + 0.37 * seed, seconds))

@@ -22,7 +22,7 @@ import pytest
 from sealscope.cli.app import normalise_arguments
 from sealscope.monitor.outputs.events import Webhook
 from sealscope.monitor.service import Service
-from sealscope.monitor.settings import ActuatorSettings
+from sealscope.monitor.settings import ActuatorSettings, MonitorSettings
 from sealscope.monitor.sources.source_block import (
     REASONS,
     STALE_DEATH,
@@ -127,6 +127,7 @@ def blocks_of(service: Service) -> list[tuple[str, str]]:
         return [tuple(row) for row in connection.execute(text("select actuator, identity from blocks order by number"))]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="names are bytes on Linux")
 def test_names_are_bytes(tmp_path: Path):
     settings = settings_in(tmp_path, folder_settings(tmp_path, "press 3", "press 4"))
@@ -219,6 +220,7 @@ def test_a_link_to_a_foreign_file_is_not_followed(tmp_path: Path, caplog):
     assert "contents" not in caplog.text
 
 
+@pytest.mark.slow
 def test_a_removed_folder_is_one_outage_and_the_others_go_on(tmp_path: Path, monkeypatch, caplog):
     monkeypatch.setattr("sealscope.monitor.sources.folder._LOOK_S", 0.05)
     settings = settings_in(tmp_path, folder_settings(tmp_path, "press 3", "press 4"))
@@ -266,8 +268,9 @@ DRIP = (b"HTTP/1.1 200 OK\r\n" + b"X-Wait: yes\r\n" * 50, 0.1)
 
 
 @pytest.fixture
-def watched(tmp_path: Path) -> Iterator[Service]:
-    service, _ = served(settings_in(tmp_path), LINES)
+def watched(taken: MonitorSettings) -> Iterator[Service]:
+    """A monitor that has raised an alarm."""
+    service, _ = served(taken)
     yield service
     service.store.engine.dispose()
 
@@ -280,7 +283,7 @@ def watched(tmp_path: Path) -> Iterator[Service]:
             pytest.param(answer, marks=[pytest.mark.slow, pytest.mark.long])
             for answer in (b"", b"\xff\x00" * 9, b"HTTP/1.1 2x4 ?\r\n\r\n")
         ),
-        b"HTTP/1.1 200\r\n" * 500,
+        pytest.param(b"HTTP/1.1 200\r\n" * 500, marks=pytest.mark.slow),
     ],
 )
 def test_a_webhook_that_speaks_no_http_is_an_outage_and_asked_again(watched: Service, answer):
@@ -295,6 +298,7 @@ def test_a_webhook_that_speaks_no_http_is_an_outage_and_asked_again(watched: Ser
     assert server.got == 2
 
 
+@pytest.mark.slow
 def test_a_webhook_that_drips_has_one_deadline(watched: Service):
     server = OddServer(DRIP)
     with refusal("0.4 s", error=PartAway):
@@ -302,6 +306,7 @@ def test_a_webhook_that_drips_has_one_deadline(watched: Service):
     assert watched.store.position("webhook") == 0
 
 
+@pytest.mark.slow
 def test_the_monitor_ends_in_its_time_whatever_the_webhook_does(tmp_path: Path, monkeypatch):
     monkeypatch.setattr("sealscope.monitor.service._END_S", 0.3)
     server = OddServer(*[DRIP] * 20)

@@ -7,7 +7,6 @@ import json
 import sqlite3
 import threading
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -20,7 +19,7 @@ from sealscope.monitor.bounded_queue import BoundedQueue, QueueLoad
 from sealscope.monitor.database.store import MonitorStore
 from sealscope.monitor.page.site import site
 from sealscope.monitor.service import Service
-from sealscope.monitor.settings import PageSettings
+from sealscope.monitor.settings import MonitorSettings, PageSettings
 from sealscope.monitor.sources.source_block import SourceBlock
 from sealscope.monitor.supervisor import BROKER, DATABASE, Supervisor
 
@@ -76,8 +75,8 @@ def test_a_queue_holds_so_many_and_so_many_bytes():
 
 
 @pytest.fixture
-def service(tmp_path: Path) -> Iterator[Service]:
-    service, _ = served(settings_in(tmp_path), LINES)
+def service(taken: MonitorSettings) -> Iterator[Service]:
+    service, _ = served(taken, LINES.splitlines()[0])  # which it knows
     service.supervisor.part(BROKER)
     yield service
     service.store.engine.dispose()
@@ -175,6 +174,7 @@ def test_a_full_queue_makes_its_source_wait_and_says_so(undisturbed, tmp_path, m
         )
         until(lambda: any("a source waits" in record.message for record in caplog.records))
         assert service.queue_load().n_blocks > 4  # those in the queue, and those that are being stored
+        until(lambda: page.get("/api/fleet").json()["outages"])
         (outage,) = page.get("/api/fleet").json()["outages"]
         assert (outage["part"], outage["reason"]) == ("database", "database is locked")
         assert metrics(page)[1]["sealscope_reached"]["database"] == 0.0

@@ -98,6 +98,7 @@ def test_a_redirect_is_not_followed_and_carries_no_token(watched):
     assert watched.store.position("webhook") == 0  # it waits
 
 
+@pytest.mark.slow
 def test_the_service_posts_what_is_left_when_it_ends(tmp_path):
     receiver = Receiver()
     (tmp_path / "token.txt").write_text("hook\n")

@@ -288,8 +288,8 @@ def test_an_alarm_goes_through_its_life_and_survives_a_restart(tmp_path: Path):
     )
     lines = lines_of({"press": WORN}, 500)
 
-    def restarted(**said: str) -> tuple[dict[str, Any], dict[str, Any]]:
-        service = Service(settings, once=True, stdin=io.BytesIO(lines), stdout=io.StringIO())
+    def restarted(taken: bytes = b"", **said: str) -> tuple[dict[str, Any], dict[str, Any]]:
+        service = Service(settings, once=True, stdin=io.BytesIO(taken), stdout=io.StringIO())
         service.run()
         view = TestClient(site(service.actuators, PageSettings(), None), base_url="http://localhost")
         if said:
@@ -298,7 +298,7 @@ def test_an_alarm_goes_through_its_life_and_survives_a_restart(tmp_path: Path):
         service.store.engine.dispose()
         return life["alarms"][0], life["summary"]["state"]
 
-    alarm, state = restarted()
+    alarm, state = restarted(lines)
     assert (alarm["state"], state["name"], state["condition"]) == ("new", "maintenance required", "leak")
     assert state == alarm["machine_state"]
     assert restarted(mark="acknowledged")[0]["state"] == "acknowledged"

@@ -136,6 +136,7 @@ def test_a_block_that_raises_an_error_is_dropped_and_the_others_go_on(tmp_path, 
     assert "is dropped" in caplog.text
 
 
+@pytest.mark.slow
 def test_files_that_appear_are_read_once_and_in_order(tmp_path):
     write_files(tmp_path / "press 3", WORN, 65.0)
     more = '[[actuator]]\nname = "press 3"\nfolder = "press 3"\npattern = "*.csv"'
@@ -303,6 +304,7 @@ def test_a_restart_with_other_thresholds_changes_nothing_that_was_said(tmp_path)
     assert [event["event"] for _, event in service.store.events_since(0)] == ["raised"]
 
 
+@pytest.mark.slow
 def test_a_fleet_shares_its_budget_and_keeps_its_baselines(tmp_path):
     """Another rate, as where an actuator is added to a budget, moves thresholds only."""
     settings = settings_in(tmp_path)
@@ -323,6 +325,7 @@ def test_a_fleet_shares_its_budget_and_keeps_its_baselines(tmp_path):
     assert again.actuators.apply_mark("press 1", "valid").state == "valid"
 
 
+@pytest.mark.slow
 def test_old_estimates_and_identities_are_forgotten(tmp_path, monkeypatch):
     monkeypatch.setattr("sealscope.monitor.actuators.MAX_IDENTITIES", 20)
     settings = settings_in(tmp_path).model_copy(update={"keep_days": 60.0 / 86_400.0})

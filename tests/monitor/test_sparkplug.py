@@ -36,6 +36,7 @@ from sealscope.monitor.sources.sparkplug_host import GAPS, SparkplugHost
 from sealscope.monitor.sparkplug import SparkplugMetric, SparkplugPayload, decode_payload, encode_payload
 from sealscope.recordings.recording import Recording
 
+from ..representatives import few
 from .plant import CHANNELS, HEALTHY, WORN, message, rows_of, settings_in
 
 DOUBLES = 31
@@ -351,7 +352,7 @@ def test_topics_of_others_are_refused():
     assert len(plant.asked) == 1
 
 
-@pytest.mark.parametrize("rate", [123.0, 400.0, 500.0, 1000.0, 2000.0])
+@pytest.mark.parametrize("rate", few([123.0, 1000.0, 400.0, 500.0, 2000.0]))
 @pytest.mark.parametrize("rounded", [np.floor, np.round])
 def test_times_in_whole_milliseconds_make_no_gap(rate, rounded):
     """The node's clock is 20 ppm faster than its rate says, and its blocks have any length."""

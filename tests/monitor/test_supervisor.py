@@ -17,7 +17,7 @@ from sealscope.monitor.sources.source_block import BlockReceiver, decode_message
 from sealscope.monitor.supervisor import DATABASE, LimitedLines, PartAway, Supervisor
 from sealscope.units import to_si
 
-from .plant import LINES, rows_of, served, settings_in, until
+from .plant import LINES, Rows, rows_of, served, settings_in, until
 
 FEW = b"\n".join(LINES.splitlines()[:40]) + b"\n"
 
@@ -107,11 +107,16 @@ def test_a_step_is_taken_at_the_end_though_its_part_pauses():
     assert len(steps) >= 2
 
 
-def test_a_source_that_ends_in_an_error_starts_again_and_the_others_go_on(tmp_path, monkeypatch):
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory) -> Rows:
+    """What a monitor stores of the lines if nothing fails."""
+    settings = settings_in(tmp_path_factory.mktemp("plain"))
+    served(settings, FEW)
+    return rows_of(settings.database)
+
+
+def test_a_source_that_ends_in_an_error_starts_again_and_the_others_go_on(plain, tmp_path, monkeypatch):
     monkeypatch.setattr("sealscope.monitor.supervisor.FIRST_PAUSE_S", 0.05)
-    plain = tmp_path / "plain"
-    plain.mkdir()
-    served(settings_in(plain), FEW)
     left = iter(FEW.splitlines())
     starts: list[int] = []
 
@@ -125,17 +130,14 @@ def test_a_source_that_ends_in_an_error_starts_again_and_the_others_go_on(tmp_pa
     service = Service(settings_in(tmp_path), stdin=io.BytesIO(b"\n".join(FEW.splitlines()[:9])), sources=[source])
     service.run()
     assert len(starts) == 3
-    assert rows_of(service.settings.database) == rows_of(str(plain / "monitor.db"))
+    assert rows_of(service.settings.database) == plain
     assert service.supervisor.outage_totals()["source 1"][1] == 1
     service.store.engine.dispose()
 
 
-def test_an_error_while_blocks_are_at_hand_loses_and_repeats_none(tmp_path, monkeypatch):
+def test_an_error_while_blocks_are_at_hand_loses_and_repeats_none(plain, tmp_path, monkeypatch):
     """The storage raises something that nobody foresaw, before and after the database has them."""
     monkeypatch.setattr("sealscope.monitor.supervisor.FIRST_PAUSE_S", 0.05)
-    plain = tmp_path / "plain"
-    plain.mkdir()
-    served(settings_in(plain), FEW)
     store, calls = Service._store, iter(range(1000))
 
     def failing(self: Service, blocks: Any, write: Any) -> None:
@@ -149,7 +151,7 @@ def test_an_error_while_blocks_are_at_hand_loses_and_repeats_none(tmp_path, monk
     monkeypatch.setattr(Service, "_store", failing)
     service, _ = served(settings_in(tmp_path), FEW)
     assert service.supervisor.outage_totals()["storage"][1] >= 1
-    assert rows_of(service.settings.database) == rows_of(str(plain / "monitor.db"))
+    assert rows_of(service.settings.database) == plain
 
 
 def test_the_log_gets_so_many_lines_a_minute_from_one_place(monkeypatch):

@@ -150,6 +150,7 @@ def test_disorder_does_not_depend_on_the_cuts():
     assert whole.counters == fine.counters
 
 
+@pytest.mark.slow
 def test_another_rate_may_begin_with_late_samples():
     first, rest = WORN.samples(slice(0, 4000)), WORN.samples(slice(3001, 6000, 2))
     slow = Recording(rest.t, dict(rest.channels), rest.units, 25.0)

@@ -99,7 +99,7 @@ def some_of(*quick: str) -> list[Any]:
     return [pytest.param(kind, marks=marks[kind]) for kind in EVENTS]
 
 
-@pytest.mark.parametrize("kind", some_of("scale of the position, smaller", "pause"))
+@pytest.mark.parametrize("kind", some_of("scale of the position, smaller"))
 def test_what_is_no_leak_raises_no_alarm(kind: str):
     assert watched(kind, leaks=False).leak is None
 

@@ -144,6 +144,7 @@ def at_rate(recording: Recording, rate: float) -> Recording:
     return Recording(kept.t, dict(kept.channels), kept.units, rate)
 
 
+@pytest.mark.slow
 def test_another_rate_is_no_leak_and_hides_none(learned: str):
     watch = Watch.from_state(json.loads(learned))
     _, estimates = run(at_rate(part(500, 620), 250.0), 5_000, watch)
@@ -244,6 +245,7 @@ def test_a_damaged_state_is_refused_in_one_line(damage: str, learned: str):
     assert "\n" not in str(raised.value)
 
 
+@pytest.mark.slow
 def test_a_rig_of_assumptions_states_no_litres():
     watch = ss.watch(ss.load_rig("thesis").as_assumed("for this test"), learn_hours=LEARN)
     _, estimates = run(part(0, 420), 50_000, watch)

@@ -188,7 +188,9 @@ HEAVY = {
 @pytest.mark.parametrize(
     "kind",
     [
-        pytest.param(kind, marks=[pytest.mark.slow, pytest.mark.long]) if kind in ("keys", "a long text") else kind
+        pytest.param(kind, marks=[pytest.mark.slow, pytest.mark.long])
+        if kind in ("keys", "a long text", "dots", "inline tables")
+        else kind
         for kind in HEAVY
     ],
 )

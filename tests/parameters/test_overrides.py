@@ -194,7 +194,7 @@ def test_a_number_is_taken_exactly_or_refused_by_name(name: str, value: float) -
         assert low <= value <= high
 
 
-@settings(deadline=None, max_examples=100)
+@settings(deadline=None, max_examples=40)
 @given(name=st.sampled_from(NUMBERS), fraction=st.floats(0.5, 2.0))
 def test_text_and_number_agree(name: str, fraction: float) -> None:
     current = RIG[name]

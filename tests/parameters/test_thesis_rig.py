@@ -163,6 +163,7 @@ def test_rig_survives_json_and_pickle() -> None:
     assert (copy, copy.name, copy.table()) == (rig, "thesis", rig.table())
 
 
+@pytest.mark.slow
 def test_loading_does_not_import_what_is_heavy() -> None:
     code = (
         "import sys, sealscope.parameters as p; assert 'pydantic' not in sys.modules;"

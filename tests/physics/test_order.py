@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
+from ..representatives import SLOW, few
+
 #: No Coulomb force: friction is F_v v at every speed, and the whole rig without throttles is linear.
 LINEAR = {"F_pr": 0.0, "F_cfr": 0.0}
 
@@ -63,7 +65,7 @@ def test_imex_is_of_order_four_where_the_throttles_are_not_stiff(check_rig, driv
     assert abs(orders[-1] - 4.0) < 0.25, orders
 
 
-@pytest.mark.parametrize("values", [LINEAR, {}], ids=["no Coulomb force", "the check rig"])
+@pytest.mark.parametrize("values", few([{}, LINEAR], 1, SLOW), ids=["the check rig", "no Coulomb force"])
 def test_imex_is_accurate_and_converges_where_the_throttles_are_stiff(check_rig, drive, values):
     # The line volumes answer in 1.6 us. Stiffly, the stages are only of order two (and the one-way throttle kinks at
     # dp = 0): the order falls to between one and two, on an error that is small already.

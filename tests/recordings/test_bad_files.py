@@ -189,7 +189,7 @@ def test_any_bytes_are_a_recording_or_one_clear_line(tmp_path: Path, content: by
         assert "\n" not in str(error)
 
 
-@settings(deadline=None, max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(deadline=None, max_examples=20, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(cut=st.integers(0, 4000), flips=st.lists(st.tuples(st.integers(0, 8000), st.integers(1, 255)), max_size=4))
 def test_damaged_netcdf_is_a_recording_or_one_clear_line(
     tmp_path: Path, cut: int, flips: list[tuple[int, int]]

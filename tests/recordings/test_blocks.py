@@ -83,7 +83,7 @@ def clocked(form: str, start: datetime, step: timedelta, count: int) -> list[str
     return [(start + k * step).strftime(STAMPS[form]) for k in range(count)]
 
 
-@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     form=st.sampled_from([*STAMPS, "seconds"]),
     day=st.datetimes(datetime(2024, 1, 1), datetime(2024, 12, 31)),

@@ -64,6 +64,7 @@ def test_without_time_a_rate_is_needed(tmp_path: Path) -> None:
     assert np.array_equal(recording.t, np.arange(200) / 250)
 
 
+@pytest.mark.slow
 def test_compressed_and_packed_by_xarray(tmp_path: Path) -> None:
     xarray = pytest.importorskip("xarray")
     path = tmp_path / "log.nc"

@@ -81,6 +81,7 @@ def test_texts_of_any_length_are_read(tmp_path: Path) -> None:
     assert read(path).rate == 500.0
 
 
+@pytest.mark.slow
 def test_a_long_text_that_a_table_repeats(tmp_path: Path) -> None:
     pyarrow = pytest.importorskip("pyarrow")
     from pyarrow import parquet

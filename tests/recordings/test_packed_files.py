@@ -145,6 +145,7 @@ def test_a_workbook_of_the_same_making_is_read(tmp_path: Path) -> None:
     assert len(read(workbook(tmp_path / "log.xlsx", [text, rows(cells)]), rate=500)) == 898
 
 
+@pytest.mark.slow
 def test_a_long_log_of_standing_channels_is_unpacked(tmp_path: Path) -> None:
     path = tmp_path / "log.csv.xz"
     path.write_bytes(

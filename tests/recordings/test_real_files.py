@@ -21,6 +21,7 @@ def stroke(path: Path) -> Recording:
     return read(path, map=MAP, rate=1000)
 
 
+@pytest.mark.slow
 def test_every_twelfth_stroke_reads_as_numpy_reads_it() -> None:
     for path in FILES[::12]:
         recording = stroke(path)

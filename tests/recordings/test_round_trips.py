@@ -3,6 +3,7 @@
 import copy
 import os
 import pickle
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,9 +13,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from sealscope.errors import InputError
+from sealscope.errors import InputError, MissingExtra
 from sealscope.recordings import CHANNEL_UNITS, COUNTS, Recording, read, write
 from sealscope.recordings.cycle import find_cycle
+from sealscope.recordings.subprocesses import CrashedSubprocessError, run_in_subprocess
 
 from ..refusals import refusal
 
@@ -155,14 +157,14 @@ def test_refused_before_anything_is_written(tmp_path: Path, recording: Recording
 
 
 def test_parquet_without_pyarrow_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import sys
-
-    from sealscope.errors import MissingExtra
-    from sealscope.recordings.subprocesses import CrashedSubprocessError, run_in_subprocess
-
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with refusal("sealscope[io]", error=MissingExtra):
         write(plain(), tmp_path / "log.parquet")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.slow
+def test_a_foreign_parquet_without_pyarrow_names_the_extra(tmp_path: Path) -> None:
     (tmp_path / "foreign.parquet").write_bytes(b"PAR1 and more")
     run_in_subprocess(exec, "__import__('sys').modules['pyarrow'] = None", limit=10.0)
     try:

@@ -77,6 +77,7 @@ def test_memory_is_limited_for_each_request() -> None:
     assert len(run_in_subprocess(bytearray, 2**28, limit=10.0, memory=2**30)) == 2**28
 
 
+@pytest.mark.slow
 def test_files_are_limited_and_removed_with_the_process(tmp_path: Path) -> None:
     """What a reader keeps in its temporary folder does not outlive it, however it ends."""
     pytest.importorskip("resource")

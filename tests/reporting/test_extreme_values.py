@@ -13,6 +13,8 @@ from sealscope.reporting.charts import Chart, ChartLine, render_still
 from sealscope.reporting.page import render_page
 from sealscope.reporting.picture import ticks
 
+from ..representatives import SLOW, few
+
 T = np.arange(4500) / 500
 S = np.sin(4 * T)
 SERIES = {
@@ -30,7 +32,7 @@ PRESSURES = {"p_A": 3e5 + 1e5 * S, "p_B": 3e5 - 1e5 * S}
 
 
 @pytest.mark.parametrize("name", SERIES)
-@pytest.mark.parametrize("where", ["command", "pressures"])
+@pytest.mark.parametrize("where", few(["pressures", "command"], 1, SLOW))
 def test_a_page_of_extreme_values(name: str, where: str) -> None:
     series = SERIES[name]
     channels = {"u": series, **PRESSURES} if where == "command" else {"p_A": series, "p_B": -series}

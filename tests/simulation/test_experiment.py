@@ -79,6 +79,7 @@ def test_a_run_is_told_in_its_provenance():
     assert "cylinder.V" in reported["experiment"]["overrides"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("values", [{}, THROTTLED], ids=["free", "throttled"])
 def test_a_smaller_error_is_a_finer_and_a_truer_run(values):
     experiment = Experiment.of(duration=4.0, set=values)

@@ -29,6 +29,7 @@ LINEAR = {"F_pr": 0.0, "F_cfr": 0.0, "G_pump": 3e-13}
 # -- drifts of the machine ------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_drifting_viscous_friction_follows_the_equation_with_time_in_it():
     """The linear rig with F_v(t) = F_v (1 + 0.3 t/20), against an independent program that has F_v in its equations."""
     rig = load_rig().with_overrides(LINEAR)

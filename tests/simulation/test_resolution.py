@@ -32,7 +32,7 @@ PRBS = "prbs 1 every 0.5 s seed 1"
             *[(True, "3 sin(4t)"), (False, "5 sin(t)"), (False, PRBS)],
             *[(False, "3 sin(4t)"), (True, "5 sin(t)"), (True, PRBS)],
         ],
-        3,
+        2,
     ),
 )
 def test_the_error_that_is_asked_for_comes_out(check_rig, throttled, command):
@@ -63,6 +63,7 @@ def test_a_quick_command_gets_a_finer_step_than_a_slow_one(check_rig):
     assert step("prbs 1 every 0.5 s seed 1") < step("1 sin(2t)")
 
 
+@pytest.mark.slow
 def test_a_change_late_in_the_run_is_seen(check_rig, drive):
     """The first half is gentle, and the second half is not: the step is that of the second."""
     rig = check_rig()

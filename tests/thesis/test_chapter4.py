@@ -196,6 +196,7 @@ def test_case_table_holds_both_runs(kept: Kept) -> None:
     assert rows["Q_B [L/min]"][6] == pytest.approx(steady_output(both["converged"], "Q_B").std() * 6e4)
 
 
+@pytest.mark.slow
 def test_a_figure_follows_the_reading_of_its_item(kept: Kept) -> None:
     usual, printed = (numbers(make(kept, ALL[name])[0]) for name in ("fig-4.14", "fig-4.14-printed"))
     key = "mean of p_2 - p_B, converged"
@@ -317,6 +318,7 @@ def test_claims_on_the_orifice_follow_their_numbers(kept: Kept, claims: dict[str
     assert all(claims[name].verdict != "holds" for name in ("claim-4.10", "claim-4.11", "claim-4.12", "claim-4.16"))
 
 
+@pytest.mark.slow
 def test_the_sweep_of_the_line_volumes_shows_where_the_step_fails(kept: Kept) -> None:
     (figure,) = make(kept, ALL["chapter-4-volumes"])
     result = numbers(figure)

@@ -107,6 +107,7 @@ def test_one_run_serves_all_figures_of_a_test() -> None:
     assert {make_test_experiment(test).duration for test in list(TESTS.values())[1:]} == {180.0}
 
 
+@pytest.mark.slow
 def test_command_speed_and_displacement(context: Direct) -> None:
     made = drawn(context, 1)
     assert [panel.y_label for panel in made.panels] == ["u [V]", "motor speed [rpm]", "x [mm]"]
@@ -177,6 +178,7 @@ def test_windows_are_a_thousand_samples_five_hundred_apart(context: Direct) -> N
     assert levels[0].y[0] == pytest.approx(float(np.sqrt(np.mean(settled**2))), rel=0.01)
 
 
+@pytest.mark.slow
 def test_the_drift_of_the_piston_has_a_control_without_the_leak(context: Direct) -> None:
     test = TESTS["5.2a"]
     leaking, control = measure_test(context, test), measure_test(context, test, leak=False)

@@ -88,6 +88,7 @@ def test_the_same_rules_hold_on_a_sheet_that_does_as_said(said: dict[str, Claim]
     assert {said[f"claim-5.2.{k}"].verdict for k in range(1, 21)} == {"holds"}
 
 
+@pytest.mark.slow
 def test_and_do_not_on_a_sheet_of_noise(nothing: dict[str, Claim]) -> None:
     assert nothing["claim-5.5.1"].verdict == "holds in part"  # that d1 and d2 do not move is true of it
     for name in ("claim-a.1", "claim-5.5.5", "claim-5.6.2", "claim-5.4.1", "claim-5.4.3", "claim-6.1.1"):
@@ -95,6 +96,7 @@ def test_and_do_not_on_a_sheet_of_noise(nothing: dict[str, Claim]) -> None:
     assert sum(nothing[f"claim-5.2.{k}"].verdict == "holds" for k in range(1, 21)) <= 3
 
 
+@pytest.mark.slow
 def test_without_the_sheet_its_claims_cannot_be_tested() -> None:
     of = every_claim(evidence(None))
     for name in ("claim-a.1", "claim-a.2", "claim-5.2.4", "claim-5.3.1", "claim-5.4.2", "claim-5.5.3", "claim-6.1.4"):

@@ -251,6 +251,7 @@ def test_an_interrupt_leaves_what_was_finished(fakes: Path, tmp_path: Path) -> N
     assert worked(tmp_path) == ["t-1", "t-2", "t-3"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "how", [signal.SIGKILL, pytest.param(signal.SIGINT, marks=pytest.mark.slow)] if hasattr(signal, "SIGKILL") else []
 )

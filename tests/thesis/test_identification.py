@@ -68,6 +68,7 @@ def test_the_noise_of_a_sample_has_three_sources() -> None:
     assert pressure_noise(rig, "p_A") * PSI == pytest.approx(np.sqrt(5e4**2 + step**2 / 12.0))
 
 
+@pytest.mark.slow
 def test_a_sensor_that_reads_less_lowers_its_own_chamber_only() -> None:
     one = (Condition(1, "3 sin(4t)", 0.0, 0.01, "small"),)
     rig = load_rig(BENCH_RIG)

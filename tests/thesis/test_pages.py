@@ -8,6 +8,7 @@ import re
 import sys
 import xml.etree.ElementTree as ET
 from base64 import b64encode
+from functools import cache
 from hashlib import sha256
 from pathlib import Path
 from typing import get_args
@@ -45,6 +46,12 @@ def figure(name: str = "fig-4.22", resolved: bool | None = True, curves: int = 2
     return Figure(name, title, (panel,), numbers, ("claim-4.3",), resolved, "A note.")
 
 
+@cache
+def drawn(resolved: bool | None = True) -> tuple[bytes, bytes]:
+    """The two pictures of a figure, drawn once."""
+    return draw(figure(resolved=resolved))
+
+
 def texts(svg: bytes) -> str:
     return " ".join("".join(node.itertext()) for node in ET.fromstring(svg).iter("{http://www.w3.org/2000/svg}text"))
 
@@ -57,7 +64,7 @@ def png_size(png: bytes) -> tuple[int, int]:
 
 
 def test_a_figure_carries_number_units_legend_and_mark_as_text() -> None:
-    svg, png = draw(figure())
+    svg, png = drawn()
     result = texts(svg)
     for words in ("t [s]", "curve 0", "curve 1", "leak opens"):
         assert words in result
@@ -70,16 +77,17 @@ def test_a_figure_carries_number_units_legend_and_mark_as_text() -> None:
 
 
 def test_the_same_figure_gives_the_same_bytes() -> None:
-    assert draw(figure()) == draw(figure())
+    assert draw(figure()) == drawn()
 
 
 def test_only_an_unresolved_figure_is_marked_on_its_face() -> None:
-    known, unknown, unresolved = (draw(figure(resolved=resolved)) for resolved in (True, None, False))
+    known, unknown, unresolved = map(drawn, (True, None, False))
     assert known == unknown
     assert UNRESOLVED.upper() not in texts(known[0]) and UNRESOLVED.upper() in texts(unresolved[0])
     assert unresolved[1] != known[1]
 
 
+@pytest.mark.slow
 def test_the_mark_does_not_cover_the_legend() -> None:
     panels = tuple(Panel("t [s]", "p [MPa]", figure().panels[0].curves) for _ in range(2))
     svg, _ = draw(Figure("fig-1.1", "Two", panels, resolved=False))
@@ -121,6 +129,7 @@ def test_a_zoomed_panel_keeps_every_sample_in_its_range() -> None:
     assert x[-1] >= 82.0
 
 
+@pytest.mark.slow
 def test_images_log_axes_points_and_stems_are_drawn() -> None:
     values = np.outer(np.arange(5), np.arange(6)).astype(float)
     panels = (
@@ -217,8 +226,10 @@ def test_an_id_that_is_no_file_name_is_refused(tmp_path: Path) -> None:
 # the page
 
 
-@pytest.fixture
-def page(tmp_path: Path) -> str:
+@pytest.fixture(scope="module")
+def published(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a page of all kinds of items."""
+    folder = tmp_path_factory.mktemp("published")
     claims = tuple(
         Claim(f"claim-4.{k}", "section 4", f"Claim <{k}> of p_A", "sheet", "simulation", verdict, "why")
         for k, verdict in enumerate(VERDICTS)
@@ -230,14 +241,19 @@ def page(tmp_path: Path) -> str:
         (Item("table-4.2-a", 4, "case", "T", make), (long,)),
         (Item("chapter-4-claims", 4, "claims", "C", make), claims),
     ):
-        made.append(ItemStatus(item, "made", products=products, files=publish(item, products, tmp_path)))
+        made.append(ItemStatus(item, "made", products=products, files=publish(item, products, folder)))
     made.append(ItemStatus(Item("table-5.1", 5, "table", "Rates", make), "left out", "needs the data sheet"))
     made.append(ItemStatus(Item("fig-5.1", 5, "figure", "Broken", make), "failed", "RuntimeError: <no>"))
-    write_thesis_page(tmp_path, made, quick=True)
-    return (tmp_path / "index.html").read_text(encoding="utf-8")
+    write_thesis_page(folder, made, quick=True)
+    return folder
 
 
-def test_the_page_is_well_formed_and_self_contained(page: str, tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def page(published: Path) -> str:
+    return (published / "index.html").read_text(encoding="utf-8")
+
+
+def test_the_page_is_well_formed_and_self_contained(page: str, published: Path) -> None:
     checker = Reader(page)
     assert len(checker.ids) == len(set(checker.ids))
     assert {"fig-4.22", "table-4.2-a", "claim-4.3", "claims", "absent", "chapter-4"} <= set(checker.ids)
@@ -245,7 +261,7 @@ def test_the_page_is_well_formed_and_self_contained(page: str, tmp_path: Path) -
         if address.startswith("#"):
             assert address[1:] in checker.ids
         elif not address.startswith("data:image/"):
-            assert (tmp_path / address).is_file(), address
+            assert (published / address).is_file(), address
     assert "http" not in re.sub(r"data:image/[^\"]+", "", page).replace("http-equiv", "")
 
 
@@ -292,8 +308,8 @@ def test_cells(value: object, text: str) -> None:
     assert format_cell(value) == text
 
 
-def test_the_svg_of_the_page_is_the_smaller_picture(page: str, tmp_path: Path) -> None:
-    sizes = {kind: (tmp_path / "figures" / f"fig-4.22.{kind}").stat().st_size for kind in ("svg", "png")}
+def test_the_svg_of_the_page_is_the_smaller_picture(page: str, published: Path) -> None:
+    sizes = {kind: (published / "figures" / f"fig-4.22.{kind}").stat().st_size for kind in ("svg", "png")}
     kind = "svg+xml" if sizes["svg"] < sizes["png"] else "png"
     assert f'src="data:image/{kind};base64,' in page
     assert io.BytesIO(page.encode()).getbuffer().nbytes < 400_000

@@ -142,6 +142,7 @@ def test_without_scikit_learn_the_claim_says_what_it_needs(monkeypatch: pytest.M
         classify_without_baseline(made_sheet(8), "test")
 
 
+@pytest.mark.slow
 def test_levels_without_information_tell_nothing() -> None:
     _, auc = classify_without_baseline(made_sheet(8, scatter=0.4), "test")
     assert 0.3 < auc < 0.7

@@ -34,6 +34,12 @@ def leaking(tmp_path_factory):
 
 
 def test_the_estimator_learns_and_predicts(folder, leaking):
+    new = record(leaking.with_name("unseen.nc"), 45)
+    assert ss.LeakDetector(rig="thesis").fit(sorted(folder.iterdir())).predict([leaking, new]).tolist() == [-1, 1]
+
+
+@pytest.mark.slow
+def test_what_the_estimator_learns_is_what_it_was_given(folder, leaking):
     """Order, subsets, copies and a pickle change nothing; a second fit forgets the first."""
     from sklearn.base import clone
 
@@ -99,6 +105,7 @@ def test_a_diagnosis_is_a_row_of_a_table(leak):
     assert row["leak_interval_lpm_low"] < row["leak_lpm"] < row["leak_interval_lpm_high"]
 
 
+@pytest.mark.slow
 def test_a_diagnosis_is_drawn_with_the_repair_limit(leak):
     pytest.importorskip("matplotlib", reason="matplotlib is not installed")
     axes = leak.plot()

@@ -38,13 +38,13 @@ def figures(diagnosis: ss.Diagnosis) -> tuple:
         *(pytest.param(leak, ("u", "p_A", "p_B"), 13, marks=OTHERS) for leak in ("none", "0.002 L/min", "0.02 L/min")),
     ],
 )
-def test_the_file_judges_as_the_recordings_do(healthy, file, by_pressures, leak, channels, seed):
+def test_the_file_judges_as_the_recordings_do(healthy, file, leak, channels, seed, request):
     """All methods, with every digit, whichever channels the judged recording has."""
     recording = ss.simulate(command="3 sin(4t)", duration="20 s", leak=leak, seed=seed)
     machine = ss.read_machine(file)
     if channels is not None:
         recording, healthy = recording.only(channels), [own.only(channels) for own in healthy]
-        machine = ss.read_machine(by_pressures)
+        machine = ss.read_machine(request.getfixturevalue("by_pressures"))
     by_file, by_recordings = machine.diagnose(recording), ss.diagnose(recording, healthy, rig="thesis")
     assert figures(by_file) == figures(by_recordings)
     assert [figures_of(part) for part in by_file.parts] == [figures_of(part) for part in by_recordings.parts]
@@ -90,6 +90,7 @@ def test_a_recording_that_is_not_like_the_others_is_named(folder, tmp_path):
     assert any(problem.startswith("bad.nc: leak by the others") for problem in machine.summary.problems)
 
 
+@pytest.mark.slow
 def test_a_zero_below_vacuum_and_glitches_are_named(folder, tmp_path):
     recording = ss.read(folder / "run1.nc")
     omega = recording["omega"].copy()
@@ -106,6 +107,7 @@ def test_a_zero_below_vacuum_and_glitches_are_named(folder, tmp_path):
     assert "omega has glitches" in problems
 
 
+@pytest.mark.slow
 def test_the_summary_has_the_units_of_the_log(folder, tmp_path):
     """Pressures in psi, rounded and repeated; a speed without a sign is named once, and no fault of a recording."""
     for path in sorted(folder.iterdir())[:2]:
@@ -126,6 +128,7 @@ def test_the_summary_has_the_units_of_the_log(folder, tmp_path):
     assert any("has no sign" in problem for problem in machine.summary.problems)
 
 
+@pytest.mark.slow
 def test_a_recording_is_added_once_and_never_a_leaking_one(machine, folder):
     new = ss.simulate(command="3 sin(4t)", duration="20 s", seed=30)
     assert len(machine.with_healthy(new).healthy) == 4
@@ -135,6 +138,7 @@ def test_a_recording_is_added_once_and_never_a_leaking_one(machine, folder):
         machine.with_healthy(ss.simulate(command="3 sin(4t)", duration="20 s", leak="0.1 L/min", seed=31))
 
 
+@pytest.mark.slow
 def test_the_date_in_a_file_s_name_is_that_of_its_summary(machine):
     new = replace(ss.simulate(command="3 sin(4t)", duration="20 s", seed=32), provenance={})
     taught = machine.with_healthy(new, file="press_20240531.csv")
@@ -154,13 +158,20 @@ def test_what_was_left_out_is_known_whenever_the_file_is_written(folder, tmp_pat
     assert ss.read_machine(path).summary.problems == machine.summary.problems
 
 
-def test_a_recording_in_which_a_found_leak_begins_or_is_repaired_is_not_taught(machine):
+@pytest.mark.parametrize(
+    "starts",
+    [
+        ((-10.0, False), (3590.0, False), (3601.0, True)),
+        pytest.param(((-60.0, True), (60.0, False)), marks=OTHERS),
+    ],
+)
+def test_a_recording_in_which_a_found_leak_begins_or_is_repaired_is_not_taught(machine, starts):
     new = ss.simulate(command="3 sin(4t)", duration="20 s", seed=33).only(("x", "theta", "p_A", "p_B"))
     onset = 1.7171e9
     repaired = JudgedAlarm("a-1", "repaired", onset + 3600.0, onset)
     alarms = (JudgedAlarm("a-1", "valid", onset + 60.0, onset), repaired)
     known = replace(machine, alarms=alarms, healthy=machine.healthy[:2])
-    for start, taught in ((-60.0, True), (-10.0, False), (60.0, False), (3590.0, False), (3601.0, True)):
+    for start, taught in starts:
         moment = datetime.fromtimestamp(onset + start, UTC).replace(tzinfo=None)
         recording = replace(new, provenance={"start": moment.isoformat()})
         if taught:
@@ -170,6 +181,7 @@ def test_a_recording_in_which_a_found_leak_begins_or_is_repaired_is_not_taught(m
                 known.with_healthy(recording)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="names of files are bytes as POSIX has them")
 def test_a_file_whose_name_is_no_text_is_kept_by_its_escaped_name(folder, tmp_path):
     (tmp_path / "runs").mkdir()
@@ -270,30 +282,25 @@ def test_a_machine_s_file_is_a_rig_s(file, machine):
     assert ss.read_machine(file).rig == machine.rig
 
 
-def test_a_duty_that_no_healthy_recording_had_is_named(machine):
+@pytest.fixture(scope="module")
+def usual(machine):
+    """The diagnosis of another healthy recording under the usual duty."""
+    return machine.diagnose(ss.simulate(command="3 sin(4t)", duration="20 s", seed=70))
+
+
+def test_a_duty_that_no_healthy_recording_had_is_named(machine, usual):
     """Its interval is wider, and the reason says of what."""
-    usual, faster = (
-        machine.diagnose(ss.simulate(command=command, duration="20 s", seed=70))
-        for command in ("3 sin(4t)", "5 sin(4t)")
-    )
+    faster = machine.diagnose(ss.simulate(command="5 sin(4t)", duration="20 s", seed=70))
     assert not says(usual.reason, "remark.speed beyond")
     assert says(faster.reason, "remark.speed beyond", ratio=1.7)
     assert faster.bound_lpm > 2.0 * usual.bound_lpm
 
 
-def test_another_actuator_is_named_and_is_no_leak(machine):
+def test_another_actuator_is_named_and_is_no_leak(machine, usual):
     """A piston 15 % larger: not the machine of the file; the same machine is not suspected."""
-    runs = {
-        area: ss.simulate(
-            command="3 sin(4t)",
-            duration="20 s",
-            set={"cylinder.A_A": f"{area} mm^2", "cylinder.A_B": f"{area} mm^2"},
-            seed=70,
-        )
-        for area in (633, 728)
-    }
-    same, another = (machine.diagnose(run) for run in runs.values())
-    assert (same.verdict, same.cause) == ("no leak", None)
+    larger = {"cylinder.A_A": "728 mm^2", "cylinder.A_B": "728 mm^2"}
+    another = machine.diagnose(ss.simulate(command="3 sin(4t)", duration="20 s", set=larger, seed=70))
+    assert (usual.verdict, usual.cause) == ("no leak", None)
     assert another.verdict != "leak" and another.cause == "sensor fault"
     assert "scale of its position or speed changed (motion" in another.reason
 

@@ -88,7 +88,9 @@ needs_fork = pytest.mark.skipif("fork" not in multiprocessing.get_all_start_meth
 
 
 @needs_fork
-@pytest.mark.parametrize("rounds", [1, pytest.param(500, marks=[pytest.mark.slow, pytest.mark.long])])
+@pytest.mark.parametrize(
+    "rounds", [pytest.param(1, marks=pytest.mark.slow), pytest.param(500, marks=[pytest.mark.slow, pytest.mark.long])]
+)
 def test_two_added_recordings_and_a_mark_at_once_are_all_there(pair, tmp_path, rounds):
     attack(pair, tmp_path, rounds)
 

@@ -145,12 +145,13 @@ def check_healthy(name: str, kind: str) -> None:
     assert changed.verdict != "leak", changed.reason
 
 
-@pytest.mark.parametrize("kind", few(KINDS, 2))
+@pytest.mark.parametrize("kind", few(KINDS, 1))
 def test_a_leak_of_a_machine_by_the_balance_stays(kind: str, two_methods: None) -> None:
     check_leak(BY_BALANCE, kind)
 
 
-@pytest.mark.parametrize("kind", few(KINDS, 2))
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", few(KINDS, 1))
 def test_a_healthy_machine_by_the_balance_stays_healthy(kind: str, two_methods: None) -> None:
     check_healthy(BY_BALANCE, kind)
 

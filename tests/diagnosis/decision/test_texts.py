@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import tomllib
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +13,16 @@ SOURCE = Path(__file__).resolve().parents[3] / "src" / "sealscope" / "diagnosis"
 TEXTS: dict[str, dict[str, str]] = tomllib.loads((SOURCE / "decision" / "texts.toml").read_text(encoding="utf-8"))
 
 
+@cache
+def trees() -> list[ast.Module]:
+    """The syntax trees of the package."""
+    return [ast.parse(path.read_text(encoding="utf-8")) for path in SOURCE.rglob("*.py")]
+
+
 def calls(name: str) -> Iterator[list[Any]]:
     """Yield the constant arguments of each call of a function."""
-    for path in SOURCE.rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for tree in trees():
+        for node in ast.walk(tree):
             if isinstance(node, ast.Call) and getattr(node.func, "id", "") == name:
                 yield [argument.value if isinstance(argument, ast.Constant) else None for argument in node.args]
 
@@ -28,8 +35,7 @@ def test_every_key_that_is_asked_for_has_a_text() -> None:
 
 def test_every_text_is_asked_for() -> None:
     constants = set()
-    for path in SOURCE.rglob("*.py"):
-        tree = ast.parse(path.read_text(encoding="utf-8"))
+    for tree in trees():
         constants |= {
             node.value for node in ast.walk(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str)
         }
