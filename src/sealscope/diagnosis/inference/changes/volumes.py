@@ -47,6 +47,8 @@ VOLUMES = "volumes"
 SCALE = "scale"
 #: A constant loss of flow, if the flow has no sensor offset.
 OUTSIDE = "loss to the outside"
+#: A constant flow that the sensor of the flow shows in addition to the true one.
+FLOW_ZERO = "zero of the flow"
 #: Causes whose coefficients wear can only raise: leaks.
 _ONE_WAY = ("piston leak", "piston or pump leak", "pump leak", "external leak")
 
@@ -65,11 +67,11 @@ def volume_observables(
 
     A leak is also tested for flows that are proportional to another power of p_A - p_B than 1, and the motion of the
     piston for a change of its scale by one factor. `blocks`: Gram matrices of the columns in blocks of the recording,
-    without the sensor offset of p_A - p_B, for the tests of leaks; `plain`: the same with the pressures as recorded,
-    for all other terms. `balances`, `columns`: the equations, and for each the indices of its columns by role (leak,
-    motion, left side); `oil_loss`: tests for an external leak by the oil that the accumulator lost, by the name of the
-    term; `volume_ratio`: measured over assumed ratio of area to displacement; `charge`: trend of the charge pressure,
-    None if it is unknown; `flow_scale`: true flow over the flow of the balance.
+    without the sensor offset of p_A - p_B, for the tests of laminar leaks; `plain`: the same with the pressures as
+    recorded, for all other tests. `balances`, `columns`: the equations, and for each the indices of its columns by role
+    (leak, motion, left side); `oil_loss`: tests for an external leak by the oil that the accumulator lost, by the name
+    of the term; `volume_ratio`: measured over assumed ratio of area to displacement; `charge`: trend of the charge
+    pressure, None if it is unknown; `flow_scale`: true flow over the flow of the balance.
     """
     centred, recorded = (series.merge(INFERENCE.blocks.coarse) for series in (blocks, plain))
     leak_disadvantage = offset_cost(estimate_offset(blocks, columns))
@@ -81,7 +83,7 @@ def volume_observables(
             continue
         best = max(range(len(steps)), key=lambda k: steps[k].score)
         step = steps[best]
-        if name.startswith(LEAK) or name == PUMP:
+        if name in (LEAK, PUMP):
             advantage = -leak_disadvantage
         else:
             advantage = -_size_penalty(name, step.fitted.size, recorded, columns[0].names, volume_ratio, flow_scale)
@@ -111,6 +113,8 @@ def _size_penalty(
         return size_penalty(INFERENCE.scale, size)
     if name == AIR:
         return size_penalty(INFERENCE.free_air, size / volume_ratio, above=True)
+    if name == FLOW_ZERO:
+        return size_penalty(INFERENCE.flow_zero, size / max(blocks.moving_flow, np.finfo(float).tiny), above=True)
     if name == OUTSIDE:
         return size_penalty(INFERENCE.outside, size * flow_scale, above=True)
     if name.startswith("external leak"):
@@ -137,9 +141,9 @@ def _step_hypotheses(
     """Yield the steps to test: of each term's coefficient, of leaks under other laws, and of the motion's scale.
 
     `centred`: Gram matrices of the columns in blocks of the recording, without the sensor offset of p_A - p_B, for
-    leaks; `recorded`: the same with the pressures as recorded; `terms`: the balance's terms; `columns`: for each
-    equation the indices of its columns by role (leak, motion, left side); `has_accumulator`: True if the accumulator's
-    volume shows external leaks.
+    laminar leaks; `recorded`: the same with the pressures as recorded; `terms`: the balance's terms; `columns`: for
+    each equation the indices of its columns by role (leak, motion, left side); `has_accumulator`: True if the
+    accumulator's volume shows external leaks.
     """
     first = columns[0]
     for index, term in enumerate(terms):
@@ -147,8 +151,9 @@ def _step_hypotheses(
             blocks = centred if term.name in (LEAK, PUMP) else recorded
             signs = (1.0,) if term.cause in _ONE_WAY and term.name != BIAS else (1.0, -1.0)
             yield _Hypothesis(_observable_name(term), signs, information(blocks, columns, index))
-    leak = information(centred, columns, first.leak)
-    for exponent, shape in law_shapes(centred, columns).items():
+    # an offset of p_A - p_B looks like another law, so that one of the two is enough
+    leak = information(recorded, columns, first.leak)
+    for exponent, shape in law_shapes(recorded, columns).items():
         if exponent < 1.0:
             yield _Hypothesis(f"{LEAK} of exponent {exponent:g}", (1.0,), leak, shape)
     orifice = first.names.index(ORIFICE)
@@ -181,7 +186,7 @@ def _observable_name(term: Term) -> str:
     """
     if term.name != BIAS:
         return term.name
-    return OUTSIDE if term.cause == "external leak" else "zero of the flow"
+    return OUTSIDE if term.cause == "external leak" else FLOW_ZERO
 
 
 def _accumulator_support(balance_test: StepTest, accumulator_test: StepTest) -> float:
