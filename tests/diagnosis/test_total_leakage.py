@@ -147,3 +147,16 @@ def test_a_size_alone_says_nothing_of_what_a_healthy_pump_leaks(stated: dict[str
     result = diagnose(pump_leaks, rig=unstated_rig().with_overrides(stated))
     assert result.verdict == "no leak" and result.total_leakage.healthy_lpm is None
     assert diagnose(pump_leaks, rig="thesis").verdict == "leak"
+
+
+def test_the_limit_of_a_healthy_machine_is_compared_with_the_true_leakage() -> None:
+    """Piston, leakage and limit twice as large: the recording is the same, and so is what exceeds the limit."""
+    worn, excess = machine(1, G=WORN), []
+    for factor in (1.0, 2.0):
+        area = f"{factor * 633.0} mm^2"
+        stated = {"cylinder.A_A": area, "cylinder.A_B": area, "pump.G_healthy": f"{factor * PUMP} m^3/(s Pa)"}
+        detector = VolumeBalance(unstated_rig().with_overrides(stated))
+        leak = detector.observe(worn).leak
+        assert leak is not None and leak.excess is not None and leak.excess > 3.0
+        excess.append(leak.excess)
+    assert excess[1] == pytest.approx(excess[0], rel=1e-6)

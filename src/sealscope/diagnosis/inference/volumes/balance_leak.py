@@ -256,14 +256,14 @@ class BalanceLeak:
         channel measures the flow, or if healthy recordings are compared instead.
         """
         balance = self.balance
-        limit = healthy_leakage(balance.rig)
+        limit, size = healthy_leakage(balance.rig), balance.size
         # without a measured flow, the drive's droop under load looks like leakage
         is_measured = len(balance.columns) == 1 and not balance.equations[0].by_command
-        if not (limit > 0.0 and self.rise is None and balance.size.stated and is_measured):
+        if not (limit > 0.0 and self.rise is None and size.stated and is_measured):
             return None
-        level = balance.conductance
-        deviation = float(np.hypot((level.high - level.low) / (2 * WITHIN_95), level.value * balance.size.deviation))
-        return (level.value - limit) / max(deviation, np.finfo(float).tiny)
+        value, low, high = (size.scale * conductance for conductance in balance.conductance)
+        deviation = float(np.hypot((high - low) / (2.0 * WITHIN_95), value * size.deviation))
+        return (value - limit) / max(deviation, np.finfo(float).tiny)
 
     @property
     def bound_flow(self) -> float:
