@@ -13,6 +13,7 @@ from sealscope.diagnosis.decision.explanations import (
     LEAK_EVENTS,
     explain,
     log_bayes_factor,
+    probability_beside_chance,
     probability_of,
 )
 from sealscope.diagnosis.inference.observable import LeakRise
@@ -89,6 +90,29 @@ def test_three_things_that_happen_are_three_events() -> None:
     names = {event.name for event in explain(happened)[0].events}
     assert names == {"piston leak", "noise of a pressure", "duty"}
     assert leak_probability(*happened) > 0.5
+
+
+def test_a_side_effect_that_is_clearer_than_its_event_has_another_cause() -> None:
+    """A scale of the position beside a doubtful change of friction, which can change the motion as well."""
+    friction, motion = observable("friction: friction", 1e-3), observable("motion: motion", 1e-8)
+    doubtful = explain([friction, motion])
+    assert probability_of(doubtful, "scale of the motion") > 0.9
+    clear = explain([observable("friction: friction", 1e-8), motion])
+    assert clear[0].events == (EVENTS["friction"],)
+
+
+def test_a_rare_change_with_an_improbable_cause_is_by_chance() -> None:
+    """Only a scale explains the motion; its odds against chance are its probability times the Bayes factor."""
+    scale = EVENTS["scale of the motion"]
+    for chance, happened in ((1e-4, False), (1e-8, True)):
+        motion = observable("motion: motion", chance)
+        explained = explain([motion])
+        assert probability_of(explained, cause=scale.cause, data_kind="motion") > 0.99
+        beside_chance = probability_beside_chance(explained, "sensor fault", "motion")
+        bound = log_bayes_factor(chance)
+        odds = scale.probability * math.exp(bound / (1.0 + 2.0 * DECISION.explanation.misfit * bound))
+        assert beside_chance == pytest.approx(odds / (1.0 + odds), rel=0.1)
+        assert (beside_chance > DECISION.explanation.happened) == happened
 
 
 def test_what_an_event_disturbs_speaks_for_it_only_where_it_shows_itself() -> None:

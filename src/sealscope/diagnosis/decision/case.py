@@ -15,6 +15,7 @@ from sealscope.diagnosis.decision.explanations import (
     Explanation,
     explain,
     log_bayes_factor,
+    probability_beside_chance,
     probability_of,
 )
 from sealscope.diagnosis.decision.null import HealthyNull, null_key
@@ -47,8 +48,8 @@ class OtherEvent(NamedTuple):
     """Event other than a leak that explains a rare change in a recording.
 
     `cause`, `description`: cause of the event, and what it changes in words; `probability`: posterior probability of an
-    event with this cause; `observable`: the rarest observable that it explains; `chance`: probability that a healthy
-    recording has at least its score.
+    event with this cause, rather than another one or none; `observable`: the rarest observable that it explains;
+    `chance`: probability that a healthy recording has at least its score.
     """
 
     cause: str
@@ -178,9 +179,10 @@ class Case:
             if chances[observable] >= allowed:
                 return None
             candidates = candidates_of[observable]
-            for cause in dict.fromkeys(event.cause for event in candidates):
-                probability = probability_of(self.explanations, cause=cause, data_kind=observable.data)
-                if cause is not None and probability > DECISION.explanation.named:
+            for cause in dict.fromkeys(event.cause for event in candidates if event.cause):
+                among_events = probability_of(self.explanations, cause=cause, data_kind=observable.data)
+                probability = probability_beside_chance(self.explanations, cause, observable.data)
+                if among_events > DECISION.explanation.named and probability > DECISION.explanation.happened:
                     likeliest = max((e for e in candidates if e.cause == cause), key=lambda e: e.probability)
                     return OtherEvent(cause, likeliest.description, probability, observable, chances[observable])
         return None

@@ -35,20 +35,24 @@ from sealscope.diagnosis.priors.decision import DECISION
 MAX_EVENTS = 3
 #: Minimum log Bayes factor for an event to be combined with others.
 MIN_LOG_FACTOR: float = DECISION.explanation.combined
+#: Largest log odds that are told apart, so that their exponential is finite.
+MAX_LOG_ODDS = 500.0
 #: Events that are a leak past the piston or in the pump, which lie in parallel.
 LEAK_EVENTS = ("piston leak", "pump leak")
 
 
 @dataclass(frozen=True)
 class Explanation:
-    """A set of events that explains a recording, with its posterior probability.
+    """A set of events that explains a recording, with its posterior probability, if some event has happened.
 
-    `data`: kinds of data (`Observable.data`) that the set explains.
+    `data`: kinds of data (`Observable.data`) that the set explains; `odds`: posterior probability of the set over that
+    of no event at all.
     """
 
     events: tuple[Event, ...]
     probability: float
     data: frozenset[str] = frozenset()
+    odds: float = 0.0
 
     def has(self, *names: str) -> bool:
         """Return True if this set of events contains one with any of the `names`."""
@@ -98,7 +102,8 @@ def explain(
     weights = np.exp(logarithms - logarithms.max())
     weights /= weights.sum()
     order = np.argsort(-weights, kind="stable")
-    return tuple(Explanation(groups[k], float(weights[k]), posteriors[k].data) for k in order)
+    odds = np.exp(np.minimum(logarithms, MAX_LOG_ODDS))  # no event has the prior 1 and explains no change
+    return tuple(Explanation(groups[k], float(weights[k]), posteriors[k].data, float(odds[k])) for k in order)
 
 
 def _compare_by_likelihood(log_factors: Sequence[tuple[Observable, float]]) -> list[tuple[Observable, float]]:
@@ -193,17 +198,18 @@ def _gains_at_onset(event: Event, factors: Sequence[tuple[Observable, float]]) -
 
     `factors`: observables with the log Bayes factors of a change of them, against no change. Of the observables that
     the event affects, the one with the largest factor gives the time of the event. The others count if they may have
-    changed at the same time. Observables that the event changes only as a side effect count if other data support it.
-    For each kind of data the largest factor is returned, with the log odds of the prior on the size of the change.
+    changed at the same time. Observables that the event changes only as a side effect count if other data support it,
+    and for no more than these do: a side effect that is much clearer than the event itself has another cause. For each
+    kind of data the largest factor is returned, with the log odds of the prior on the size of the change.
     """
     affected = [(observable, gain) for observable, gain in factors if event.affects(observable)]
     if not affected:
         return {}
-    best_explained, _ = max(affected, key=lambda pair: pair[1])
+    best_explained, best_gain = max(affected, key=lambda pair: pair[1])
     # side effects count only if other data support the event
     supporting_data = {observable.data for observable, gain in affected if gain > MIN_LOG_FACTOR}
     side_effects = [
-        (observable, gain)
+        (observable, min(gain, best_gain))
         for observable, gain in factors
         if supporting_data and observable.data not in supporting_data and event.may_disturb(observable)
     ]
@@ -273,3 +279,14 @@ def probability_of(
         if explanation.has(*names) or (cause is not None and any(event.cause == cause for event in explanation.events))
     )
     return float(matching / total) if total > 0.0 else 0.0
+
+
+def probability_beside_chance(explanations: Sequence[Explanation], cause: str, data_kind: str) -> float:
+    """Compute the probability that an event with a cause has changed a kind of data, rather than another event or none.
+
+    It is the sum of the odds of the sets that contain such an event and explain this kind of data (`Observable.data`),
+    over 1 + the sum of the odds of all sets that explain it. The 1 stands for no event: the change is then by chance.
+    """
+    relevant = [explanation for explanation in explanations if data_kind in explanation.data]
+    matching = sum(row.odds for row in relevant if any(event.cause == cause for event in row.events))
+    return float(matching / (1.0 + sum(row.odds for row in relevant)))

@@ -35,7 +35,8 @@ class ExplanationPriors(PriorTable):
     - `heading`: allowed probability of naming another event for a healthy recording, over the allowed
       probability of a false leak.
     - `leak`: probability from which a change is called a leak.
-    - `named`: probability from which a cause other than a leak is named.
+    - `named`: probability from which a cause other than a leak is named, of all causes of the change.
+    - `happened`: probability from which such a cause is named, of all causes of the change and chance.
     - `sure`: a leak is excluded if its probability is below 1 - `sure`.
     - `combined`: smallest logarithm of the Bayes factor with which an event is combined with others.
     - `misfit`: smallest relative error with which a term of the model is assumed to describe the data.
@@ -44,6 +45,7 @@ class ExplanationPriors(PriorTable):
     heading: float
     leak: float
     named: float
+    happened: float
     sure: float
     combined: float
     misfit: float
