@@ -152,7 +152,7 @@ class HoldPriors(PriorTable):
 class ReadingPriors(PriorTable):
     """Limits beyond which pressures and speeds cannot come from one hydraulic machine.
 
-    - `noise`: white noise over the variance of a pressure, above which the pressure is taken for noise alone.
+    - `noise`: share of the variance of a pressure that is white noise, above which it is taken for noise alone.
 
     The motor speed is compared with the rate of the motor angle:
 

@@ -19,7 +19,7 @@ from sealscope.diagnosis.inference.balance import (
 from sealscope.diagnosis.inference.blocks import ColumnRoles
 from sealscope.diagnosis.inference.circuit.store import recorded_oil_loss_tests
 from sealscope.diagnosis.inference.circuit.without_position import circulations
-from sealscope.diagnosis.inference.differences import Estimate, PriorScatter, compare_estimates, size_penalty
+from sealscope.diagnosis.inference.differences import Estimate, PriorScatter, compare_estimates
 from sealscope.diagnosis.inference.observable import Observable, Observed
 from sealscope.diagnosis.inference.regimes import add_pump_columns
 from sealscope.diagnosis.inference.rows.weak_form import STRIDE, stride_samples
@@ -316,10 +316,9 @@ def compare_motion(
     """Test whether the piston's motion takes more or less flow for the same speed than in healthy recordings.
 
     Yields one observable, or none if there are too few healthy recordings. A change means another machine or another
-    scale of a sensor; one of much more than a percent is improbable (`scale` in `priors.toml`). Load and speed outside
-    of the range of the healthy recordings make the comparison less certain. `judged_sums`, `healthy`: summaries of the
-    recording and of the healthy ones; `roles`: indices of the columns of the volume balance by role (leak, motion, left
-    side).
+    scale of a sensor. Load and speed outside of the range of the healthy recordings make the comparison less certain.
+    `judged_sums`, `healthy`: summaries of the recording and of the healthy ones; `roles`: indices of the columns of the
+    volume balance by role (leak, motion, left side).
     """
     prior, healthy_sums = INFERENCE.repeats, np.sum([recording.sums[0] for recording in healthy], axis=0)
 
@@ -336,8 +335,7 @@ def compare_motion(
         PriorScatter(prior.scatter, prior.recordings, prior.inflation),
         further_deviation=INFERENCE.conditions.motion * excess,
     )
-    if observable is not None:
-        yield replace(observable, advantage=-size_penalty(INFERENCE.scale, observable.size, above=True))
+    yield from () if observable is None else (observable,)
 
 
 def _are_valves_shut(summaries: Sequence[Summary], odds_key: str) -> bool:
