@@ -97,7 +97,8 @@ def _ask_size(label: str, unit: str) -> str:
 def _parse_size(text: str, si_unit: str, default_unit: str, option: str) -> float:
     """Parse the text of an option to a number in `si_unit`; without a unit it is in `default_unit`.
 
-    `option`: name of the option for the error message. Raises InputError for any other text.
+    `option`: name of the option for the error message. Raises InputError if the text does not begin with a finite
+    number, or if its unit is unknown or has another dimension than `si_unit`.
     """
     from sealscope.units import parse_quantity
 

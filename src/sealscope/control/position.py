@@ -109,7 +109,11 @@ class PositionPI:
         return Started(self.compiled())
 
     def compiled(self) -> CompiledLaw:
-        """Make the control law of a new run as machine code."""
+        """Return the control law as machine code, with a new memory for one run.
+
+        The machine code is the same for all runs. The memory holds the controller's parameters and its initial state,
+        so that a run does not continue an earlier one.
+        """
         return CompiledLaw(_position_law.address, self.make_memory().view(np.float64))
 
     def make_memory(self) -> Any:

@@ -130,7 +130,11 @@ def _build_parameters_law(
 
     @law
     def model_parameters(v: Any, G_ext_A: float, G_ext_B: float) -> Any:
-        """Compute the model's parameters from the FMU's values v (n,) and added external leakage [m^3/(s Pa)]."""
+        """Compute the numbers that the equations of the model take (`RigNumbers`) from the FMU's values.
+
+        `v`: values in the order of `variables.VALUES`; `G_ext_A`, `G_ext_B`: conductances [m^3/(s Pa)] of external
+        leakage, added to those of chambers A and B.
+        """
         derived = derived_numbers(RigValues(*to_fixed_tuple(v, _N_VALUES)), exponent, literal_metering)
         parameters = to_fixed_tuple(v, _N_PARAMETERS)
         parameters = tuple_setitem(parameters, _G_EXT_A, parameters[_G_EXT_A] + G_ext_A)
@@ -154,9 +158,10 @@ def build_functions(choice: RigChoice) -> dict[str, Callable[..., Any]]:
 
     @law
     def model_parameters(v: Any, inputs: Any) -> Any:
-        """Compute the model's parameters from the FMU's parameter values v (n,) and from its inputs.
+        """Compute the numbers that the equations of the model take (`RigNumbers`) from the FMU's values and inputs.
 
-        The inputs contain conductances of external leakage, which are added to those of the rig.
+        `v`: the FMU's parameters in the order of `variables.VALUES`; `inputs`: its inputs in the order of
+        `variables.INPUTS`, of which the conductances of external leakage [m^3/(s Pa)] are added to those of the rig.
         """
         return parameters_from_values(v, inputs[_ADDED_G_EXT_A], inputs[_ADDED_G_EXT_B])
 

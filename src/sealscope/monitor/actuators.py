@@ -485,7 +485,10 @@ class WatchedActuators:
 
     @property
     def false_alarms_per_1000_h(self) -> float:
-        """Upper limit of the false alarms of all actuators together in 1000 h, if all of them run and are healthy."""
+        """Upper limit of the expected number of false alarms in 1000 h of operation, of all actuators together.
+
+        It applies if all of them run and are healthy.
+        """
         return sum(settings.false_alarms_per_1000_h for settings in self.settings.values())
 
     def summaries(self) -> dict[str, dict[str, Any]]:

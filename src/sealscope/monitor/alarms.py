@@ -129,7 +129,8 @@ class AlarmJudge:
         The event is "raised", "error" or "warning" (a change of the level), "returned" (the cause has ended), or "" for
         none of these. Returns None if the block is not judged, or if no alarm was active and none is raised. `leak`:
         the leak that the actuator's detector has found, None if there is none; `baseline`: version of the healthy
-        baseline; `settings`: thresholds [L/min] and the number of successive blocks beyond one that changes the alarm.
+        baseline; `settings`: thresholds [L/min], and how many successive blocks must lie beyond a threshold before the
+        alarm changes (`debounce_blocks`).
 
         An alarm is raised while a leak is found and its flow reaches the threshold of a warning or an error. It ends,
         or an error becomes a warning, when the flow is below `return_share` times the threshold of its level. A leak

@@ -116,7 +116,7 @@ def _common_lanes_type(arg_types: tuple[Any, ...]) -> Lanes | None:
 
 
 def _define_on_lanes(function: Any, build: Any, *, is_test: bool = False) -> None:
-    """Define a Python function or operator on lanes (vectors of numbers) for compiled code.
+    """Tell numba how a Python function or operator on lanes (vectors of numbers) is compiled.
 
     Its arguments may mix lanes with single numbers. `build(builder, *values)` adds the LLVM instructions to LLVM's
     `builder` and returns their result; its `values` are lanes of one type. The result is lanes, or a mask of truth

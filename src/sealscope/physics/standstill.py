@@ -141,9 +141,9 @@ def initial_state(rig: Rig, x_0: float, push: float = 0.0) -> np.ndarray:
 
 
 def _fill_standstill_state(rig: Rig, y: np.ndarray, x: float, force: float, p: RigNumbers) -> np.ndarray:
-    """Set the state `y` (14,) to the equilibrium of a rig whose servo valve is centred, and return it.
+    """Fill the state `y` (14,) with the equilibrium of a rig whose servo valve is centred; return `y`.
 
-    All elements of `y` are 0 before the call.
+    `y` must be all zeros before the call, since only some of its elements are set.
 
     `x` [m]: position of the piston; `force` [N]: load against +x. Raises InputError if the pressures cannot carry the
     force, or if the drive cannot hold the supply.

@@ -91,11 +91,14 @@ def _bound_text(case: Case, evidence: Evidence, bound: float) -> str:
 
 
 def _ringing_text(evidence: Evidence, ringing: Ringing | None, provider: str) -> str:
-    """Describe in words the largest drop of the pressures' ringing that the data allow.
+    """State in words the 95 % upper limit [%] of a fall of the pressures' ringing that the detector has not seen.
 
-    The ringing is an oscillation of the pressures, measured by the RMS of their wavelet details. If the verdict is
-    `cannot tell`, or if the sampling rate is too low for the ringing, the text says so. `ringing`: facts on the
-    comparison (`Ringing`), None if the ringing was not measured; `provider`: name of the detector.
+    The ringing is an oscillation of the pressures, measured by the RMS of their wavelet details. The limit is of the
+    fall of this RMS, relative to healthy recordings or, without these, to the start of the same recording. If the
+    verdict is `cannot tell`, the text says that a fall by this limit would not show, otherwise that there is no larger
+    fall. If the sampling rate is too low for the ringing, it also says so, or names the columns that are not assigned
+    to a channel. `ringing`: facts on the comparison (`Ringing`), None if the ringing was not measured; `provider`: name
+    of the detector.
     """
     if ringing is None:
         return text_of("bound", "unseen", provider=provider)

@@ -322,8 +322,12 @@ class _BlockRows(NamedTuple):
 def _z_score(products: Array) -> float:
     """Compute the z score of the sum of `products` (r,) under the hypothesis that their mean is zero.
 
-    z = sum(products) / sqrt(OVERLAP sum(products^2)). There is one product for each row of the regression. Neighbouring
-    rows overlap, which increases the variance of the sum by the factor `OVERLAP`.
+    Each row of the regression has one product: of the flow on the left side of the balance, and of a quantity that on
+    average has the same sign if the sensors are wired correctly, such as the motion of the piston. Then
+
+        z = sum(products) / sqrt(OVERLAP sum(products^2)).
+
+    Neighbouring rows overlap, which increases the variance of the sum by the factor `OVERLAP`.
     """
     standard_deviation = float(np.linalg.norm(products) * np.sqrt(OVERLAP))
     return float(products.sum()) / max(standard_deviation, float(np.finfo(float).tiny))

@@ -134,7 +134,8 @@ class DatedTest(RiseTest, Protocol):
     def detectable_step(self, chance: float) -> float:
         """Return the smallest step of the leak's conductance [m^3/(s Pa)] that is detected with a high probability.
 
-        A step is a sudden, lasting increase. `chance`: false-alarm probability of the test.
+        A step is a sudden, lasting increase. `chance`: probability, without a step, that the test finds one; it sets
+        the threshold of the test.
         """
 
 

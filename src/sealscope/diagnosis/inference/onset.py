@@ -181,9 +181,10 @@ class StepTest:
         return replace(self, chance=min(1.0, self.chance / share), law=self.law._replace(share=share))
 
     def detectable_step(self, chance: float, power: float = 0.9) -> float:
-        """Compute the step that is detected with the probability `power`, at a false-alarm probability `chance`.
+        """Compute the smallest step that is detected with the probability `power`.
 
-        It is (sqrt(threshold of the score) + normal quantile of `power`) times the median standard error over all
+        `chance`: probability, without a step, that the test finds one, which sets the threshold of the score. The step
+        is (sqrt(threshold of the score) + normal quantile of `power`) times the median standard error over all
         onsets, in the unit of the coefficient.
         """
         from scipy.special import ndtri

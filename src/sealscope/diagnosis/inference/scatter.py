@@ -206,7 +206,11 @@ class Rise(NamedTuple):
         return log_max + float(np.log(max(np.trapezoid(np.exp(logarithms - log_max), grid), TINY)))
 
     def _log_density(self, value: float) -> float:
-        """Compute the log density of the estimated rise of a healthy recording at `value`, up to a constant."""
+        """Compute the log probability density at `value` of the estimated rise if the recording is healthy.
+
+        The rise is that of the leak's coefficient over the healthy recordings; `value` is in the unit of this
+        coefficient. A constant is left out.
+        """
         if self.mixture is None:
             z = value / self.deviation
             if np.isinf(self.degrees_of_freedom):  # Student's t is then normal

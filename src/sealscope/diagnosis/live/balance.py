@@ -121,9 +121,10 @@ class NotJudged(NamedTuple):
 
     @classmethod
     def with_count(cls, end: float, status: str, restarts: bool = False) -> NotJudged:
-        """Build a NotJudged whose counter has the name of its reason `status`.
+        """Build the result of a block without an estimate, with a counter for the blocks of the same reason.
 
-        `end` is the end of the block [s]. `restarts` is True if later blocks cannot be compared with earlier ones.
+        `end`: end of the block [s]; `status`: the reason in words, such as "at standstill"; `restarts`: True if later
+        blocks cannot be compared with earlier ones. The counter is called "blocks: " and the reason.
         """
         return cls(end, status, f"blocks: {status}", restarts)
 

@@ -263,9 +263,9 @@ class PressureEstimator:
         return state | {"follower": save_attributes(follower, _FOLLOWER_ATTRIBUTES) | machine}
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Restore the fit and the blocks saved by `state`, so that later results are identical to the last bit.
+        """Restore the parameters and blocks saved by `state`, so that later results are identical to the last bit.
 
-        Raises InputError if they do not fit.
+        Raises InputError if a part of the saved state is missing or has an invalid value.
         """
         restore_attributes(self, _SAVED, state)
         if (saved := require_part(state, "follower", (Mapping, type(None)))) is None:

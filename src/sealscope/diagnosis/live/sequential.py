@@ -214,8 +214,9 @@ class StepDetector:
     def rise(self) -> LiveRise:
         """Estimate the onset [s] and the size of a rise of the coefficient, in the coefficient's unit.
 
-        Both are averages over the sizes of the random walk, the possible onsets and the prior variances of the step,
-        weighted by their posterior probabilities. The onset has a 95 % interval, and the size a standard deviation.
+        Both are averages over the variance of the random walk in a block (`WALKS`), the possible onsets, and the prior
+        variance of the step's size (`SIZES`), weighted by their posterior probabilities. The onset has a 95 % interval,
+        and the size a standard deviation.
         """
         terms = self._log_terms()
         log_e = float(np.logaddexp.reduce(terms.ravel()))

@@ -129,10 +129,11 @@ class Levels:
         return math.sqrt(float(np.average([prior_variance, measured_variance], weights=weights)))
 
     def average_neighbours(self, max_count: int = 240) -> Levels:
-        """Average the levels of successive recordings in a group, so that about `max_count` levels remain.
+        """Average levels of successive recordings, so that about `max_count` levels remain; limits the computing time.
 
+        With n > `max_count` levels, each average is of up to ceil(n / `max_count`) successive recordings of one group
+        of comparable recordings (`group`). As no average spans two groups, some more than `max_count` may remain.
         Times and covariates are averaged, too; the standard error of an average is sqrt(sum of error^2) / number.
-        This limits the computing time.
         """
         size = math.ceil(len(self) / max_count)
         if size <= 1:

@@ -176,11 +176,16 @@ class _Pages:
         return JSONResponse(alarm.as_dict())
 
     async def changes(self, request: Request) -> Response:
-        """Answer with a stream of server-sent events: one after each change, and the live curves of an actuator.
+        """Answer with a stream of server-sent events: notices of changes and, in the same stream, live curves.
 
-        Without changes an event is repeated from time to time, to keep the connection alive. Parameters of the query:
-        `actuator`, the actuator's name, without which there are no curves; `pressure`, the pressure whose wavelet
-        details are drawn; `drawn`, the form in which they are drawn.
+        After each change of results, alarms or outages an event without a name follows. Its data is the number of the
+        change, at which the page loads the new state; the number is repeated after `_ALIVE_S` [s] without a change, to
+        keep the connection alive. Each time the actuator in the query has new samples, an event "live" has its curves
+        as JSON (`live.curves`).
+
+        Parameters of the query: `actuator`, the actuator's name, without which there are no curves; `pressure`, "p_A"
+        or "p_B", whose wavelet details are drawn; `drawn`, "rms" for the RMS of the details in windows or "details" for
+        the details themselves.
         """
         if self._n_listeners >= self._max_listeners:
             return _make_refusal("too many listeners", 503)

@@ -121,7 +121,11 @@ class ValueGatherer:
         target.arrival, target.newest = self._now(), last if target.newest is None else max(last, target.newest)
 
     def discard_values(self) -> None:
-        """Discard all values, for example because others were lost with the connection."""
+        """Discard the values of all channels that are in no block yet, and the last value of each.
+
+        The time axis begins anew with the next value. This is needed after values were lost with the connection, or if
+        the clock was set back.
+        """
         self._channels = {name: _Channel() for name in self._channels}
         self._start = self._newest = None
 

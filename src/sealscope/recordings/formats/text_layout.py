@@ -422,7 +422,10 @@ def _has_prefixes(body: Sequence[str]) -> bool:
 
 
 def _expand_sample_prefixes(line: str) -> str:
-    """Expand the SI prefixes of the numbers in a line if most of its cells are numbers; other lines stay."""
+    """Replace the SI prefixes of the numbers in a line by exponents: `170.3m;2.5k` becomes `170.3e-3;2.5e3`.
+
+    A line in which no more than half of the cells are then numbers is returned unchanged, such as a heading.
+    """
     expanded = expand_prefixes(line)
     cells = re.split(r"[;,|\t]", expanded)
     return expanded if 2 * sum(is_value(cell, ".") for cell in cells) > len(cells) else line

@@ -616,9 +616,9 @@ class SetRun:
     def mean_flow(self) -> Array:
         """Compute the mean flow |Q_L| (runs,) [m^3/s] of each run's leak while it is open.
 
-        It is the sum of |Q_L| over the run, divided by the sum of the opening (0 to 1). An output at which the leak is
-        half open thus counts half. The leaks have the coefficients `flow_coefficients`. The flow is 0 for a leak that
-        never opens.
+        It is the sum of |Q_L| over the output times of the run, divided by the sum of the leak's opening (0 to 1) over
+        the same times. An output time at which the leak is half open thus counts as half a time. The leaks have the
+        coefficients `flow_coefficients`. The flow is 0 for a leak that never opens.
         """
         from sealscope.physics.vector.runs import FLOW, OPENING
 

@@ -129,7 +129,10 @@ def format_rate(tests: Sequence[bool] | np.ndarray) -> str:
 
 
 def log_change_to_percent(change: Array | float) -> float:
-    """Convert a change c of a natural logarithm to the relative change 100 (exp(c) - 1) [%]; average several first."""
+    """Convert a change c of a natural logarithm to the relative change 100 (exp(c) - 1) [%].
+
+    Of several changes the mean is converted.
+    """
     return float(100.0 * np.expm1(np.mean(change)))
 
 

@@ -126,7 +126,7 @@ class ChargeTrend(NamedTuple):
 
 
 def estimate_charge_trend(recording: Recording) -> ChargeTrend | None:
-    """Estimate how fast the charge pressure of a closed circuit falls, with its standard error.
+    """Estimate how fast the charge pressure of a closed circuit falls [Pa/s], with its standard error [Pa/s].
 
     The fall is the weighted mean over the chambers whose lowest pressures show it. Return None if there is no such
     chamber, or if a pressure or the pump's angle or speed is not recorded.

@@ -209,9 +209,12 @@ class _OilRegression(NamedTuple):
         return self.displaced - (oil * self.strained + air * self.aired) @ volumes
 
     def slopes(self, logs: Array) -> Array:
-        """Compute the derivatives (r, 4) of the compressed volumes [m^3] by the logarithms of the oil's properties.
+        """Compute the derivatives of the r readings' compressed volumes by the logarithms of the oil's properties.
 
-        `logs` (4,): values of these logarithms.
+        A compressed volume [m^3] is the part of the displaced volume that the compression of oil and free air takes
+        up. `logs` (4,): the logarithms at which the derivatives are taken, of compressibility, dead volume of A, dead
+        volume of B and free air, each relative to its usual value. Returns the derivatives (r, 4) [m^3], with columns
+        in this order.
         """
         oil, air, volumes = _oil_factors(logs)
         strained, aired = oil * self.strained * volumes, air * self.aired * volumes
@@ -456,11 +459,12 @@ class HeldChambers:
         return offset_cost(offset) + sum(hold.own_offset(offset)[1] for hold in self.holds)
 
     def leaks_since(self, onset: float) -> Array | None:
-        """Estimate the leaks past the piston and to the outside from the holds, with standard deviations, shape (6,).
+        """Estimate the conductances of three leaks from the holds, each followed by its standard deviation, shape (6,).
 
-        The conductances [m^3/(s Pa)] are in the order of `HeldLeaks`. The leak past the piston is that since `onset`
-        [s], times its probability (`piston_leak`). The leaks to the outside are means over the whole recording. Return
-        None if no hold shows a flow past the piston after the onset.
+        The leaks are past the piston, to the outside from A, and to the outside from B, all in m^3/(s Pa). The
+        conductance past the piston is that of a leak since `onset` [s], times the probability of this leak
+        (`piston_leak`); its standard deviation is not multiplied by the probability. The leaks to the outside are means
+        over the whole recording. Return None if no hold shows a flow past the piston after the onset.
         """
         fits = self._fits_over_offsets(onset)
         if not fits:

@@ -89,10 +89,12 @@ class ResponseLeak:
 
     @property
     def step_flow(self) -> Flow:
-        """Mean flow [m^3/s] of a leak that begins within the recording, from its onset to the end.
+        """Mean flow [m^3/s] of a leak that begins within the recording, at the recording's mean abs(p_A - p_B).
 
-        It is midway between a laminar leak and an orifice; the two are the ends of a 95 % interval. Without a step
-        test it is 0 with an infinite standard error.
+        It is the step of the conductance that `step` has fitted, converted to a flow. The law of the leak is not known:
+        an orifice of the same fitted conductance has `ORIFICE_RATIO` times the flow of a laminar leak. The result is
+        the mean of the two flows, and its standard error includes their difference, as if they were the ends of a 95 %
+        interval. Without a step test it is 0 with an infinite standard error.
         """
         if self.step is None:
             return Flow(0.0, np.inf)

@@ -375,10 +375,12 @@ class Follower:
         return Normal(self.theta, np.asarray(np.linalg.inv(self.covariance + np.diag(variance))), self.priors.unit)
 
     def _fit_block(self, segment: Segment, block_s: float) -> tuple[Linearisation, Normal]:
-        """Fit the parameters to the next block, `block_s` [s] long; return the fit and the prior that it used.
+        """Fit the parameters to the next block of samples; return the fit and the prior that it used.
 
-        If slow variations do not explain the block, a jump of the conductance or of the oil's stiffness is tried as
-        well.
+        `segment`: the samples of that block as prepared by `next_segment`; `block_s` [s]: their duration, by which the
+        prior is widened. If slow variations of the parameters do not explain the block, fits with a jump of the
+        conductance or of the oil's stiffness are tried as well, and the one with the highest posterior density is
+        returned. The state of the filter is not changed; `update` advances it.
         """
 
         def fit_candidate(start: Array, prior: Normal) -> tuple[float, Linearisation, Normal]:

@@ -24,9 +24,9 @@ _SCOPE_ROWS, _UNIT_WITH_QUANTITY = (
 def apply_descriptions(labels: Sequence[Label], rows: Sequence[Sequence[str]]) -> list[Label]:
     """Replace the names of columns by the descriptions that a user has entered for them in the logger.
 
-    They are in a table of channels above the heading, or in a row of labels. `rows`: cells of the lines above the
-    heading, and of rows of labels in it. A description may state the unit if the heading does not. The columns' own
-    names are kept in `Label.called`.
+    They are in a table of channels above the heading, or in a row of labels, whose first cell is `label` or `labels`.
+    `rows`: cells of the lines above the heading, and of the heading's rows of labels. A description may state the unit
+    if the heading does not. The columns' own names are kept in `Label.called`.
     """
     names: dict[str, str] = {}
     name_column: int | None = None

@@ -81,7 +81,10 @@ def collect_remarks(pairs: Iterable[tuple[object, object]]) -> dict[str, str]:
 
 
 def clean_remarks(provenance: Mapping[str, object]) -> dict[str, str]:
-    """Return the remarks in the provenance of a recording, name -> text, made printable and shortened."""
+    """Return the remarks on a recording, name -> text, made printable and shortened (`collect_remarks`).
+
+    They are the entries of the mapping `about` in its provenance, read from the header of the file; none without it.
+    """
     remarks = provenance.get("about")
     return collect_remarks(remarks.items()) if isinstance(remarks, Mapping) else {}
 

@@ -198,8 +198,9 @@ def _strip_accents(text: str) -> str:
 def _split_words(name: str) -> set[str]:
     """Split a name into its words, in lower case.
 
-    Added are the last parts of German compounds (`weg` of `kolbenweg`), and the two letters of `pa` and of `pb`, i.e.
-    `p` and the side.
+    The result also contains the last part of a German compound (`weg` of `kolbenweg`); the two letters of a word `pa`
+    or `pb`, i.e. `p` and the side; and known words of languages without spaces, such as Chinese, that the name
+    contains.
     """
     words = {word for word in _UNSPACED if word in name}
     for token in (token.casefold() for token in _TOKEN.findall(_strip_accents(name))):

@@ -268,7 +268,11 @@ def _judge_opening(context: Context) -> Iterator[Claim]:
         return _changes(rows, "peak") + _changes(rows, "range")
 
     def format_flow_difference(rows_of_readings: list[Rows]) -> str:
-        """Format the largest rms(Q_A - Q_B) / rms(Q_A) over the interpretations, with orifices that are 25 % closed."""
+        """Format the largest rms(Q_A - Q_B) / rms(Q_A) of the runs with orifices that are 25 % closed.
+
+        The largest is over the interpretations of the throttles' equations (`READINGS`). `rows_of_readings`: for each
+        interpretation the summaries of two runs, of which the second has the orifices 25 % closed (`summarise_run`).
+        """
         largest = max(rows[1][flows] for rows in rows_of_readings)
         return f"rms of Q_A - Q_B over rms of Q_A at most {100 * largest:.2f} %"
 
