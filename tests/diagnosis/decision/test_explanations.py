@@ -101,6 +101,13 @@ def test_a_side_effect_that_is_clearer_than_its_event_has_another_cause() -> Non
     assert clear[0].events == (EVENTS["friction"],)
 
 
+def test_a_step_of_the_turning_pump_s_leakage_is_a_leak() -> None:
+    """Behind valves that shut at rest, a step in motion alone is that of the pump, beside a scale of the motion."""
+    step = observable("volumes: pump leak while it turns", 1e-40)
+    rivals = [step, observable("volumes: leak", 1e-20), observable("volumes: scale", 1e-36)]
+    assert leak_probability(*rivals) > DECISION.explanation.leak
+
+
 def test_a_rare_change_with_an_improbable_cause_is_by_chance() -> None:
     """Only a scale explains the motion; its odds against chance are its probability times the Bayes factor."""
     scale = EVENTS["scale of the motion"]
