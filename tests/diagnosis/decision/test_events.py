@@ -59,6 +59,7 @@ def known_names() -> frozenset[str]:
     names |= {f"{FRICTION}: {FRICTION}"} | {f"drift: {name}" for name in (*DRIFTS, FALL)}
     names |= {f"drift: {LOW.format(side)}" for side in "AB"}
     names |= {"motion: motion", "sides: filter of p_A", "sides: filter of p_B", f"{TURNING_DATA}: {TURNING}"}
+    names.add(f"volumes: {TURNING}")  # behind valves that shut at rest
     names |= {f"rise: {name}" for name in volume_names() if name == AIR or name.startswith("external leak")}
     names |= {f"levels: scale of {chamber}" for chamber in ("p_A", "p_B")}
     names |= {f"hum: hum of {hertz:g} Hz" for hertz in CHANGES.features.mains}
