@@ -196,6 +196,15 @@ def test_growth_and_limit_hold_the_truth() -> None:
     assert own.healthy.low < flow(HEALTHY) < own.healthy.high
 
 
+def test_the_limit_is_reached_after_the_last_recording_that_is_compared() -> None:
+    """A defective recording ten days later belongs to the trend, and changes no date but that of the last."""
+    days = life(40, wears=0.006, since=15.0)
+    defective = replace(reading(49.0), basis=None, problem="p_A is constant", level=math.nan, error=math.nan)
+    own, later = (trend_of(given, healthy=5, limit="15.6 mL/min").as_dict() for given in (days, [*days, defective]))
+    assert own["limit_reached"] is not None and later["limit_reached"] == own["limit_reached"]
+    assert later["first"] == own["first"] and later["last"] > own["last"]
+
+
 def test_leak_and_total_are_named_as_in_a_diagnosis() -> None:
     trend = trend_of(life(60, wears=0.006, since=15.0), healthy=5)
     row, truth = trend.as_dict(), 0.006 * (59.0 - 15.0) / DAYS_PER_MONTH

@@ -187,8 +187,11 @@ class Trend:
     def as_dict(self) -> dict[str, Any]:
         """Return the trend as plain values for JSON; a number that is not finite becomes None."""
         wear, total = self.wear, self.decision.total_leakage
-        alarm, days = self.alarm, [point.day for point in self.points if point.group >= 0] or [math.nan]
-        limit_day = wear and wear.reach and Interval(*(days[-1] + wait for wait in wear.reach))
+        alarm, days = self.alarm, [point.day for point in self.points] or [math.nan]
+        limit_day = None
+        if wear is not None and wear.reach is not None:
+            last_compared = self.points[self.rows[-1]].day
+            limit_day = Interval(*(last_compared + wait for wait in wear.reach))
         points = [
             {
                 "file": point.file,
