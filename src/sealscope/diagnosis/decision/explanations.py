@@ -58,6 +58,10 @@ class Explanation:
         """Return True if this set of events contains one with any of the `names`."""
         return any(event.name in names for event in self.events)
 
+    def has_cause(self, cause: str | None) -> bool:
+        """Return True if this set of events contains one with the `cause`; False if it is None."""
+        return cause is not None and any(event.cause == cause for event in self.events)
+
 
 #: Log Bayes factors of an event by kind of data.
 _Gains = Mapping[str, float]
@@ -274,9 +278,7 @@ def probability_of(
     relevant = [explanation for explanation in explanations if data_kind is None or data_kind in explanation.data]
     total = sum(explanation.probability for explanation in relevant)
     matching = sum(
-        explanation.probability
-        for explanation in relevant
-        if explanation.has(*names) or (cause is not None and any(event.cause == cause for event in explanation.events))
+        explanation.probability for explanation in relevant if explanation.has(*names) or explanation.has_cause(cause)
     )
     return float(matching / total) if total > 0.0 else 0.0
 
@@ -288,5 +290,5 @@ def probability_beside_chance(explanations: Sequence[Explanation], cause: str, d
     over 1 + the sum of the odds of all sets that explain it. The 1 stands for no event: the change is then by chance.
     """
     relevant = [explanation for explanation in explanations if data_kind in explanation.data]
-    matching = sum(row.odds for row in relevant if any(event.cause == cause for event in row.events))
-    return float(matching / (1.0 + sum(row.odds for row in relevant)))
+    matching = sum(explanation.odds for explanation in relevant if explanation.has_cause(cause))
+    return float(matching / (1.0 + sum(explanation.odds for explanation in relevant)))

@@ -315,7 +315,7 @@ class RestPriors(PriorTable):
     - `least` [s]: shortest rest.
     - `share`: largest averaged flow at rest.
     - `holding`: mean flow of a pump that holds a load.
-    - `moves`: smallest mean flow of the pump in a block that counts as motion.
+    - `moves`: smallest mean flow of the pump in a block that counts as motion, and smallest flow by a flow meter.
     - `shut`: leakage at rest over that in motion if valves cut the pump off, a standard deviation.
     - `open`: relative difference of the leakage at rest and in motion if no valve shuts, a standard deviation.
     - `most`: limit of the log odds, from a healthy recording, that valves cut the pump off.
