@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated
 
@@ -87,8 +86,9 @@ def commission(
 
 def _parse_date(text: str) -> float:
     """Parse the date of `--since` to seconds since 1970; it is in UTC unless it states a time zone."""
+    from sealscope.diagnosis.commissioned.machine_file import parse_moment
+
     try:
-        moment = datetime.fromisoformat(text)
+        return parse_moment(text)
     except ValueError:
         raise InputError(f"--since must be a date such as 2026-11-25, got {text!r}") from None
-    return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()

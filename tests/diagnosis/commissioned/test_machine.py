@@ -17,6 +17,7 @@ import pytest
 
 import sealscope as ss
 from sealscope.diagnosis.commissioned.machine import JudgedAlarm
+from sealscope.diagnosis.commissioned.machine_file import parse_moment
 from sealscope.errors import InputError
 from sealscope.storage.atomic import remove_temporaries
 
@@ -326,3 +327,9 @@ def test_what_would_not_be_read_again_is_not_written(machine, tmp_path):
         assert tracemalloc.get_traced_memory()[1] < 10 * path.stat().st_size
     finally:
         tracemalloc.stop()
+
+
+@pytest.mark.parametrize("text", ["2026-03-01T06:30:00", "2026-03-01 07:30+01:00", "2026-03-01T06:30:00Z"])
+def test_a_time_without_a_zone_is_utc(text: str) -> None:
+    # as on a computer of any time zone: local time would differ between the engineer's desk and the machine
+    assert parse_moment(text) == datetime(2026, 3, 1, 6, 30, tzinfo=UTC).timestamp()

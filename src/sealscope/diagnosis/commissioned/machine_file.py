@@ -61,19 +61,23 @@ _HEAD = """\
 """
 
 
-def _parse_moment(text: Any) -> float:
-    """Parse a time in ISO 8601 format to seconds since 1970; raise ValueError for any other value."""
+def parse_moment(text: Any) -> float:
+    """Parse a time in ISO 8601 format to seconds since 1970; it is in UTC unless it states a time zone.
+
+    Raises ValueError for any other value.
+    """
     try:
-        moment = datetime.fromisoformat(text).timestamp()
-        datetime.fromtimestamp(moment, UTC)
+        moment = datetime.fromisoformat(text)
+        seconds = (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
+        datetime.fromtimestamp(seconds, UTC)
     except (TypeError, ValueError, OverflowError, OSError):
         raise ValueError("must be a time as ISO 8601 writes it") from None
-    return moment
+    return seconds
 
 
 #: Name of a file of summaries in the same folder.
 _FILE_NAME = re.compile(r"[^/\\\0:]{1,200}\.(healthy|lessons)")
-_Moment = Annotated[float, BeforeValidator(_parse_moment)]
+_Moment = Annotated[float, BeforeValidator(parse_moment)]
 
 
 def _check_format(number: int) -> int:
