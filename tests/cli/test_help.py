@@ -12,6 +12,8 @@ import typer
 
 import sealscope as ss
 from sealscope.cli.app import app
+from sealscope.cli.options import FALSE_ALARM_PROBABILITY
+from sealscope.diagnosis import diagnose
 
 
 def commands(command: Any = None, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
@@ -56,3 +58,7 @@ def test_each_argument_of_an_experiment_is_an_option_with_the_same_text_and_defa
             continue
         assert plain(options[name].help).removesuffix(plain("Repeat for several.")) in plain(ss.simulate.__doc__)
         assert str(argument.default).removesuffix(".0") == str(options[name].default)
+
+
+def test_the_default_false_alarm_probability_is_that_of_the_library() -> None:
+    assert FALSE_ALARM_PROBABILITY == diagnose.FALSE_ALARM_PROBABILITY

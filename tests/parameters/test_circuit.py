@@ -13,6 +13,7 @@ from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.parameters import load_rig, rig_names
 from sealscope.parameters.circuit import CIRCUITS, PUMP_CIRCUIT, VALVE_CIRCUIT, check_circuit_property
 from sealscope.parameters.rig import declared_names
+from sealscope.physics.rig import rig_numbers
 from sealscope.recordings.channels import CHANNEL_UNITS
 
 from ..refusals import refusal
@@ -61,6 +62,15 @@ def test_a_circuit_without_a_property_is_refused_with_those_that_have_it() -> No
         check_circuit_property("a unit", "worn", VALVE_CIRCUIT, "pump_feeds_chambers")
 
 
+def test_a_circuit_without_laws_is_not_simulated_by_those_of_another(monkeypatch: pytest.MonkeyPatch) -> None:
+    tandem = PUMP_CIRCUIT._replace(name="tandem", parameter="makeup.check_valves", value="present", simulated=False)
+    monkeypatch.setattr("sealscope.parameters.rig.CIRCUITS", (tandem, *CIRCUITS))
+    rig = load_rig("thesis-closed-loop")
+    assert rig.circuit is tandem
+    with refusal("a simulation", rig.name, "tandem", "valve.spool = absent"):
+        rig_numbers(rig)
+
+
 def test_laws_alone_ask_which_valve_a_circuit_has() -> None:
     """Elsewhere a property of the circuit answers, so that a further circuit changes nothing there."""
     users = {
@@ -69,7 +79,7 @@ def test_laws_alone_ask_which_valve_a_circuit_has() -> None:
         if ".valve_controlled" in path.read_text("utf-8")
     }
     drawn = {"reporting/schematic.py", "thesis/chapters/chapter6.py"}
-    assert users == drawn | {"physics/rig.py", "physics/standstill.py", "diagnosis/inference/terms.py"}
+    assert users == drawn | {"physics/rig.py", "physics/standstill.py"}
 
 
 def test_packages_ask_the_circuit_and_not_the_valve() -> None:

@@ -34,3 +34,11 @@ def test_what_has_slopes_or_recurs_is_no_spike() -> None:
     ringing[500:520] += 50e5 * (-1.0) ** np.arange(20) * np.exp(-np.arange(20) / 8.0)
     for pressure in (step, peak, ringing):
         assert find_spikes(pressure).tolist() == []
+
+
+def test_a_few_spikes_in_a_short_recording_are_a_logger_s_errors_and_many_are_a_signal() -> None:
+    pressure = with_noise(np.full(1400, 80e5))
+    pressure[[200, 700, 1200]] = 0.0, 400e5, 0.0
+    assert find_spikes(pressure).tolist() == [200, 700, 1200]
+    pressure[15::40] += 50e5
+    assert find_spikes(pressure).tolist() == []

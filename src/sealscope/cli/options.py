@@ -126,6 +126,8 @@ _BASELINE = "Leak-free recordings of the same machine."
 BaselineOption = Annotated[list[Path] | None, Option("--baseline", metavar="FILE...", help=_BASELINE)]
 _MACHINE = "The machine's file, by `sealscope commission`; it states map, rig, limit and healthy recordings."
 MachineOption = Annotated[Path | None, Option("--machine", metavar="FILE", help=_MACHINE)]
+#: Default of `--false-alarm`, equal to `FALSE_ALARM_PROBABILITY` of `diagnose`, whose import would slow down the help.
+FALSE_ALARM_PROBABILITY = 0.01
 FalseAlarmOption = Annotated[float, Option("--false-alarm", help="Probability of `leak` on a leak-free recording.")]
 SeedOption = Annotated[int, declared_option("seed")]
 _JOBS = "Processes; by default one a core, two a core at most."

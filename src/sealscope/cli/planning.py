@@ -21,7 +21,7 @@ def plan(
     command: Annotated[str, Option(help="Command of the machine's usual duty.")] = "3 sin(4t)",
     load: Annotated[str, Option(help="Load of the usual duty: '500 N'.")] = "",
     hold: Annotated[str | None, Option(metavar="FORCE", help=_HELD)] = None,
-    false_alarm: opt.FalseAlarmOption = 0.01,
+    false_alarm: opt.FalseAlarmOption = opt.FALSE_ALARM_PROBABILITY,
     detection: Annotated[float, Option(help="Probability with which the leak is to be found.")] = 0.9,
     overrides: opt.SetOption = None,
     output: Annotated[Literal["text", "json"], Option("--format", help="Text, or one JSON object.")] = "text",

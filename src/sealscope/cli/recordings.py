@@ -57,7 +57,7 @@ def diagnose(
     stated: opt.StatedMachine,
     output: Annotated[Literal["text", "jsonl"], Option("--format", help="Text, or one JSON object a line.")] = "text",
     join: opt.JoinOption = False,
-    false_alarm: opt.FalseAlarmOption = 0.01,
+    false_alarm: opt.FalseAlarmOption = opt.FALSE_ALARM_PROBABILITY,
     quiet: Annotated[bool, Option("--quiet", "-q", help="Print the first line of each verdict only.")] = False,
     fail_on: Annotated[list[FailOn] | None, Option("--fail-on", metavar="VERDICT|LEVEL", help=_FAIL_ON)] = None,
 ) -> None:
@@ -237,7 +237,7 @@ def report(
     ],
     stated: opt.StatedMachine,
     join: opt.JoinOption = False,
-    false_alarm: opt.FalseAlarmOption = 0.01,
+    false_alarm: opt.FalseAlarmOption = opt.FALSE_ALARM_PROBABILITY,
 ) -> None:
     """Diagnose each file and write a self-contained page; several pages get an index, the most severe first.
 

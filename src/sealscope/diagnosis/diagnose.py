@@ -24,7 +24,7 @@ from sealscope.diagnosis.healthy import Healthy, SummarisedRecording
 from sealscope.diagnosis.inference.observable import Observed
 from sealscope.diagnosis.inference.volumes.balance_leak import BalanceLeak
 from sealscope.diagnosis.inspection import inspect_recording, select_comparable
-from sealscope.diagnosis.priors.verdict import VERDICT
+from sealscope.diagnosis.priors.decision import DECISION
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.evidence import RMS_CHANGE, Evidence
 from sealscope.diagnosis.verdict.machine import assumed_rig
@@ -34,15 +34,15 @@ from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.recording import Recording
 
 #: Probability of `leak` on a leak-free recording, unless the caller asks for another.
-FALSE_ALARM_PROBABILITY: float = VERDICT.false_alarm.probability
+FALSE_ALARM_PROBABILITY: float = DECISION.false_alarm.probability
 
 
 def check_probability(probability: float) -> None:
     """Check that a false-alarm probability is a number from 1e-4 to 0.2; raise InputError otherwise.
 
-    The limits are `rarest` and `largest` of `verdict/priors.toml`.
+    The limits are `rarest` and `largest` of `[false_alarm]` in `decision/priors.toml`.
     """
-    min_probability, max_probability = VERDICT.false_alarm.rarest, VERDICT.false_alarm.largest
+    min_probability, max_probability = DECISION.false_alarm.rarest, DECISION.false_alarm.largest
     if not (isinstance(probability, float | int) and min_probability <= probability <= max_probability):
         rule = f"false-alarm probability must be {min_probability:g} to {max_probability:g}"
         raise InputError(f"{rule}, got {probability!r}")

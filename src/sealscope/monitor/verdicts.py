@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sealscope.diagnosis.live.estimates import BlockEstimate, Interval
-from sealscope.diagnosis.priors.verdict import VERDICT
+from sealscope.diagnosis.priors.decision import DECISION
 from sealscope.diagnosis.verdict.evidence import CANNOT_TELL, LEAK, NO_LEAK
 from sealscope.diagnosis.verdict.states import state_of
 from sealscope.reporting.messages import how_much
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from sealscope.diagnosis.verdict.diagnosis import Diagnosis
     from sealscope.recordings.recording import Recording
 
-_FALSE_ALARM = VERDICT.false_alarm
+_FALSE_ALARM = DECISION.false_alarm
 
 
 @dataclass(frozen=True)

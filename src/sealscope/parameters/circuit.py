@@ -13,9 +13,9 @@ class HydraulicCircuit(NamedTuple):
 
     Other modules read the properties below instead of comparing circuits, so that another circuit can be added.
     `valve_controlled` chooses the laws of `physics/rig.py` and `physics/standstill.py`, the longest step of
-    `physics/solvers/limits.py` (as `valved`), the volume balance of `diagnosis/inference/terms.py`, and the drawing of
-    `reporting/schematic.py`. `pump_feeds_chambers` chooses the controller's model of the drive (`control/drive.py`:
-    `drive_of`).
+    `physics/solvers/limits.py` (as `valved`), and the drawing of `reporting/schematic.py`. `pump_feeds_chambers`
+    chooses the volume balance (`diagnosis/inference/terms.py`: `equations`) and the controller's model of the drive
+    (`control/drive.py`: `drive_of`). A circuit that is diagnosed and never simulated needs an entry of `CIRCUITS` only.
 
     Attributes
     ----------
@@ -25,6 +25,8 @@ class HydraulicCircuit(NamedTuple):
         Parameter that chooses the circuit, and its value.
     required : mapping of str to str
         Further parameters that must have a value in a rig with this circuit.
+    simulated : bool
+        There are laws for it in `physics`. A rig with any other circuit can be diagnosed, but not simulated.
     valve_controlled : bool
         A servo valve on a supply of constant pressure meters the flow into each chamber; else the pump's speed does.
     pump_feeds_chambers : bool
@@ -48,6 +50,7 @@ class HydraulicCircuit(NamedTuple):
     parameter: str
     value: str
     required: Mapping[str, str]
+    simulated: bool
     valve_controlled: bool
     pump_feeds_chambers: bool
     pump_is_measured: bool
@@ -75,6 +78,7 @@ PUMP_CIRCUIT = HydraulicCircuit(
     parameter="valve.spool",
     value="absent",
     required={"supply.drive": "absent"},
+    simulated=True,
     valve_controlled=False,
     pump_feeds_chambers=True,
     pump_is_measured=True,
@@ -89,6 +93,7 @@ VALVE_CIRCUIT = HydraulicCircuit(
     parameter="valve.spool",
     value="present",
     required={"supply.drive": "constant-speed", "line.orifices": "absent", "makeup.check_valves": "absent"},
+    simulated=True,
     valve_controlled=True,
     pump_feeds_chambers=False,
     pump_is_measured=False,

@@ -24,6 +24,7 @@ import numpy as np
 
 from sealscope.compiled import contracted, law
 from sealscope.parameters import Rig
+from sealscope.parameters.circuit import check_circuit_property
 from sealscope.parameters.fields import iter_fields, unit_of
 from sealscope.physics import cylinder, external, friction, motor, pump, restrictors, valve
 from sealscope.physics.fluid import effective_bulk_modulus, mixture_density_ratio, oil_density_ratio
@@ -183,8 +184,9 @@ def rig_numbers(rig: Rig) -> RigNumbers:
     """Convert a rig to the numbers and choices that the compiled physical laws take.
 
     These are its parameters in SI units and the numbers derived from them (`DERIVED`). For each optional law
-    (`LAWS`) there is (True,) if the rig has it, else ().
+    (`LAWS`) there is (True,) if the rig has it, else (). Raises InputError if there are no laws for the rig's circuit.
     """
+    check_circuit_property("a simulation", rig.name, rig.circuit, "simulated")
     values = parameter_values(rig)
     choices = {name: attrgetter(parameter)(rig) == value for name, (parameter, value) in _CHOICES.items()}
     choices["made_up"] = rig.makeup.check_valves != "absent"

@@ -58,11 +58,13 @@ class SpikePriors(PriorTable):
     """Assumptions on spikes, i.e. single samples that leap and return at once.
 
     - `times`: smallest ratio of a spike to the changes around it.
-    - `share`: largest fraction of spikes in a channel.
+    - `share`: largest fraction of samples that a logger gets wrong, on average.
+    - `tail`: probability by chance, below which so many spikes are a signal.
     """
 
     times: float
     share: float
+    tail: float
 
 
 class UnsignedPriors(PriorTable):

@@ -291,7 +291,7 @@ def how_sure(diagnosis: Diagnosis) -> str:
     """
     if diagnosis.score is None or diagnosis.threshold is None:
         return say("how_sure.no_score")
-    odds, found_cause = _odds(diagnosis), cause(diagnosis)
+    odds, found_cause = diagnosis.odds, cause(diagnosis)
     odds = "" if odds is None else f"{odds}; "
     relation = "over" if diagnosis.score > diagnosis.threshold else "not over"
     if diagnosis.verdict != "leak" and found_cause is not None and diagnosis.alarmed:
@@ -306,23 +306,11 @@ def how_sure(diagnosis: Diagnosis) -> str:
 
 def odds_or_false_alarms(diagnosis: Diagnosis) -> str:
     """Format the odds that a healthy recording looks like this one; if unknown, the false-alarm probability."""
-    return _odds(diagnosis) or false_alarms(diagnosis)
-
-
-def _odds(diagnosis: Diagnosis) -> str | None:
-    """Format the odds that a healthy recording looks like this one; return None if they are not known.
-
-    They are a text such as "1 in 200 healthy recordings looks like this". If the verdict is `no leak` and no detector
-    raised an alarm, "shows as much change" stands in place of "looks like this".
-    """
-    odds = diagnosis.odds
-    if odds is None or diagnosis.verdict != "no leak" or diagnosis.alarmed:
-        return odds
-    return odds.replace("looks like this", "shows as much change").replace("look like this", "show as much change")
+    return diagnosis.odds or false_alarms(diagnosis)
 
 
 def false_alarms(diagnosis: Diagnosis) -> str:
-    """Format the false-alarm probability of the threshold as a percentage and as 1 in n."""
+    """Format the false-alarm probability of all tests together as a percentage and as 1 in n."""
     p = diagnosis.false_alarm_probability
     if not 0 < p < 1:
         return say("how_sure.probability", probability=number(p))

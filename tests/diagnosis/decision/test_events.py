@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from collections.abc import Iterator
 from dataclasses import replace
@@ -9,6 +10,7 @@ from fnmatch import fnmatchcase
 from functools import cache
 from importlib.resources import files
 from itertools import product
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -29,6 +31,8 @@ from sealscope.parameters import load_rig
 from sealscope.parameters.load import rig_names
 from sealscope.signals.details import QUANTITIES
 
+SOURCE = Path(ss.__file__).parent
+OBSERVABLES = Path(__file__).resolve().parents[3] / "docs" / "reference" / "observables.md"
 ROWS = tomllib.loads((files("sealscope.diagnosis.decision") / "events.toml").read_text("utf-8"))
 CAUSES = tomllib.loads((files("sealscope.diagnosis.verdict") / "states.toml").read_text("utf-8"))["causes"]
 KEYS = {"cause", "probability", "moves", "words"}
@@ -103,6 +107,15 @@ def test_whatever_a_provider_makes_shows_some_event() -> None:
     patterns = [pattern for name, row in ROWS.items() if name not in CATCH_ALL for pattern in row["moves"]]
     unexplained = [key for key in known_names() if not any(fnmatchcase(key, pattern) for pattern in patterns)]
     assert sorted(unexplained) == []
+
+
+def test_the_reference_lists_every_observable_and_no_other() -> None:
+    rows = [line.split("|") for line in OBSERVABLES.read_text(encoding="utf-8").splitlines() if line[:3] == "| `"]
+    patterns = [pattern for row in rows for pattern in re.findall(r"`([^`]+)`", row[1])]
+    assert [key for key in sorted(known_names()) if not any(fnmatchcase(key, pattern) for pattern in patterns)] == []
+    assert [pattern for pattern in patterns if not any(fnmatchcase(key, pattern) for key in known_names())] == []
+    modules = {module for row in rows for module in re.findall(r"`([\w/]+\.py)`", row[4]) if "/" in module}
+    assert [module for module in modules if not (SOURCE / "diagnosis" / module).is_file()] == []
 
 
 def test_what_may_happen_in_a_recording_is_less_than_certain() -> None:

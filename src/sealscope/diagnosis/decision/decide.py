@@ -3,11 +3,13 @@
 The verdict is `leak` if both conditions hold for one test of the leakage:
 
 - An alarm: `chance` < `probability` (`Case.alarms`). `chance` is the probability that a healthy recording scores as
-  high, calibrated by healthy recordings. `probability` is the test's share (`case._leak_tests`, `[questions] within` of
-  `priors.toml`) of the allowed probability of a false alarm, which the caller states, or else `[false_alarm]
-  probability` of `verdict/priors.toml`. Score and threshold are the same comparison, for display.
-- No better explanation: the probability that a leak caused the alarm (`Case.leak_probability`) is above
-  `[explanation] leak` of `priors.toml`.
+  high, calibrated by healthy recordings. `probability` is the test's share (`case._leak_tests`) of the allowed
+  probability of a false alarm, which the caller states, by default 0.01. A quarter of it goes to a change within the
+  recording where there are healthy recordings to compare with, and the rest to the comparison; to a change within it
+  goes all or three quarters where there are none. Score and threshold are the same comparison, for display.
+- No better explanation: the probability that a leak caused the alarm (`Case.leak_probability`) is above 0.5.
+
+These three numbers are `[false_alarm] probability`, `[questions] within` and `[explanation] leak` of `priors.toml`.
 
 Otherwise the verdict is `no leak` if the 95 % upper bound of a leak is small enough, i.e. at most the fraction `[worth]
 share` of the pump's flow (`verdicts.bound_worth_stating`). It is `cannot tell` if the bound is larger, and the reason

@@ -537,11 +537,11 @@ def _chamber_equation(side: str, rig: Rig) -> Equation:
 def equations(rig: Rig, channels: frozenset[str]) -> tuple[Equation, ...]:
     """Return the volume balances of a machine that can be computed from the recorded channels.
 
-    Behind a servo valve there is one balance for each chamber. Otherwise there is one of the cylinder, in which the
-    pump's flow is computed from its angle, its speed, a flow meter or, without these, the command. `channels`: names of
-    the recorded channels. The result is empty if they do not suffice.
+    If a valve meters the flow into the chambers, there is one balance for each chamber. Otherwise there is one of the
+    cylinder, in which the pump's flow is computed from its angle, its speed, a flow meter or, without these, the
+    command. `channels`: names of the recorded channels. The result is empty if they do not suffice.
     """
-    if rig.circuit.valve_controlled and {"x", "u", "p_1", "p_2"} <= channels:
+    if not rig.circuit.pump_feeds_chambers and {"x", "u", "p_1", "p_2"} <= channels:
         if not channels.issuperset(_PRESSURES):
             return ()
         return tuple(_select_recorded_terms(_chamber_equation(side, rig), channels) for side in "AB")

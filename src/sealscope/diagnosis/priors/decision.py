@@ -3,6 +3,18 @@
 from sealscope.storage.toml_file import PriorTable, read_priors
 
 
+class FalseAlarmPriors(PriorTable):
+    """Probability of the verdict "leak" on a leak-free recording.
+
+    - `probability`: default value.
+    - `rarest`, `largest`: limits of the values that a caller may choose.
+    """
+
+    probability: float
+    rarest: float
+    largest: float
+
+
 class NullPriors(PriorTable):
     """Prior on the error of the p-values that a detector states for the scores of healthy recordings.
 
@@ -65,6 +77,7 @@ class WorthPriors(PriorTable):
 class DecisionPriors(PriorTable):
     """All tables of `decision/priors.toml`, the probabilities on which a decision rests."""
 
+    false_alarm: FalseAlarmPriors
     null: NullPriors
     questions: QuestionPriors
     explanation: ExplanationPriors

@@ -1,4 +1,4 @@
-"""Typed tables of `verdict/priors.toml`: the default repair limit, and false-alarm probabilities."""
+"""Typed table of `verdict/priors.toml`: the default repair limit."""
 
 from sealscope.storage.toml_file import PriorTable, read_priors
 
@@ -14,23 +14,10 @@ class RepairPriors(PriorTable):
     watch: float
 
 
-class FalseAlarmPriors(PriorTable):
-    """Probability of the verdict "leak" on a leak-free recording.
-
-    - `probability`: default value.
-    - `rarest`, `largest`: limits of the values that a caller may choose.
-    """
-
-    probability: float
-    rarest: float
-    largest: float
-
-
 class VerdictPriors(PriorTable):
-    """All tables of `verdict/priors.toml`, which are the default repair limit and the false-alarm probabilities."""
+    """The table of `verdict/priors.toml`, which is the default repair limit."""
 
     repair: RepairPriors
-    false_alarm: FalseAlarmPriors
 
 
 VERDICT = read_priors("sealscope.diagnosis.verdict", VerdictPriors)

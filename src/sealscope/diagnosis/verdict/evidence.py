@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal, get_args
 
-from sealscope.diagnosis.priors.verdict import VERDICT
+from sealscope.diagnosis.priors.decision import DECISION
 from sealscope.recordings.recording import Array
 
 Verdict = Literal["leak", "no leak", "cannot tell"]
@@ -31,7 +31,7 @@ LEAKS: tuple[Cause, ...] = ("piston leak", "piston or pump leak", "internal or e
 #: Tests of the leakage: for a rise within the recording, and for a rise over healthy recordings.
 WITHIN, AGAINST = "within the recording", "against the baseline"
 #: Smallest chance that is stated.
-RAREST: float = VERDICT.false_alarm.rarest
+RAREST: float = DECISION.false_alarm.rarest
 #: The built-in detectors. They use the balance of volumes, a model of the pressures, and changes of the pressures'
 #: wavelet details; the last one decides only where no other can, and states no size.
 VOLUME_BALANCE, PRESSURE_RESPONSE, RMS_CHANGE = "volume balance", "pressure response", "rms change"
@@ -125,7 +125,8 @@ class Evidence:
     reason : str
         Reason for the verdict, in one line.
     score, threshold : float, optional
-        A leak is reported if the score exceeds the threshold.
+        A change is detected if the score exceeds the threshold. It is reported as a leak if no other event explains
+        it better.
     onset_s, onset_interval_s : float and pair of floats, optional
         Time at which the leak began, on the recording's time axis, and its 95 % interval [s].
     leak_lpm, leak_interval_lpm : float and pair of floats, optional
@@ -214,14 +215,17 @@ class Evidence:
 
     @property
     def odds(self) -> str | None:
-        """The stated `chance` in words: how rarely a healthy recording scores this high, such as "1 in 50 ...".
+        """The stated `chance` in words, such as "1 in 50 healthy recordings looks like this".
 
-        None if the chance is unknown.
+        If the verdict is `no leak` and the test raised no alarm, it "shows as much change". None if the chance is
+        unknown.
         """
         if self.stated_chance is None:
             return None
+        is_unchanged = self.verdict == NO_LEAK and not self.alarmed
         if self.stated_chance >= 0.2:
-            return "more than 1 in 5 healthy recordings look like this"
+            return f"more than 1 in 5 healthy recordings {'show as much change' if is_unchanged else 'look like this'}"
         rounded = float(f"{1.0 / self.stated_chance:.2g}")  # to two digits
         count = f"{rounded:,.0f}".replace(",", " ")
-        return f"{'fewer than ' if self.stated_chance == RAREST else ''}1 in {count} healthy recordings looks like this"
+        share = f"{'fewer than ' if self.stated_chance == RAREST else ''}1 in {count} healthy recordings"
+        return f"{share} {'shows as much change' if is_unchanged else 'looks like this'}"

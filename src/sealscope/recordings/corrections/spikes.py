@@ -52,7 +52,8 @@ def find_spikes(values: Array) -> NDArray[np.intp]:
 
     Such a sample lies above both neighbours, or below both. The smaller of the two changes must be several times
     (`spike.times` of `priors.toml`) larger than usual changes, other leaps nearby and the local slope. The result is
-    empty if there are so many such samples that the signal itself leaps.
+    empty if there are so many such samples that the signal itself leaps: more than a logger's errors at the rate
+    `spike.share` explain, which have Poisson's distribution.
     """
     known = np.flatnonzero(np.isfinite(values))
     if known.size < _MIN_SAMPLES:
@@ -71,5 +72,13 @@ def find_spikes(values: Array) -> NDArray[np.intp]:
         nearby_jumps = np.r_[jumps[max(k - _NEIGHBOURS, 0) : k], jumps[k + 1 : k + 1 + _NEIGHBOURS]]
         if jumps[k] > _PRIORS.times * max(slopes[k], nearby_jumps.max(initial=0.0)):
             rows.append(known[k + 1])
-    # with many of them, the channel itself leaps
-    return np.array(rows if len(rows) <= _PRIORS.share * known.size else [], dtype=np.intp)
+    # more than a logger's errors explain: the channel itself leaps
+    is_signal = _probability_of_at_least(len(rows), _PRIORS.share * known.size) < _PRIORS.tail
+    return np.array([] if is_signal else rows, dtype=np.intp)
+
+
+def _probability_of_at_least(count: int, mean: float) -> float:
+    """Compute the probability of at least `count` events by Poisson's distribution with a `mean` number of them."""
+    from scipy.special import pdtrc
+
+    return float(pdtrc(count - 1, mean)) if count > 0 else 1.0
