@@ -13,7 +13,7 @@ from sealscope.diagnosis.decision.events import load_events
 from sealscope.diagnosis.diagnose import diagnose
 from sealscope.diagnosis.verdict.evidence import LEAKS, Cause
 from sealscope.diagnosis.verdict.severity import RepairLimit
-from sealscope.diagnosis.verdict.states import state_of
+from sealscope.diagnosis.verdict.states import joint_causes, state_of
 
 from .balance_machine import machine, step
 
@@ -59,7 +59,9 @@ def test_a_worse_state_has_a_higher_severity_and_a_leak_beyond_the_limit_the_hig
 
 def test_every_cause_says_what_to_do():
     causes = tomllib.loads((files("sealscope.diagnosis.verdict") / "states.toml").read_text("utf-8"))["causes"]
-    assert {*get_args(Cause), *(event.cause for event in load_events() if event.cause)} == causes.keys()
+    single_causes = {*get_args(Cause), *(event.cause for event in load_events() if event.cause)}
+    assert single_causes | joint_causes().keys() == causes.keys()
+    assert all(set(joined) <= single_causes for joined in joint_causes().values())
     actions = {cause: state_of("cannot tell", cause).action for cause in causes}
     assert len({*actions.values()}) == len(actions)
     assert state_of("cannot tell").action not in actions.values()

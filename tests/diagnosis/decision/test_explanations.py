@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import t as student
 
+from sealscope.diagnosis.decision.case import Case
 from sealscope.diagnosis.decision.events import load_events
 from sealscope.diagnosis.decision.explanations import (
     LEAK_EVENTS,
@@ -16,9 +17,11 @@ from sealscope.diagnosis.decision.explanations import (
     probability_beside_chance,
     probability_of,
 )
-from sealscope.diagnosis.inference.observable import LeakRise
+from sealscope.diagnosis.decision.null import HealthyNull
+from sealscope.diagnosis.inference.observable import LeakRise, Observed
 from sealscope.diagnosis.inference.scatter import Rise
 from sealscope.diagnosis.priors.decision import DECISION
+from sealscope.diagnosis.verdict.states import state_of
 
 from .cases import observable
 
@@ -114,8 +117,8 @@ def test_a_rare_change_with_an_improbable_cause_is_by_chance() -> None:
     for chance, happened in ((1e-4, False), (1e-8, True)):
         motion = observable("motion: motion", chance)
         explained = explain([motion])
-        assert probability_of(explained, cause=scale.cause, data_kind="motion") > 0.99
-        beside_chance = probability_beside_chance(explained, "sensor fault", "motion")
+        assert probability_of(explained, causes=[scale.cause], data_kind="motion") > 0.99
+        beside_chance = probability_beside_chance(explained, ["sensor fault"], "motion")
         bound = log_bayes_factor(chance)
         odds = scale.probability * math.exp(bound / (1.0 + 2.0 * DECISION.explanation.misfit * bound))
         assert beside_chance == pytest.approx(odds / (1.0 + odds), rel=0.1)
@@ -197,3 +200,15 @@ def test_a_step_that_later_holds_contradict_is_no_leak() -> None:
     for rise, is_likely in ((Rise(0.0, 1.0, 30.0), False), (Rise(40.0, 1.0, 30.0), True)):
         explained = explain([LEAK, rival], rise=LeakRise(rise, rise.log_ratio(40.0)))
         assert (probability_of(explained, *LEAK_EVENTS, data_kind="volumes") > 0.5) == is_likely
+
+
+def test_two_causes_that_the_data_cannot_separate_are_named_together() -> None:
+    """A pressure that falls near the charge pressure, of a recording in which the other never comes near it."""
+    falls = [observable("drift: fall of the charge pressure", 1e-8), observable("drift: drift of low p_A", 1e-8)]
+    event = Case(Observed("test", observables=tuple(falls)), falls, HealthyNull(), 0.01).other_event
+    assert event is not None and event.cause == "external leak or sensor fault"
+    assert event.description == "the external leakage on side A or the zero of p_A"
+    assert state_of("no change", event.cause).name == "maintenance required"
+    clear = [falls[0], observable("drift: drift of low p_A", 1e-3)]
+    event = Case(Observed("test", observables=tuple(clear)), clear, HealthyNull(), 0.01).other_event
+    assert event is not None and event.cause == "external leak"

@@ -11,6 +11,7 @@ from typing import Any
 from sealscope.campaigns.cases.case import CampaignCase, CaseInputs
 from sealscope.campaigns.plans.duty import COMMAND
 from sealscope.diagnosis.verdict.evidence import LEAKS, Evidence, Verdict
+from sealscope.diagnosis.verdict.states import joint_causes
 from sealscope.errors import InputError, SealscopeError
 from sealscope.evaluation.table import CANNOT_TELL
 from sealscope.simulation.faults import parse_fault
@@ -23,6 +24,7 @@ STROKE = "stroke"
 _AMBIGUOUS_CAUSES = {
     "piston or pump leak": (PISTON_LEAK, "pump leak"),
     "internal or external leak": (PISTON_LEAK, "pump leak", "external leak"),
+    **joint_causes(),
 }
 #: By detector: its score, None for `cannot tell`, and the onset [s] that it estimates, None for none.
 Scores = Mapping[str, tuple[float | None, float | None]]
@@ -79,7 +81,8 @@ def duty_label(levels: Mapping[str, str | float]) -> str:
 def matches_cause(named: str, true_cause: str) -> bool:
     """Return True if the cause that a detector names is the true one, or an ambiguous one that includes it.
 
-    "piston or pump leak" includes both kinds of leak, "internal or external leak" also one to the outside.
+    "piston or pump leak" includes both kinds of leak, "internal or external leak" also one to the outside, and a joint
+    cause each of its causes (`joint_causes`).
     """
     return named == true_cause or true_cause in _AMBIGUOUS_CAUSES.get(named, ())
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.decision.events import load_events
+from sealscope.diagnosis.decision.events import Event, load_events
 from sealscope.diagnosis.decision.explanations import (
     LEAK_EVENTS,
     Explanation,
@@ -23,6 +23,7 @@ from sealscope.diagnosis.inference.observable import LeakMeasure, Observable, Ob
 from sealscope.diagnosis.inference.scatter import RISE
 from sealscope.diagnosis.priors.decision import DECISION
 from sealscope.diagnosis.verdict.evidence import AGAINST, WITHIN
+from sealscope.diagnosis.verdict.states import joint_causes
 
 #: Name of the third test, besides WITHIN and AGAINST: whether the leakage exceeds the limit in the rig's file.
 LEVEL = "against the rig's file"
@@ -115,7 +116,7 @@ class Case:
         """
         if not self.weigh_rivals:
             return 0.0
-        return probability_of(self.explanations, cause="external leak", data_kind=self._data_kind(alarm))
+        return probability_of(self.explanations, causes=["external leak"], data_kind=self._data_kind(alarm))
 
     def _data_kind(self, alarm: LeakTest) -> str:
         """Return the kind of data (`Observable.data`) by which a test raised its alarm.
@@ -164,7 +165,8 @@ class Case:
         """Event other than a leak that explains a rare change with sufficient probability; None if there is none.
 
         The changes are tried in the order of their probability in a healthy recording, the least probable first. The
-        search ends at a change that is more probable than the allowed probability of naming an event by mistake.
+        search ends at a change that is more probable than the allowed probability of naming an event by mistake. Two
+        causes that the data cannot separate are named together if neither is probable enough alone (`joint_causes`).
         """
         named_events = [event for event in load_events() if event.cause and event.name not in LEAK_EVENTS]
         candidates_of = {
@@ -178,14 +180,37 @@ class Case:
         for observable in sorted(self.observables, key=chances.__getitem__):
             if chances[observable] >= allowed:
                 return None
-            candidates = candidates_of[observable]
-            for cause in dict.fromkeys(event.cause for event in candidates if event.cause):
-                among_events = probability_of(self.explanations, cause=cause, data_kind=observable.data)
-                probability = probability_beside_chance(self.explanations, cause, observable.data)
-                if among_events > DECISION.explanation.named and probability > DECISION.explanation.happened:
-                    likeliest = max((e for e in candidates if e.cause == cause), key=lambda e: e.probability)
-                    return OtherEvent(cause, likeliest.description, probability, observable, chances[observable])
+            single_causes = {event.cause: (event.cause,) for event in candidates_of[observable] if event.cause}
+            joined = {name: causes for name, causes in joint_causes().items() if single_causes.keys() & set(causes)}
+            for cause, alternatives in (single_causes | joined).items():
+                probability = self._probability_of_causes(alternatives, observable.data)
+                if probability is not None:
+                    description = " or ".join(self._describe(cause, observable.data) for cause in alternatives)
+                    return OtherEvent(cause, description, probability, observable, chances[observable])
         return None
+
+    def _probability_of_causes(self, causes: Sequence[str], data_kind: str) -> float | None:
+        """Compute the probability that a change of a kind of data has one of the causes, and is not by chance.
+
+        None if it is too improbable to be named, be it against all other causes or against chance, or if one of
+        several causes is excluded.
+        """
+        limits = DECISION.explanation
+        among_events = [probability_of(self.explanations, causes=[cause], data_kind=data_kind) for cause in causes]
+        probability = probability_beside_chance(self.explanations, causes, data_kind)
+        is_named = probability_of(self.explanations, causes=causes, data_kind=data_kind) > limits.named
+        is_whole = min(among_events) > 1.0 - limits.sure
+        return probability if is_named and is_whole and probability > limits.happened else None
+
+    def _describe(self, cause: str, data_kind: str) -> str:
+        """Describe the most probable event with a cause that explains a kind of data (`Observable.data`) in words."""
+        tests = [observable for observable in self.observables if observable.data == data_kind]
+        events = [event for event in load_events() if event.cause == cause and any(map(event.affects, tests))]
+
+        def probability(event: Event) -> float:
+            return probability_of(self.explanations, event.name, data_kind=data_kind)
+
+        return max(events, key=probability).description
 
 
 def _leak_tests(case: Case, leak: LeakMeasure) -> tuple[LeakTest, ...]:

@@ -58,9 +58,9 @@ class Explanation:
         """Return True if this set of events contains one with any of the `names`."""
         return any(event.name in names for event in self.events)
 
-    def has_cause(self, cause: str | None) -> bool:
-        """Return True if this set of events contains one with the `cause`; False if it is None."""
-        return cause is not None and any(event.cause == cause for event in self.events)
+    def has_cause(self, *causes: str) -> bool:
+        """Return True if this set of events contains one with any of the `causes`."""
+        return any(event.cause in causes for event in self.events)
 
 
 #: Log Bayes factors of an event by kind of data.
@@ -267,9 +267,9 @@ def _coincide(observable: Observable, anchor: Observable) -> bool:
 
 
 def probability_of(
-    explanations: Sequence[Explanation], *names: str, cause: str | None = None, data_kind: str | None = None
+    explanations: Sequence[Explanation], *names: str, causes: Sequence[str] = (), data_kind: str | None = None
 ) -> float:
-    """Compute the probability that one of the named events, or any event with the given cause, happened.
+    """Compute the probability that one of the named events, or any event with one of the causes, happened.
 
     `explanations`: sets of events with their probabilities; `names`: names of events; `data_kind`: if given, only the
     sets that explain this kind of data (`Observable.data`) count, and their probabilities are renormalised. The
@@ -278,17 +278,17 @@ def probability_of(
     relevant = [explanation for explanation in explanations if data_kind is None or data_kind in explanation.data]
     total = sum(explanation.probability for explanation in relevant)
     matching = sum(
-        explanation.probability for explanation in relevant if explanation.has(*names) or explanation.has_cause(cause)
+        explanation.probability for explanation in relevant if explanation.has(*names) or explanation.has_cause(*causes)
     )
     return float(matching / total) if total > 0.0 else 0.0
 
 
-def probability_beside_chance(explanations: Sequence[Explanation], cause: str, data_kind: str) -> float:
-    """Compute the probability that an event with a cause has changed a kind of data, rather than another event or none.
+def probability_beside_chance(explanations: Sequence[Explanation], causes: Sequence[str], data_kind: str) -> float:
+    """Compute the probability that an event with one of the causes has changed a kind of data, and not chance.
 
     It is the sum of the odds of the sets that contain such an event and explain this kind of data (`Observable.data`),
     over 1 + the sum of the odds of all sets that explain it. The 1 stands for no event: the change is then by chance.
     """
     relevant = [explanation for explanation in explanations if data_kind in explanation.data]
-    matching = sum(explanation.odds for explanation in relevant if explanation.has_cause(cause))
+    matching = sum(explanation.odds for explanation in relevant if explanation.has_cause(*causes))
     return float(matching / (1.0 + sum(explanation.odds for explanation in relevant)))

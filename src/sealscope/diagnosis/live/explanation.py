@@ -61,7 +61,7 @@ def explain_rise(observables: Sequence[Observable], data: str, onset: Interval, 
     if probability_of(explanations, *names) > _MIN_PROBABILITY.leak:
         if not any(event.affects(observable) for event in events for observable in rare_changes):
             return UNKNOWN
-        is_outside = probability_of(explanations, cause=OUTSIDE) > _MIN_PROBABILITY.named
+        is_outside = probability_of(explanations, causes=[OUTSIDE]) > _MIN_PROBABILITY.named
         return RiseExplanation(is_leak=True, is_outside=is_outside)
     best = next((explanation for explanation in explanations if not explanation.has(*ALARMING)), None)
     if best is None or not rare_changes:

@@ -89,6 +89,12 @@ def find_separation(cause: str) -> str | None:
     return words
 
 
+@cache
+def joint_causes() -> Mapping[str, tuple[str, ...]]:
+    """Return the names under which `states.toml` joins causes that some data cannot separate, each with its causes."""
+    return {name: tuple(row["joins"]) for name, row in _tables()["causes"].items() if "joins" in row}
+
+
 def action_of(condition: str, cause: str | None = None, parts: Sequence[str] = ()) -> str:
     """Return the action for a condition of `states.toml`, or for the cause of a change if the table has one.
 
