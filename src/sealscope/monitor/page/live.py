@@ -23,9 +23,11 @@ from sealscope.units import LITRE_PER_MINUTE
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-#: Samples kept of an actuator: the last `SPAN_S` [s], but at least `MIN_SAMPLES`, which the details need, and at most
-#: `MAX_SAMPLES`; they are kept for at most `MAX_ACTUATORS` at a time.
-SPAN_S, MIN_SAMPLES, MAX_SAMPLES, MAX_ACTUATORS = 20.0, 2500, 20_000, 20
+#: Samples kept of a viewed actuator: those of the last `SPAN_S` seconds, but at least `MIN_SAMPLES`, which the wavelet
+#: details need, and at most `MAX_SAMPLES`.
+SPAN_S, MIN_SAMPLES, MAX_SAMPLES = 20.0, 2500, 20_000
+#: Most actuators that are viewed at a time.
+MAX_ACTUATORS = 20
 #: Bins of a chart, each with its minimum and maximum; rate of the drawn motion [Hz], and its length [s].
 _BINS, _MOTION_HZ, _MOTION_S = 400, 20.0, 8.0
 #: Samples between two windows of the RMS.
@@ -40,8 +42,8 @@ PRESSURES = ("p_A", "p_B")
 class _Window:
     """The last samples of an actuator without a gap.
 
-    `rate` [Hz]: sampling rate; `t` [s]: times; `version`: number of blocks added. The arrays are replaced and never
-    changed, so readers need no lock.
+    `rate` [Hz]: sampling rate; `t` (n,) [s]: times; `channels`: samples (n,) by channel; `version`: number of blocks
+    added so far. An array is never changed after it is set, so readers need no copy.
     """
 
     rate: float = 0.0
@@ -89,7 +91,8 @@ class LiveSamples:
     def viewing(self, name: str) -> Iterator[bool]:
         """Keep the samples of an actuator while the context lasts, and yield True.
 
-        If too many actuators are viewed already, yield False and keep none.
+        The last stored samples are shown until new ones arrive. If `MAX_ACTUATORS` others are viewed already, nothing
+        is kept, and False is yielded.
         """
         with self._lock:
             is_first = name not in self._windows
@@ -137,11 +140,13 @@ class LiveSamples:
     def curves(self, name: str, pressure: str = "p_A", detail_form: str = "rms") -> dict[str, Any]:
         """Compute the curves that the page draws of a viewed actuator, as plain values with None for a missing one.
 
-        In the result, `t` is the time of the last sample [s], None if there are no samples. The times of the curves are
-        relative to it. `pressures` has the chamber pressures [bar]; `details` the wavelet details d1 to d4 of one
-        pressure [kPa]; and `motion` the position [mm], the pressures [bar], and the speeds of piston [mm/s] and pump
-        [rpm]. `pressure`: channel for `details`; `detail_form`: "rms" for the RMS of the details in windows of
-        `WINDOW_SIZE` samples, "details" for the details themselves.
+        `pressure`: channel whose wavelet details are computed; `detail_form`: "rms" for the RMS of the details in
+        windows of `WINDOW_SIZE` samples, "details" for the details themselves. Among the returned values are:
+
+        - `t`: time of the last sample [s], None if there are no samples; the times of the curves are relative to it;
+        - `pressures`: the chamber pressures [bar];
+        - `details`: the wavelet details d1 to d4 of one pressure [kPa], or their RMS;
+        - `motion`: position [mm], pressures [bar], and speeds of piston [mm/s] and pump [rpm].
         """
         with self._lock:
             window = self._windows.get(name) or _Window()
@@ -255,9 +260,11 @@ def _motion_curves(t: Array, channels: dict[str, Array], rate: float) -> dict[st
 def describe_rig(rig: str) -> dict[str, Any]:
     """Describe the parts of a rig that the page draws, as plain values by name.
 
-    `rig`: name of a packaged rig, or path of a rig's or machine's file. The values are `title`; `rods`, the sides of
-    the cylinder at which a rod leaves it; `valve`, True if a servo valve drives the cylinder; `stroke` [mm]; `area`,
-    the mean piston area as flow per speed [L/min per mm/s]; and `displacement`, that of the pump [L/rev].
+    `rig`: name of a packaged rig, or path of a rig's or machine's file. The values are:
+
+    - `title`; `stroke` of the cylinder [mm]; `rods`: sides of the cylinder at which a rod leaves it;
+    - `valve`: True if a servo valve drives the cylinder; `displacement` of the pump [L/rev];
+    - `area`: mean piston area, expressed as flow per speed [L/min per mm/s].
     """
     from sealscope.diagnosis.commissioned.watched import load_watched
     from sealscope.reporting.schematic import build_circuit
