@@ -26,10 +26,12 @@ from sealscope.monitor.supervisor import OPCUA, PartAway
 from sealscope.recordings.recording import CHANNEL_UNITS
 from sealscope.units import to_si
 
-#: Publications per block; largest number of blocks in the queue, and of their bytes: more are dropped and counted.
-_PUBLICATIONS, _MAX_QUEUE, _MAX_QUEUE_BYTES = 4, 256, 64_000_000
+#: Publications per block.
+_PUBLICATIONS = 4
+#: Most blocks in the queue, and most bytes of them; further blocks are dropped and counted.
+_MAX_QUEUE, _MAX_QUEUE_BYTES = 256, 64_000_000
 #: How often the connection is checked [s].
-_LOOK_S = 0.5
+_POLL_S = 0.5
 _NO_ROOM = "blocks of OPC UA that found no room"
 _NO_NUMBER = "OPC UA values that are no number"
 
@@ -56,20 +58,23 @@ class _OpcUaSession:
         self._settings, self._password, self._service = settings, password, service
         self._server = service.supervisor.part(OPCUA)
         self._gatherers: dict[str, ValueGatherer] = {}
-        self._scales: dict[tuple[str, str], Callable[[Any], Any]] = {}
+        # by actuator and channel: function that converts values to SI units
+        self._converters: dict[tuple[str, str], Callable[[Any], Any]] = {}
         self._actuators = [actuator for actuator in service.settings.actuator if actuator.nodes]
         for actuator in self._actuators:
             rate = float(actuator.rate or math.nan)  # never None: the settings are checked
             self._gatherers[actuator.name] = ValueGatherer(tuple(actuator.nodes), rate, settings.block_s, service.count)
             for channel in actuator.nodes:
-                si, unit = CHANNEL_UNITS[channel], actuator.units.get(channel)
-                self._scales[actuator.name, channel] = partial(to_si, unit=unit or si, si_unit=si, name=channel)
-        self._channels: dict[Any, tuple[str, str]] = {}
+                si_unit = CHANNEL_UNITS[channel]
+                unit = actuator.units.get(channel) or si_unit
+                self._converters[actuator.name, channel] = partial(to_si, unit=unit, si_unit=si_unit, name=channel)
+        self._channels: dict[Any, tuple[str, str]] = {}  # actuator and channel by node
         self._waiting: BoundedQueue[SourceBlock] = BoundedQueue(_MAX_QUEUE, _MAX_QUEUE_BYTES)
 
     def run(self) -> None:
         """Submit blocks until the service stops, and reconnect after a lost connection."""
-        stopping, submitting = self._service.stopping, self._service.supervisor.start("OPC UA blocks", self._submit)
+        stopping = self._service.stopping
+        submitting = self._service.supervisor.start("OPC UA blocks", self._submit)
         while not stopping.wait(self._server.pause_s):
             self._server.attempt(lambda: asyncio.run(self._connect()))
             for gatherer in self._gatherers.values():
@@ -113,7 +118,7 @@ class _OpcUaSession:
             self._server.end_outage()
             while not self._service.stopping.is_set():
                 await client.check_connection()
-                await asyncio.sleep(_LOOK_S)
+                await asyncio.sleep(_POLL_S)
 
     def datachange_notification(self, node: Any, value: Any, data: Any) -> None:
         """Add a value of a subscription, and queue the blocks that it completes; asyncua calls this.
@@ -134,14 +139,18 @@ class _OpcUaSession:
         if samples.ndim != 1 or not samples.size:
             self._service.count(_NO_NUMBER)
             return
-        for block in self._gatherers[name].push(channel, t, self._scales[name, channel](samples).tolist()):
+        si_samples = self._converters[name, channel](samples)
+        for block in self._gatherers[name].push(channel, t, si_samples.tolist()):
             # a digest of the contents: a block sent again is recognised
             identity = compute_digest(np.concatenate([block.t, *block.channels.values()]).tobytes())
             if not self._waiting.put(SourceBlock(name, identity, block), count_bytes(block)):
                 self._service.count(_NO_ROOM)
 
     def _submit(self) -> None:
-        """Submit the queued blocks until the service stops, in a separate thread, because the service may block."""
+        """Submit the queued blocks until the service stops.
+
+        This runs in a separate thread, because the service may block.
+        """
         while not self._service.stopping.is_set():
-            for block in self._waiting.pop(1, _LOOK_S):
+            for block in self._waiting.pop(1, _POLL_S):
                 self._service.submit(block)
