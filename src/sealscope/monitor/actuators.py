@@ -129,7 +129,7 @@ class _Actuator:
         return estimates, events
 
     def _baseline_version(self) -> int:
-        """Return the version number of the actuator's learned healthy baseline, 0 while one is being learned."""
+        """Return the version number of the actuator's healthy baseline, 0 while a baseline is being learned."""
         return 0 if self.watch.baseline is None else self.watch.baseline.version
 
     def _update_oil_temperature(self, samples: Recording) -> None:
@@ -199,9 +199,9 @@ class _Actuator:
     def summary(self) -> dict[str, Any]:
         """Build the summary of the actuator for the page, the metrics and messages, as plain values by name.
 
-        If whole recordings are judged, status and time are those of the last verdict, and the flows too if it decides
-        (`RecordingVerdict.decides`). Otherwise they are those of the detector's last block. Unknown values are None.
-        The names are:
+        If whole recordings are judged, status and time come from the last verdict, and so do the flows if this verdict
+        decides (`RecordingVerdict.decides`). Otherwise they come from the detector's last block. Unknown values are
+        None. The names are:
 
         - `blocks`: number of blocks of samples that the detector has seen; `counters`: its counters; `by`: its method;
         - `t`: end of the last block or recording [s since 1970]; `status`: its result in words;

@@ -89,10 +89,7 @@ class Alarm:
 
     @property
     def status_word(self) -> int:
-        """Status of the actuator as a sum of bits.
-
-        The bits are 1 for an active warning, 2 for an active error, and 4 for a new alarm that is not shelved.
-        """
+        """Status as a sum of bits: 1 for an active warning, 2 for an active error, 4 for a new alarm, not shelved."""
         level_bit = ERROR_BIT if self.level == "error" else WARNING_BIT
         new_bit = NEW_BIT if self.state == "new" and not self.shelved else 0
         return (level_bit if self.active else 0) | new_bit
@@ -307,7 +304,7 @@ def rank_actuators(summaries: Mapping[str, Mapping[str, Any]], alarms: list[dict
     """
 
     def rank(row: Mapping[str, Any]) -> tuple[Any, ...]:
-        """Compute the sorting key of an actuator's row; the most urgent one has the smallest key."""
+        """Compute the sorting key of an actuator's row, which is smallest for the most urgent actuator."""
         low_lpm, _ = row["leak_interval_lpm"] or (0.0, 0.0)
         by_chance = (row["alarm"] or {}).get("by_chance_per_1000_h")
         evidence = math.inf if by_chance is None else by_chance

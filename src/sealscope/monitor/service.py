@@ -245,8 +245,5 @@ class Service:
 
 
 def _is_logged(number: int) -> bool:
-    """Return True if occurrence `number`, from 1, of a repeated problem is to be logged.
-
-    The first `_FIRST_LINES` occurrences are logged, then those whose number is a power of two.
-    """
+    """Return True for the occurrences of a problem to log: the first `_FIRST_LINES`, then those at powers of two."""
     return number <= _FIRST_LINES or number.bit_count() == 1

@@ -185,8 +185,5 @@ def _decode_metric(entry: Any) -> SparkplugMetric:
 
 
 def topic_of(group: str, kind: str, node: str, device: str | None = None) -> str:
-    """Build the MQTT topic of a Sparkplug message of a node, or of one of its devices.
-
-    `kind`: type of the message, such as ``NBIRTH`` or ``DDATA``.
-    """
+    """Build the MQTT topic of a Sparkplug message of a node or of its device; `kind`: its type, such as ``NBIRTH``."""
     return "/".join([NAMESPACE, group, kind, node, *([] if device is None else [device])])

@@ -73,7 +73,8 @@ class RecordingVerdict:
         onset, onset_ends = plain["onset_s"], _parse_interval(plain["onset_interval_s"])
         leaks = diagnosis.verdict == LEAK
         total = plain["total_leakage"] or {}
-        since = None if not leaks else start_s if onset is None else onset + shift
+        onset_s = None if onset is None else onset + shift
+        leak_since_s = start_s if onset_s is None else onset_s
         return cls(
             file=diagnosis.file,
             verdict=diagnosis.verdict,
@@ -82,10 +83,10 @@ class RecordingVerdict:
             odds=diagnosis.odds or "",
             reason=diagnosis.reason,
             cause=diagnosis.named_cause or "",
-            state={**plain["state"], "since_s": since},
+            state={**plain["state"], "since_s": leak_since_s if leaks else None},
             start_s=start_s,
             end_s=end_s,
-            onset_s=None if onset is None else onset + shift,
+            onset_s=onset_s,
             onset_interval_s=None if onset_ends is None else (onset_ends[0] + shift, onset_ends[1] + shift),
             leak_lpm=plain["leak_lpm"] if leaks else None,
             leak_interval_lpm=_parse_interval(plain["leak_interval_lpm"]) if leaks else None,

@@ -29,10 +29,7 @@ def is_file_path(text: str | os.PathLike[str]) -> bool:
 
 
 def special_kind(mode: int) -> str | None:
-    """Return the kind of a file that is not regular, such as "a folder", from its `st_mode`.
-
-    The result is None for a regular file.
-    """
+    """Return the kind of a file, such as "a folder", by its `st_mode`; return None for a regular file."""
     return next((name for is_kind, name in _KINDS if is_kind(mode)), None)
 
 

@@ -46,10 +46,7 @@ def _parse_whole(text: str) -> int:
 
 @cache
 def _type_adapter(kind: Any) -> Any:
-    """Make the pydantic validator of a type.
-
-    It is cached, because making one takes long.
-    """
+    """Build the pydantic validator of a type; the result is cached, because building it takes long."""
     from pydantic import TypeAdapter
 
     return TypeAdapter(kind)

@@ -27,7 +27,8 @@ def export_labels(store: MonitorStore, folder: Path) -> tuple[int, int]:
     The estimates from the start of an alarm's onset interval until its last mark are labelled: `leak` if the mark is
     `repaired` or `valid`, `healthy` if it is `invalid`. Other estimates have no label.
     """
-    events, rows = _events_by_alarm(store), []
+    events = _events_by_alarm(store)
+    rows = []
     # by actuator: start and stop [s] of an interval, and the columns `label` and `alarm` of the estimates in it
     intervals = defaultdict[str, list[tuple[float, float, dict[str, str]]]](list)
     for alarm in sorted(reversed(store.alarms()), key=lambda alarm: float(alarm["raised_s"])):

@@ -57,10 +57,10 @@ def limit_answers(engine: Engine) -> None:
             return super().wait(self._with_time_limit(gen), *arguments, **options)
 
         def _with_time_limit(self, gen: Generator[Any, Any, Any]) -> Generator[Any, Any, Any]:
-            """Run psycopg's generator `gen`, which waits for an answer of the server, for up to `ANSWER_S`.
+            """Run psycopg's generator `gen`, which waits for answers of the server, each for up to `ANSWER_S`.
 
-            Then the connection is closed and OperationalError raised. Psycopg resumes this generator several times a
-            second, even if there is no answer; `ready` is then false.
+            If an answer takes longer, the connection is closed and OperationalError raised. Psycopg resumes this
+            generator several times a second; `ready` is false while there is no answer.
             """
             last_answer = time.monotonic()
             ready: Any = None

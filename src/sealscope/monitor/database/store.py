@@ -228,7 +228,7 @@ class MonitorStore:
     def insert_blocks(self, connection: sa.Connection, blocks: Iterable[tuple[str, str, int]]) -> None:
         """Store the identities of blocks, each given as (actuator, identity, running number in the actuator's blocks).
 
-        Raises IntegrityError, which ends the transaction, if one of them is stored already.
+        Raises IntegrityError, which ends the transaction, if one of the blocks is stored already.
         """
         names = ("actuator", "identity", "number")
         connection.execute(tables.blocks.insert(), [dict(zip(names, block, strict=True)) for block in blocks])
@@ -267,7 +267,7 @@ class MonitorStore:
         if not rows:
             return
         key = table.primary_key.columns.keys()
-        # SQLAlchemy takes a parameter with the name of a column as its new value, so those of the key get a prefix
+        # SQLAlchemy takes a parameter with the name of a column as its new value: the values of the key get a prefix
         is_row = [table.c[name] == bindparam(f"of_{name}") for name in key]
         values = [{f"of_{name}" if name in key else name: value for name, value in row.items()} for row in rows]
         if connection.execute(table.update().where(*is_row), values).rowcount < len(rows):
@@ -386,15 +386,14 @@ class MonitorStore:
                 yield dict(row._mapping)
 
     def position(self, name: str) -> int:
-        """Read how far an output has come in the sequence of alarm events: number of the last delivered event, or 0.
+        """Read the number of the last alarm event that the output `name` has delivered, 0 for none.
 
-        `name`: the output. The Sparkplug node also stores the number of its last birth message here, under another
-        name.
+        The Sparkplug node also stores the number of its last birth message in this way.
         """
         return self._value(select(tables.facts.c.value).where(tables.facts.c.name == name))
 
     def write_position(self, name: str, number: int) -> None:
-        """Store how far the output `name` has come: `number` of the last delivered event, which `position` reads."""
+        """Store the number of the last alarm event that the output `name` has delivered."""
         with self.writing() as connection:
             self.upsert(connection, tables.facts, [{"name": name, "value": str(number)}])
 

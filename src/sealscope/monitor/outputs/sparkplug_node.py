@@ -113,7 +113,7 @@ class SparkplugNode:
             self._link.close()
 
     def _topic(self, kind: str, device: str | None = None) -> str:
-        """Build the topic of a message of this node, or of one of its devices; `kind`: its type, such as "DDATA"."""
+        """Build the topic of a message of this node, or of one of its devices; `kind`: type, such as "DDATA"."""
         return spb.topic_of(self._settings.group, kind, self._settings.node, device)
 
     def _birth_number_metric(self) -> spb.SparkplugMetric:
@@ -215,10 +215,7 @@ def _load_table(name: str) -> Mapping[str, Mapping[str, str]]:
 
 
 def _milliseconds(t: float | None) -> int:
-    """Convert a time of samples [s] to milliseconds since 1970.
-
-    If the time is None, or not counted from 1970, the present time is returned.
-    """
+    """Convert a time [s] to milliseconds since 1970; use the present time for None, or if `t` is not since 1970."""
     return round(1000.0 * (t if t is not None and counts_from_1970(t) else time.time()))
 
 

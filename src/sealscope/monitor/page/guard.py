@@ -31,7 +31,7 @@ class Admission:
 
     `token`: the valid token; `now`: function that returns a monotonic time [s].
 
-    After five wrong tokens the next one from the same address, right or wrong, is checked only after a pause of 1 s.
+    After five wrong tokens the next token from the same address, right or wrong, is checked only after a pause of 1 s.
     Each further wrong token doubles the pause, up to a minute. An IPv6 network (/64) counts as one address.
     """
 
@@ -45,8 +45,8 @@ class Admission:
     def pause_s(self, address: str) -> float:
         """Compute the time [s] that a client's IP address must wait until its next token is checked, 0 for no wait.
 
-        After `_FREE_ATTEMPTS` wrong tokens from its network the pause doubles with each further one, up to
-        `_MAX_PAUSE_S`.
+        After `_FREE_ATTEMPTS` wrong tokens from its network the pause is `_FIRST_PAUSE_S`. Each further wrong token
+        doubles it, up to `_MAX_PAUSE_S`.
         """
         n_failures, last = self._failures.get(_network(address), (0, 0.0))
         if n_failures < _FREE_ATTEMPTS:

@@ -54,7 +54,7 @@ class _Window:
     def add(self, samples: Recording) -> None:
         """Append samples to the window; start anew after a gap, or if the sampling rate or the channels change.
 
-        Samples that are in the window already, without channels, or with times that are not finite are ignored.
+        Samples are ignored if they are in the window already, have no channels, or have times that are not finite.
         """
         max_samples = min(MAX_SAMPLES, max(MIN_SAMPLES, round(SPAN_S * samples.rate)))
         t = samples.t[-max_samples:]
@@ -76,7 +76,7 @@ class _Window:
 
 
 class LiveSamples:
-    """The last seconds of samples of the actuators that somebody views; no others are kept.
+    """The last seconds of samples of the actuators that somebody views; other samples are not kept.
 
     `recall`: function that returns the last stored samples of an actuator, which are shown first.
     """
@@ -199,8 +199,8 @@ def _detail_curves(t: Array, signal: Array | None, pressure: str, detail_form: s
     """Compute the curves of the wavelet details [kPa] of a pressure, or of their RMS, as plain values.
 
     `signal` [Pa]: the pressure over the times `t` [s], None if it is not recorded; `pressure`: its name;
-    `detail_form`: "details" or "rms". Only the samples after the last missing one are used; if they are too few, the
-    curves are empty.
+    `detail_form`: "details" or "rms". Only the samples after the last missing one are used. If they are fewer than
+    needed, the curves are empty, and `needs` and `has` state these numbers.
     """
     samples = np.empty(0) if signal is None else signal / _KILOPASCAL
     missing_indices = np.flatnonzero(~np.isfinite(samples))
@@ -235,10 +235,7 @@ def _motion_curves(t: Array, channels: dict[str, Array], rate: float) -> dict[st
         return {"t": []}
 
     def bin_means(values: Array) -> Array:
-        """Average samples (n,) over bins of `bin_size` successive samples; return the means (n_bins,).
-
-        The last bin ends with the last sample. Samples before the first of the `n_bins` bins are left out.
-        """
+        """Average the last samples of `values` (n,) over bins of `bin_size` successive samples; return (n_bins,)."""
         return np.asarray(values[values.size - n_bins * bin_size :].reshape(n_bins, bin_size).mean(axis=1))
 
     times = bin_means(t)

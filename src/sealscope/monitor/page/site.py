@@ -99,7 +99,7 @@ def site(
 
 
 class _Pages:
-    """The request handlers of the page; each method serves one URL path of `_ROUTES`."""
+    """The request handlers of the page; `_ROUTES` states which method serves which URL path."""
 
     def __init__(
         self, actuators: WatchedActuators, token: str | None, queue_load: Callable[[], QueueLoad], live: LiveSamples

@@ -65,7 +65,7 @@ _ASKED_AGAIN = "messages of QoS 1 that found no room and were asked for again"
 def broker_source(settings: BrokerSettings) -> Callable[[BlockReceiver], None]:
     """Build a source that submits the messages of a broker as blocks, and publishes alarms to it.
 
-    Returns a function that takes the receiver of the blocks and runs until that stops. Raises InputError if a secret
+    Returns a function that takes the receiver of the blocks, and runs until it stops. Raises InputError if a secret
     cannot be read, and MissingExtra if the MQTT library is not installed.
     """
     password = read_secret(settings.password_file, "mqtt.password_file")

@@ -146,10 +146,7 @@ class WatchedFolder:
         return True
 
     def _may_be_incomplete(self, file: _FoundFile) -> bool:
-        """Return True if an unreadable file may still be written.
-
-        This is assumed until it has not changed for `_PATIENCE_FACTOR` times `settle_s`.
-        """
+        """Return True if an unreadable file may be unfinished: it changed within `_PATIENCE_FACTOR` x `settle_s`."""
         return self._unchanged_s(file) < _PATIENCE_FACTOR * self.settle_s
 
     def _start_time(self, file: _FoundFile) -> float:
@@ -275,8 +272,8 @@ def watch_folders(service: BlockReceiver, *, once: bool) -> None:
 
     `once`: True to submit only the present files.
     """
-    settle_s, part = 0.0 if once else service.settings.settle_s, service.supervisor.part
-    summaries = service.summaries()
+    settle_s = 0.0 if once else service.settings.settle_s
+    part, summaries = service.supervisor.part, service.summaries()
 
     def newest_time(name: str) -> float:
         """Return the time of an actuator's newest stored sample [s since 1970], -inf if there is none."""

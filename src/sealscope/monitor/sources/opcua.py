@@ -1,7 +1,7 @@
 """Read samples from an OPC UA server by subscription, and gather them into blocks.
 
-Each channel of an actuator is a variable of the server. Its value is a number, or an array of samples of which the
-first is at the source timestamp. The server queues the changes of each variable between two publications. Changes are
+Each channel of an actuator is a variable of the server. Its value is a number, or an array of samples that
+begins at the source timestamp. The server queues the changes of each variable between two publications. Changes are
 lost while there is no connection, because OPC UA subscriptions end with their session.
 """
 
@@ -39,7 +39,7 @@ _NO_NUMBER = "OPC UA values that are no number"
 def opcua_source(settings: OpcUaSettings) -> Callable[[BlockReceiver], None]:
     """Build a source that submits the values of an OPC UA server as blocks.
 
-    Returns a function that takes the receiver of the blocks and runs until that stops. Raises MissingExtra if the
+    Returns a function that takes the receiver of the blocks, and runs until it stops. Raises MissingExtra if the
     library asyncua is not installed, and InputError if a secret cannot be read.
     """
     if find_spec("asyncua") is None:  # before the service starts
@@ -147,10 +147,7 @@ class _OpcUaSession:
                 self._service.count(_NO_ROOM)
 
     def _submit(self) -> None:
-        """Submit the queued blocks until the service stops.
-
-        This runs in a separate thread, because the service may block.
-        """
+        """Submit the queued blocks until the service stops, in a thread of its own, because `submit` may wait."""
         while not self._service.stopping.is_set():
             for block in self._waiting.pop(1, _POLL_S):
                 self._service.submit(block)

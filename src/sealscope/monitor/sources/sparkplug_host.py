@@ -1,10 +1,10 @@
 """Read blocks of samples from edge nodes of Sparkplug B.
 
 Birth messages of a node name its metrics, data messages bring samples, and death messages end the session. A node or
-one of its devices is an actuator, and its metrics are the channels. The value of a metric is an array of samples, of
-which the first is at its timestamp, or a single sample; a single value that is left out has not changed. Timestamps
-are whole milliseconds; a block that continues the one before within that resolution is joined to it. After a missing
-sequence number an alias may stand for another metric, so messages with aliases are refused until the node has sent
+one of its devices is an actuator, and its metrics are the channels. The value of a metric is an array of samples
+that begins at its timestamp, or a single sample; a single value that is left out has not changed. Timestamps are whole
+milliseconds; a block that follows the block before within that resolution is joined to it. After a missing sequence
+number an alias may stand for another metric, so messages with aliases are refused until the node has sent
 the birth that is then requested.
 """
 
@@ -42,7 +42,7 @@ GAPS = "gaps in the sequence of a Sparkplug node"
 _REQUEST_PAUSE_S = 10.0
 #: Timestamps are truncated or rounded to whole milliseconds: largest distance of the true time before and after [s].
 _EARLY_S, _LATE_S = 0.0005, 0.001
-#: Largest shift of a block against the end of the one before [samples], as clock and rate of a node may disagree.
+#: Largest shift of a block against the end of the block before [samples], as clock and rate of a node may disagree.
 _MAX_SHIFT = 0.3
 #: Name of the metric that states the sampling rate [Hz], unless `map` names another.
 _RATE = "rate"
