@@ -67,13 +67,14 @@ class AlarmEvent(NamedTuple):
 class _Actuator:
     """The state of one watched actuator in memory.
 
-    `watch`: its leak detector; `judge`: decides on its alarm; `pending`: number of blocks of samples since the last
-    checkpoint, at which the state was stored in the database; `bytes`: total size of these blocks [bytes]; `n_stored`:
-    number of all blocks of samples so far; `last`: the detector's last estimate, with flows averaged over the machine's
-    cycles; `shown`: the summary that was stored last; `oil_celsius` [deg C]: oil temperature, None if unknown;
-    `judged_s` [s]: end of the last stretch of samples that the detector judged; `verdict`: verdict on the last
-    recording, None if whole recordings are not judged; `alarm_samples`: the last samples during an alarm, which may
-    become a healthy recording in the machine's file.
+    - `watch`: the leak detector; `judge`: decides on the alarm;
+    - `pending`, `bytes`: number of blocks of samples since the last checkpoint, at which the state was stored in the
+      database, and their total size [bytes]; `n_stored`: number of all blocks of samples so far;
+    - `last`: the detector's last estimate, with flows averaged over the machine's cycles; `judged_s` [s]: end of the
+      last stretch of samples that the detector judged;
+    - `stored_summary`: the summary that was stored last; `oil_celsius` [deg C]: oil temperature, None if unknown;
+    - `verdict`: verdict on the last recording, None if whole recordings are not judged;
+    - `alarm_samples`: the last samples during an alarm, which may become a healthy recording in the machine's file.
     """
 
     settings: ActuatorSettings
@@ -83,7 +84,7 @@ class _Actuator:
     bytes: int = 0
     n_stored: int = 0
     last: BlockEstimate | None = None
-    shown: dict[str, Any] | None = None
+    stored_summary: dict[str, Any] | None = None
     oil_celsius: float | None = None
     judged_s: float | None = None
     verdict: RecordingVerdict | None = None
@@ -96,9 +97,9 @@ class _Actuator:
 
         The detector divides the samples into blocks of some seconds, and estimates the leakage of each. `follows`:
         False if there is a gap between these samples and those before; `settings`: thresholds of the alarm; `verdict`:
-        verdict on the samples as a whole recording, None for none. If this verdict is `leak` or `no leak`, it
-        updates the alarm, and the estimates state the leak that it finds; otherwise each estimate updates the alarm.
-        The result depends only on the arguments and the state of the actuator.
+        verdict on the samples as a whole recording, None for none. If this verdict decides
+        (`RecordingVerdict.decides`), it updates the alarm, and the estimates state its leak. Otherwise each estimate
+        updates the alarm. The result depends only on the arguments and the state of the actuator.
         """
         estimates, events = [], []
         deciding_verdict = verdict if verdict is not None and verdict.decides else None
@@ -128,7 +129,7 @@ class _Actuator:
         return estimates, events
 
     def _baseline_version(self) -> int:
-        """Return the version number of the actuator's learned healthy baseline, 0 while one is being learned."""
+        """Return the version number of the actuator's healthy baseline, 0 while a baseline is being learned."""
         return 0 if self.watch.baseline is None else self.watch.baseline.version
 
     def _update_oil_temperature(self, samples: Recording) -> None:
@@ -178,11 +179,11 @@ class _Actuator:
     def _machine_state(self) -> MachineState:
         """Determine the state of the machine by NAMUR NE 107, such as "good" or "maintenance required".
 
-        It follows from the alarm if that is active, else from the verdict on the last recording if there is one. Else
-        it is that of the condition "no data", "not comparable" (nothing was judged for some time), "learning" (of the
-        healthy baseline) or "watched".
+        An active alarm determines it, otherwise the verdict on the last recording. If there is neither, it follows from
+        the detector: "no data", "not comparable" (nothing was judged for some time), "learning" (of the healthy
+        baseline) or "watched".
         """
-        alarm, baseline, ended_s = self.judge.alarm, self.watch.baseline, self.judge.over_s
+        alarm, baseline, alarm_end_s = self.judge.alarm, self.watch.baseline, self.judge.over_s
         if alarm is not None and alarm.active:
             return state_of(alarm.condition, alarm.cause, since_s=alarm.onset_s, action=alarm.next_check)
         if self.verdict is not None:
@@ -192,15 +193,15 @@ class _Actuator:
         if self.last.t - self.judged_s > self.settings.not_comparable_s:
             return state_of("not comparable", self.last.status, since_s=self.judged_s)
         if baseline is None:
-            return state_of("learning", since_s=ended_s)
-        return state_of("watched", since_s=max(baseline.known_s, ended_s or -math.inf))
+            return state_of("learning", since_s=alarm_end_s)
+        return state_of("watched", since_s=max(baseline.known_s, alarm_end_s or -math.inf))
 
     def summary(self) -> dict[str, Any]:
         """Build the summary of the actuator for the page, the metrics and messages, as plain values by name.
 
-        If whole recordings are judged, status and time are those of the last verdict, and the flows too if it decides
-        (`RecordingVerdict.decides`). Otherwise they are those of the detector's last block. Unknown values are None.
-        The names are:
+        If whole recordings are judged, status and time come from the last verdict, and so do the flows if this verdict
+        decides (`RecordingVerdict.decides`). Otherwise they come from the detector's last block. Unknown values are
+        None. The names are:
 
         - `blocks`: number of blocks of samples that the detector has seen; `counters`: its counters; `by`: its method;
         - `t`: end of the last block or recording [s since 1970]; `status`: its result in words;
@@ -215,7 +216,9 @@ class _Actuator:
         last = self.last or BlockEstimate(0, math.nan, "waits for samples")
         result: BlockEstimate | RecordingVerdict = last if verdict is None or not verdict.decides else verdict
         t = None if self.last is None else last.t
-        facts = None if baseline is None else {name: getattr(baseline, name) for name in ("version", "hours", "lpm")}
+        baseline_values = None
+        if baseline is not None:
+            baseline_values = {"version": baseline.version, "hours": baseline.hours, "lpm": baseline.lpm}
         return {
             "blocks": self.watch.blocks,
             "t": t if verdict is None else verdict.end_s,
@@ -230,7 +233,7 @@ class _Actuator:
             "recording": None if verdict is None else {name: getattr(verdict, name) for name in _VERDICT_TEXTS},
             "why_no_litres": self.watch.why_no_litres if verdict is None else "",
             "oil_celsius": self.oil_celsius,
-            "baseline": facts,
+            "baseline": baseline_values,
             "alarm": None if alarm is None else alarm.id,
             "status_word": 0 if alarm is None else alarm.status_word,
             "counters": self.watch.counters,
@@ -249,9 +252,10 @@ def _has_same_learning_settings(stored: Watch, fresh: Watch) -> bool:
     """Return True if two leak detectors learn their healthy baseline with the same settings and rig.
 
     `stored`: detector from the database; `fresh`: detector by the present settings. The rigs may differ in the pump's
-    displacement by up to 5 %, as if that were measured again.
+    displacement by up to 5 %, as two measurements of it do.
     """
-    (rig, *conditions), (stored_rig, *stored_conditions) = fresh.learned_with, stored.learned_with
+    rig, *conditions = fresh.learned_with
+    stored_rig, *stored_conditions = stored.learned_with
     return conditions == stored_conditions and (rig == stored_rig or is_remeasured(rig, stored_rig))
 
 
@@ -262,7 +266,8 @@ class _AlreadyStored(Exception):  # noqa: N818 (says what happened)
 class WatchedActuators:
     """The watched actuators of a monitor, restored from its database.
 
-    `settings`: of each actuator; `store`: the database; `keep_days`: days of operation whose estimates are stored.
+    `settings`: settings of each actuator; `store`: the database; `keep_days`: days of operation whose estimates are
+    stored.
     """
 
     def __init__(self, settings: list[ActuatorSettings], store: MonitorStore, keep_days: float = 90.0) -> None:
@@ -301,11 +306,12 @@ class WatchedActuators:
     def _load_checkpoint(self, actuator: _Actuator, stored: StoredCheckpoint) -> bool:
         """Restore an actuator from its checkpoint in the database, and judge the samples since then again.
 
-        Its detector (`watch`) starts anew if another version saved the state, or if it learned with another rig or
+        The detector (`watch`) starts anew if another version saved its state, or if it learned with another rig or
         learning time. Returns True if a new checkpoint must be saved, because the detector starts anew or the
         settings changed.
         """
-        settings, fresh, state, name = actuator.settings, actuator.watch, stored.state, actuator.settings.name
+        settings, name = actuator.settings, actuator.settings.name
+        fresh, state = actuator.watch, stored.state
         actuator.judge = restore(AlarmJudge, state["judge"], "alarm")
         if (version := require_part(state["watch"], "version", int)) != STATE_VERSION:
             _log.warning("%s: its state has version %s, not %d, begins anew", name, version, STATE_VERSION)
@@ -358,7 +364,8 @@ class WatchedActuators:
         """
         if not blocks:
             return
-        by_identity = {(block.actuator, block.identity): block for block in reversed(blocks)}  # keeps the first of two
+        # of two blocks with one identity the first is kept: reversed, it replaces the other
+        by_identity = {(block.actuator, block.identity): block for block in reversed(blocks)}
         new_blocks = [block for block in blocks if by_identity[block.actuator, block.identity] is block]
         try:
             try:
@@ -421,7 +428,8 @@ class WatchedActuators:
     def _checkpoint(self, actuator: _Actuator, rows: StoredRows) -> None:
         """Add a checkpoint of an actuator's state to the rows that will be stored.
 
-        Also add the running numbers up to which the actuator's blocks and estimates are too old and will be deleted.
+        Also add the running numbers up to which the actuator's blocks and estimates are too old and will be deleted,
+        and count the blocks since the checkpoint from 0 again.
         """
         settings = actuator.settings
         rows.add_checkpoint(settings.name, settings.watched_with.model_dump_json(), actuator.state())
@@ -435,18 +443,22 @@ class WatchedActuators:
     def _add_summary(actuator: _Actuator, rows: StoredRows) -> None:
         """Add the summary of an actuator to the rows that will be stored, if it has changed."""
         summary = actuator.summary()
-        if summary != actuator.shown:
-            actuator.shown = summary
+        if summary != actuator.stored_summary:
+            actuator.stored_summary = summary
             rows.add_summary(actuator.settings.name, summary)
 
     def apply_mark(self, name: str, mark: str, *, by_whom: str = "", text: str = "", hours: float = 8.0) -> Alarm:
         """Apply the mark that a person gives an actuator's alarm, store it in one transaction, and return the alarm.
 
-        `name`: the actuator; `mark`: ``acknowledged``, ``comment``, ``valid``, ``invalid``, which withdraws the leak
-        for the reason `text`, ``repaired``, which withdraws it and starts to learn a new healthy baseline, or
-        ``shelved``, which silences the alarm for `hours` of operation; `by_whom`: name of the person; `text`: comment
-        or reason. A mark ``valid``, ``invalid`` or ``repaired`` is also written to the file of a commissioned machine,
-        and an event states the result. Raises InputError if there is no open alarm or an argument is invalid.
+        `name`: the actuator; `by_whom`: name of the person; `text`: comment, or reason of ``invalid``; `mark`:
+
+        - ``acknowledged``, ``comment``, or ``valid``, which confirms the leak;
+        - ``shelved``: the alarm is not announced for `hours` of operation;
+        - ``invalid``: the detector withdraws the leak;
+        - ``repaired``: the detector withdraws the leak and learns a new healthy baseline.
+
+        A mark ``valid``, ``invalid`` or ``repaired`` is also written to the file of a commissioned machine, and an
+        event states the result. Raises InputError if there is no open alarm or an argument is invalid.
         """
         if len(text) > _MAX_COMMENT_LENGTH or len(by_whom) > 80:
             raise InputError(f"a comment must have at most {_MAX_COMMENT_LENGTH} characters, a name 80")
@@ -458,7 +470,10 @@ class WatchedActuators:
             if name not in self.settings:
                 raise InputError(f"the settings must have the actuator {name[:60]!r}, got none")
             actuator, rows = self._actuator(name), StoredRows()
-            t = getattr(actuator.last, "t", getattr(actuator.judge.alarm, "updated_s", 0.0))
+            open_alarm = actuator.judge.alarm
+            t = 0.0 if open_alarm is None else open_alarm.updated_s
+            if actuator.last is not None:
+                t = actuator.last.t
             alarm_samples = list(actuator.alarm_samples)
             alarm = actuator.judge.apply_mark(mark, t, until=t + hours * 3600.0, reason=text)
             try:
@@ -501,7 +516,8 @@ class WatchedActuators:
         summaries = {}
         for name, settings in self.settings.items():
             if name in stored_summaries:
-                summary, state = stored_summaries[name], stored_summaries[name].get("state")
+                summary = stored_summaries[name]
+                state = summary.get("state")
                 is_silent = now - self._last_block_clock[name] > settings.no_data_s
                 if state is None or (is_silent and state["condition"] not in LEAKING):
                     state = state_of("no data", since_s=summary["t"]).as_dict()

@@ -23,8 +23,9 @@ from sealscope.storage.plain_state import save_attributes
 
 Level = Literal["warning", "error"]
 AlarmState = Literal["new", "acknowledged", "valid", "invalid", "closed"]
-#: Message number of each level in the message catalogue of a control or a plant, and its condition by NAMUR NE 107.
+#: Message number of each level in the message catalogue of a control or a plant.
 DIAGNOSTIC_NUMBERS: dict[Level, int] = {"warning": 4101, "error": 4102}
+#: Condition of the machine at each level, which determines its state by NAMUR NE 107.
 _CONDITIONS: dict[Level, str] = {"warning": "leak", "error": "leak over the limit"}
 #: Bits of the status word.
 WARNING_BIT, ERROR_BIT, NEW_BIT = 1, 2, 4
@@ -36,13 +37,14 @@ MARKS = ("acknowledged", "comment", "shelved", *JUDGEMENTS)
 class Alarm:
     """An alarm of an actuator; times [s] are those of its samples, intervals have 95 % confidence.
 
-    `id`: name of the actuator with a running number; `level`: "warning" or "error"; `raised_s`, `updated_s`: times at
-    which it was raised and last changed; `onset_s`: time at which the leak began; `leak_lpm` [L/min]: flow of the leak;
-    `cause`: path of the leaking oil; `evidence`: reason for the alarm, in one line; `next_check`: recommended
-    inspection; `baseline`: version of the healthy baseline; `returned_s`: time at which the cause ended, None while it
-    lasts; `mark`: last mark of a person ("valid", "invalid" or "repaired"); `reason`: why the alarm is invalid;
-    `shelved_until_s`: time before which it is not announced; `by_chance_per_1000_h`: upper limit of the false alarms of
-    this strength that a healthy actuator raises in 1000 operating hours.
+    - `id`: name of the actuator with a running number; `level`: "warning" or "error";
+    - `raised_s`, `updated_s`: times at which the alarm was raised and last changed;
+    - `onset_s`: time at which the leak began; `returned_s`: time at which it ended, None while it lasts;
+    - `leak_lpm`: leak flow [L/min]; `cause`: path of the leaking oil; `baseline`: version of the healthy baseline;
+    - `evidence`: reason for the alarm, in one line; `next_check`: recommended inspection;
+    - `mark`: last mark of a person ("valid", "invalid" or "repaired"); `reason`: why the alarm is invalid;
+    - `shelved_until_s`: time before which the alarm is not announced;
+    - `by_chance_per_1000_h`: most false alarms of this strength that a healthy actuator raises in 1000 operating hours.
     """
 
     id: str
@@ -87,12 +89,10 @@ class Alarm:
 
     @property
     def status_word(self) -> int:
-        """Status of the actuator as a sum of bits.
-
-        The bits are 1 for an active warning, 2 for an active error, and 4 for a new alarm that is not shelved.
-        """
-        level = 0 if not self.active else ERROR_BIT if self.level == "error" else WARNING_BIT
-        return level | (NEW_BIT if self.state == "new" and not self.shelved else 0)
+        """Status as a sum of bits: 1 for an active warning, 2 for an active error, 4 for a new alarm, not shelved."""
+        level_bit = ERROR_BIT if self.level == "error" else WARNING_BIT
+        new_bit = NEW_BIT if self.state == "new" and not self.shelved else 0
+        return (level_bit if self.active else 0) | new_bit
 
     def as_dict(self) -> dict[str, Any]:
         """Convert the alarm to plain values, with the state of the machine by NE 107.
@@ -188,14 +188,17 @@ class AlarmJudge:
         return self._set_alarm(updated), event
 
     def _raise_alarm(self, **findings: Any) -> Alarm:
-        """Raise an alarm and return it; if an alarm is open whose leak had ended, it is raised again under its id.
+        """Raise a new alarm, or raise the open alarm, whose leak had ended, again under its id; return the alarm.
 
         `findings`: fields of the alarm besides id, actuator, state and shelving.
         """
-        self.raised += self.alarm is None
-        shelved_until_s = 0.0 if self.alarm is None else self.alarm.shelved_until_s
-        id = f"{self.actuator}-{self.raised}"
-        self.alarm = Alarm(id, self.actuator, state="new", shelved_until_s=shelved_until_s, **findings)
+        shelved_until_s = 0.0
+        if self.alarm is None:
+            self.raised += 1
+        else:
+            shelved_until_s = self.alarm.shelved_until_s
+        alarm_id = f"{self.actuator}-{self.raised}"
+        self.alarm = Alarm(alarm_id, self.actuator, state="new", shelved_until_s=shelved_until_s, **findings)
         return self.alarm
 
     def update_from_verdict(
@@ -246,10 +249,10 @@ class AlarmJudge:
         return self._raise_alarm(cause=verdict.cause, baseline=baseline, **findings), "raised"
 
     def _set_alarm(self, alarm: Alarm) -> Alarm:
-        """Keep a changed alarm as the open one, or that there is none if it is closed or invalid; return the alarm.
+        """Store a changed alarm as the open alarm, or None if it is closed or invalid; return the changed alarm.
 
-        If it is no longer active, because its cause has ended or it is closed or invalid, the time of its last change
-        is stored as the time at which the last alarm ended.
+        If its cause has ended, or it is closed or invalid, the time of its change is stored as the end of the last
+        alarm (`over_s`).
         """
         if not alarm.active:
             self.over_s = alarm.updated_s
@@ -260,9 +263,9 @@ class AlarmJudge:
         """Apply the mark that a person gives the open alarm at time `t` [s], and return the changed alarm.
 
         `mark`: "acknowledged", "comment" (which changes nothing), "shelved", "valid", "invalid" or "repaired"; `until`
-        [s]: time until which a shelved alarm is not announced; `reason`: why the alarm is invalid. Raises InputError
-        for an unknown mark, if there is no open alarm, if its state is that of the mark already, or if the mark
-        ``invalid`` has no reason.
+        [s]: time until which a shelved alarm is not announced; `reason`: why the alarm is invalid. All marks but a
+        comment also reset the counters of successive blocks. Raises InputError for an unknown mark, if there is no open
+        alarm, if the alarm has the state of this mark already, or if the mark ``invalid`` has no reason.
         """
         if mark not in MARKS:
             raise InputError(f"an alarm must be marked {', '.join(MARKS)}, got {mark[:40]!r}")
@@ -276,7 +279,7 @@ class AlarmJudge:
         if mark == "invalid" and not reason.strip():
             raise InputError(f"{alarm.id} must be invalid for a reason, got none: state it as the comment")
         open_state: AlarmState = "valid" if mark == "valid" else "acknowledged"
-        by_mark: dict[str, dict[str, Any]] = {
+        changes: dict[str, dict[str, Any]] = {  # by mark
             "shelved": {"shelved_until_s": until},
             "invalid": {"state": "invalid", "mark": mark, "reason": reason},
             "repaired": {"state": "closed", "mark": mark},
@@ -284,7 +287,7 @@ class AlarmJudge:
             "acknowledged": {"state": open_state if alarm.active else "closed"},
         }
         self.above = self.error = self.below = 0
-        return self._set_alarm(replace(alarm, updated_s=t, **by_mark[mark]))
+        return self._set_alarm(replace(alarm, updated_s=t, **changes[mark]))
 
     def state(self) -> dict[str, Any]:
         """Convert the alarm and its counters to plain values, from which `restore` can rebuild this object."""
@@ -292,22 +295,23 @@ class AlarmJudge:
 
 
 def rank_actuators(summaries: Mapping[str, Mapping[str, Any]], alarms: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Sort actuators by urgency: severity of their state, then new alarms first, then strongest evidence first.
+    """Sort actuators by urgency, and return their summaries as rows, each with the `name` and the open `alarm` or None.
 
-    Evidence is stronger the more seldom a healthy actuator raises such an alarm by chance. Ties are decided by the
-    larger lower end of the leak's interval, then by the larger leak, then by the name. `summaries`: summary of each
-    actuator by name; `alarms`: the open alarms. Returns the summaries as rows, each with the name and the open alarm,
-    None for none.
+    More urgent is, in this order: the more severe state; a new alarm; the stronger evidence, that is an alarm that a
+    healthy actuator raises more seldom by chance; the larger lower end of the leak's interval; the larger leak. Ties
+    are decided by the name. `summaries`: summary of each actuator by name; `alarms`: the open alarms, for each
+    actuator with the latest first.
     """
 
     def rank(row: Mapping[str, Any]) -> tuple[Any, ...]:
-        """Compute the sorting key of an actuator's row; the most urgent one has the smallest key."""
-        low_lpm = (row["leak_interval_lpm"] or (0.0,))[0]
+        """Compute the sorting key of an actuator's row, which is smallest for the most urgent actuator."""
+        low_lpm, _ = row["leak_interval_lpm"] or (0.0, 0.0)
         by_chance = (row["alarm"] or {}).get("by_chance_per_1000_h")
         evidence = math.inf if by_chance is None else by_chance
         is_new = row["status_word"] & NEW_BIT
         return -row["state"]["severity"], -is_new, evidence, -low_lpm, -(row["leak_lpm"] or 0.0), row["name"]
 
-    by_actuator = {alarm["actuator"]: alarm for alarm in reversed(alarms)}  # the first of several is the latest
+    # of several alarms of an actuator, the first in `alarms` is the latest: reversed, it replaces the others
+    by_actuator = {alarm["actuator"]: alarm for alarm in reversed(alarms)}
     rows = [{"name": name, **summary, "alarm": by_actuator.get(name)} for name, summary in summaries.items()]
     return sorted(rows, key=rank)

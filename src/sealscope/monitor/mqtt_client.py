@@ -12,9 +12,9 @@ from sealscope.monitor.settings import BrokerSettings
 
 _log = logging.getLogger(__name__)
 _log.setLevel(logging.WARNING)  # paho logs each packet
-#: Silence after which the client pings the broker [s]; the connection counts as lost half of it later.
+#: Silence after which the client pings the broker [s]; the broker takes the client for lost after 1.5 times as long.
 KEEP_ALIVE_S = 20
-#: Topic and payload.
+#: Topic and payload of a message.
 _Message = tuple[str, bytes | str]
 #: Timeout for a message to be published [s].
 _PUBLISH_TIMEOUT_S = 3.0
@@ -29,10 +29,9 @@ def check_mqtt() -> None:
 class MqttLink:
     """A connection to a broker by MQTT 5; the caller must acknowledge the received messages.
 
-    `broker`: settings of the connection; `will`: function that returns topic and payload of the last will, which the
-    broker publishes when the connection is lost; it is called before each connection, and `close` publishes the same
-    message. `retain`: True if the broker is to retain this message. The attribute `client` is the client of the
-    library paho.
+    `broker`: settings of the connection; `will`: function that returns topic and payload of the last will. It is called
+    before each connection. The broker publishes this message when the connection is lost, and `close` publishes it,
+    too. `retain`: True if the broker is to retain the message. `client` is the client of the library paho.
     """
 
     def __init__(
@@ -55,7 +54,7 @@ class MqttLink:
         if broker.tls:
             client.tls_set(ca_certs=None if broker.ca_file is None else str(broker.ca_file))
         client.reconnect_delay_set(1, 30)
-        client.suppress_exceptions = True  # an error of a callback ends no connection; paho logs it
+        client.suppress_exceptions = True  # an error of a callback does not end the connection; paho logs it
         client.enable_logger(_log)
         self.client: Any = client
         client.on_pre_connect = self._set_will
@@ -77,7 +76,8 @@ class MqttLink:
 
     def check_thread(self) -> None:
         """Close the connection and raise RuntimeError if its thread has ended, as after a malformed packet."""
-        if getattr(self.client, "_thread", self) is None:  # private, as paho has no public attribute for it
+        # a private attribute, as paho has no public one; `self` stands for a thread if a later paho lacks it
+        if getattr(self.client, "_thread", self) is None:
             self.close()
             raise RuntimeError("the thread of the connection to the broker has ended")
 

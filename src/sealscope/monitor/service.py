@@ -36,10 +36,10 @@ _log = logging.getLogger(__name__)
 #: Blocks in the queue and their bytes, at most; a source that waits longer than this [s] is logged.
 _QUEUE_BLOCKS, _QUEUE_BYTES, _LONG_WAIT_S = 512, 256_000_000, 5.0
 #: How often outputs look for events [s], and how long `run` waits at its end for all threads together [s].
-_LOOK_S, _END_S = 0.05, 2.5
+_POLL_S, _END_S = 0.05, 2.5
 #: Blocks in one transaction, at most, and how long the first one waits for others [s].
 _MAX_TRANSACTION_BLOCKS, _GATHER_S = 256, 0.02
-#: Repeats of a problem that are all logged; later ones only at powers of two.
+#: Number of first occurrences of a problem that are all logged; later ones are logged at powers of two.
 _FIRST_LINES = 3
 #: The name of the source of lines.
 _LINES = "standard input"
@@ -158,7 +158,10 @@ class Service:
             self.close()
 
     def _all_sources(self) -> list[tuple[str, Source]]:
-        """Build all sources in the settings, with their names; raise InputError if a secret cannot be read."""
+        """List all sources with their names: the additional ones, and those in the settings.
+
+        Raises InputError if a secret cannot be read.
+        """
         sources = [(f"source {number}", source) for number, source in enumerate(self._extra_sources, 1)]
         if self.settings.lines:
             sources.append((_LINES, line_source(self._stdin)))
@@ -173,9 +176,9 @@ class Service:
     def _start_outputs(self) -> list[threading.Thread]:
         """Start the threads that send events and states to the outputs in the settings, and return them."""
         repeat = self.supervisor.repeat
-        threads = [repeat("standard output", self._write_events, _LOOK_S, last=self._write_events)]
+        threads = [repeat("standard output", self._write_events, _POLL_S, last=self._write_events)]
         outputs = open_outputs(self.actuators, self.settings)
-        threads.extend(repeat(output.part, output.deliver, _LOOK_S, last=output.end) for output in outputs)
+        threads.extend(repeat(output.part, output.deliver, _POLL_S, last=output.end) for output in outputs)
         return threads
 
     def _store_queued(self) -> None:
@@ -203,8 +206,8 @@ class Service:
     def _store(self, blocks: list[_Storable], write: Callable[[list[_Storable]], object]) -> None:
         """Store blocks, or refused messages, in one transaction by the function `write`, and acknowledge them.
 
-        In an outage of the database its error is raised. After any other error the blocks are stored one by one, and
-        a block that fails is dropped and acknowledged: it would fail again, and the others must not wait for it.
+        If the database has an outage, its error is raised. After any other error the blocks are stored one by one. A
+        block that then fails is counted, dropped and acknowledged: it would fail again, and later ones must not wait.
         """
         if not blocks:
             return
@@ -242,8 +245,5 @@ class Service:
 
 
 def _is_logged(number: int) -> bool:
-    """Return True if occurrence `number`, from 1, of a repeated problem is to be logged.
-
-    The first `_FIRST_LINES` occurrences are logged, then those whose number is a power of two.
-    """
+    """Return True for the occurrences of a problem to log: the first `_FIRST_LINES`, then those at powers of two."""
     return number <= _FIRST_LINES or number.bit_count() == 1

@@ -22,13 +22,13 @@ from sealscope.units import same_dimension, to_si
 _PathLike = TypeVar("_PathLike", Path, str)
 _Text = Annotated[str, Field(min_length=1, max_length=100)]
 _Level = Annotated[str, Field(pattern=r"^[^/+#\x00]+$", max_length=100)]  # of an MQTT topic
-_Words = Annotated[str, Field(min_length=1, max_length=1000)]
+_LongText = Annotated[str, Field(min_length=1, max_length=1000)]
 
 
 def _resolve_in_folder(place: _PathLike, info: ValidationInfo) -> _PathLike:
     """Resolve a path in the settings relative to the folder of their file.
 
-    Names of packaged rigs and URLs are returned unchanged, as are all paths if the settings come from no file.
+    Names of packaged rigs and URLs are returned unchanged. So are all paths if the settings do not come from a file.
     """
     is_name = isinstance(place, str) and ("://" in place or (info.field_name == "rig" and not place.endswith(".toml")))
     return place if is_name or not info.context else type(place)(Path(info.context["folder"]) / place)
@@ -37,11 +37,13 @@ def _resolve_in_folder(place: _PathLike, info: ValidationInfo) -> _PathLike:
 _File = Annotated[Path, AfterValidator(_resolve_in_folder)]
 
 
-class _Part(BaseModel):
+class _Table(BaseModel):
+    """A table of the settings, which cannot be changed and must not have unknown keys."""
+
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class WatchSettings(_Part):
+class WatchSettings(_Table):
     """Settings by which an actuator is watched.
 
     `rig`: name of a packaged rig or path of a file; `false_alarms_per_1000_h`: upper limit of the false alarms in
@@ -65,23 +67,23 @@ class WatchSettings(_Part):
 
     @property
     def watched_with(self) -> WatchSettings:
-        """The settings of the watch alone, without the actuator's name and source of samples."""
+        """Only those settings that concern the watch, without the actuator's name and source of samples."""
         return WatchSettings(**{name: getattr(self, name) for name in WatchSettings.model_fields})
 
 
-class SimulateSettings(_Part):
+class SimulateSettings(_Table):
     """A simulated rig that provides the samples of an actuator instead of a real machine.
 
     The fields are those options of ``sealscope simulate`` that have the same names; `speed`: multiple of real time at
     which it runs.
     """
 
-    command: _Words = "3 sin(4t)"
-    load: _Words | None = None
-    leak: _Words | list[_Words] = Field(default_factory=list)
-    fault: _Words | list[_Words] = Field(default_factory=list)
-    duration: _Words = "20 min"
-    rate: _Words | None = None
+    command: _LongText = "3 sin(4t)"
+    load: _LongText | None = None
+    leak: _LongText | list[_LongText] = Field(default_factory=list)
+    fault: _LongText | list[_LongText] = Field(default_factory=list)
+    duration: _LongText = "20 min"
+    rate: _LongText | None = None
     seed: int = Field(default=0, ge=0)
     speed: float = Field(default=1.0, gt=0, allow_inf_nan=False)
 
@@ -89,10 +91,11 @@ class SimulateSettings(_Part):
 class ActuatorSettings(WatchSettings):
     """The settings of one actuator: its name, the source of its samples, and how it is watched.
 
-    `folder`, `pattern`: folder of its recordings and pattern of their names; `map`: by channel, the column of the
-    files or the Sparkplug metric; `topic`: MQTT topic of its messages; `sparkplug`: "group/node" or
-    "group/node/device"; `rate` [Hz]: sampling rate; `nodes`: by channel, the OPC UA node; `units`: by channel, the
-    unit of values that state none; `simulate`: a simulated rig as the source.
+    - Files: `folder` of the recordings, and `pattern` of their names.
+    - MQTT: `topic` of the messages. Sparkplug: `sparkplug`, as "group/node" or "group/node/device".
+    - OPC UA: `nodes`, the node of each channel. Simulation: `simulate`, a simulated rig as the source.
+    - `map`: by channel, the column of the files or the Sparkplug metric; `rate` [Hz]: sampling rate; `units`: by
+      channel, the unit of values whose source does not state it.
     """
 
     name: _Text
@@ -111,9 +114,9 @@ class ActuatorSettings(WatchSettings):
     def _fill_from_machine(cls, values: Any, info: ValidationInfo) -> Any:
         """Complete the table of an actuator with the rate, columns, units and repair limit in its machine's file.
 
-        Entries that the table states stay. The key `machine` is another name of `rig`; it must name a file written by
-        `sealscope commission`. The limit becomes `error_lpm` [L/min]. The units are those in the column headings of the
-        machine's logs; they are filled in for Sparkplug and OPC UA alone, whose values need not state any.
+        Entries of the table take precedence. Its key `machine` is another name of `rig`, but must name a file written
+        by `sealscope commission`. The limit becomes `error_lpm` [L/min]. The units are those in the column headings of
+        the machine's logs; they are used only for Sparkplug and OPC UA, whose values need not state units.
         """
         if not isinstance(values, dict):
             return values
@@ -132,11 +135,12 @@ class ActuatorSettings(WatchSettings):
         units = {name: unit for name, column in columns.items() if (unit := _column_unit(name, column))}
         needs_units = units and (values.get("nodes") or values.get("sparkplug"))
         machine_values = {"map": columns or None, "rate": watched.rate, "error_lpm": watched.limit_lpm}
-        machine_values |= {"units": units if needs_units else None}
-        return {**{name: value for name, value in machine_values.items() if value is not None}, **values}
+        machine_values["units"] = units if needs_units else None
+        known_values = {name: value for name, value in machine_values.items() if value is not None}
+        return {**known_values, **values}
 
 
-class PageSettings(_Part):
+class PageSettings(_Table):
     """The settings of the web page.
 
     `host`, `port`: address at which it is served; `token_file`: file with the token that a visitor must state, None
@@ -149,7 +153,7 @@ class PageSettings(_Part):
     proxies: list[IPvAnyAddress] = Field(default_factory=list, max_length=100)
 
 
-class BrokerSettings(_Part):
+class BrokerSettings(_Table):
     """The settings of the connection to an MQTT broker.
 
     `alarms_topic`: topic under which alarms and states are published, None to publish none; `host_id`: identity of
@@ -167,7 +171,7 @@ class BrokerSettings(_Part):
     host_id: _Level | None = None
 
 
-class OpcUaSettings(_Part):
+class OpcUaSettings(_Table):
     """The settings of the connection to an OPC UA server.
 
     `security`: security string in the form of the library asyncua, None for no security; `block_s` [s]: length of the
@@ -182,7 +186,7 @@ class OpcUaSettings(_Part):
     timeout_s: float = Field(default=10.0, gt=0, le=300)
 
 
-class OutputSettings(_Part):
+class OutputSettings(_Table):
     """The settings of an output of alarms, which is switched on by its table in the settings (`MonitorSettings`).
 
     `sender`: "module:class" of the `Output` in `monitor/outputs/` that they are for.
@@ -215,7 +219,7 @@ class WebhookSettings(OutputSettings):
     timeout_s: float = Field(default=10.0, gt=0, le=300)
 
 
-class MonitorSettings(_Part):
+class MonitorSettings(_Table):
     """All settings of a monitor.
 
     `database`: file of SQLite or URL; `lines`: True to read blocks from standard input; `settle_s` [s]: time without
@@ -240,17 +244,21 @@ class MonitorSettings(_Part):
     @model_validator(mode="before")
     @classmethod
     def _apply_defaults(cls, values: Any) -> Any:
-        """Fill the defaults into the table of each actuator, and divide the fleet's false-alarm rate among them."""
+        """Fill the defaults into the table of each actuator; divide the fleet's false-alarm rate equally among them.
+
+        Raises ValueError if a table states a false-alarm rate beside that of the fleet.
+        """
         if not isinstance(values, dict):
             return values
         defaults, actuators = values.get("defaults", {}), values.get("actuator")
         if not (isinstance(defaults, dict) and isinstance(actuators, list)):
             return values
-        budget, rate = values.get("fleet_false_alarms_per_1000_h"), "false_alarms_per_1000_h"
-        if isinstance(budget, int | float) and actuators:
-            if any(isinstance(part, dict) and rate in part for part in (defaults, *actuators)):
-                raise ValueError(f"state {rate} of actuators, or fleet_{rate}, which they share in equal parts")
-            defaults = {**defaults, rate: budget / len(actuators)}
+        key = "false_alarms_per_1000_h"
+        fleet_rate = values.get(f"fleet_{key}")
+        if isinstance(fleet_rate, int | float) and actuators:
+            if any(isinstance(table, dict) and key in table for table in (defaults, *actuators)):
+                raise ValueError(f"state {key} of actuators, or fleet_{key}, which they share in equal parts")
+            defaults = {**defaults, key: fleet_rate / len(actuators)}
         merged_tables = [{**defaults, **actuator} if isinstance(actuator, dict) else actuator for actuator in actuators]
         return {**values, "actuator": merged_tables}
 
@@ -288,7 +296,7 @@ class MonitorSettings(_Part):
 
 
 def _check_channels(actuator: ActuatorSettings, *, has_opcua: bool) -> None:
-    """Check the OPC UA nodes and the units of an actuator's channels; raise ValueError or InputError otherwise.
+    """Check the OPC UA nodes and the units of an actuator's channels; raise ValueError or InputError if they are wrong.
 
     `has_opcua`: True if the settings have the table [opcua].
     """
@@ -310,7 +318,8 @@ def _check_channels(actuator: ActuatorSettings, *, has_opcua: bool) -> None:
 def _column_unit(channel: str, column: str) -> str | None:
     """Find the unit in the heading of a channel's column; return None if it has no unit of the right dimension."""
     label = Label.parse(column)
-    unit = label.unit or split_unit(label.name)[1]
+    _, unit_in_name = split_unit(label.name)
+    unit = label.unit or unit_in_name
     return unit if unit and channel in CHANNELS and same_dimension(unit, CHANNEL_UNITS[channel]) else None
 
 

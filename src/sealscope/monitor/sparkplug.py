@@ -25,6 +25,7 @@ INT64, UINT32, UINT64, DOUBLE, BOOLEAN, STRING = 4, 7, 8, 10, 11, 12
 _SIGNED = {1: 8, 2: 16, 3: 32, 4: 64}
 #: NumPy data types of the data types that are arrays of numbers.
 _ARRAYS = {22: "<i1", 23: "<i2", 24: "<i4", 25: "<i8", 26: "<u1", 27: "<u2", 28: "<u4", 29: "<u8", 30: "<f4", 31: "<f8"}
+#: Field of the protobuf message that holds a value, by data type.
 _FIELD_OF_TYPE = {
     **dict.fromkeys((1, 2, 3, 5, 6, 7), "int_value"),
     **dict.fromkeys((4, 8, 13), "long_value"),
@@ -58,8 +59,8 @@ class SparkplugMetric:
         """Convert the value from its transmitted form to a Sparkplug data type; return the metric with value and type.
 
         The bytes of an array become numbers (n,), or None if the type is not supported. Integers of a signed type are
-        converted from two's complement. Other values are unchanged. Raises ValueError if the bytes of an array are no
-        whole number of values.
+        converted from two's complement. Other values are unchanged. Raises ValueError if the bytes of an array are not
+        a whole number of values.
         """
         value = self.value
         if isinstance(value, bytes):
@@ -146,7 +147,7 @@ def encode_payload(payload: SparkplugPayload) -> bytes:
 
 
 def decode_payload(data: bytes) -> SparkplugPayload:
-    """Decode a payload from bytes; raise ValueError of one line if they are invalid.
+    """Decode a payload from bytes; raise ValueError, with a message of one line, if they are invalid.
 
     The value of a metric without a type is left as transmitted: `SparkplugMetric.with_datatype` converts it.
     """
@@ -179,13 +180,10 @@ def _decode_metric(entry: Any) -> SparkplugMetric:
     properties = zip(entry.properties.keys, entry.properties.values, strict=False)
     unit = next((str(value.string_value)[:40] for key, value in properties if key == _UNIT), None)
     name, alias, timestamp = _get_fields(entry, "name", "alias", "timestamp")
-    metric = SparkplugMetric(name, value, 0, alias, timestamp, unit or None)
+    metric = SparkplugMetric(name, value, alias=alias, timestamp=timestamp, unit=unit or None)
     return metric.with_datatype(int(entry.datatype)) if entry.datatype else metric
 
 
 def topic_of(group: str, kind: str, node: str, device: str | None = None) -> str:
-    """Build the MQTT topic of a Sparkplug message of a node, or of one of its devices.
-
-    `kind`: type of the message, such as ``NBIRTH`` or ``DDATA``.
-    """
+    """Build the MQTT topic of a Sparkplug message of a node or of its device; `kind`: its type, such as ``NBIRTH``."""
     return "/".join([NAMESPACE, group, kind, node, *([] if device is None else [device])])

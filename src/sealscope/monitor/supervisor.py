@@ -25,8 +25,10 @@ DATABASE, BROKER, OPCUA = "database", "broker", "OPC UA server"
 FIRST_PAUSE_S, MAX_PAUSE_S, DATABASE_PAUSE_S = 0.2, 60.0, 5.0
 #: A restarted part counts as reached after running for this long [s].
 _WORKING_S = 2.0
-#: Log lines per minute from one place in the code, in this package and in libraries; places that are remembered.
-_PACKAGE_LINES, _LIBRARY_LINES, _MINUTE_S, _MAX_PLACES = 300, 10, 60.0, 1000
+#: Most log lines per minute from one place in the code of this package, and of a library; a minute [s].
+_PACKAGE_LINES, _LIBRARY_LINES, _MINUTE_S = 300, 10, 60.0
+#: Most places in the code whose log lines are counted.
+_MAX_PLACES = 1000
 _PACKAGE = Path(__file__).resolve().parents[1]
 _Work = Callable[[], object]
 
@@ -90,8 +92,9 @@ class SupervisedPart:
     def attempt(self, work: _Work, *, at_once: bool = False) -> bool:
         """Run the function `work` unless the part pauses after an error; return True if it ran without an error.
 
-        An error begins an outage and a pause, which is twice as long as the one before, up to a limit. An error of
-        the database begins the outage of the database instead. `at_once`: True to run it even during a pause.
+        An error begins an outage and a pause, which is twice as long as the last pause, up to a limit. An error of the
+        database begins an outage of the database instead of the part. Success ends the outage of the part. `at_once`:
+        True to run `work` even during a pause.
         """
         if self.pause_s and not at_once:
             return False
@@ -167,27 +170,27 @@ class Supervisor:
             finally:
                 timer.cancel()
 
-        def attempts() -> None:
+        def run_until_success() -> None:
             while not part.attempt(work_with_timer) and restart and not self.stopping.wait(part.pause_s):
                 pass
             on_end()
 
-        return _start_thread(attempts, name)
+        return _start_thread(run_until_success, name)
 
     def repeat(self, name: str, step: _Work, every_s: float, *, last: _Work | None = None) -> threading.Thread:
         """Start a thread that runs `step` every `every_s` seconds as the part `name`; return the thread.
 
-        Once `stopping` is set, it runs `last`, if given, and ends.
+        An error pauses the steps for a longer time. Once `stopping` is set, the thread runs `last`, if given, and ends.
         """
         part = self.part(name)
 
-        def attempts() -> None:
+        def run_steps() -> None:
             while not self.stopping.wait(max(every_s, part.pause_s)):
                 part.attempt(step)
             if last is not None:
                 part.attempt(last, at_once=True)
 
-        return _start_thread(attempts, name)
+        return _start_thread(run_steps, name)
 
 
 class LimitedLines(logging.Filter):
@@ -202,9 +205,13 @@ class LimitedLines(logging.Filter):
         self._places: dict[tuple[str, str, int], tuple[float, int]] = {}
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Return True if a log record is within the limit for its place in the code; make it one printable line."""
+        """Return True if a log record is within the limit for its place in the code; make it one printable line.
+
+        The first record after a minute also states how many lines were left out before.
+        """
         place = (record.name, record.pathname, record.lineno)
-        now, max_lines = time.monotonic(), _PACKAGE_LINES if record.name.startswith("sealscope") else _LIBRARY_LINES
+        max_lines = _PACKAGE_LINES if record.name.startswith("sealscope") else _LIBRARY_LINES
+        now = time.monotonic()
         minute_start, n_records = self._places.get(place, (now, 0))
         if now - minute_start >= _MINUTE_S:
             if n_records > max_lines:

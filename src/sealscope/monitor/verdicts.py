@@ -30,14 +30,16 @@ _FALSE_ALARM = DECISION.false_alarm
 class RecordingVerdict:
     """The verdict on one recording, as plain values for the database; times are in seconds since 1970.
 
-    `file`: name of the file; `verdict`: "leak", "no leak" or "cannot tell"; `summary`, `size`, `odds`: texts for the
-    verdict, for the size or bound of the leak, and for the fraction of healthy recordings that look like this one;
-    `reason`: of the verdict, in words; `cause`: of the leak or of another event, "" if not named; `state`: of the
-    machine by NAMUR NE 107; `start_s`, `end_s`: times of the first and last sample; `onset_s`, `onset_interval_s`:
-    start of the leak, None if it leaks from the first sample on or not at all; `leak_lpm`, `total_lpm` [L/min]: flow of
-    the leak, and of all leakage, with their 95 % intervals; `bound_lpm` [L/min]: upper bound of a leak that is not
-    found; these are None if not stated; `chance`: probability that a leak-free recording scores as high, None if not
-    known; `mark`: mark of a person that ended the alarm, else "".
+    - `file`: name of the file; `verdict`: "leak", "no leak" or "cannot tell", with its `reason` in words;
+    - `summary`, `size`, `odds`: texts that state the verdict, the size or bound of the leak, and the fraction of
+      healthy recordings that look like this one;
+    - `cause`: cause of the leak or of another event, "" if not named; `state`: state of the machine by NAMUR NE 107;
+    - `start_s`, `end_s`: times of the first and last sample;
+    - `onset_s`, `onset_interval_s`: start of the leak, None if it leaks from the first sample on or not at all;
+    - `leak_lpm`, `total_lpm`: flows of the leak and of all leakage [L/min], with 95 % intervals, None if not stated;
+    - `bound_lpm`: upper bound of a leak that is not found [L/min], None if not stated;
+    - `chance`: probability that a leak-free recording scores as high, None if not known;
+    - `mark`: mark of a person that ended the alarm, else "".
     """
 
     file: str
@@ -71,7 +73,8 @@ class RecordingVerdict:
         onset, onset_ends = plain["onset_s"], _parse_interval(plain["onset_interval_s"])
         leaks = diagnosis.verdict == LEAK
         total = plain["total_leakage"] or {}
-        since = None if not leaks else start_s if onset is None else onset + shift
+        onset_s = None if onset is None else onset + shift
+        leak_since_s = start_s if onset_s is None else onset_s
         return cls(
             file=diagnosis.file,
             verdict=diagnosis.verdict,
@@ -80,10 +83,10 @@ class RecordingVerdict:
             odds=diagnosis.odds or "",
             reason=diagnosis.reason,
             cause=diagnosis.named_cause or "",
-            state={**plain["state"], "since_s": since},
+            state={**plain["state"], "since_s": leak_since_s if leaks else None},
             start_s=start_s,
             end_s=end_s,
-            onset_s=None if onset is None else onset + shift,
+            onset_s=onset_s,
             onset_interval_s=None if onset_ends is None else (onset_ends[0] + shift, onset_ends[1] + shift),
             leak_lpm=plain["leak_lpm"] if leaks else None,
             leak_interval_lpm=_parse_interval(plain["leak_interval_lpm"]) if leaks else None,
@@ -140,13 +143,14 @@ class RecordingVerdict:
     def restate_block(self, block: BlockEstimate) -> BlockEstimate:
         """Replace the leak in the estimate of a block by the leak of the whole recording.
 
-        Before the onset, or if the recording has no leak, the block has no leak either. Its interval is then from 0 to
-        `bound_lpm`, the 95 % upper bound of a leak in the recording, or None without a bound.
+        Before the onset, or if the recording has no leak, the block gets no leak. Its interval is then from 0 to
+        `bound_lpm`, the 95 % upper bound of a leak in the recording, or None if there is no such bound.
         """
-        lpm, interval = self.leak_lpm, self.leak_interval_lpm
-        if not self.leaks or (self.onset_s is not None and block.t < self.onset_s):
-            lpm, interval = None, None if self.bound_lpm is None else (0.0, self.bound_lpm)
-        return replace(block, leak_lpm=lpm, leak_interval_lpm=interval)
+        is_before_onset = self.onset_s is not None and block.t < self.onset_s
+        if self.leaks and not is_before_onset:
+            return replace(block, leak_lpm=self.leak_lpm, leak_interval_lpm=self.leak_interval_lpm)
+        interval = None if self.bound_lpm is None else (0.0, self.bound_lpm)
+        return replace(block, leak_lpm=None, leak_interval_lpm=interval)
 
 
 def _parse_interval(ends: Any) -> Interval | None:

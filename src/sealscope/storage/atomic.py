@@ -14,13 +14,17 @@ from pathlib import Path
 
 from sealscope.errors import InputError
 
-#: Name of a temporary file: .TARGET.MACHINE-PROCESS.RANDOM.part.
-_TEMPORARY = re.compile(r"\.(.{1,60})\.([0-9a-f]{6})-(\d{1,9})\.[a-z0-9_]{8}\.part", re.DOTALL)
-#: Age [s] from which a temporary file of another machine is removed.
+#: Length to which the file's name is cut in the name of its temporary file.
+_MAX_NAME = 60
+#: Name of a temporary file: .TARGET.COMPUTER-PROCESS.RANDOM.part.
+_TEMPORARY = re.compile(
+    r"\.(?P<target>.{1,60})\.(?P<computer>[0-9a-f]{6})-(?P<process>\d{1,9})\.[a-z0-9_]{8}\.part", re.DOTALL
+)
+#: Age [s] from which a temporary file of another computer is removed.
 _MAX_AGE = 86_400.0
 
 
-def _machine_hash() -> str:
+def _computer_hash() -> str:
     """Return the first 6 hexadecimal digits of the SHA-256 of this computer's name."""
     return sha256(platform.node().encode()).hexdigest()[:6]
 
@@ -45,7 +49,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
         if target.is_dir():
             raise InputError(f"a file to write must not be a folder, got {target}")
         handle, name = tempfile.mkstemp(
-            prefix=f".{target.name[:60]}.{_machine_hash()}-{os.getpid()}.", suffix=".part", dir=target.parent
+            prefix=f".{target.name[:_MAX_NAME]}.{_computer_hash()}-{os.getpid()}.", suffix=".part", dir=target.parent
         )
         os.close(handle)
     except OSError as error:
@@ -65,7 +69,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def _file_mode(target: Path) -> int:
-    """Return the permission bits of the file `target`; if it does not exist, those that umask gives a new file."""
+    """Return the permission bits of the file `target`, or those of a new file (by the umask) if it does not exist."""
     with suppress(FileNotFoundError):
         return target.stat().st_mode & 0o777
     mask = os.umask(0)
@@ -74,9 +78,9 @@ def _file_mode(target: Path) -> int:
 
 
 def _sync(path: Path, flags: int) -> None:
-    """Write what the system holds in memory of a file's content, or of a folder's list of files, to the disk.
+    """Force the system to write the content of a file, or the list of files of a folder, from its memory to the disk.
 
-    `path`: the file or folder; `flags`: flags for `os.open`, with which it is opened.
+    `flags`: flags of `os.open` with which the file or folder `path` is opened.
     """
     descriptor = os.open(path, flags)
     try:
@@ -92,12 +96,13 @@ def remove_temporaries(folder: Path, target: str | None = None) -> None:
     files are removed, in subfolders, too. A file is removed if its process ran on this computer and has ended, or if
     it was last changed more than a day ago. Links to folders are not followed.
     """
-    for path in folder.glob(".*.part") if target is not None else folder.rglob(".*.part"):
+    paths = folder.rglob(".*.part") if target is None else folder.glob(".*.part")
+    for path in paths:
         match = _TEMPORARY.fullmatch(path.name)
-        if match is None or (target is not None and match[1] != target[:60]):
+        if match is None or (target is not None and match["target"] != target[:_MAX_NAME]):
             continue
         with suppress(OSError):
-            is_abandoned = match[2] == _machine_hash() and not _is_alive(int(match[3]))
+            is_abandoned = match["computer"] == _computer_hash() and not _is_alive(int(match["process"]))
             if is_abandoned or path.lstat().st_mtime < time.time() - _MAX_AGE:
                 path.unlink()
 

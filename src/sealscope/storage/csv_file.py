@@ -10,15 +10,17 @@ from typing import Any
 
 from sealscope.storage.atomic import atomic_write
 
-#: Beginnings of a cell that spreadsheets read as a formula, and numbers, which are none.
-_FORMULA_BEGINNINGS, _NUMBER = ("=", "+", "-", "@", "\t", "\r"), re.compile(r"[+-]?[\d.]+(?:e[+-]?\d+)?|-")
+#: Beginnings of a cell that spreadsheets read as a formula.
+_FORMULA_BEGINNINGS = ("=", "+", "-", "@", "\t", "\r")
+#: Cells that may begin so although they are not formulas: numbers, and a single dash.
+_NUMBER = re.compile(r"[+-]?[\d.]+(?:e[+-]?\d+)?|-")
 
 
 def guard_cell(value: Any) -> Any:
     """Escape a text that a spreadsheet would execute like a formula, or a terminal like a command.
 
-    Names and comments may come from other people's files. A text that begins like a formula and is no number gets an
-    apostrophe in front. Unprintable characters are escaped, but not line feeds. Values that are no texts are returned
+    Names and comments may come from other people's files. A text that begins like a formula and is not a number gets
+    an apostrophe in front. Unprintable characters except line feeds are escaped. A value that is not a text is returned
     unchanged.
     """
     if not isinstance(value, str):

@@ -25,8 +25,8 @@ def make_folder(folder: Path) -> None:
 def make_inner_folder(folder: Path, *names: str) -> Path:
     """Create the nested folders `names` within `folder`, one in the other, and return the innermost one.
 
-    Other users may write to `folder`: a folder within it that is a link could lead elsewhere. Raises InputError if one
-    is a link or cannot be created.
+    Other users may write to `folder`, and a link within it could lead elsewhere. Raises InputError if one of these
+    nested folders is a link, or if a folder cannot be created.
     """
     make_folder(folder)
     for name in names:
@@ -40,8 +40,8 @@ def make_inner_folder(folder: Path, *names: str) -> Path:
 def iter_inner_files(folder: Path, paths: Iterable[Path]) -> Iterator[Path]:
     """Yield those of `paths` that are files in `folder`; skip links that lead out of the folder.
 
-    A skipped link is logged as a warning. The folder may come from others. Links that stay within it are followed,
-    and the folder may itself be a link.
+    A folder that comes from other people may have links to any file of this computer. A skipped link is logged as a
+    warning. Links to files within the folder are followed, and the folder may itself be a link.
     """
     root = folder.resolve()
     for path in paths:
@@ -56,17 +56,17 @@ def iter_inner_files(folder: Path, paths: Iterable[Path]) -> Iterator[Path]:
 
 
 def numeric_sort_key(name: str) -> list[str | int]:
-    """Split a name into a list of its texts and whole numbers, a sorting key that puts "day_2" before "day_10"."""
-    return [int(word) if word.isdecimal() else word for word in re.split(r"(\d+)", name)]
+    """Build a sorting key that puts "day_2" before "day_10": the texts and whole numbers of which a name consists."""
+    return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)]
 
 
 @contextmanager
 def lock_file(file: Path, busy: str | None, wait: float = 0.0) -> Iterator[None]:
     """Hold the lock `file` against other processes while the block runs; the lock also ends with the process.
 
-    If another process holds the lock for longer than `wait` [s], an InputError with the message `busy` is raised; if
-    `busy` is None, there is no limit. The file is created if necessary, and never emptied. Raises InputError if it is
-    a link or cannot be created.
+    If another process still holds the lock after `wait` [s], InputError with the message `busy` is raised; if `busy` is
+    None, the wait has no limit. The file is created if necessary, and never emptied. Raises InputError if the file is a
+    link or cannot be created.
     """
     from filelock import FileLock, Timeout
 

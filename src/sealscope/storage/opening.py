@@ -13,6 +13,7 @@ from typing import BinaryIO, Literal
 from sealscope.errors import InputError, MissingExtra, UnreadableFile
 
 _log = logging.getLogger(__name__)
+#: Flags of `os.open` that do not wait for the other end of a pipe, and do not follow a link; 0 where unknown.
 _NO_WAITING = getattr(os, "O_NONBLOCK", 0)
 _NO_LINK = getattr(os, "O_NOFOLLOW", 0)
 #: Names of kinds of files that are not regular, for messages.
@@ -28,10 +29,7 @@ def is_file_path(text: str | os.PathLike[str]) -> bool:
 
 
 def special_kind(mode: int) -> str | None:
-    """Return the kind of a file that is not regular, such as "a folder", from its `st_mode`.
-
-    The result is None for a regular file.
-    """
+    """Return the kind of a file, such as "a folder", by its `st_mode`; return None for a regular file."""
     return next((name for is_kind, name in _KINDS if is_kind(mode)), None)
 
 
@@ -39,14 +37,14 @@ def open_regular(path: str | os.PathLike[str], what: str) -> BinaryIO:
     """Open a regular file for reading, in binary mode.
 
     `what` names the file in error messages, such as "a recording". Raises InputError for a folder, pipe, socket or
-    device, and for an empty file. Files in /proc, whose reading may never end, are refused as empty, too. Raises
-    OSError if the file cannot be opened.
+    device, and for an empty file. This includes files in /proc, which have size 0 but may never end. Raises OSError if
+    the file cannot be opened.
     """
-    opened = _open_checked(path, what, "rb", _NO_WAITING)
-    if not os.fstat(opened.fileno()).st_size:
-        opened.close()
+    file = _open_checked(path, what, "rb", _NO_WAITING)
+    if not os.fstat(file.fileno()).st_size:
+        file.close()
         raise InputError(f"{what} must hold data, got an empty file ({path})")
-    return opened
+    return file
 
 
 def open_inner(path: str | os.PathLike[str], what: str, mode: Literal["rb", "ab+"] = "rb") -> BinaryIO:
@@ -62,10 +60,11 @@ def open_inner(path: str | os.PathLike[str], what: str, mode: Literal["rb", "ab+
 
 
 def _open_checked(path: str | os.PathLike[str], what: str, mode: Literal["rb", "ab+"], extra_flags: int) -> BinaryIO:
-    """Open a file in binary mode with additional flags of `os.open`; raise InputError unless it is a regular file.
+    """Open a regular file in binary mode.
 
-    `mode`: `rb` to read, `ab+` to append or create; `what` names the file in error messages. A file to write must
-    not have several hard links.
+    `mode`: `rb` to read, `ab+` to append or create; `what` names the file in error messages; `extra_flags`: additional
+    flags of `os.open`. Raises InputError for a file that is not regular and, when writing, for a file with several hard
+    links; raises OSError if the file cannot be opened.
     """
     flags = os.O_RDONLY if mode == "rb" else os.O_RDWR | os.O_CREAT | os.O_APPEND
     try:

@@ -15,15 +15,15 @@ from sealscope.errors import InputError
 from sealscope.storage.plain_values import convert_type
 
 _T = TypeVar("_T")
-#: Most numbers in an array of a stream's state.
+#: Most numbers in an array that is restored.
 _MAX_SIZE = 50_000_000
 
 
 def plain_array(values: NDArray[Any]) -> dict[str, Any]:
-    """Convert an array of numbers to a mapping for JSON with the entries `shape` and `f8`, its values.
+    """Convert an array of numbers to a mapping for JSON; its entries are the array's `shape` and its values, `f8`.
 
-    The values are 64-bit floats, little endian, as base64 text. The columns of a structured array become the last
-    axis, without names.
+    The values are stored as 64-bit floats, little endian, in base64 text. The columns of a structured array become the
+    last axis, without names.
     """
     values = np.ascontiguousarray(_as_plain_array(values), dtype="<f8")
     return {"shape": list(values.shape), "f8": b64encode(values.tobytes()).decode("ascii")}
@@ -97,7 +97,7 @@ def require_count(state: Any, name: str) -> int:
 
 
 def require_numbers(state: Any, name: str, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """Return the entry `name` of a saved state as an array of this shape; raise InputError if it is not one."""
+    """Return the entry `name` of a saved state as an array of numbers with this shape; raise InputError otherwise."""
     try:
         values = np.asarray(require_part(state, name, object))
         if values.size and values.dtype.kind not in "fi":
@@ -136,17 +136,20 @@ def restore_attributes(
 ) -> None:
     """Set the attributes of `owner` called `names` to the values that `save_attributes` saved in `state`.
 
-    A saved None leaves an attribute unchanged if its present value is a float or None. `kinds`: types of attributes
-    that may be None or may have another type than the present value. An attribute with a method `load_state`
-    restores itself. If `owner` is a named tuple, its arrays are filled in place. Raises InputError if an attribute is
-    missing in `state`, or differs from the present value in type or in the shape of an array; axes that are empty at
-    present may have any length.
+    - An array must have its present shape, except that an axis of length 0 may get any length. If `owner` is a named
+      tuple, its arrays are filled in place.
+    - An attribute with a method `load_state` restores itself.
+    - A saved None leaves an attribute unchanged if its present value is a float or None.
+    - Any other value must have the type that `kinds` states, by default the type of the present value.
+
+    Raises InputError if an attribute is missing in `state` or breaks one of these rules.
     """
     for name in names:
         key, present = name.lstrip("_"), getattr(owner, name)
         value = require_part(state, key, object)
         if isinstance(present, np.ndarray):
-            value, dtype, present = restore_array(value, key), present.dtype, _as_plain_array(present)
+            value, dtype = restore_array(value, key), present.dtype
+            present = _as_plain_array(present)
             if value.ndim != present.ndim or any(
                 length not in (saved_length, 0) for saved_length, length in zip(value.shape, present.shape, strict=True)
             ):

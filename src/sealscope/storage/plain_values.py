@@ -39,17 +39,14 @@ def _parse_finite(text: str) -> float:
 
 def _parse_whole(text: str) -> int:
     """Parse a whole number; raise ValueError if its size exceeds 2^53."""
-    if len(text) > len(f"-{MAX_WHOLE}") or abs(int(text)) > MAX_WHOLE:  # the time of int grows with the square
+    if len(text) > len(f"-{MAX_WHOLE}") or abs(int(text)) > MAX_WHOLE:  # `int` takes long for long texts
         raise ValueError(f"a whole number must be at most 2^53, got {text[:40]}")
     return int(text)
 
 
 @cache
 def _type_adapter(kind: Any) -> Any:
-    """Make the pydantic validator of a type.
-
-    It is cached, because making one takes long.
-    """
+    """Build the pydantic validator of a type; the result is cached, because building it takes long."""
     from pydantic import TypeAdapter
 
     return TypeAdapter(kind)
@@ -79,13 +76,14 @@ _PLAIN_RULES = {
 def format_error(error: ValidationError, entry_name: Callable[[str], str] = str, unit: str = "") -> str:
     """Format the first error of pydantic as one line, "ENTRY must be ..., got ...".
 
-    Unknown entries come before other errors. `entry_name` converts the name of an entry ("" for the whole value) to
-    its name in the text. `unit` is appended to the rule.
+    An unknown entry is stated before all other errors. `entry_name` converts the name of an entry ("" for the whole
+    value) to its name in the text. `unit` is appended to the rule.
     """
     errors = error.errors(include_url=False)
     first = next((detail for detail in errors if _PLAIN_RULES.get(detail["type"]) == "is not known"), errors[0])
     entry, *path = (str(part) for part in first["loc"] or ("",) if part != "[key]")  # pydantic's mark of a wrong key
-    place = "".join([entry_name(entry), *(f"[{int(part) + 1}]" if part.isdigit() else f".{part}" for part in path)])
+    inner_names = [f"[{int(part) + 1}]" if part.isdigit() else f".{part}" for part in path]  # items count from 1
+    place = entry_name(entry) + "".join(inner_names)
     if plain_rule := _PLAIN_RULES.get(first["type"]):
         return f"{place} {plain_rule}"
     rule = re.sub(r"^\w+ should", "must", first["msg"].removeprefix("Value error, ")).replace("tuple", "list") + unit

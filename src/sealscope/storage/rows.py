@@ -25,7 +25,7 @@ class StoredRow(Protocol):
 
     @property
     def id(self) -> str:
-        """Name of the job whose result the row is; a later row of the same job replaces an earlier one."""
+        """Name of the job that gave this result; of several rows with one name, the last is valid."""
 
     def as_dict(self) -> dict[str, Any]:
         """Return the result of the job as plain values for JSON."""
@@ -39,9 +39,9 @@ def read_rows(
 ) -> dict[str, Row]:
     """Read the results of jobs that `store_rows` stored in a folder; return the last row of each job by its id.
 
-    `row_of` makes a row from the JSON value of a line, or None for a line to ignore; `parse` parses a line. `what`
+    `parse` parses the JSON of a line, and `row_of` makes a row from the result, or None to ignore the line. `what`
     names the folder in errors. A last line that was cut off is ignored, and a missing file has no rows. Raises
-    UnreadableFile, with the place, for a line that is not a row.
+    UnreadableFile if the file cannot be read or a line is not a row, and InputError if the file is a link.
     """
     path = folder / ROWS
     rows: dict[str, Row] = {}
@@ -69,16 +69,16 @@ def read_rows(
 def store_rows(folder: Path, rows: Generator[Row, None, None], what: str, allow_nan: bool = False) -> Iterator[Row]:
     """Append each row that the generator `rows` yields to the file `rows.jsonl` in a folder, then yield the row.
 
-    Each row, the result of a job, is on the disk before the generator runs the next job. A last line that an
-    interrupted run left incomplete is removed first. `rows` is closed at the end; `what` names the folder in errors.
+    The generator runs a job for each row. A row is on the disk before the next job starts. An incomplete last line,
+    which an interrupted run has left, is removed first. `rows` is closed at the end; `what` names the folder in errors.
     Raises ValueError for a row with a number that is not finite, unless `allow_nan`, and InputError if the file
     cannot be written.
     """
     with closing(rows), open_inner(folder / ROWS, f"{what}'s file of rows", "ab+") as file:
         size = file.seek(0, os.SEEK_END)
         file.seek(max(0, size - _MAX_LINE))
-        truncated = file.read().rpartition(b"\n")[2]  # a line that was interrupted by a power loss
-        file.truncate(size - len(truncated))
+        _, _, incomplete_line = file.read().rpartition(b"\n")  # empty unless a power loss cut a line off
+        file.truncate(size - len(incomplete_line))
         for row in rows:
             line = json.dumps(row.as_dict(), allow_nan=allow_nan, sort_keys=True).encode() + b"\n"
             try:

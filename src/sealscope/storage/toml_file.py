@@ -18,12 +18,15 @@ from sealscope.storage.plain_values import MAX_WHOLE, convert_type
 _T = TypeVar("_T")
 #: Largest file that is read [bytes].
 MAX_SIZE = 1_000_000
-#: Most dots in a key, as tomllib's time grows with their square; characters of keys.
+#: Most dots in a key, as tomllib's time grows with their square.
 _MAX_DOTS = 30
-_KEYS = re.compile(r"[\w.\"' \t\r-]+")
-#: Memory [bytes] for a table, an element of an array of tables, a key's value, and a value in an array; most memory in
-#: all: the larger of _MAX_MEMORY and _MEMORY_RATIO times the file.
-_TABLE, _ROW, _ENTRY, _VALUE, _MAX_MEMORY, _MEMORY_RATIO = 900, 60, 110, 70, 2_000_000, 6
+#: A piece of text that may be a key.
+_KEY = re.compile(r"[\w.\"' \t\r-]+")
+#: Memory [bytes] for a table, an element of an array of tables, a key's value, and a value in an array.
+_TABLE, _ROW, _ENTRY, _VALUE = 900, 60, 110, 70
+#: Most memory of a parsed file [bytes], and relative to the file's size; the larger limit applies.
+_MAX_MEMORY, _MEMORY_RATIO = 2_000_000, 6
+#: A line with the header of a table, and a key of an inline table.
 _HEADER, _INNER_KEY = re.compile(r"\s*\[[^\[\],]*\]\s*(?:#.*)?\n?"), re.compile(r"[{,]([^{},=]*)=")
 
 
@@ -50,7 +53,7 @@ def parse_toml(data: bytes, what: str, place: str, max_size: int = MAX_SIZE) -> 
         raise InputError(f"{what} must be at most {max_size} bytes, got more ({place})")
     try:
         text = data.decode("utf-8-sig")
-        if any(part[0].count(".") > _MAX_DOTS for part in _KEYS.finditer(text)):
+        if any(key[0].count(".") > _MAX_DOTS for key in _KEY.finditer(text)):
             raise ValueError(f"a dotted key must have at most {_MAX_DOTS} dots")
         if (memory := _estimate_memory(text)) > max(_MAX_MEMORY, _MEMORY_RATIO * len(data)):
             raise ValueError(f"{len(data)} bytes of text must hold fewer tables and values, got some {memory} bytes")
@@ -112,7 +115,8 @@ def _parse_table(rows: Mapping[str, Any], kind: Any, place: str) -> Any:
 
     `rows`: mapping from key to {value, unit, source}; `place` names the table in errors.
     """
-    is_mapping, optional = get_origin(kind) is not None, tuple[str, ...]()
+    is_mapping = get_origin(kind) is not None  # such as Mapping[str, float]
+    optional: tuple[str, ...] = ()
     if is_mapping:
         names, value_kind = get_args(kind)
         kinds = dict.fromkeys(get_args(names) if get_origin(names) is Literal else rows, value_kind)
@@ -127,8 +131,9 @@ def _parse_table(rows: Mapping[str, Any], kind: Any, place: str) -> Any:
 def _parse_value(row: Any, kind: Any, place: str) -> Any:
     """Return the value of a prior as `kind`: an int, a tuple of numbers, or else a float.
 
-    `row`: its entry {value, unit, source} in the file; `place` names it in errors. The value stays in the unit that
-    the row states. Raises InputError if the row lacks one of the three, or if the value does not fit `kind`.
+    `row`: entry {value, unit, source} of the prior in the file; `place` names the prior in errors. The value stays in
+    the unit that the row states. Raises InputError if the row lacks value, unit or source, or if the value does not fit
+    `kind`.
     """
     if not isinstance(row, dict) or set(row) != {"value", "unit", "source"} or not (row["unit"] and row["source"]):
         raise InputError(f"{place} must have value, unit and source, got {row!r}")
@@ -188,5 +193,6 @@ def _check_whole_numbers(value: Any) -> None:
     """
     if isinstance(value, int) and abs(value) > MAX_WHOLE:
         raise ValueError("a whole number must be at most 2^53 in size")
-    for inner in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
+    items = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+    for inner in items:
         _check_whole_numbers(inner)

@@ -8,15 +8,15 @@ from sealscope.errors import UnreadableFile
 
 #: Largest unpacked size of any file [bytes].
 MAX_UNPACKED = 8 * 2**30
-#: Unpacked size allowed for any file [bytes], and for larger ones relative to the size on the disk.
+#: Unpacked size that is allowed for every file [bytes], and largest ratio of a larger one to the size on the disk.
 _MIN_LIMIT, _MAX_EXPANSION = 2**26, 200
 
 
 def max_unpacked_size(path: Path) -> int:
     """Compute the largest size [bytes] that the packed file at `path` may unpack to.
 
-    It is 200 times the size on the disk, but at least 64 MiB and at most 8 GiB. The holes of a sparse file do not
-    count as size on the disk. Logs usually shrink to a tenth, and logs of constant channels to a hundredth.
+    The limit is 200 times the size on the disk, but at least 64 MiB and at most 8 GiB. Packing usually reduces a log to
+    a tenth of its size, and a log of constant channels to a hundredth. Holes of a sparse file take no size on the disk.
     """
     status = path.stat()
     disk_bytes = 512 * getattr(status, "st_blocks", 0)  # 0 where the file system does not say

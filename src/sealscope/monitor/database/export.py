@@ -28,24 +28,28 @@ def export_labels(store: MonitorStore, folder: Path) -> tuple[int, int]:
     `repaired` or `valid`, `healthy` if it is `invalid`. Other estimates have no label.
     """
     events = _events_by_alarm(store)
+    rows = []
     # by actuator: start and stop [s] of an interval, and the columns `label` and `alarm` of the estimates in it
-    rows, intervals = [], defaultdict[str, list[tuple[float, float, dict[str, str]]]](list)
+    intervals = defaultdict[str, list[tuple[float, float, dict[str, str]]]](list)
     for alarm in sorted(reversed(store.alarms()), key=lambda alarm: float(alarm["raised_s"])):
         history = events[alarm["id"]]
         last_mark = next((event for event in reversed(history) if event["event"] in _LABELS), None)
-        onset, leak = alarm["onset_interval_s"] or (None, None), alarm["leak_interval_lpm"] or (None, None)
+        onset_low, onset_high = alarm["onset_interval_s"] or (None, None)
+        leak_low, leak_high = alarm["leak_interval_lpm"] or (None, None)
         comments = (f"{event['by']}: {event['text']}" for event in history if event["by"] and event["text"])
         row = {
             "marked_by": None if last_mark is None else last_mark["by"],
             "marked_s": None if last_mark is None else last_mark["t"],
             "comments": "; ".join(comments),
-            **dict(zip(("onset_low_s", "onset_high_s"), onset, strict=True)),
-            **dict(zip(("leak_low_lpm", "leak_high_lpm"), leak, strict=True)),
+            "onset_low_s": onset_low,
+            "onset_high_s": onset_high,
+            "leak_low_lpm": leak_low,
+            "leak_high_lpm": leak_high,
         }
         rows.append({**alarm, **row})
         if last_mark is not None:
-            start, label = alarm["onset_s"] if onset[0] is None else onset[0], _LABELS[last_mark["event"]]
-            labels = {"label": label, "alarm": alarm["id"]}
+            start = alarm["onset_s"] if onset_low is None else onset_low
+            labels = {"label": _LABELS[last_mark["event"]], "alarm": alarm["id"]}
             intervals[alarm["actuator"]].append((start, last_mark["t"], labels))
 
     n_estimates = 0
@@ -57,7 +61,8 @@ def export_labels(store: MonitorStore, folder: Path) -> tuple[int, int]:
         (the alarm's `id`).
         """
         nonlocal n_estimates
-        for n_estimates, row in enumerate(store.estimates(), 1):  # noqa: B007 (returned)
+        for row in store.estimates():
+            n_estimates += 1
             labels = [labels for start, stop, labels in intervals[row["actuator"]] if start <= row["t"] <= stop]
             yield _select_columns({**row, **(labels[-1] if labels else {})}, ESTIMATE_COLUMNS)
 
@@ -68,11 +73,12 @@ def export_labels(store: MonitorStore, folder: Path) -> tuple[int, int]:
 
 def _events_by_alarm(store: MonitorStore) -> defaultdict[str, list[dict[str, Any]]]:
     """Read all events of alarms, and group them by the id of the alarm, in their order."""
-    events, number = defaultdict[str, list[dict[str, Any]]](list), 0
-    while batch := store.events_since(number):
-        number = batch[-1][0]
-        for _, event in batch:
+    events = defaultdict[str, list[dict[str, Any]]](list)
+    last_number = 0
+    while batch := store.events_since(last_number):
+        for number, event in batch:
             events[event["alarm"]["id"]].append(event)
+            last_number = number
     return events
 
 

@@ -21,10 +21,10 @@ from sealscope.storage.toml_file import read_toml
 def record_mark(rig: str, alarm: Alarm, mark: str, samples: Sequence[Recording]) -> str:
     """Write the mark that a person gave an alarm into the machine's file, and return one line that states the result.
 
-    `rig`: path of the file; `samples`: the last samples before the mark. With the mark `invalid` these are added as a
-    healthy recording, unless the machine judges that they leak. After a `valid` mark no recording from the onset on
-    becomes healthy until a repair. Returns "" for a mark that such a file does not store, and if `rig` is no
-    machine's file.
+    `rig`: path of the file; `samples`: the last samples before the mark. With the mark `invalid` these samples are
+    added as a healthy recording, unless the machine judges that they leak. After a `valid` mark no recording from the
+    onset on becomes healthy until a repair. Returns "" if a machine's file does not store this mark, or if `rig` is
+    not a machine's file.
     """
     path = Path(rig)
     if mark not in JUDGEMENTS or path.suffix.lower() != ".toml":

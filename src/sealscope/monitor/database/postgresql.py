@@ -34,6 +34,7 @@ def engine_options(url: URL) -> dict[str, Any]:
         **{f"tcp_{name}": value for name, value in keepalive.items()},
     }
     options = " ".join(f"-c {name}={value}" for name, value in server.items())
+    # the server's times are in milliseconds, as is tcp_user_timeout; the others are in seconds
     limits = {**keepalive, "tcp_user_timeout": 10_000, "connect_timeout": CONNECT_S, "options": options}
     arguments = {name: value for name, value in limits.items() if name not in url.query}
     return {"pool_pre_ping": True, "pool_timeout": 5.0, "connect_args": arguments}
@@ -53,15 +54,16 @@ def limit_answers(engine: Engine) -> None:
 
         def wait(self, gen: Any, *arguments: Any, **options: Any) -> Any:
             """Run `gen`, the generator by which psycopg waits for an answer, under the time limit."""
-            return super().wait(self._limited(gen), *arguments, **options)
+            return super().wait(self._with_time_limit(gen), *arguments, **options)
 
-        def _limited(self, gen: Generator[Any, Any, Any]) -> Generator[Any, Any, Any]:
-            """Run psycopg's generator `gen`; raise OperationalError if the server does not answer within `ANSWER_S`.
+        def _with_time_limit(self, gen: Generator[Any, Any, Any]) -> Generator[Any, Any, Any]:
+            """Run psycopg's generator `gen`, which waits for answers of the server, each for up to `ANSWER_S`.
 
-            Before that the connection is closed. Psycopg resumes the generator several times a second, even if there
-            is no answer.
+            If an answer takes longer, the connection is closed and OperationalError raised. Psycopg resumes this
+            generator several times a second; `ready` is false while there is no answer.
             """
-            last_answer, ready = time.monotonic(), None
+            last_answer = time.monotonic()
+            ready: Any = None
             while True:
                 try:
                     condition = gen.send(ready)

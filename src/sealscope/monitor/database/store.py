@@ -42,9 +42,9 @@ _ATTEMPTS = 10
 class StoredRows:
     """The rows that one transaction writes to the tables of the database, besides the blocks' identities.
 
-    `estimates`, `pending` (samples since the last checkpoint), `events`: new rows; `alarms` (by id), `actuators`
-    (checkpoints, by actuator) and `summaries` (by actuator): rows that are new or replace others; `old_blocks`,
-    `old_estimates`: by actuator, the running number up to which old rows are deleted.
+    - `estimates`, `pending` (samples since the last checkpoint), `events`: new rows.
+    - `alarms` by id, `actuators` (checkpoints) and `summaries` by actuator: rows that are new or replace stored ones.
+    - `old_blocks`, `old_estimates`: by actuator, the running number up to which old rows are deleted.
     """
 
     estimates: list[dict[str, Any]] = field(default_factory=list)
@@ -59,32 +59,37 @@ class StoredRows:
     def add_estimates(self, actuator: str, estimates: Iterable[BlockEstimate], oil_celsius: float | None) -> None:
         """Add the estimates of an actuator's blocks, each with the oil temperature [deg C], None if unknown."""
         for estimate in estimates:
-            total, leak = estimate.total_interval_lpm or (None, None), estimate.leak_interval_lpm or (None, None)
-            figures = (estimate.total_lpm, *total, estimate.leak_lpm, *leak, oil_celsius)
-            row = {"actuator": actuator, "number": estimate.number, "t": estimate.t, "status": estimate.status[:160]}
+            total_ends = estimate.total_interval_lpm or (None, None)
+            leak_ends = estimate.leak_interval_lpm or (None, None)
+            figures = (estimate.total_lpm, *total_ends, estimate.leak_lpm, *leak_ends, oil_celsius)
+            status = estimate.status[:160]  # the length of the column
+            row = {"actuator": actuator, "number": estimate.number, "t": estimate.t, "status": status}
             self.estimates.append({**row, **dict(zip(tables.FIGURES, figures, strict=True))})
 
     def add_pending(
         self, actuator: str, number: int, samples: Recording, follows: bool, verdict: RecordingVerdict | None = None
     ) -> None:
-        """Add the samples of a block and the verdict on them, which a restarted monitor must judge again.
+        """Add a block of samples, which a restarted monitor judges again to recover the actuator's state.
 
-        They are deleted at the next checkpoint of the actuator. `number`: number of the block since the checkpoint,
-        from 1; `follows`: False if there is a gap between these samples and those before.
+        `number`: running number of the block since the actuator's last checkpoint, from 1; `follows`: False if there is
+        a gap between these samples and those before; `verdict`: verdict on the samples as a whole recording, None for
+        none. The stored samples are deleted at the next checkpoint.
         """
-        self.pending.append({"actuator": actuator, "number": number, "samples": _pack(samples, follows, verdict)})
+        self.pending.append(
+            {"actuator": actuator, "number": number, "samples": _pack_samples(samples, follows, verdict)}
+        )
 
     def add_alarm(self, alarm: Alarm, kind: str, t: float, by_whom: str = "", text: str = "") -> None:
-        """Add an alarm in its present state, and an event of this kind at the time `t` [s].
+        """Add an alarm in its present state, and the event that changed it at the time `t` [s].
 
-        `kind`: name of the event, "" to add none; `by_whom`, `text`: the person who caused it and their comment, ""
-        for none.
+        `kind`: name of the event, "" to add the alarm only; `by_whom`, `text`: the person who caused the event and
+        their comment, "" for none.
         """
-        actuator, plain = {"actuator": alarm.actuator}, json.dumps(alarm.as_dict())
-        self.alarms[alarm.id] = {**actuator, "id": alarm.id, "state": alarm.state, "alarm": plain}
+        plain = json.dumps(alarm.as_dict())
+        self.alarms[alarm.id] = {"actuator": alarm.actuator, "id": alarm.id, "state": alarm.state, "alarm": plain}
         if kind:
-            entry = {"kind": kind, "by_whom": by_whom, "text": text}
-            self.events.append({**actuator, **entry, "t": t, "alarm_id": alarm.id, "alarm": plain})
+            event = {"actuator": alarm.actuator, "kind": kind, "by_whom": by_whom, "text": text}
+            self.events.append({**event, "t": t, "alarm_id": alarm.id, "alarm": plain})
 
     def add_checkpoint(self, actuator: str, settings: str, state: dict[str, Any]) -> None:
         """Add a checkpoint, that is the settings (JSON) and the state of an actuator.
@@ -107,7 +112,7 @@ class StoredSamples(NamedTuple):
     """The stored samples of a block.
 
     `follows`: False if there is a gap between these samples and those before; `verdict`: verdict on the samples as a
-    whole recording, None if they are no recording.
+    whole recording, None if they are not a whole recording.
     """
 
     samples: Recording
@@ -151,9 +156,9 @@ class MonitorStore:
             raise InputError(f"the monitor's database must have version {tables.SCHEMA}, got {version} ({database})")
 
     def _prepare_tables(self, attempts: int) -> str:
-        """Create missing tables, and return the version of the database's schema.
+        """Create missing tables, and return the version of the database's schema, which the table `facts` stores.
 
-        Tries up to `attempts` times, because another monitor may be creating the tables.
+        An attempt fails if another monitor creates the tables at the same time; `attempts`: largest number of attempts.
         """
         facts = tables.facts
         try:
@@ -177,7 +182,7 @@ class MonitorStore:
 
     @contextmanager
     def _begin_relaxed_transaction(self) -> Iterator[sa.Connection]:
-        """Open a faster transaction, whose changes survive the end of this process but perhaps no loss of power."""
+        """Open a faster transaction, whose changes survive a crash of this process but perhaps not a power failure."""
         is_file = self.engine.dialect.name == "sqlite"
         with self._writing_lock, self.engine.connect() as connection:
             if is_file:
@@ -223,7 +228,7 @@ class MonitorStore:
     def insert_blocks(self, connection: sa.Connection, blocks: Iterable[tuple[str, str, int]]) -> None:
         """Store the identities of blocks, each given as (actuator, identity, running number in the actuator's blocks).
 
-        Raises IntegrityError, which ends the transaction, if one of them is stored already.
+        Raises IntegrityError, which ends the transaction, if one of the blocks is stored already.
         """
         names = ("actuator", "identity", "number")
         connection.execute(tables.blocks.insert(), [dict(zip(names, block, strict=True)) for block in blocks])
@@ -247,10 +252,10 @@ class MonitorStore:
         for table in (tables.actuators, tables.summaries, tables.alarms):
             self.upsert(connection, table, [*getattr(rows, table.name).values()])
         for table, last_numbers in ((tables.blocks, rows.old_blocks), (tables.estimates, rows.old_estimates)):
-            last_old_rows = [{"name": name, "last": last} for name, last in last_numbers.items() if last > 0]
-            if last_old_rows:
+            parameters = [{"name": name, "last": last} for name, last in last_numbers.items() if last > 0]
+            if parameters:
                 is_old = (table.c.actuator == actuator) & (table.c.number <= bindparam("last"))
-                connection.execute(table.delete().where(is_old), last_old_rows)
+                connection.execute(table.delete().where(is_old), parameters)
 
     def commit_rows(self, rows: StoredRows) -> None:
         """Write rows to their tables in a transaction of their own, and delete rows that are no longer needed."""
@@ -262,7 +267,7 @@ class MonitorStore:
         if not rows:
             return
         key = table.primary_key.columns.keys()
-        # SQLAlchemy takes a parameter with the name of a column as its new value, so those of the key get a prefix
+        # SQLAlchemy takes a parameter with the name of a column as its new value: the values of the key get a prefix
         is_row = [table.c[name] == bindparam(f"of_{name}") for name in key]
         values = [{f"of_{name}" if name in key else name: value for name, value in row.items()} for row in rows]
         if connection.execute(table.update().where(*is_row), values).rowcount < len(rows):
@@ -308,7 +313,7 @@ class MonitorStore:
             connection.execute(tables.decodings.delete().where(columns.reader == reader, columns.digest == digest))
 
     def last_number(self, table: sa.Table, actuator: str) -> int:
-        """Read the highest running number of an actuator in `table`, that of blocks or of estimates; 0 for none."""
+        """Read the highest running number of an actuator's rows in `table` (`blocks` or `estimates`), 0 for no rows."""
         return self._value(select(func.max(table.c.number)).where(table.c.actuator == actuator))
 
     def checkpoint(self, actuator: str) -> StoredCheckpoint | None:
@@ -317,7 +322,7 @@ class MonitorStore:
         samples = select(pending.c.samples).where(pending.c.actuator == actuator).order_by(pending.c.number)
         with self.engine.connect() as connection:
             row = connection.execute(select(states).where(states.c.actuator == actuator)).first()
-            blocks = [_unpack(data) for (data,) in connection.execute(samples)]
+            blocks = [_unpack_samples(data) for (data,) in connection.execute(samples)]
         return None if row is None else StoredCheckpoint(row.settings, json.loads(row.checkpoint), blocks)
 
     def last_samples(self, actuator: str) -> list[Recording]:
@@ -359,9 +364,9 @@ class MonitorStore:
     def history(self, actuator: str, max_rows: int = 600, seconds: float | None = None) -> list[dict[str, Any]]:
         """Read the history of an actuator's estimates in order of time, averaged to at most about `max_rows` rows.
 
-        Each row has the means over equally many successive estimates of the time `t` [s], the flows and interval ends
-        [L/min], and the oil temperature [deg C], with None for unknown ones. `seconds` [s]: length of the history
-        before the newest estimate, None for all of it.
+        Each row averages a group of successive estimates. It has the mean time `t` [s], flows and interval ends
+        [L/min], and oil temperature [deg C], with None for unknown ones. `seconds` [s]: length of the history before
+        the newest estimate, None for all of it.
         """
         columns = tables.estimates.c
         is_chosen = columns.actuator == actuator
@@ -381,19 +386,22 @@ class MonitorStore:
                 yield dict(row._mapping)
 
     def position(self, name: str) -> int:
-        """Read the number of the last event that the output `name` has delivered, 0 if there is none."""
+        """Read the number of the last alarm event that the output `name` has delivered, 0 for none.
+
+        The Sparkplug node also stores the number of its last birth message in this way.
+        """
         return self._value(select(tables.facts.c.value).where(tables.facts.c.name == name))
 
     def write_position(self, name: str, number: int) -> None:
-        """Store the number of the last event that the output `name` has delivered."""
+        """Store the number of the last alarm event that the output `name` has delivered."""
         with self.writing() as connection:
             self.upsert(connection, tables.facts, [{"name": name, "value": str(number)}])
 
     def deliver(self, output: str, send: Callable[[dict[str, Any]], bool]) -> None:
-        """Send the events of alarms that an output has not sent yet, by the function `send`, until it returns False.
+        """Send the events of alarms that an output has not sent yet, in order and at most 1000 of them.
 
-        They are sent in order. After each event its number is stored, so the next call continues there. `output`: name
-        of the output.
+        `output`: name of the output; `send`: function that sends an event, and returns False to try it again in the
+        next call. The number of each sent event is stored, so the next call continues after it.
         """
         for number, event in self.events_since(self.position(output)):
             if not send(event):
@@ -402,9 +410,9 @@ class MonitorStore:
 
 
 def outage_reason(error: BaseException) -> str | None:
-    """Describe an outage of the database in one line; return None if the error means no outage.
+    """Describe an outage of the database in one line; return None if `error` is of another kind.
 
-    Values that the database cannot store are no outage: it would refuse them again.
+    A value that the database cannot store (DataError) is not an outage: waiting would not help.
     """
     if isinstance(error, PoolTimeout):
         return "every connection to the database is in use"
@@ -413,10 +421,10 @@ def outage_reason(error: BaseException) -> str | None:
     return " ".join(str(error.orig).split())[:200]
 
 
-def _pack(samples: Recording, follows: bool, verdict: RecordingVerdict | None) -> bytes:
+def _pack_samples(samples: Recording, follows: bool, verdict: RecordingVerdict | None) -> bytes:
     """Pack samples as bytes: a line of JSON, then the times and all channels as little-endian doubles.
 
-    The line has units, rate, `follows` (False after a gap), and the verdict if there is one.
+    The line has units, rate, `follows` (False after a gap), and the verdict unless it is None.
     """
     header = _format_header(tuple((name, samples.units[name]) for name in samples.channels), samples.rate, follows)
     if verdict is not None:
@@ -426,15 +434,15 @@ def _pack(samples: Recording, follows: bool, verdict: RecordingVerdict | None) -
 
 @lru_cache(maxsize=64)
 def _format_header(units: tuple[tuple[str, str], ...], rate: float, follows: bool) -> bytes:
-    """Format the line of JSON with which packed samples begin (`_pack`), without a verdict.
+    """Format the line of JSON with which packed samples begin (`_pack_samples`), without a verdict.
 
     `units`: (channel, unit) of each channel; `rate` [Hz]; `follows`: False after a gap.
     """
     return json.dumps({"units": dict(units), "rate": rate, "follows": follows}).encode() + b"\n"
 
 
-def _unpack(data: bytes) -> StoredSamples:
-    """Unpack a block of samples from the bytes in which the database stores it (`_pack`)."""
+def _unpack_samples(data: bytes) -> StoredSamples:
+    """Unpack a block of samples from the bytes in which the database stores it (`_pack_samples`)."""
     line, _, numbers = data.partition(b"\n")
     header = json.loads(line)
     t, *channels = np.frombuffer(numbers, dtype="<f8").reshape(1 + len(header["units"]), -1)

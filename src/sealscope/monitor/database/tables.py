@@ -34,6 +34,7 @@ def _table(name: str, columns: str, *indexes: Index) -> Table:
     return Table(name, metadata, *table_columns, *indexes)
 
 
+#: Single values by name: the version of the tables, and how far each output has come.
 facts = _table("facts", "name 40 key, value text")
 #: Blocks that are stored, by identity.
 _block_order = Index("blocks_in_order", "actuator", "number")

@@ -39,7 +39,7 @@ class EventLines:
 
     def __init__(self, store: MonitorStore, stream: TextIO | None) -> None:
         self._store, self._stream = store, stream
-        self._unwritten, self._number = b"", 0  # rest of the line under way, and the number of its event
+        self._unwritten, self._number = b"", 0  # part of the last line still to be written, and number of its event
 
     def deliver(self) -> None:
         """Write the new alarm events as lines of JSON; raise PartAway if the stream is closed or refuses them."""
@@ -109,8 +109,8 @@ class Webhook:
             asyncio.run(self._post(event))
         except TimeoutError:
             raise PartAway(f"no answer within {self._timeout:g} s") from None
-        except httpx.RemoteProtocolError:  # its text is what the server sent
-            raise PartAway("an answer that is no HTTP") from None
+        except httpx.RemoteProtocolError:  # the text of the error quotes the server: it is not passed on
+            raise PartAway("the answer is not valid HTTP") from None
         except (httpx.HTTPError, httpx.InvalidURL, OSError, ValueError) as error:
             raise PartAway((str(error).splitlines() or [""])[0][:200] or type(error).__name__) from None
         return True

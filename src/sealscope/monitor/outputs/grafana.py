@@ -10,9 +10,10 @@ from typing import Any
 def dashboard() -> dict[str, Any]:
     """Build the Grafana dashboard, on which the actuator can be chosen, as plain values for Grafana's JSON."""
     tables: dict[str, Any] = tomllib.loads((files("sealscope.monitor.outputs") / "grafana.toml").read_text("utf-8"))
-    panels, x, y, row_height = [], 0, 0, 0
+    panels = []
+    x = y = row_height = 0  # in columns and rows of Grafana's grid, which has 24 columns
     for number, (title, kind, query, legend, unit, width, height) in enumerate(tables["panels"], 1):
-        if x + width > 24:  # columns of Grafana's grid
+        if x + width > 24:
             x, y, row_height = 0, y + row_height, 0
         expression = query.replace("%s", 'actuator=~"$actuator"')
         panels.append(

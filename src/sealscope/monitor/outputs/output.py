@@ -18,9 +18,9 @@ if TYPE_CHECKING:
 class Output(Protocol):
     """An output of alarms.
 
-    `part`: name under which page, log and metrics show its outages. `deliver` is called again and again; it sends the
-    new events by `MonitorStore.deliver`, which remembers how far the output has come, and raises PartAway if they are
-    not taken. `end` is called once, at the end.
+    `part`: name under which page, log and metrics show its outages. `deliver` is called again and again; `end` is
+    called once, at the end. Both send the new events by `MonitorStore.deliver`, which stores how far the output has
+    come, and raise PartAway if the receiver does not accept them.
     """
 
     part: str
@@ -41,7 +41,6 @@ def open_outputs(actuators: WatchedActuators, settings: MonitorSettings) -> Iter
     for name in type(settings).model_fields:
         table = getattr(settings, name)
         if isinstance(table, OutputSettings):
-            module, _, sender = table.sender.partition(":")
-            yield getattr(import_module(f"sealscope.monitor.outputs.{module}"), sender).from_settings(
-                actuators, table, settings
-            )
+            module_name, _, class_name = table.sender.partition(":")
+            module = import_module(f"sealscope.monitor.outputs.{module_name}")
+            yield getattr(module, class_name).from_settings(actuators, table, settings)

@@ -54,7 +54,7 @@ def format_metrics(
     families: dict[str, Any] = {}
 
     def add(name: str, text: str, value: float | None, **labels: str) -> None:
-        """Add a value with its labels to the metric `name`; skip None. `text`: help text of the metric."""
+        """Add a value with its labels to the metric `name`, unless it is None. `text`: help text of the metric."""
         if value is not None:
             kind = CounterMetricFamily if name.endswith("_total") else GaugeMetricFamily
             families.setdefault(name, kind(name, text, labels=[*labels])).add_metric([*labels.values()], float(value))
@@ -78,6 +78,6 @@ def format_metrics(
     for (name, text), value in zip(_QUEUE_METRICS.items(), queue_load or QueueLoad(), strict=True):
         add(name, text, value)
     registry = CollectorRegistry(auto_describe=False)
-    # a collector is an object with a method `collect`
+    # the registry asks an object with a method `collect` for the metrics
     registry.register(type("Families", (), {"collect": lambda self: families.values()})())
     return generate_latest(registry).decode()

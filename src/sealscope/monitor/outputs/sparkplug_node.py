@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from sealscope.monitor.actuators import WatchedActuators
 
 _log = logging.getLogger(__name__)
+#: Names under which the database stores the numbers of the last sent event, and of the last birth message.
 _NAME, _BIRTHS = "sparkplug", "sparkplug bdSeq"
 
 
@@ -57,7 +58,7 @@ class SparkplugNode:
         self._client.on_connect = self._on_connect
         self._client.on_message = self._on_message
         self._last_birth_number = self._birth_number = 0  # bdSeq of the last birth, and of this connection
-        self._seq = 255
+        self._seq = 255  # sequence number of the last message; the next is 0
         self._birth_due = threading.Event()
         self._sent_values: dict[str, dict[str, Any]] = {}
         self._next_update = 0.0
@@ -73,8 +74,8 @@ class SparkplugNode:
     def deliver(self) -> None:
         """Send new events of alarms and, every few seconds, changed values to the Sparkplug host.
 
-        Before that it sends the birth messages, which state all metrics, if they are due. It connects to the broker
-        at the first call, and does nothing while there is no connection.
+        If birth messages, which state all metrics, are due, they are sent first. The first call connects to the broker.
+        While there is no connection, nothing is sent.
         """
         if not self._link.is_open:
             self._last_birth_number = self._store.position(_BIRTHS)
@@ -112,7 +113,7 @@ class SparkplugNode:
             self._link.close()
 
     def _topic(self, kind: str, device: str | None = None) -> str:
-        """Build the topic of a message of this node, or of one of its devices; `kind`: its type, such as "DDATA"."""
+        """Build the topic of a message of this node, or of one of its devices; `kind`: type, such as "DDATA"."""
         return spb.topic_of(self._settings.group, kind, self._settings.node, device)
 
     def _birth_number_metric(self) -> spb.SparkplugMetric:
@@ -121,8 +122,8 @@ class SparkplugNode:
     def _death_message(self) -> tuple[str, bytes]:
         """Build topic and payload of the node's death message, which is the last will of the next connection.
 
-        The broker publishes it when the connection is lost. Its number bdSeq is the one after that of the last birth
-        message.
+        The broker publishes this message when the connection is lost. Its number bdSeq, one more than that of the last
+        birth message, becomes the number of this connection and its birth message.
         """
         self._birth_number = (self._last_birth_number + 1) % 256
         payload = spb.SparkplugPayload(_milliseconds(None), (self._birth_number_metric(),))
@@ -141,17 +142,17 @@ class SparkplugNode:
         self._birth_due.set()
 
     def _on_message(self, client: Any, userdata: Any, message: Any) -> None:
-        """Acknowledge a received command; if it requests the birth messages, mark them as due.
+        """Acknowledge a received command; if it requests the birth messages, which state all metrics, mark them as due.
 
-        Birth messages state all metrics.
+        A message that is not a valid Sparkplug payload is counted and logged.
         """
         if message.qos:
             client.ack(message.mid, message.qos)
         try:
             request = spb.decode_payload(message.payload).find_metric(spb.REBIRTH)
         except ValueError as error:
-            self._count("Sparkplug commands that are none")
-            _log.info("a command that is none: %s", error)
+            self._count("invalid Sparkplug commands")
+            _log.info("an invalid Sparkplug command: %s", error)
             return
         if request is not None and request.value is True:
             self._birth_due.set()
@@ -214,10 +215,7 @@ def _load_table(name: str) -> Mapping[str, Mapping[str, str]]:
 
 
 def _milliseconds(t: float | None) -> int:
-    """Convert a time of samples [s] to milliseconds since 1970.
-
-    If the time is None, or not counted from 1970, the present time is returned.
-    """
+    """Convert a time [s] to milliseconds since 1970; use the present time for None, or if `t` is not since 1970."""
     return round(1000.0 * (t if t is not None and counts_from_1970(t) else time.time()))
 
 

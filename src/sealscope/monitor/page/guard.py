@@ -11,9 +11,12 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
-#: Number of wrong tokens that an address may state without a pause; first and longest pause [s]; time after which
-#: they are forgotten [s]; number of addresses that are remembered.
-_FREE_ATTEMPTS, _FIRST_PAUSE_S, _MAX_PAUSE_S, _FORGET_S, _MAX_ADDRESSES = 5, 1.0, 60.0, 3600.0, 10_000
+#: Number of wrong tokens that an address may state without a pause, and time after which they are forgotten [s].
+_FREE_ATTEMPTS, _FORGET_S = 5, 3600.0
+#: First and longest pause after a wrong token [s].
+_FIRST_PAUSE_S, _MAX_PAUSE_S = 1.0, 60.0
+#: Number of addresses whose wrong tokens are remembered.
+_MAX_ADDRESSES = 10_000
 #: Most connections, and the largest fraction of the file descriptors of this process for them: sources, outputs and
 #: the database need the others.
 _MAX_CONNECTIONS, _DESCRIPTOR_FRACTION = 400, 0.4
@@ -28,7 +31,7 @@ class Admission:
 
     `token`: the valid token; `now`: function that returns a monotonic time [s].
 
-    After five wrong tokens the next one from the same address, right or wrong, is checked only after a pause of 1 s.
+    After five wrong tokens the next token from the same address, right or wrong, is checked only after a pause of 1 s.
     Each further wrong token doubles the pause, up to a minute. An IPv6 network (/64) counts as one address.
     """
 
@@ -42,8 +45,8 @@ class Admission:
     def pause_s(self, address: str) -> float:
         """Compute the time [s] that a client's IP address must wait until its next token is checked, 0 for no wait.
 
-        After `_FREE_ATTEMPTS` wrong tokens from its network the pause doubles with each further one, up to
-        `_MAX_PAUSE_S`.
+        After `_FREE_ATTEMPTS` wrong tokens from its network the pause is `_FIRST_PAUSE_S`. Each further wrong token
+        doubles it, up to `_MAX_PAUSE_S`.
         """
         n_failures, last = self._failures.get(_network(address), (0, 0.0))
         if n_failures < _FREE_ATTEMPTS:
@@ -79,13 +82,13 @@ def _network(address: str) -> str:
 
 
 def connection_limit() -> int:
-    """Compute the largest number of connections: `_MAX_CONNECTIONS`, or fewer if file descriptors are few."""
+    """Compute the largest number of connections: `_MAX_CONNECTIONS`, or 8 to that many if file descriptors are few."""
     with suppress(ImportError, OSError, ValueError):
         import resource
 
-        soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
-        if soft != resource.RLIM_INFINITY:
-            return max(8, min(_MAX_CONNECTIONS, round(_DESCRIPTOR_FRACTION * soft)))
+        max_descriptors, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+        if max_descriptors != resource.RLIM_INFINITY:
+            return max(8, min(_MAX_CONNECTIONS, round(_DESCRIPTOR_FRACTION * max_descriptors)))
     return _MAX_CONNECTIONS
 
 
@@ -93,7 +96,7 @@ def limit_protocol(max_connections: int, silent_s: float = SILENT_S) -> type[asy
     """Build a subclass of uvicorn's HTTP protocol that limits the number of connections and their idle time.
 
     A connection is closed after `silent_s` seconds without activity. If there are more than `max_connections`, the
-    one that has been silent for longest is closed, or the new one if all others are being answered.
+    connection that has been silent for longest is closed, or the new connection if all others are being answered.
     """
     from uvicorn.protocols.http.auto import AutoHTTPProtocol
 
@@ -106,14 +109,14 @@ def limit_protocol(max_connections: int, silent_s: float = SILENT_S) -> type[asy
         """
 
         def connection_made(self, transport: Any) -> None:
-            """Accept the connection; if there are too many, close the one that has been silent for longest."""
+            """Accept the connection; if there are too many, close the surplus one as `limit_protocol` describes."""
             super().connection_made(transport)
             self.last_activity = self.loop.time()
             if len(self.connections) > max_connections:
                 silent = [other for other in self.connections if other is not self and not other.is_sending_answer()]
                 surplus = min(silent, key=lambda other: other.last_activity, default=self)
                 surplus.transport.abort()
-                self.connections.discard(surplus)  # a closed one must not be chosen again
+                self.connections.discard(surplus)  # a closed connection must not be chosen again
             self.loop.call_later(_CHECK_INTERVAL_S, self.check_silence)
 
         def is_sending_answer(self) -> bool:
@@ -121,7 +124,10 @@ def limit_protocol(max_connections: int, silent_s: float = SILENT_S) -> type[asy
             return self.cycle is not None and not self.cycle.response_complete
 
         def check_silence(self) -> None:
-            """Close the connection if it has been silent for too long; otherwise schedule the next check."""
+            """Close the connection if it has been silent for too long; otherwise schedule the next check.
+
+            A client that receives an answer counts as active while it reads.
+            """
             if self.transport.is_closing():
                 return
             now = self.loop.time()

@@ -23,9 +23,11 @@ from sealscope.units import LITRE_PER_MINUTE
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-#: Samples kept of an actuator: the last `SPAN_S` [s], but at least `MIN_SAMPLES`, which the details need, and at most
-#: `MAX_SAMPLES`; they are kept for at most `MAX_ACTUATORS` at a time.
-SPAN_S, MIN_SAMPLES, MAX_SAMPLES, MAX_ACTUATORS = 20.0, 2500, 20_000, 20
+#: Samples kept of a viewed actuator: those of the last `SPAN_S` seconds, but at least `MIN_SAMPLES`, which the wavelet
+#: details need, and at most `MAX_SAMPLES`.
+SPAN_S, MIN_SAMPLES, MAX_SAMPLES = 20.0, 2500, 20_000
+#: Most actuators that are viewed at a time.
+MAX_ACTUATORS = 20
 #: Bins of a chart, each with its minimum and maximum; rate of the drawn motion [Hz], and its length [s].
 _BINS, _MOTION_HZ, _MOTION_S = 400, 20.0, 8.0
 #: Samples between two windows of the RMS.
@@ -40,8 +42,8 @@ PRESSURES = ("p_A", "p_B")
 class _Window:
     """The last samples of an actuator without a gap.
 
-    `rate` [Hz]: sampling rate; `t` [s]: times; `version`: number of blocks added. The arrays are replaced and never
-    changed, so readers need no lock.
+    `rate` [Hz]: sampling rate; `t` (n,) [s]: times; `channels`: samples (n,) by channel; `version`: number of blocks
+    added so far. An array is never changed after it is set, so readers need no copy.
     """
 
     rate: float = 0.0
@@ -52,7 +54,7 @@ class _Window:
     def add(self, samples: Recording) -> None:
         """Append samples to the window; start anew after a gap, or if the sampling rate or the channels change.
 
-        Samples that are in the window already, without channels, or with times that are not finite are ignored.
+        Samples are ignored if they are in the window already, have no channels, or have times that are not finite.
         """
         max_samples = min(MAX_SAMPLES, max(MIN_SAMPLES, round(SPAN_S * samples.rate)))
         t = samples.t[-max_samples:]
@@ -74,7 +76,7 @@ class _Window:
 
 
 class LiveSamples:
-    """The last seconds of samples of the actuators that somebody views; no others are kept.
+    """The last seconds of samples of the actuators that somebody views; other samples are not kept.
 
     `recall`: function that returns the last stored samples of an actuator, which are shown first.
     """
@@ -89,7 +91,8 @@ class LiveSamples:
     def viewing(self, name: str) -> Iterator[bool]:
         """Keep the samples of an actuator while the context lasts, and yield True.
 
-        If too many actuators are viewed already, yield False and keep none.
+        The last stored samples are shown until new ones arrive. If `MAX_ACTUATORS` others are viewed already, nothing
+        is kept, and False is yielded.
         """
         with self._lock:
             is_first = name not in self._windows
@@ -137,11 +140,13 @@ class LiveSamples:
     def curves(self, name: str, pressure: str = "p_A", detail_form: str = "rms") -> dict[str, Any]:
         """Compute the curves that the page draws of a viewed actuator, as plain values with None for a missing one.
 
-        In the result, `t` is the time of the last sample [s], None if there are no samples. The times of the curves are
-        relative to it. `pressures` has the chamber pressures [bar]; `details` the wavelet details d1 to d4 of one
-        pressure [kPa]; and `motion` the position [mm], the pressures [bar], and the speeds of piston [mm/s] and pump
-        [rpm]. `pressure`: channel for `details`; `detail_form`: "rms" for the RMS of the details in windows of
-        `WINDOW_SIZE` samples, "details" for the details themselves.
+        `pressure`: channel whose wavelet details are computed; `detail_form`: "rms" for the RMS of the details in
+        windows of `WINDOW_SIZE` samples, "details" for the details themselves. Among the returned values are:
+
+        - `t`: time of the last sample [s], None if there are no samples; the times of the curves are relative to it;
+        - `pressures`: the chamber pressures [bar];
+        - `details`: the wavelet details d1 to d4 of one pressure [kPa], or their RMS;
+        - `motion`: position [mm], pressures [bar], and speeds of piston [mm/s] and pump [rpm].
         """
         with self._lock:
             window = self._windows.get(name) or _Window()
@@ -194,8 +199,8 @@ def _detail_curves(t: Array, signal: Array | None, pressure: str, detail_form: s
     """Compute the curves of the wavelet details [kPa] of a pressure, or of their RMS, as plain values.
 
     `signal` [Pa]: the pressure over the times `t` [s], None if it is not recorded; `pressure`: its name;
-    `detail_form`: "details" or "rms". Only the samples after the last missing one are used; if they are too few, the
-    curves are empty.
+    `detail_form`: "details" or "rms". Only the samples after the last missing one are used. If they are fewer than
+    needed, the curves are empty, and `needs` and `has` state these numbers.
     """
     samples = np.empty(0) if signal is None else signal / _KILOPASCAL
     missing_indices = np.flatnonzero(~np.isfinite(samples))
@@ -230,10 +235,7 @@ def _motion_curves(t: Array, channels: dict[str, Array], rate: float) -> dict[st
         return {"t": []}
 
     def bin_means(values: Array) -> Array:
-        """Average samples (n,) over bins of `bin_size` successive samples; return the means (n_bins,).
-
-        The last bin ends with the last sample. Samples before the first of the `n_bins` bins are left out.
-        """
+        """Average the last samples of `values` (n,) over bins of `bin_size` successive samples; return (n_bins,)."""
         return np.asarray(values[values.size - n_bins * bin_size :].reshape(n_bins, bin_size).mean(axis=1))
 
     times = bin_means(t)
@@ -255,9 +257,11 @@ def _motion_curves(t: Array, channels: dict[str, Array], rate: float) -> dict[st
 def describe_rig(rig: str) -> dict[str, Any]:
     """Describe the parts of a rig that the page draws, as plain values by name.
 
-    `rig`: name of a packaged rig, or path of a rig's or machine's file. The values are `title`; `rods`, the sides of
-    the cylinder at which a rod leaves it; `valve`, True if a servo valve drives the cylinder; `stroke` [mm]; `area`,
-    the mean piston area as flow per speed [L/min per mm/s]; and `displacement`, that of the pump [L/rev].
+    `rig`: name of a packaged rig, or path of a rig's or machine's file. The values are:
+
+    - `title`; `stroke` of the cylinder [mm]; `rods`: sides of the cylinder at which a rod leaves it;
+    - `valve`: True if a servo valve drives the cylinder; `displacement` of the pump [L/rev];
+    - `area`: mean piston area, expressed as flow per speed [L/min per mm/s].
     """
     from sealscope.diagnosis.commissioned.watched import load_watched
     from sealscope.reporting.schematic import build_circuit

@@ -41,8 +41,8 @@ from sealscope.storage.plain_values import parse_json
 
 #: Largest body of a request [bytes], time limit for receiving it [s], and most listeners at a time.
 _MAX_BODY_BYTES, _BODY_S, _MAX_LISTENERS = 10_000, 10.0, 200
-#: How often listeners get news [s], and how often they get a sign of life if there are none [s].
-_LOOK_S, _ALIVE_S = 0.3, 15.0
+#: How often changes are looked for [s], and silence after which an event keeps a connection to a browser alive [s].
+_POLL_S, _KEEP_ALIVE_S = 0.3, 15.0
 _HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
     "img-src 'self' data:; form-action 'self'; frame-ancestors 'none'; base-uri 'none'",
@@ -99,7 +99,7 @@ def site(
 
 
 class _Pages:
-    """The request handlers of the page; each method serves one URL path of `_ROUTES`."""
+    """The request handlers of the page; `_ROUTES` states which method serves which URL path."""
 
     def __init__(
         self, actuators: WatchedActuators, token: str | None, queue_load: Callable[[], QueueLoad], live: LiveSamples
@@ -114,9 +114,9 @@ class _Pages:
 
     def file(self, request: Request) -> Response:
         """Answer with the static file of the request's URL path."""
-        name, kind = _FILES[request.url.path]
+        name, media_type = _FILES[request.url.path]
         text = str(read_package_file(name)) if name.startswith("vendor/") else _read_packaged(name)
-        return Response(text, media_type=kind)
+        return Response(text, media_type=media_type)
 
     def _counters_and_outages(self) -> dict[str, Any]:
         """Collect the counters, the number of queued blocks and the outages, which are known without the database."""
@@ -133,7 +133,7 @@ class _Pages:
     def actuator(self, request: Request) -> Response:
         """Answer with the summary, history, events and alarms of one actuator, as JSON.
 
-        Query: `name` of the actuator; `hours`, length of the history, all of it if missing.
+        Query: `name` of the actuator; `hours`: length of the history [h], all of it if missing.
         """
         name, hours = request.query_params.get("name", ""), request.query_params.get("hours", "")
         summary = self._actuators.summaries().get(name)
@@ -176,16 +176,15 @@ class _Pages:
         return JSONResponse(alarm.as_dict())
 
     async def changes(self, request: Request) -> Response:
-        """Answer with a stream of server-sent events: notices of changes and, in the same stream, live curves.
+        """Answer with a stream of server-sent events that keeps the page up to date.
 
-        After each change of results, alarms or outages an event without a name follows. Its data is the number of the
-        change, at which the page loads the new state; the number is repeated after `_ALIVE_S` [s] without a change, to
-        keep the connection alive. Each time the actuator in the query has new samples, an event "live" has its curves
-        as JSON (`live.curves`).
+        - An event without a name is sent after each change of results, alarms or outages: the page then loads them
+          again. Its data is the number of changes so far. It is repeated after `_KEEP_ALIVE_S` [s] without a change.
+        - An event "live" is sent when the actuator in the query has new samples. Its data are the curves of the last
+          samples as JSON (`LiveSamples.curves`).
 
-        Parameters of the query: `actuator`, the actuator's name, without which there are no curves; `pressure`, "p_A"
-        or "p_B", whose wavelet details are drawn; `drawn`, "rms" for the RMS of the details in windows or "details" for
-        the details themselves.
+        Query: `actuator`: name of the actuator, without which there are no curves; `pressure`: "p_A" or "p_B", whose
+        wavelet details are drawn; `drawn`: "rms" for the RMS of the details, "details" for the details themselves.
         """
         if self._n_listeners >= self._max_listeners:
             return _make_refusal("too many listeners", 503)
@@ -196,32 +195,35 @@ class _Pages:
         if pressure not in PRESSURES or detail_form not in DETAIL_FORMS:
             return _make_refusal(f"pressure must be one of {PRESSURES}, drawn one of {DETAIL_FORMS}", 400)
         self._n_listeners += 1
-        return _EventStream(self._lines(request, name, pressure, detail_form), self._remove_listener)
+        return _EventStream(self._events(request, name, pressure, detail_form), self._remove_listener)
 
     def _remove_listener(self) -> None:
         self._n_listeners -= 1
 
-    async def _lines(self, request: Request, name: str, pressure: str, detail_form: str) -> AsyncIterator[str]:
-        """Yield the text of server-sent events: a number after each change, and curves of an actuator's last samples.
+    async def _events(self, request: Request, name: str, pressure: str, detail_form: str) -> AsyncIterator[str]:
+        """Yield the server-sent events of `changes` as text, until the client disconnects or the monitor ends.
 
-        Without changes the number is repeated from time to time, to keep the connection alive. `name`: the actuator,
-        "" for no curves; `pressure`: the pressure whose wavelet details are drawn; `detail_form`: "rms" or "details".
+        `name`: actuator whose curves are sent, "" for no curves; `pressure`: pressure whose wavelet details are drawn;
+        `detail_form`: "rms" or "details". If too many actuators are viewed already, an event "live" states this error
+        instead of the curves.
         """
         live, actuators = self._live, self._actuators
-        with ExitStack() as viewing:
-            is_viewing = bool(name) and await asyncio.to_thread(viewing.enter_context, live.viewing(name))
+        with ExitStack() as contexts:
+            is_viewing = bool(name) and await asyncio.to_thread(contexts.enter_context, live.viewing(name))
             if name and not is_viewing:
-                yield _format_event("live", {"name": name, "t": None, "error": "too many others are looked at"})
-            sent_change, sent_version, silence_s = -1, -1, 0.0
+                yield _format_event("live", {"name": name, "t": None, "error": "too many actuators are viewed"})
+            sent_change_number = sent_version = -1  # nothing is sent yet
+            silence_s = 0.0
             while not await request.is_disconnected() and not actuators.closed:
-                if actuators.change_number != sent_change or silence_s >= _ALIVE_S:
-                    sent_change, silence_s = actuators.change_number, 0.0
-                    yield f"data: {sent_change}\n\n"
+                if actuators.change_number != sent_change_number or silence_s >= _KEEP_ALIVE_S:
+                    sent_change_number, silence_s = actuators.change_number, 0.0
+                    yield f"data: {sent_change_number}\n\n"
                 if is_viewing and live.version(name) != sent_version:
                     sent_version = live.version(name)
-                    yield _format_event("live", await asyncio.to_thread(live.curves, name, pressure, detail_form))
-                await asyncio.sleep(_LOOK_S)
-                silence_s += _LOOK_S
+                    curves = await asyncio.to_thread(live.curves, name, pressure, detail_form)
+                    yield _format_event("live", curves)
+                await asyncio.sleep(_POLL_S)
+                silence_s += _POLL_S
 
     def metrics(self, request: Request) -> Response:
         """Answer with the metrics of the monitor in the text format of Prometheus."""
@@ -234,7 +236,8 @@ class _Pages:
     async def answer_outage(self, request: Request, error: Exception) -> Response:
         """Answer with status 503 in an outage of the database; raise any other error again.
 
-        The answer has the counters, queue and outages, which are known without the database.
+        The answer has the counters, queue and outages, which are known without the database. The outage is also
+        reported to the supervisor.
         """
         reason = outage_reason(error)
         if reason is None:
@@ -248,14 +251,19 @@ class _Pages:
         return JSONResponse({"error": text, **self._counters_and_outages()}, 503, _RETRY_HEADERS)
 
     async def login(self, request: Request) -> Response:
-        """Answer with the login form; if the right token is posted, set a cookie and redirect to the page."""
-        status, admission, address = 200, self._admission, _client_address(request)
+        """Answer with the login form; if the right token is posted, set a cookie and redirect to the page.
+
+        After a wrong token the form has status 401. A client that must wait gets status 429.
+        """
+        status = 200
+        admission, address = self._admission, _client_address(request)
         if request.method == "POST" and admission is not None:
             if wait := admission.pause_s(address):
                 return _refuse_for_now(wait)
             token = ""
             with suppress(InputError, TimeoutError):
-                token = parse_qs((await _read_body(request)).decode("utf-8", "replace")).get("token", [""])[0]
+                form = parse_qs((await _read_body(request)).decode("utf-8", "replace"))
+                token, *_ = form.get("token", [""])
             if admission.admits(address, token):
                 answer = RedirectResponse("/", 303)
                 options: Any = {"max_age": _COOKIE_S, "secure": request.url.scheme == "https", "samesite": "strict"}
@@ -292,17 +300,17 @@ class _Pages:
 
 
 class _EventStream(StreamingResponse):
-    """A response of server-sent events; the function `ended` is called when it ends for any reason."""
+    """A response of server-sent events; the function `on_end` is called when the response ends for any reason."""
 
-    def __init__(self, lines: AsyncIterator[str], ended: Callable[[], None]) -> None:
-        super().__init__(lines, media_type="text/event-stream")
-        self._ended = ended
+    def __init__(self, events: AsyncIterator[str], on_end: Callable[[], None]) -> None:
+        super().__init__(events, media_type="text/event-stream")
+        self._on_end = on_end
 
     async def __call__(self, *connection: Any) -> None:
         try:
             await super().__call__(*connection)
         finally:
-            self._ended()
+            self._on_end()
 
 
 def _read_packaged(name: str) -> str:
@@ -373,7 +381,7 @@ class PageServer:
 
     def _serve(self) -> None:
         """Serve the page until `leave` is called; uvicorn closes the socket at the end."""
-        page_socket = self._socket or self._open_socket()  # after an error it is closed
+        page_socket = self._socket or self._open_socket()  # opened again after an error, which closes it
         self._socket = None
         config = uvicorn.Config(
             self._application,

@@ -44,16 +44,17 @@ from sealscope.monitor.supervisor import BROKER
 _log = logging.getLogger(__name__)
 #: Lifetime of the session without a connection [s]; most messages in flight; largest message [bytes].
 _SESSION_S, _IN_FLIGHT, _MAX_PACKET_BYTES = 30 * 86_400, 256, 16_000_000
-#: Queued messages and their bytes up to which one more of QoS 0 is accepted, and up to which one of QoS 1 is.
+#: Queued messages, and their bytes, up to which another message of QoS 0 is accepted.
 _MAX_QUEUE, _MAX_QUEUE_BYTES = 256, 64_000_000
+#: ... and up to which another message of QoS 1 is accepted.
 _MAX_QOS1_QUEUE, _MAX_QOS1_BYTES = 2048, 192_000_000
-#: Size above which the start of decoding a message is stored [bytes], and the largest number of starts.
+#: Size above which the start of decoding a message is stored [bytes], and most attempts to decode a message.
 _NOTED_BYTES, _MAX_ATTEMPTS = 256_000, 2
 _NAME = "mqtt"
 #: How long `run` waits for the decoder at its end [s].
 _END_S = 2.0
 #: How often new events are published [s].
-_LOOK_S = 0.05
+_POLL_S = 0.05
 #: How often changed states of the actuators are published [s].
 _STATES_S = 2.0
 #: Counters of messages that find the queue full.
@@ -64,7 +65,7 @@ _ASKED_AGAIN = "messages of QoS 1 that found no room and were asked for again"
 def broker_source(settings: BrokerSettings) -> Callable[[BlockReceiver], None]:
     """Build a source that submits the messages of a broker as blocks, and publishes alarms to it.
 
-    Returns a function that takes the receiver of the blocks and runs until that stops. Raises InputError if a secret
+    Returns a function that takes the receiver of the blocks, and runs until it stops. Raises InputError if a secret
     cannot be read, and MissingExtra if the MQTT library is not installed.
     """
     password = read_secret(settings.password_file, "mqtt.password_file")
@@ -88,12 +89,13 @@ class _Connection:
         if any(actuator.sparkplug is not None for actuator in service.settings.actuator):
             self._host = SparkplugHost(service.settings.actuator, self._client.publish, service.count)
         self._connected_ms = self._connection = 0  # time of the connection [ms since 1970], and its number
-        self._refusing = -1  # the connection whose further messages stay unacknowledged
-        self._to_close: Any = None  # the socket of that connection
+        self._overfull_connection = -1  # number of the connection whose further messages stay unacknowledged
+        self._overfull_socket: Any = None  # its socket, which will be closed
         self._ended = threading.Event()
         self._published_states: dict[str, str] = {}
         self._states_due = 0.0
-        self._arrived: BoundedQueue[Any] = BoundedQueue(_MAX_QUEUE, _MAX_QUEUE_BYTES)
+        # pairs (number of the connection, message), or (number, None) when a connection is made
+        self._received: BoundedQueue[Any] = BoundedQueue(_MAX_QUEUE, _MAX_QUEUE_BYTES)
         self._client.on_connect_fail = self._on_connect_fail
         self._client.on_connect = self._on_connect
         self._client.on_message = self._on_message
@@ -108,11 +110,11 @@ class _Connection:
         properties.SessionExpiryInterval = _SESSION_S
         properties.ReceiveMaximum = _IN_FLIGHT
         properties.MaximumPacketSize = _MAX_PACKET_BYTES
-        decoding = self._service.supervisor.start("MQTT decoder", self._submit_arrived)
+        decoding = self._service.supervisor.start("MQTT decoder", self._submit_received)
         alarms = self._service.supervisor.part("MQTT alarms")
         self._link.open(clean_start=False, properties=properties)
         try:
-            while not self._service.stopping.wait(_LOOK_S):
+            while not self._service.stopping.wait(_POLL_S):
                 self._link.check_thread()
                 alarms.attempt(self._deliver)
             self._states_due = 0.0
@@ -125,7 +127,8 @@ class _Connection:
     def _on_connect(self, client: Any, userdata: Any, flags: Any, reason: Any, properties: Any) -> None:
         """Subscribe to all topics after a connection, or begin an outage if the broker refuses it.
 
-        A Sparkplug primary host also publishes that it is online.
+        A Sparkplug primary host also publishes that it is online. The decoder is told, so that it requests the births
+        of Sparkplug nodes.
         """
         self._connection += 1
         if reason.is_failure:
@@ -137,12 +140,13 @@ class _Connection:
             client.publish(*self._state_message(online=True), qos=1, retain=True)
         for topic in (*self._names, *(self._host.topics if self._host is not None else ())):
             client.subscribe(topic, qos=1)
-        self._arrived.put((self._connection, None), 0, always=True)
+        self._received.put((self._connection, None), 0, always=True)
 
     def _offline_message(self) -> tuple[str, str]:
-        """Build topic and payload of the last will of a Sparkplug primary host, which says that it is offline.
+        """Build topic and payload of the last will, by which a Sparkplug primary host states that it is offline.
 
-        Its timestamp is the present time, at which the connection is about to start.
+        Its timestamp is the present time, at which the connection is about to start. The message that the host is
+        online repeats this timestamp.
         """
         self._connected_ms = round(1000.0 * time.time())
         return self._state_message(online=False)
@@ -153,8 +157,8 @@ class _Connection:
         return f"{NAMESPACE}/STATE/{self._settings.host_id}", state
 
     def _on_disconnect(self, client: Any, userdata: Any, flags: Any, reason: Any, properties: Any) -> None:
-        """Begin an outage after the connection is lost, unless this side has ended it."""
-        if not self._service.stopping.is_set() and self._refusing != self._connection:
+        """Begin an outage after the connection is lost, unless this side has closed the connection."""
+        if not self._service.stopping.is_set() and self._overfull_connection != self._connection:
             self._broker.begin_outage(f"the connection to {self._settings.host} is lost: {reason}")
 
     def _on_connect_fail(self, client: Any, userdata: Any) -> None:
@@ -169,40 +173,40 @@ class _Connection:
     def _on_message(self, client: Any, userdata: Any, message: Any) -> None:
         """Queue a received message, without waiting for room: that would let the connection time out.
 
-        If the queue is full, a message of QoS 0 is dropped. One of QoS 1 is left unacknowledged, as are all later
-        ones of this connection, and the broker sends them again after the next connection.
+        If the queue is full, a message of QoS 0 is dropped. A message of QoS 1 is left unacknowledged, and so are all
+        later ones of this connection; the broker sends them again over the next connection. Both are counted.
         """
         queue_entry, size = (self._connection, message), len(message.payload)
         if message.qos == 0:
-            if not self._arrived.put(queue_entry, size):
+            if not self._received.put(queue_entry, size):
                 self._service.count(_NO_ROOM)
             return
-        n_messages, n_bytes = self._arrived.size()
+        n_messages, n_bytes = self._received.size()
         is_full = n_messages >= _MAX_QOS1_QUEUE or n_bytes + size > _MAX_QOS1_BYTES
-        if is_full and self._refusing != self._connection:
-            self._refusing, self._to_close = self._connection, self._client.socket()
-        if self._refusing == self._connection:
+        if is_full and self._overfull_connection != self._connection:
+            self._overfull_connection, self._overfull_socket = self._connection, self._client.socket()
+        if self._overfull_connection == self._connection:
             self._service.count(_ASKED_AGAIN)
         else:
-            self._arrived.put(queue_entry, size, always=True)
+            self._received.put(queue_entry, size, always=True)
 
-    def _submit_arrived(self) -> None:
+    def _submit_received(self) -> None:
         """Decode and submit the queued messages in their order until the service stops.
 
         If a connection left messages unacknowledged because the queue was full, it is closed once the queue is empty;
         the broker then sends them again.
         """
         while not (self._service.stopping.is_set() or self._ended.is_set()):
-            queue_entries = self._arrived.pop(1, 0.5)
+            queue_entries = self._received.pop(1, 0.5)
             for connection, message in queue_entries:
                 if message is not None:
                     self._submit(connection, message)
                 elif self._host is not None:  # a connection was made
                     self._host.request_all_births()
-            if not queue_entries and (refusing_socket := self._to_close) is not None:
-                self._to_close = None
+            if not queue_entries and (overfull_socket := self._overfull_socket) is not None:
+                self._overfull_socket = None
                 with suppress(OSError):  # paho reconnects
-                    refusing_socket.shutdown(socket.SHUT_RDWR)
+                    overfull_socket.shutdown(socket.SHUT_RDWR)
 
     def _submit(self, connection: int, message: Any) -> None:
         """Decode a message, and submit its block or the reason to refuse the message.
@@ -226,8 +230,11 @@ class _Connection:
                 block = self._decode(topic, message.payload)
         except RefusedMessage as error:  # stored and acknowledged, as it would fail again
             self._service.submit(RefusedMessage(error.reason, f"{topic[:100]}: {error}", message.payload, acknowledge))
+            return
+        if block is None:
+            acknowledge()
         else:
-            acknowledge() if block is None else self._service.submit(replace(block, done=acknowledge))
+            self._service.submit(replace(block, done=acknowledge))
 
     def _decode(self, topic: str, payload: bytes) -> SourceBlock | None:
         """Decode a message to its block; return None for a Sparkplug message without samples.
@@ -243,11 +250,13 @@ class _Connection:
         """Store in the database, until the context ends, that a large or repeated message is being decoded.
 
         Raises RefusedMessage if its decoding has begun twice and never ended, because the process died both times.
+        A message of QoS 0, or a small one that is sent for the first time, is not stored.
         """
         if not message.qos or not (message.dup or len(message.payload) > _NOTED_BYTES):
             yield
             return
-        store, digest, n_starts = self._service.store, compute_digest(message.payload), 0
+        store, digest = self._service.store, compute_digest(message.payload)
+        n_starts = 0
         with suppress(SQLAlchemyError):  # the storage of the block reports the outage
             n_starts = store.begin_decoding(self._name, digest)
         try:

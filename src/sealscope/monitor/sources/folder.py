@@ -83,10 +83,13 @@ class WatchedFolder:
         # None keeps the machine's limit in its own unit: a limit of creep is compared with the creep
         self._limit_lpm = None if settings.error_lpm == watched.limit_lpm else settings.error_lpm
         self._newest_s = self._end_s = newest_s
-        self._first_seen: dict[str, float] = {}  # time at which a file was first seen [s]
-        self._starts: dict[str, float] = {}  # time of the first sample of a file [s since 1970]
-        self._read_ahead: dict[str, tuple[Recording | None, str]] = {}  # files read in advance, to find their order
-        self._submitted, self._unreadable, self._outside_links = set[str](), set[str](), set[str]()
+        # by identity of the file: time at which it was first found [s], and time of its first sample [s since 1970]
+        self._first_found: dict[str, float] = {}
+        self._starts: dict[str, float] = {}
+        # by identity: recording or None, and reason why it cannot be read, of files that were read to find their order
+        self._read_ahead: dict[str, tuple[Recording | None, str]] = {}
+        self._submitted, self._unreadable = set[str](), set[str]()  # identities
+        self._outside_links = set[str]()  # names
 
     def blocks(self) -> Iterator[SourceBlock | RefusedMessage]:
         """Yield the blocks of all files that are complete and not stored yet, in the order of their recording.
@@ -97,11 +100,11 @@ class WatchedFolder:
         too. Raises PartAway if the folder cannot be read.
         """
         files = sorted(self._files())
-        self._first_seen = {file.identity: self._first_seen.get(file.identity, time.monotonic()) for file in files}
-        self._submitted &= self._first_seen.keys()
-        self._unreadable &= self._first_seen.keys()
+        self._first_found = {file.identity: self._first_found.get(file.identity, time.monotonic()) for file in files}
+        self._submitted &= self._first_found.keys()
+        self._unreadable &= self._first_found.keys()
         self._read_ahead.clear()
-        self._starts = {identity: start for identity, start in self._starts.items() if identity in self._first_seen}
+        self._starts = {identity: start for identity, start in self._starts.items() if identity in self._first_found}
         due_files = [file for file in files if file.identity not in self._submitted and self._is_due(file)]
         if len(due_files) > 1:  # files may be copied in another order than recorded
             due_files.sort(key=self._start_time)
@@ -124,8 +127,8 @@ class WatchedFolder:
             yield block
 
     def _unchanged_s(self, file: _FoundFile) -> float:
-        """Compute the time [s] since a file changed or since it was first seen, whichever is longer."""
-        return max(time.time() - file.modified_s, time.monotonic() - self._first_seen[file.identity])
+        """Compute the time [s] since a file changed or since it was first found, whichever is longer."""
+        return max(time.time() - file.modified_s, time.monotonic() - self._first_found[file.identity])
 
     def _is_due(self, file: _FoundFile) -> bool:
         """Return True if a file is to be read now: it has not changed for `settle_s` and is not stored yet.
@@ -143,10 +146,7 @@ class WatchedFolder:
         return True
 
     def _may_be_incomplete(self, file: _FoundFile) -> bool:
-        """Return True if an unreadable file changed so recently that it may still be written.
-
-        This is less than `_PATIENCE_FACTOR` times `settle_s` ago.
-        """
+        """Return True if an unreadable file may be unfinished: it changed within `_PATIENCE_FACTOR` x `settle_s`."""
         return self._unchanged_s(file) < _PATIENCE_FACTOR * self.settle_s
 
     def _start_time(self, file: _FoundFile) -> float:
@@ -176,11 +176,11 @@ class WatchedFolder:
             return None, f"{_printable(path.name)}: {describe_error(error)}"
 
     def _find_refusal_reason(self, samples: Recording | None, file: _FoundFile) -> str:
-        """Return the reason to refuse a recording that is older than those watched before, or "" to accept it.
+        """Return the reason to refuse a recording that starts before the newest one watched so far, or "" to accept it.
 
-        It is older if its first sample is earlier than the newest time watched. A recording that states the day of that
-        time and no time of day is accepted. If that newest time is in the future, none is refused. A file that is dated
-        in the future is logged.
+        After a restart the last stored sample stands for the start of the newest recording. A recording of the same day
+        that states no time of day is accepted. If the newest recording is dated in the future, all are accepted. A file
+        that is dated in the future is logged.
         """
         if samples is None:
             return ""
@@ -188,7 +188,7 @@ class WatchedFolder:
         start = file_seconds(samples, path)
         if max(start, file.modified_s) > now + _AHEAD_S:
             _log.warning("%s: %s is dated in the future", self.actuator, _printable(path.name))
-        if start >= self._newest_s or self._newest_s > now + _AHEAD_S or _is_date_of(start, self._newest_s):
+        if start >= self._newest_s or self._newest_s > now + _AHEAD_S or _is_midnight_before(start, self._newest_s):
             return ""
         dates = (datetime.fromtimestamp(t, UTC).isoformat(" ", "seconds")[:19] for t in (start, self._newest_s))
         return "{} must not be older than what was watched, got {} after {}".format(_printable(path.name), *dates)
@@ -204,7 +204,7 @@ class WatchedFolder:
         if not len(corrected_samples):
             return replace(block, samples=corrected_samples)
         machine = self._read_machine()
-        if _is_date_of(start, self._newest_s):
+        if _is_midnight_before(start, self._newest_s):
             start = max(start, self._end_s + _GAP_S)
         finite_t = recording.t[np.isfinite(recording.t)]
         shift = start - float(finite_t[0]) if finite_t.size else 0.0
@@ -219,7 +219,7 @@ class WatchedFolder:
     def _judge(
         self, machine: CommissionedMachine, recording: Recording, path: Path, shift: float
     ) -> RecordingVerdict | None:
-        """Judge a whole recording by its machine's healthy ones; if that raises an error, log it and return None.
+        """Judge a whole recording by its machine's healthy recordings; log any error, and then return None.
 
         `shift` [s]: added to the recording's times to give seconds since 1970.
         """
@@ -233,7 +233,7 @@ class WatchedFolder:
     def _read_machine(self) -> CommissionedMachine | None:
         """Read the file of the commissioned machine, which may have changed; return None if there is no such file.
 
-        Raises PartAway if it cannot be read.
+        Raises PartAway if the file cannot be read.
         """
         try:
             return load_watched(self._rig).machine
@@ -241,7 +241,10 @@ class WatchedFolder:
             raise PartAway(_printable(str(error))) from None
 
     def _files(self) -> Iterator[_FoundFile]:
-        """Yield the complete files of the folder that match the pattern; raise PartAway if it cannot be read."""
+        """Yield the files of the folder that match the pattern; raise PartAway if the folder cannot be read.
+
+        Hidden files, files whose ending shows that they are still written, and links out of the folder are left out.
+        """
         try:
             root = self.folder.resolve()
             entries = list(self.folder.iterdir())
@@ -269,8 +272,8 @@ def watch_folders(service: BlockReceiver, *, once: bool) -> None:
 
     `once`: True to submit only the present files.
     """
-    settle_s, part = 0.0 if once else service.settings.settle_s, service.supervisor.part
-    summaries = service.summaries()
+    settle_s = 0.0 if once else service.settings.settle_s
+    part, summaries = service.supervisor.part, service.summaries()
 
     def newest_time(name: str) -> float:
         """Return the time of an actuator's newest stored sample [s since 1970], -inf if there is none."""
@@ -304,8 +307,8 @@ def _printable(name: str) -> str:
     return "".join(letter if letter.isprintable() else letter.encode("unicode_escape").decode() for letter in name)
 
 
-def _is_date_of(start: float, newest: float) -> bool:
-    """Return True if `start` is midnight (UTC) of the day that contains `newest`; both are in seconds since 1970.
+def _is_midnight_before(start: float, newest: float) -> bool:
+    """Return True if `start` is the midnight (UTC) at which the day of `newest` begins; both are in seconds since 1970.
 
     A recording that is dated without a time of day starts at midnight.
     """

@@ -28,9 +28,9 @@ LATE = "values that came after their block"
 class _Channel:
     """The values of one channel that are not in a block yet.
 
-    `values`: by index on the time axis, i.e. by number of the sample; `previous`: the value before them, None for
-    none; `arrival` [s]: time at which the last value arrived; `newest`: index of the newest value so far, None for
-    none.
+    `values`: by index on the time axis, i.e. by number of the sample; `previous`: the last value before `values`;
+    `arrival` [s]: time at which the last value arrived; `newest`: index of the newest value so far. `previous` and
+    `newest` are None if there is no such value.
     """
 
     values: dict[int, float] = field(default_factory=dict)
@@ -45,12 +45,13 @@ class _Channel:
     def pop_values(self, first: int, stop: int) -> Array:
         """Remove the values before index `stop`, and return the samples (stop - first,) from index `first` on.
 
-        A missing sample repeats the value before it.
+        A missing sample repeats the value before it, NaN if there is none.
         """
         known_indices = sorted(k for k in self.values if k < stop)
-        n_known_before = np.searchsorted(known_indices, np.arange(first, stop), side="right")  # up to each sample
+        n_known = np.searchsorted(known_indices, np.arange(first, stop), side="right")  # up to each sample
         previous = math.nan if self.previous is None else self.previous
-        samples = np.array([previous, *(self.values.pop(k) for k in known_indices)])[n_known_before]
+        known_values = np.array([previous, *(self.values.pop(k) for k in known_indices)])
+        samples = known_values[n_known]
         self.previous = float(samples[-1])
         return samples
 
@@ -80,17 +81,19 @@ class ValueGatherer:
         """Add successive samples of a channel, in SI units; return the blocks of all channels that they complete.
 
         `t` [s]: time of the first sample, rounded to the sampling interval; the others follow at the sampling rate. NaN
-        is an unknown value. Values without a finite time are dropped. If the time jumps forward by more than
-        `_AHEAD_S`, the blocks continue after the pause with each channel's last value. If it jumps back by more than
-        that, all values are discarded first; but the first value of a channel, if as old, counts as constant since.
+        is an unknown value. Values without a finite time, and too many values at once, are dropped. If the time jumps
+        forward by more than `_AHEAD_S`, the blocks continue after the pause with each channel's last value. If it jumps
+        back by more than `_AHEAD_S`, all earlier values are discarded. Only the first value of a channel may be so old:
+        the channel then counts as constant since.
         """
         if not math.isfinite(t) or abs(t * self.rate) > 2**52 or not 0 < len(values) <= MAX_SAMPLES:
             self._count("values without a clock, or too many")
             return []
-        first, target = round(t * self.rate), self._channels[channel]
+        first = round(t * self.rate)
         lead = 0 if self._newest is None else first - self._newest
+        target = self._channels[channel]
         if lead < -self._max_lead and target.last_value() is None:
-            # its first value, dated by its last change long ago: it has not changed since
+            # the channel's first value, dated by its last change long ago: it has not changed since
             target.previous, target.arrival = values[-1], self._now()
         else:
             if lead > self._max_lead:
@@ -108,17 +111,21 @@ class ValueGatherer:
             self._channels[name] = _Channel(previous=old_channel.last_value(), arrival=old_channel.arrival)
 
     def _add_values(self, target: _Channel, first: int, values: Sequence[float]) -> None:
-        """Add values to a channel from index `first` of the time axis on; drop those before the block to come."""
+        """Add values to a channel from index `first` of the time axis on; drop those before the next block.
+
+        Until the first block starts, a channel keeps at most `_max_lead` values, as another channel may never arrive.
+        """
         for k, value in enumerate(values, first):
             if self._start is not None and k < self._start:
                 self._count(LATE)
             else:
                 target.values[k] = value
-        while self._start is None and len(target.values) > self._max_lead:  # another channel may never arrive
+        while self._start is None and len(target.values) > self._max_lead:
             target.previous = target.values.pop(next(iter(target.values)))
         last = first + len(values) - 1
         self._newest = last if self._newest is None else max(self._newest, last)
-        target.arrival, target.newest = self._now(), last if target.newest is None else max(last, target.newest)
+        target.newest = last if target.newest is None else max(last, target.newest)
+        target.arrival = self._now()
 
     def discard_values(self) -> None:
         """Discard the values of all channels that are in no block yet, and the last value of each.

@@ -26,10 +26,10 @@ def line_source(stream: BinaryIO) -> Callable[[BlockReceiver], None]:
         while not service.stopping.is_set() and (line := stream.readline(MAX_MESSAGE_BYTES + 1)):
             if len(line) > MAX_MESSAGE_BYTES:
                 rule = f"a line must have at most {MAX_MESSAGE_BYTES} bytes, got more"
-                refused = RefusedMessage(OVERSIZED, rule, line)
+                refusal = RefusedMessage(OVERSIZED, rule, line)
                 while line and not line.endswith(b"\n"):  # skip the rest of the line
                     line = stream.readline(MAX_MESSAGE_BYTES)
-                service.submit(refused)
+                service.submit(refusal)
             elif line := line.strip():
                 try:
                     service.submit(decode_message(line, units_of=units_of))

@@ -67,10 +67,10 @@ def check_cbor(payload: bytes) -> int:
 
 
 def check_json(payload: bytes) -> int:
-    """Check that a JSON message has not too many quotation marks and brackets; return its number of colons.
+    """Check that a JSON message does not have too many quotation marks or brackets; return its number of colons.
 
-    Colons within texts count, too; their number serves `check_json_keys` to find repeated keys. Raises MessageLimit if
-    there are more than `_MAX_QUOTES` quotation marks or `_MAX_BRACKETS` opening brackets and braces.
+    `check_json_keys` needs this number, which includes colons within texts, to find repeated keys. Raises MessageLimit
+    if there are more than `_MAX_QUOTES` quotation marks or `_MAX_BRACKETS` opening brackets and braces.
     """
     n_quotes, n_brackets, n_colons = _count_marks(np.frombuffer(payload, dtype=np.uint8))
     if n_quotes > _MAX_QUOTES:
@@ -96,7 +96,10 @@ def check_keys(values: Any, n_pairs: int) -> None:
 
     `values`: the decoded message; `n_pairs`: number of pairs in its bytes, which is larger if a key is repeated.
     """
-    if _count_shallow_pairs(values) != n_pairs and (n_decoded := _count_pairs(values)) != n_pairs:
+    if _count_shallow_pairs(values) == n_pairs:  # a quick test
+        return
+    n_decoded = _count_pairs(values)
+    if n_decoded != n_pairs:
         raise MessageLimit(f"keys must differ, got {n_pairs - n_decoded} again")
 
 
@@ -140,7 +143,7 @@ def _read_argument(data: Any, position: int, info: int) -> tuple[int, int]:
         return 0, -1
     number = 0
     for k in range(position, position + width):
-        number = (number << 8) | int(data[k])  # one over 2^63 becomes negative
+        number = (number << 8) | int(data[k])  # a number from 2^63 on becomes negative
     return number, position + width
 
 
@@ -150,7 +153,7 @@ def _skip_pieces(data: Any, start: int, position: int, major: int, n_texts: int)
 
     `data` (n,): bytes of the message; `start`, `position`: index of the item's first byte, and of its first piece;
     `n_texts`: number of pieces of text or bytes so far. Returns the code of the broken rule (0 for none), the
-    position of the fault or else the one after the item, and the new `n_texts`.
+    position of the fault or, without a fault, after the item, and the new `n_texts`.
     """
     while True:
         n_texts += 1
@@ -168,10 +171,10 @@ def _skip_pieces(data: Any, start: int, position: int, major: int, n_texts: int)
 
 @kernel
 def _scan_items(data: Any) -> tuple[int, int, int]:
-    """Check the numbers, depth and types of the items of a CBOR message, given as bytes (n,), in one pass.
+    """Check number, depth and types of the items of a CBOR message, given as bytes (n,), in one pass.
 
-    Returns the code of the broken rule (0 for none, an index into `_RULES`), the position of the fault, and the
-    number of pairs.
+    Returns the code of the broken rule (0 for none, an index into `_RULES`), the position of the fault or the end, and
+    the number of key-value pairs so far.
     """
     # arrays by depth: `n_left` is the number of items that a container still needs, negative if its length is
     # unknown; `role` is 0 in a list, in a mapping 1 before a key and 2 before a value; `n_items` counts the items so

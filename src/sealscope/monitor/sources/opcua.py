@@ -1,7 +1,7 @@
 """Read samples from an OPC UA server by subscription, and gather them into blocks.
 
-Each channel of an actuator is a variable of the server. Its value is a number, or an array of samples of which the
-first is at the source timestamp. The server queues the changes of each variable between two publications. Changes are
+Each channel of an actuator is a variable of the server. Its value is a number, or an array of samples that
+begins at the source timestamp. The server queues the changes of each variable between two publications. Changes are
 lost while there is no connection, because OPC UA subscriptions end with their session.
 """
 
@@ -26,10 +26,12 @@ from sealscope.monitor.supervisor import OPCUA, PartAway
 from sealscope.recordings.recording import CHANNEL_UNITS
 from sealscope.units import to_si
 
-#: Publications per block; largest number of blocks in the queue, and of their bytes: more are dropped and counted.
-_PUBLICATIONS, _MAX_QUEUE, _MAX_QUEUE_BYTES = 4, 256, 64_000_000
+#: Publications per block.
+_PUBLICATIONS = 4
+#: Most blocks in the queue, and most bytes of them; further blocks are dropped and counted.
+_MAX_QUEUE, _MAX_QUEUE_BYTES = 256, 64_000_000
 #: How often the connection is checked [s].
-_LOOK_S = 0.5
+_POLL_S = 0.5
 _NO_ROOM = "blocks of OPC UA that found no room"
 _NO_NUMBER = "OPC UA values that are no number"
 
@@ -37,7 +39,7 @@ _NO_NUMBER = "OPC UA values that are no number"
 def opcua_source(settings: OpcUaSettings) -> Callable[[BlockReceiver], None]:
     """Build a source that submits the values of an OPC UA server as blocks.
 
-    Returns a function that takes the receiver of the blocks and runs until that stops. Raises MissingExtra if the
+    Returns a function that takes the receiver of the blocks, and runs until it stops. Raises MissingExtra if the
     library asyncua is not installed, and InputError if a secret cannot be read.
     """
     if find_spec("asyncua") is None:  # before the service starts
@@ -56,20 +58,23 @@ class _OpcUaSession:
         self._settings, self._password, self._service = settings, password, service
         self._server = service.supervisor.part(OPCUA)
         self._gatherers: dict[str, ValueGatherer] = {}
-        self._scales: dict[tuple[str, str], Callable[[Any], Any]] = {}
+        # by actuator and channel: function that converts values to SI units
+        self._converters: dict[tuple[str, str], Callable[[Any], Any]] = {}
         self._actuators = [actuator for actuator in service.settings.actuator if actuator.nodes]
         for actuator in self._actuators:
             rate = float(actuator.rate or math.nan)  # never None: the settings are checked
             self._gatherers[actuator.name] = ValueGatherer(tuple(actuator.nodes), rate, settings.block_s, service.count)
             for channel in actuator.nodes:
-                si, unit = CHANNEL_UNITS[channel], actuator.units.get(channel)
-                self._scales[actuator.name, channel] = partial(to_si, unit=unit or si, si_unit=si, name=channel)
-        self._channels: dict[Any, tuple[str, str]] = {}
+                si_unit = CHANNEL_UNITS[channel]
+                unit = actuator.units.get(channel) or si_unit
+                self._converters[actuator.name, channel] = partial(to_si, unit=unit, si_unit=si_unit, name=channel)
+        self._channels: dict[Any, tuple[str, str]] = {}  # actuator and channel by node
         self._waiting: BoundedQueue[SourceBlock] = BoundedQueue(_MAX_QUEUE, _MAX_QUEUE_BYTES)
 
     def run(self) -> None:
         """Submit blocks until the service stops, and reconnect after a lost connection."""
-        stopping, submitting = self._service.stopping, self._service.supervisor.start("OPC UA blocks", self._submit)
+        stopping = self._service.stopping
+        submitting = self._service.supervisor.start("OPC UA blocks", self._submit)
         while not stopping.wait(self._server.pause_s):
             self._server.attempt(lambda: asyncio.run(self._connect()))
             for gatherer in self._gatherers.values():
@@ -113,7 +118,7 @@ class _OpcUaSession:
             self._server.end_outage()
             while not self._service.stopping.is_set():
                 await client.check_connection()
-                await asyncio.sleep(_LOOK_S)
+                await asyncio.sleep(_POLL_S)
 
     def datachange_notification(self, node: Any, value: Any, data: Any) -> None:
         """Add a value of a subscription, and queue the blocks that it completes; asyncua calls this.
@@ -134,14 +139,15 @@ class _OpcUaSession:
         if samples.ndim != 1 or not samples.size:
             self._service.count(_NO_NUMBER)
             return
-        for block in self._gatherers[name].push(channel, t, self._scales[name, channel](samples).tolist()):
+        si_samples = self._converters[name, channel](samples)
+        for block in self._gatherers[name].push(channel, t, si_samples.tolist()):
             # a digest of the contents: a block sent again is recognised
             identity = compute_digest(np.concatenate([block.t, *block.channels.values()]).tobytes())
             if not self._waiting.put(SourceBlock(name, identity, block), count_bytes(block)):
                 self._service.count(_NO_ROOM)
 
     def _submit(self) -> None:
-        """Submit the queued blocks until the service stops, in a separate thread, because the service may block."""
+        """Submit the queued blocks until the service stops, in a thread of its own, because `submit` may wait."""
         while not self._service.stopping.is_set():
-            for block in self._waiting.pop(1, _LOOK_S):
+            for block in self._waiting.pop(1, _POLL_S):
                 self._service.submit(block)

@@ -152,11 +152,14 @@ def decode_message(
 ) -> SourceBlock:
     """Decode the block of samples in a message, which is JSON if it begins with ``{``, else CBOR.
 
-    The message is a mapping. Its entries are ``t``, the time of the first sample [s]; ``rate``, the sampling rate
-    [Hz]; and for each channel a list of numbers, with null for a missing sample, or in CBOR a typed array of floats
-    (RFC 8746), with NaN for a missing sample. A slow channel (``T_oil``) may be a single number. Optional entries are
-    ``units``, of channels that are not in SI units; ``actuator``, needed if the source does not state it; and ``id``,
-    the identity of the block, by default a digest of the message.
+    The message is a mapping with these entries:
+
+    - ``t``: time of the first sample [s]; ``rate``: sampling rate [Hz];
+    - for each channel a list of numbers, with null for a missing sample, or in CBOR a typed array of floats (RFC 8746),
+      with NaN for a missing sample. A slow channel (``T_oil``) may be a single number;
+    - ``units``: by channel, unless the values are in SI units;
+    - ``actuator``: name of the actuator, needed if the source does not state it;
+    - ``id``: identity of the block, by default a digest of the message.
 
     `actuator`: name of the actuator that the source states, None for none; `units_of`: default units of channels, by
     actuator. Raises RefusedMessage if a rule is broken.
@@ -177,7 +180,7 @@ def decode_message(
         raise RefusedMessage(NO_CLOCK, f"rate must be > 0 Hz, got {rate:g}")
     units = {**units_of.get(name, {}), **units}
     channels = {channel: _parse_channel(values[channel], channel, units) for channel in CHANNELS if channel in values}
-    sizes = {values.size for channel, values in channels.items() if channel not in SLOW}
+    sizes = {array.size for channel, array in channels.items() if channel not in SLOW}
     if sizes and max(sizes) > MAX_SAMPLES:
         raise RefusedMessage(OVERSIZED, f"a channel must have at most {MAX_SAMPLES} samples, got {max(sizes)}")
     if len(sizes) != 1 or not min(sizes):
@@ -231,7 +234,7 @@ def _parse_mapping(payload: bytes) -> Mapping[str, Any]:
     """Parse a message of JSON or CBOR to a mapping.
 
     Size, depth and number of entries are checked before (`message_limits`). Raises RefusedMessage if the message
-    exceeds a limit, cannot be parsed, or is no mapping.
+    exceeds a limit, cannot be parsed, or is not a mapping.
     """
     try:
         if payload.lstrip()[:1] == b"{":
@@ -279,7 +282,7 @@ def _parse_channel(values: Any, name: str, units: Mapping[str, Any]) -> np.ndarr
     """
     if name in SLOW and isinstance(values, (int, float)) and not isinstance(values, bool):
         values = [values]  # a slow channel may be a single number
-    dtype = _ARRAY_DTYPES.get(getattr(values, "tag", None) or 0)
+    dtype = _ARRAY_DTYPES.get(getattr(values, "tag", None) or 0)  # None unless `values` is a typed array of CBOR
     try:
         if dtype is not None:
             values = np.frombuffer(values.value, dtype=dtype)

@@ -1,10 +1,10 @@
 """Read blocks of samples from edge nodes of Sparkplug B.
 
 Birth messages of a node name its metrics, data messages bring samples, and death messages end the session. A node or
-one of its devices is an actuator, and its metrics are the channels. The value of a metric is an array of samples, of
-which the first is at its timestamp, or a single sample; a single value that is left out has not changed. Timestamps
-are whole milliseconds; a block that continues the one before within that resolution is joined to it. After a missing
-sequence number an alias may stand for another metric, so messages with aliases are refused until the node has sent
+one of its devices is an actuator, and its metrics are the channels. The value of a metric is an array of samples
+that begins at its timestamp, or a single sample; a single value that is left out has not changed. Timestamps are whole
+milliseconds; a block that follows the block before within that resolution is joined to it. After a missing sequence
+number an alias may stand for another metric, so messages with aliases are refused until the node has sent
 the birth that is then requested.
 """
 
@@ -42,7 +42,7 @@ GAPS = "gaps in the sequence of a Sparkplug node"
 _REQUEST_PAUSE_S = 10.0
 #: Timestamps are truncated or rounded to whole milliseconds: largest distance of the true time before and after [s].
 _EARLY_S, _LATE_S = 0.0005, 0.001
-#: Largest shift of a block against the end of the one before [samples], as clock and rate of a node may disagree.
+#: Largest shift of a block against the end of the block before [samples], as clock and rate of a node may disagree.
 _MAX_SHIFT = 0.3
 #: Name of the metric that states the sampling rate [Hz], unless `map` names another.
 _RATE = "rate"
@@ -67,15 +67,18 @@ class _Birth:
 
         The name of a metric may be followed by a unit in brackets, such as "pressure [bar]".
         """
-        birth, channel_of = cls(), {actuator.map.get(channel, channel): channel for channel in (*CHANNELS, _RATE)}
+        birth = cls()
+        channel_of = {actuator.map.get(channel, channel): channel for channel in (*CHANNELS, _RATE)}
         for metric in metrics:
             name, unit = metric.name or "", metric.unit
-            channel, name_with_unit = channel_of.get(name), _BRACKETED.fullmatch(name)
-            if name_with_unit is not None:
-                channel, unit = channel or channel_of.get(name_with_unit["name"]), unit or name_with_unit["unit"]
+            channel = channel_of.get(name)
+            if (name_with_unit := _BRACKETED.fullmatch(name)) is not None:
+                channel = channel or channel_of.get(name_with_unit["name"])
+                unit = unit or name_with_unit["unit"]
             if channel is None:
                 continue
-            birth.names[channel], birth.metrics[name] = name, replace(metric, unit=unit)
+            birth.names[channel] = name
+            birth.metrics[name] = replace(metric, unit=unit)
             if metric.alias is not None:
                 birth.aliases[metric.alias] = name
         return birth
@@ -83,9 +86,9 @@ class _Birth:
     def complete_metric(self, metric: spb.SparkplugMetric, *, is_complete: bool) -> spb.SparkplugMetric | None:
         """Add the name, type and unit that the birth states to a metric of a data message.
 
-        Returns None if the metric is no channel. `is_complete`: True if no message since the birth is missing. Raises
-        RefusedMessage if a message is missing and the metric has an alias instead of a name, or if its value does not
-        fit its type.
+        Returns None if the metric is neither a channel nor the sampling rate. `is_complete`: True if no message since
+        the birth is missing. Raises RefusedMessage if a message is missing and the metric has an alias instead of a
+        name, or if its value does not fit its type.
         """
         if metric.name is None and not is_complete:
             raise RefusedMessage(blocks.OUT_OF_SEQUENCE, "after a missing message an alias must wait for a birth")
@@ -131,7 +134,7 @@ class SparkplugHost:
     """Receives the messages of Sparkplug B nodes and devices that are actuators, and converts them to blocks.
 
     `actuators`: settings of all actuators; those without `sparkplug` are ignored; `publish`: function that sends a
-    payload to a topic; `count_event`: function that increments the counter of that name, such as `GAPS`.
+    payload to a topic; `count_event`: function that increments the counter with a given name, such as `GAPS`.
     """
 
     def __init__(
@@ -218,8 +221,9 @@ class SparkplugHost:
     def _follow_session(self, group: str, node: str, kind: str, payload: spb.SparkplugPayload) -> None:
         """Update the state of a node with the birth, death or sequence number of a message of `kind`.
 
-        A gap in the sequence is counted and the birth requested. Raises RefusedMessage if the message has no sequence
-        number, comes before the birth, or is the death of an earlier connection.
+        The birth of a node (NBIRTH) begins its session, and the death (NDEATH) ends it; both discard the births of its
+        devices. A gap in the sequence is counted and the birth requested. Raises RefusedMessage if the message has no
+        sequence number, comes before the birth, or is the death of an earlier connection.
         """
         state = self._nodes[group, node]
         if kind in ("NBIRTH", "NDEATH"):
@@ -248,8 +252,8 @@ class SparkplugHost:
         """Build a recording in SI units from the samples in a message's metrics; return None if there are none.
 
         `birth`: the birth of the actuator; `sent_ms` [ms since 1970]: time of sending, which metrics without a time
-        get. A single value of a slow channel, such as the oil temperature, is no sample: all recordings repeat it
-        until the next value. Raises RefusedMessage if the samples cannot be used.
+        get. A single value of a slow channel, such as the oil temperature, is not a sample: `birth` stores it, and all
+        recordings repeat it until the next value. Raises RefusedMessage if the samples cannot be used.
         """
         channel_of = {name: channel for channel, name in birth.names.items() if channel != _RATE}
         groups: dict[int, dict[str, spb.SparkplugMetric]] = defaultdict(dict)
@@ -270,7 +274,8 @@ class SparkplugHost:
             pieces.append({"t": self._sample_times(actuator.name, timestamp / 1000.0, size, rate), **piece})
         if (n_samples := sum(piece["t"].size for piece in pieces)) > MAX_SAMPLES:
             raise RefusedMessage(blocks.OVERSIZED, f"{MAX_SAMPLES} samples are the most, got {n_samples}")
-        t, values = np.concatenate([piece["t"] for piece in pieces]), {}
+        t = np.concatenate([piece["t"] for piece in pieces])
+        values = {}
         for channel in CHANNELS:  # NaN where a piece lacks the channel
             if any(channel in piece for piece in pieces):
                 series = [piece.get(channel, np.full(piece["t"].size, np.nan)) for piece in pieces]
@@ -278,22 +283,23 @@ class SparkplugHost:
         for name, channel in channel_of.items():
             if channel in SLOW and isinstance(last := birth.metrics[name].value, (int, float)):
                 values[channel] = np.full(n_samples, float(last))
-        births = ((channel, birth.metrics[name]) for name, channel in channel_of.items())
-        units = {channel: metric.unit or actuator.units.get(channel) for channel, metric in births}
+        units = {
+            channel: birth.metrics[name].unit or actuator.units.get(channel) for name, channel in channel_of.items()
+        }
         si_values = {channel: convert_to_si(array, units.get(channel), channel) for channel, array in values.items()}
         return Recording(t, si_values, {channel: CHANNEL_UNITS[channel] for channel in si_values}, rate)
 
     def _sample_times(self, actuator: str, t: float, size: int, rate: float) -> Array:
         """Compute the times [s] of `size` samples at `rate` [Hz], the first at or near its stated time `t` [s].
 
-        `t` is in whole milliseconds. If the end of the actuator's block before, one sampling interval after its last
-        sample, is within 3 ms of `t`, the times start there. If the rounding of `t` cannot explain the difference, they
-        are also shifted towards `t`, by at most `_MAX_SHIFT` samples.
+        `t` is in whole milliseconds. If it is within 3 ms of the expected start, one sampling interval after the last
+        sample of the actuator before, the times begin at the expected start instead. If the rounding of `t` cannot
+        explain the difference, they are shifted towards `t`, by at most `_MAX_SHIFT` samples.
         """
-        start, expected = t, self._next_starts.get(actuator, math.nan)
-        if abs(expected - t) < 3.0 * _LATE_S:  # else samples are missing, or the clock was set
-            gap = min(max(expected, t - _EARLY_S), t + _LATE_S) - expected
-            start = expected + min(max(gap, -_MAX_SHIFT / rate), _MAX_SHIFT / rate)
+        start, expected_start = t, self._next_starts.get(actuator, math.nan)
+        if abs(expected_start - t) < 3.0 * _LATE_S:  # else samples are missing, or the clock was set
+            shift = min(max(expected_start, t - _EARLY_S), t + _LATE_S) - expected_start
+            start = expected_start + min(max(shift, -_MAX_SHIFT / rate), _MAX_SHIFT / rate)
         self._next_starts[actuator] = start + size / rate
         return np.asarray(start + np.arange(size) / rate)
 
@@ -305,7 +311,7 @@ def _simultaneous_samples(
 
     `group`: metric by channel; `birth`: the last value of each metric, which is updated with single numbers;
     `channel_of`: channel by name of its metric. If all values are single numbers, n is 1, and a channel that is left
-    out repeats its last value. Raises RefusedMessage if the values are no numbers, or arrays of different lengths.
+    out repeats its last value. Raises RefusedMessage if the values are not numbers, or arrays of different lengths.
     """
     if any(isinstance(metric.value, np.ndarray) for metric in group.values()):
         piece = {name: np.atleast_1d(metric.value) for name, metric in group.items() if metric.value is not None}
