@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Self, TextIO
 import httpx
 
 from sealscope.monitor.database.store import MonitorStore
+from sealscope.monitor.outputs.output import is_announced
 from sealscope.monitor.settings import MonitorSettings, WebhookSettings, read_secret
 from sealscope.monitor.supervisor import PartAway
 
@@ -22,13 +23,6 @@ if TYPE_CHECKING:
     from sealscope.monitor.actuators import WatchedActuators
 
 logging.getLogger("httpx").setLevel(logging.WARNING)  # it logs every request
-#: Events that the detector causes; they are not announced while an alarm is shelved.
-_DETECTOR_EVENTS = ("raised", "error", "warning", "returned")
-
-
-def _is_announced(event: dict[str, Any]) -> bool:
-    """Return True if an event is to be sent; for a shelved alarm, only the marks and comments of persons are sent."""
-    return event["event"] not in _DETECTOR_EVENTS or not event["alarm"]["shelved"]
 
 
 class EventLines:
@@ -54,7 +48,7 @@ class EventLines:
         if event["number"] != self._number:
             self._unwritten, self._number = (json.dumps(event) + "\n").encode(), event["number"]
         try:
-            if not _is_announced(event):
+            if not is_announced(event):
                 return True
             if self._stream is None:
                 raise OSError("it is closed")
@@ -103,7 +97,7 @@ class Webhook:
 
     def _send_post(self, event: dict[str, Any]) -> bool:
         """Post an alarm event unless its alarm is shelved; return True, or raise PartAway if it is not confirmed."""
-        if not _is_announced(event):
+        if not is_announced(event):
             return True
         try:
             asyncio.run(self._post(event))

@@ -1,11 +1,14 @@
 """The outputs of alarms that the settings switch on, each by a table of its own.
 
-Settings and the class that sends are a pair: `OutputSettings.sender` names the class in this folder.
+A new output is a module in this folder with a class that has the methods of `Output`, and in `monitor/settings.py` the
+class of its table, whose `sender` names the first class, with a field of `MonitorSettings`. `deliver` of the new class
+calls `store.deliver(NAME, send)`. The function `send` takes an event, skips it unless `is_announced`, and returns
+False if the event was not taken and must be sent again.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Protocol, Self
 
@@ -13,6 +16,15 @@ from sealscope.monitor.settings import MonitorSettings, OutputSettings
 
 if TYPE_CHECKING:
     from sealscope.monitor.actuators import WatchedActuators
+
+
+#: Events that the detector causes; they are not announced while an alarm is shelved.
+_DETECTOR_EVENTS = ("raised", "error", "warning", "returned")
+
+
+def is_announced(event: Mapping[str, Any]) -> bool:
+    """Return True if an event is to be sent; for a shelved alarm, only the marks and comments of persons are sent."""
+    return event["event"] not in _DETECTOR_EVENTS or not event["alarm"]["shelved"]
 
 
 class Output(Protocol):
