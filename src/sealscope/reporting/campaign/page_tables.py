@@ -24,7 +24,8 @@ def percent(proportion: Proportion | None) -> str:
 def _format_percent(fraction: float) -> str:
     """Format a fraction as a percentage without the sign %.
 
-    It has two decimals below 9.95 %; from there on none if it is a whole number or above 99.95 %, otherwise one.
+    Percentages below 9.95 have two decimals. Larger percentages have one decimal, but none if they are whole numbers or
+    above 99.95.
     """
     value = 100.0 * fraction
     digits = 2 if value < 9.95 else 0 if value > 99.95 or value == round(value) else 1

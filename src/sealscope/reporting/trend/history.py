@@ -84,8 +84,8 @@ def history_pictures(ordered: Sequence[Judged]) -> dict[str, Picture] | None:
     """Draw each recording's leak flow [L/min] over time, as a picture for each of the `SIZES`, "wide" and "narrow".
 
     `ordered`: recordings in order of their starts; if one has no date, all are drawn over their numbers, from 1. A
-    diagnosis that finds no leak is drawn with the upper bound of a leak. Returns None if no recording has a leak flow
-    or a bound.
+    diagnosis without the verdict `leak` is drawn with the upper bound of a leak. Returns None if no recording has a
+    leak flow or a bound.
     """
     levels = [_leak_level(entry.diagnosis) for entry in ordered]
     known_levels = [level for level in levels if level is not None]
@@ -94,7 +94,7 @@ def history_pictures(ordered: Sequence[Judged]) -> dict[str, Picture] | None:
     has_dates = all(entry.start_s is not None for entry in ordered)
     days = [(entry.start_s or 0.0) / DAY if has_dates else float(k + 1) for k, entry in enumerate(ordered)]
     limit = ordered[-1].diagnosis.limit_lpm
-    # larger values are drawn as a symbol at the top, as they would flatten the others
+    # values above `max_shown` would flatten the others; they are drawn as a symbol at the top
     max_shown = 8.0 * float(np.median([lpm for lpm, *_ in known_levels])) or math.inf
     shown_values = [value for lpm, _, high in known_levels for value in (lpm, high)]
     shown_values = [value for value in shown_values if value <= max_shown and value < math.inf]
