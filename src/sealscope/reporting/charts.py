@@ -52,7 +52,7 @@ class Mark:
 
 
 class ChartLine(NamedTuple):
-    """One line of a chart: its label, its style's name in the style sheet, and its values in the chart's unit."""
+    """One line of a chart: label, name of the style in the style sheet, and values in the chart's unit."""
 
     label: str
     style: str

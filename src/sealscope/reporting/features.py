@@ -108,8 +108,8 @@ def chamber_details(recording: Recording, channel: str) -> tuple[ChamberDetails 
 class Parts(NamedTuple):
     """Two parts of a recording that are compared on the page.
 
-    `end` [s]: end of the first part; `start` [s]: start of the second part; `heads`: their headings in the table;
-    `text`: sentence that explains the choice.
+    `end` [s]: end of the first part; `start` [s]: start of the second part; `heads`: headings of both parts in the
+    table; `text`: sentence that explains the choice.
     """
 
     end: float

@@ -249,7 +249,7 @@ def total_leakage(diagnosis: Diagnosis, *, basis: bool = True) -> str | None:
 def _leakage_fraction(leakage: TotalLeakage, pressure: str) -> str:
     """Format a total leakage as a fraction of the pump's flow, with the smallest change that could be detected.
 
-    `pressure`: text of the pressure at which the leakage is stated.
+    An unknown fraction is called "not measured". `pressure`: text of the pressure at which the leakage is stated.
     """
     is_known = leakage.pump_share is not None
     key = "share" if is_known else "not_measured"
@@ -471,9 +471,9 @@ _FILE_COLUMNS = 22
 def table_line(diagnosis: Diagnosis, start_s: float | None = None) -> str:
     """Format a diagnosis as a line of a table: file, date, verdict and leak flow in L/min.
 
-    A second line states the named cause and the next step; it is left out for `no leak` without a cause. The name of
-    a file longer than its column stands on a line of its own. `start_s`: start of the recording [s since 1970], None
-    to leave the date blank.
+    Further lines state the next step or, for `cannot tell`, the reason; a named cause comes first unless the verdict is
+    `leak`. They are left out for `no leak` without a cause. A file name that is longer than its column stands on a line
+    of its own. `start_s`: start of the recording [s since 1970], None to leave the date blank.
     """
     file = PurePath(diagnosis.file).name
     date = "" if start_s is None else datetime.fromtimestamp(start_s, UTC).date().isoformat()

@@ -227,9 +227,11 @@ def _change_rows(
 ) -> dict[str, Any]:
     """Build the template's values for the table that compares the details' RMS in two parts of the recording.
 
-    `chambers`: wavelet details of each chamber's pressure. Returns `changes`, rows of (channel, detail, unit, RMS
-    before, RMS after, change [%]); `bar_limit` [%], the largest change that the table's bars show; and `parts`, the
-    two parts.
+    `chambers`: wavelet details of each chamber's pressure. Returns a dictionary:
+
+    - `changes`: rows (channel, detail, unit, RMS in the first part, RMS in the second part, change [%])
+    - `bar_limit`: largest change [%] that the table's bars show
+    - `parts`: the two parts
     """
     parts = features.parts_to_compare(diagnosis, recording)
     rows = []

@@ -47,8 +47,8 @@ N_SCOUT_MACHINES, SCOUT_SECONDS = 4, 4.0
 def scored_bounds(plan: SimulatedPlan) -> IntArray:
     """Compute the usable samples before and after the planned onset, whose wavelet details scorers compare.
 
-    Returns an array (2, 2) with [begin, end) of the range before the onset and of that after it. Samples whose details
-    depend on the other side of the onset or on padding are left out, and so is the machine's start.
+    Returns an array (2, 2) with [begin, end) of the range before the onset and of the range after the onset. Samples
+    whose details depend on the other range or on padding are left out, and so is the machine's start.
     """
     rate = plan.rig.daq.sample_rate
     return split_bounds(round(plan.duration_s * rate), rate, round(plan.onset_s * rate))
@@ -102,9 +102,9 @@ def check_plan(plan: SimulatedPlan, cases: Sequence[CampaignCase]) -> None:
 
 
 def iter_batch_rows(plan: SimulatedPlan, cases: Sequence[CampaignCase], threads: int) -> Generator[CaseRow, None, None]:
-    """Simulate the cases of a plan batch by batch, and yield the row of each with its scores.
+    """Simulate the cases of a plan batch by batch, and yield a row with the scores for each case.
 
-    An error of a case is stored in its row. A row depends on its case only, not on the other cases of its batch.
+    An error of a case is stored in its row. A row depends only on its own case, not on the other cases of the batch.
     `threads`: number of threads of the simulation.
     """
     profile = load_profile(plan.profile) if plan.profile else None

@@ -33,8 +33,8 @@ class StatedErrors:
 class NamedCauses:
     """The confusion matrix of one detector: how often it names each cause, for each true cause of a record.
 
-    The cause of a record without leak and fault is `none`. `covered`: fraction of records in which the detector names
-    the true cause, or an ambiguous cause that includes it.
+    The true cause of a record without leak and fault is "none". `covered`: fraction of records for which the detector
+    names the true cause, or an ambiguous cause that includes the true one.
     """
 
     detector: str

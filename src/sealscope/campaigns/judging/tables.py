@@ -25,8 +25,8 @@ _PROPORTION = ("count", "of", "fraction", "low", "high")
 class PriorKnowledge:
     """The information that a detector is given before it judges a record.
 
-    `onset`: True if it knows the true onset of the leak; `channels`: the channels that it reads; `rig`: name of the
-    rig that it assumes, "" for none.
+    `onset`: True if the detector knows the true onset of the leak; `channels`: channels that the detector may read;
+    `rig`: name of the rig that the detector assumes, "" if it assumes no rig.
     """
 
     onset: bool

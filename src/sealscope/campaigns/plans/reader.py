@@ -49,7 +49,7 @@ def plan_names() -> tuple[str, ...]:
 def load_plan(name_or_path: str | os.PathLike[str]) -> AnyPlan:
     """Load a packaged plan by its name, or a plan from a TOML file by its path.
 
-    Raises InputError, with the rule that is broken and its place, if the plan is invalid.
+    Raises InputError, which names the broken rule and the file, if the plan is invalid.
     """
     text = os.fspath(name_or_path)
     if text in plan_names():
@@ -124,7 +124,7 @@ def _call_for_entry(entry: str, place: str, function: Callable[[], _T]) -> _T:
 def _path_in_plan_folder(name: str, place: str) -> str:
     """Complete the path of a TOML file that a plan names, relative to the plan's folder.
 
-    A name without the ending .toml is that of a packaged file, and is returned unchanged.
+    A name without the ending .toml is the name of a packaged file, and is returned unchanged.
     """
     return os.fspath(Path(place).parent / name) if name.endswith(".toml") else name
 

@@ -94,7 +94,7 @@ class SplitRms:
         """Return one statistic of a wavelet detail's natural log RMS: its change at the split, or its overall value.
 
         `chamber`: "p_A" or "p_B"; `quantity`: "d1" to "d4" or "d3d4"; `statistic`: "change" for the log RMS after the
-        split minus that before it, "level" for the log RMS over both parts. Returns None if the chamber is missing or
+        split minus the one before, "level" for the log RMS over both parts. Returns None if the chamber is missing or
         the number is not finite.
         """
         if chamber not in self.log_rms:

@@ -46,7 +46,7 @@ def _format_area(area: Area) -> str:
 def column_sizes(judgement: Judgement) -> list[float]:
     """List the leak sizes for the columns of the main table, in the unit of the plan.
 
-    If there are more than `_MAX_SIZES` sizes or none, the list is [nan], for one column of all sizes together.
+    If there are no sizes, or more than `_MAX_SIZES`, the list is [nan], for one column of all sizes together.
     """
     sizes = sorted({row.leak_lpm for row in judgement.table if row.leak_lpm > 0})
     return sizes if 0 < len(sizes) <= _MAX_SIZES else [math.nan]
@@ -321,7 +321,7 @@ def _size_text(roc: SizeRoc, unit: str) -> str:
 
 
 def _describe_score(name: str) -> str:
-    """Describe in words which score the ROC curve of a detector is computed from; "" if it is not installed.
+    """Describe the score from which the ROC curve of a detector is computed; "" if the detector is not installed.
 
     `name`: name of the detector in the plan, such as "diagnose @ pressures".
     """
@@ -335,7 +335,7 @@ def _describe_score(name: str) -> str:
 
 
 class _PlotCurve(NamedTuple):
-    """A curve y(x) with its label, and the lower and upper end of its confidence band, None for none."""
+    """A curve y(x) with a label; `band`: lower and upper end of its confidence band, None for a curve without band."""
 
     label: str
     x: Array

@@ -35,8 +35,8 @@ def _format_percent(fraction: float) -> str:
 class PageTable(NamedTuple):
     """A table of the campaign's page.
 
-    `id`: its identifier in the HTML; `about`: description of its content; `heads`: headings of the columns; `rows`:
-    cells as text; `words`: number of leading columns with text instead of numbers.
+    `id`: identifier of the table in the HTML; `about`: description of the content; `heads`: headings of the columns;
+    `rows`: cells as text; `words`: number of columns with text, which stand left of the columns with numbers.
     """
 
     id: str
@@ -66,8 +66,8 @@ def page_tables(judgement: Judgement, unit: str, part: str = "") -> dict[str, Pa
 def _format_cell(row: Any, content: str) -> str:
     """Format one cell of a table as text.
 
-    `content`: kind of format, a space, and the dotted path of the value in `row`. The kind is an entry of `_FORMATS`,
-    such as "percent", or a format specification of Python.
+    `content`: name of a format, a space, and the dotted path of the value in `row`. The format is an entry of
+    `_FORMATS`, such as "percent", or a format specification of Python; without a format, `str` is used.
     """
     format_name, _, path = content.rpartition(" ")
     value = resolve_attribute(row, path)
@@ -77,9 +77,9 @@ def _format_cell(row: Any, content: str) -> str:
 class CauseTable(NamedTuple):
     """The table of the causes that one detector names, as text.
 
-    `columns`: the named causes; `rows`: for each true cause, its name, the number of its records, and the fraction of
-    them for which each cause is named; `right`: fraction of all records for which exactly the true cause is named;
-    `covered`: the same, also counting ambiguous causes that include the true one.
+    `columns`: causes that are named; `rows`: for each true cause, its name, its number of records, and for each column
+    the fraction of these records with the column's cause named; `right`, `covered`: fraction of all records for which
+    exactly the true cause is named, and for which the true cause or an ambiguous cause that includes it is named.
     """
 
     detector: str

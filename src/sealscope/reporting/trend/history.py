@@ -41,8 +41,8 @@ def write_history_page(
 ) -> Path:
     """Write the page of a machine as .html, .htm or .pdf, and return its path.
 
-    `judged`: its recordings with their diagnoses; `title`: name of the machine; `left_out`: number of files that
-    could not be read. Raises InputError if `judged` is empty, or if the page cannot be written.
+    `judged`: the machine's recordings with their diagnoses; `title`: name of the machine; `left_out`: number of files
+    that could not be read. Raises InputError if `judged` is empty, or if the page cannot be written.
     """
     return template.write(template.parse_page_path(path, card=False), render_history_page(judged, title, left_out))
 
@@ -158,8 +158,8 @@ def _dates(ordered: Sequence[Judged]) -> list[str]:
 def _draw_comparison(ordered: Sequence[Judged]) -> tuple[list[charts.Chart], charts.DrawnCharts | None, list[str]]:
     """Draw the channels of the newest recording and of an earlier one in the same charts, from a common start.
 
-    The earlier recording is the last one with the verdict `no leak`, or if there is none, the last one before the
-    newest. Returns the charts, the charts as drawn, and the names of the two files. Returns ([], None, []) if there
+    The earlier recording is the last one with the verdict `no leak` or, without such a recording, the last one before
+    the newest. Returns the charts, the charts as drawn, and the names of the two files. Returns ([], None, []) if there
     is no earlier recording, no common channel, or a clock that does not increase.
     """
     *earlier, newest = ordered
@@ -179,7 +179,7 @@ def _draw_comparison(ordered: Sequence[Judged]) -> tuple[list[charts.Chart], cha
         pressure_unit = latest.pressure_unit
         unit, values = charts.display_values(latest, name, pressure_unit)
         samples = np.interp(latest.t, other_t, other[name], left=np.nan, right=np.nan)
-        resampled = replace(latest, channels={name: samples})
+        resampled = replace(latest, channels={name: samples})  # to be displayed in the units of the newest recording
         other_values = charts.display_values(resampled, name, pressure_unit)[1]
         lines = (charts.ChartLine(files[0], "a", values), charts.ChartLine(files[1], "b", other_values))
         comparison.append(charts.Chart(f"over-{name}", "channels", name, unit, lines))
