@@ -146,7 +146,7 @@ def render_card(
 ) -> str:
     """Render the card, a picture of the diagnosis, as HTML of `WIDTH` x `HEIGHT` pixels.
 
-    The arguments and errors are those of `report`.
+    Arguments and errors are the same as for `report`.
     """
     card_charts = charts.course_charts(diagnosis, height=_CURVE_HEIGHT)
     all_marks = _all_marks(recording, marks, truth_onset_s)
@@ -179,7 +179,7 @@ def render_page(
     title: str | None = None,
     pressure_unit: str | None = None,
 ) -> str:
-    """Render the page of a diagnosis as HTML; the arguments and errors are those of `report`."""
+    """Render the page of a diagnosis as HTML; arguments and errors are the same as for `report`."""
     from markupsafe import Markup
 
     pressure_unit = pressure_unit or recording.pressure_unit

@@ -111,7 +111,7 @@ class Picture:
     def area(self, style: str, x: Array, low: Array, high: Array) -> None:
         """Draw the area between two lines, which are given as values of the axes.
 
-        `x`, `low`, `high` (n,): points of the lower and upper line; those where one line is NaN are left out. `style`:
+        `x`, `low`, `high` (n,): points of both lines; a point is left out if either line is NaN there. `style`:
         name of the area's style in the style sheet.
         """
         is_known = np.isfinite(low) & np.isfinite(high)

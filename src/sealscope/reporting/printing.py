@@ -90,7 +90,7 @@ def _find_browser() -> str | None:
 
 
 def _is_complete_pdf(data: bytes) -> bool:
-    """Return True if the bytes of a PDF are complete, so that the offset at their end is that of a cross-reference.
+    """Return True if the bytes of a PDF are complete: the offset at the end must lead to a cross-reference table.
 
     Source: ISO 32000-1, 7.5.5.
     """

@@ -64,7 +64,7 @@ def experiment_with_flow_leak(plan: SimulatedPlan, case: CampaignCase, profile: 
         elif name == LOAD:
             machine = replace(machine, load=parse_force(str(level)))
         elif name == "closed":
-            # for a level of 0 `throttle_values` lacks `line.orifices`, which then is that of the plan's rig
+            # for a level of 0 `throttle_values` lacks `line.orifices`, which is then taken from the plan's rig
             values |= {"line.orifices": str(plan.rig["line.orifices"])} | throttle_values(level)
         elif name != FAMILY:
             values[name] = level

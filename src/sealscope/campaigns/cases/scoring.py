@@ -1,4 +1,4 @@
-"""Run the detectors of a plan on one record: their scores, and what they state of a leak."""
+"""Run the detectors of a plan on one record, and collect their scores and statements."""
 
 from __future__ import annotations
 

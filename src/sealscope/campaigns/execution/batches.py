@@ -1,6 +1,6 @@
 """Simulate many cases of a plan side by side, and score them from the RMS of the wavelet details around the onset.
 
-The scores are computed by the same functions and from the same samples as those of a recording (`scorers.SplitRms`).
+The same functions compute the scores from the same samples as for a recording (`scorers.SplitRms`).
 A batch stores nothing else of a record, so a plan that needs more is refused. The solver's step of a case is chosen
 on short runs of machines with the same levels of the factors.
 """

@@ -1,4 +1,4 @@
-"""Compare what detectors state of a leak, its onset, flow and cause, with the truth."""
+"""Compare the onset, flow and cause of a leak that detectors state with the true ones."""
 
 from __future__ import annotations
 

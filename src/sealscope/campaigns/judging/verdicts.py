@@ -34,7 +34,7 @@ class JudgedRow(NamedTuple):
 
     @property
     def flow_lpm(self) -> float:
-        """Simulated mean flow [L/min] of the true leak while open, or the planned one if it was not simulated."""
+        """Simulated mean flow [L/min] of the true leak while open, or the planned flow without a simulation."""
         return self.size if self.row.flow_lpm is None else self.row.flow_lpm
 
     @property

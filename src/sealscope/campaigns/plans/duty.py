@@ -1,7 +1,7 @@
 """Check and parse the texts in a plan: commands, controllers, loads, closed throttles and faults.
 
-The texts have the form of the options of `sealscope simulate`: `command` that of `--command` (a voltage, or a target
-of the piston's position), `controller` that of `--controller`, `load` that of `--load`.
+A text has the same form as the option of `sealscope simulate` with the same name, such as `--command` (a voltage, or
+a target of the piston's position), `--controller` or `--load`.
 """
 
 from __future__ import annotations

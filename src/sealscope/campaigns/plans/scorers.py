@@ -1,7 +1,7 @@
 """The decision rules of the thesis as scorers: they compute a score of a record, which is high if there is a leak.
 
 The score is computed from the RMS of the pressures' wavelet details d1 to d4 and d3d4, the product of d3 and d4. The
-threshold of a scorer is set from a plan's leak-free records; that of a sign rule is 0.
+threshold of a scorer is set from a plan's leak-free records, except that sign rules have the threshold 0.
 """
 
 from __future__ import annotations
