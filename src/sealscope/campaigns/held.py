@@ -5,13 +5,13 @@ together,
 
     d(p_A - p_B)/dt = -G (1/V_A + 1/V_B) K (p_A - p_B),
 
-with the leak's conductance G and the volumes V of oil of bulk modulus K. Such holds are simulated with the noise of
-the rig's sensors and judged like those of a recording (`HeldChambers`, `held_rise`), against as many leak-free holds
-as a machine is usually commissioned with. The smallest leak is the one that is detected in the wanted fraction of the
-holds.
+with the leak's conductance G, the chambers' volumes V_A and V_B, and the bulk modulus K of the oil. Such holds are
+simulated with the noise of the rig's sensors and judged like the holds of a recording (`HeldChambers`, `held_rise`),
+by comparison with `N_HEALTHY` leak-free holds. The planned leak is the smallest one that is detected in the wanted
+fraction of the holds.
 
-A hold distinguishes a leak past the piston from one of the pump, which is shut off, and from one of a rod seal, which
-lowers one pressure alone.
+A hold distinguishes a leak past the piston from a leak of the pump, which is shut off, and from a leak of a rod seal,
+which lowers one pressure only.
 """
 
 from __future__ import annotations
@@ -40,18 +40,18 @@ HOLD_DURATIONS, DEFAULT_DURATION = (3.0, 10.0, 30.0, 60.0, 120.0), 30.0
 N_HEALTHY = 5
 #: Length of the recording before the valves shut [s].
 BEFORE = 1.0
-#: Number of simulated holds with a leak, and of bisections of its conductance.
+#: Number of simulated holds with a leak, and of bisections of the leak's conductance.
 _N_DRAWS, _N_BISECTIONS = 5, 8
-#: Smallest and largest conductance that are tried, given as conductance times duration times
-#: `_decay_per_conductance`: the logarithm of the factor by which p_A - p_B falls during the hold.
+#: Smallest and largest leak that are tried, given as the natural logarithm of the factor by which p_A - p_B falls in
+#: the hold. It is the leak's conductance times `_decay_per_conductance` times the duration.
 _TRIED_LOSSES = (1e-4, 10.0)
 
 
 class PlannedHold(NamedTuple):
     """A locked hold, in which valves shut the cylinder off from its pump, and the smallest piston leak that it finds.
 
-    `duration` [s]: time with shut valves; `pressure_A`, `pressure_B` [Pa]: absolute pressures of the chambers at its
-    beginning; `conductance` [m^3/(s Pa)]: that of the smallest leak found, inf if none is found.
+    `duration` [s]: time with shut valves; `pressure_A`, `pressure_B` [Pa]: absolute pressures of the chambers when the
+    valves shut; `conductance` [m^3/(s Pa)]: conductance of the smallest leak that is found, inf if none is found.
     """
 
     duration: float
@@ -115,11 +115,12 @@ def plan_hold(
 
 
 class _HoldDraws:
-    """Simulated locked holds of one duration, by which the smallest leak that they detect is found.
+    """Simulated locked holds of one duration, which show the smallest leak that such holds detect.
 
     In a locked hold, valves shut the cylinder off from its pump. `load` [N]: load that the cylinder holds; `flow`
-    [m^3/s]: mean flow of the pump under the usual command and load; `duration` [s]; `false_alarm`: probability of the
-    verdict `leak` without a leak; `detection`: probability of this verdict with the leak.
+    [m^3/s]: mean flow of the pump under the usual command and load; `duration` [s]: time with shut valves;
+    `false_alarm`: probability of the verdict `leak` without a leak; `detection`: probability of this verdict with the
+    leak.
     """
 
     def __init__(
@@ -127,25 +128,25 @@ class _HoldDraws:
     ) -> None:
         """Set the pressures of the locked hold, and the limits on false alarms and missed leaks.
 
-        Chamber B is at the charge pressure; chamber A is higher by the load over its piston area.
+        Chamber B is at the charge pressure; the pressure of chamber A is higher by load / A_A.
         """
         pressure_B = rig.fluid.p_charge + P_ATM
         self._rig, self._flow = rig, flow
         self._hold = PlannedHold(duration, pressure_B + load / rig.cylinder.A_A, pressure_B, np.inf)
-        # the rest of the probability is reserved for a step within a recording
+        # the fraction `within` of the probability is reserved for the test for a step within a recording
         self._max_false_alarm = false_alarm * (1.0 - DECISION.questions.within)
         self._max_missed = _N_DRAWS - detection * _N_DRAWS
 
     @cached_property
     def _healthy(self) -> list[RecordingSums]:
-        """Summaries (`RecordingSums`) of `N_HEALTHY` simulated holds without a leak, for comparison with others."""
+        """Summaries (`RecordingSums`) of `N_HEALTHY` simulated holds without a leak, to compare leaky holds with."""
         return [draw_hold(self._rig, self._hold, 0.0, self._flow, seed) for seed in range(N_HEALTHY)]
 
     def detects(self, conductance: float) -> bool:
-        """Return True if a leak of this conductance [m^3/(s Pa)] is detected in enough of `_N_DRAWS` simulated holds.
+        """Return True if at least the fraction `detection` of `_N_DRAWS` simulated holds detects a leak.
 
-        A hold detects it if the probability that a leak-free hold leaks as much, compared with the healthy holds, is
-        below the allowed false-alarm probability. Enough is the fraction `detection` of the holds.
+        `conductance` [m^3/(s Pa)]: conductance of the leak. A hold detects the leak if, judged by the healthy holds,
+        the probability that a leak-free hold leaks as much is below the allowed false-alarm probability.
         """
         n_missed = 0
         for seed in range(N_HEALTHY, N_HEALTHY + _N_DRAWS):
@@ -156,9 +157,9 @@ class _HoldDraws:
         return True
 
     def with_smallest_leak(self) -> PlannedHold:
-        """Find by bisection the smallest conductance of a leak that the hold detects; return the hold with it.
+        """Find by bisection the smallest leak that the hold detects; return the hold with the leak's conductance.
 
-        The conductance [m^3/(s Pa)] is inf if the hold detects no leak that is tried (`_TRIED_LOSSES`).
+        The conductance [m^3/(s Pa)] is inf if even the largest leak that is tried (`_TRIED_LOSSES`) is not detected.
         """
         loss_per_conductance = _decay_per_conductance(self._rig) * self._hold.duration
         low, high = np.log(np.array(_TRIED_LOSSES) / loss_per_conductance)  # logarithms of conductances
@@ -184,15 +185,15 @@ def _decay_per_conductance(rig: Rig) -> float:
 def draw_hold(rig: Rig, hold: PlannedHold, conductance: float, flow: float, seed: int) -> RecordingSums:
     """Simulate a locked hold with a leak past the piston and with sensor noise; measure the leak as in a recording.
 
-    `conductance` [m^3/(s Pa)]: of the leak; `flow` [m^3/s]: mean flow of the pump under the usual command and load;
-    `seed`: of the noise. Returns the summary of a recording with this hold. It has the leak measured in the hold, the
-    pump's flow and the pressure difference. Its Gram matrix, which would contain the data from the motion of the
-    piston, is 0.
+    `conductance` [m^3/(s Pa)]: conductance of the leak; `flow` [m^3/s]: mean flow of the pump under the usual command
+    and load; `seed`: seed of the noise. Returns the summary of a recording with this hold: the leak measured in the
+    hold, the pump's flow and the pressure difference. Its Gram matrix, for data from the motion of the piston, is 0.
     """
-    random, cylinder, sensors = np.random.default_rng(seed), rig.cylinder, rig.sensors
+    random = np.random.default_rng(seed)
+    cylinder, sensors = rig.cylinder, rig.sensors
     t = np.arange(round((BEFORE + hold.duration) * MAX_RATE)) / MAX_RATE
     loss = hold.difference * -np.expm1(-conductance * _decay_per_conductance(rig) * np.maximum(t - BEFORE, 0.0))
-    fraction_A = cylinder.A_B / (cylinder.A_A + cylinder.A_B)  # of the loss, inversely to the volumes
+    fraction_A = cylinder.A_B / (cylinder.A_A + cylinder.A_B)  # of the loss, inverse to the volumes
     p_A, p_B = (
         pressure + np.hypot(sensor.noise, sensors.common_noise) * random.standard_normal(t.size)
         for pressure, sensor in (

@@ -21,9 +21,9 @@ from sealscope.storage.folders import make_folder
 class CampaignResult:
     """A campaign and its results.
 
-    `rows`: result of each record; `missing`: number of the plan's records that have not been run; `judgement`:
-    statistics of the verdicts; `mode`: how a simulated campaign was run, run by run or in batches, "" for recordings;
-    `known`: by detector, the information that it was given.
+    `rows`: result of each record; `missing`: number of the plan's records without a row; `judgement`: statistics of the
+    verdicts; `mode`: how a simulated campaign was run, "run by run" or "in batches", "" for recordings; `known`: by
+    detector, the information that it was given.
     """
 
     plan: AnyPlan
@@ -37,9 +37,9 @@ class CampaignResult:
 def prior_knowledge(plan: SimulatedPlan | RecordedPlan) -> dict[str, PriorKnowledge]:
     """Collect the information that a plan gives to each of its detectors, by the detector's name.
 
-    A scorer, which computes a score but no verdict, may compare two parts of a record. It then knows the true onset
-    of simulated records, where they are split; recordings are split in the middle. All other detectors assume the
-    plan's rig.
+    A scorer, which only computes a score, may compare two parts of a record. It then knows the true onset of simulated
+    records, because they are split there; recordings are split in the middle. Detectors that are not scorers assume
+    the plan's rig.
     """
     is_simulated = isinstance(plan, SimulatedPlan)
     rig = "" if plan.assumed is None else plan.assumed.name
@@ -62,7 +62,7 @@ def _judge(
 ) -> Judgement:
     """Judge the rows of a campaign with the detectors and probabilities of its plan.
 
-    `onset_s` [s]: true onset of the leaks; `hours`: operating time of a record; None if they are not known.
+    `onset_s` [s]: true onset of the leaks, None if unknown; `hours`: operating time of a record, None if unknown.
     """
     return judge(
         rows,
@@ -94,7 +94,7 @@ def judge_recorded_campaign(
 ) -> CampaignResult:
     """Judge the recordings in a folder with the detectors of a plan.
 
-    `progress`: called after each recording with the numbers of recordings done, of all, and of failed ones.
+    `progress`: called after each recording with the numbers of recordings done, of all recordings, and of failed ones.
     """
     rows = judge_recordings(plan, folder, progress)
     return CampaignResult(plan, tuple(rows), missing=0, judgement=_judge(plan, rows), known=prior_knowledge(plan))

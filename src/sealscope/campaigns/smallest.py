@@ -6,10 +6,10 @@ follows from the test that `diagnose` uses (`StepTest.detectable_step`),
 
     detectable step = (threshold^(1/2) + z_detection) s,
 
-with the standard error s of a step at the median onset, and the threshold of the likelihood ratio at the false-alarm
-probability. Duties are compared by the conductance of the leak; flows are stated at the mean pressure difference of
-the usual duty. The smallest step that can be told from a step of the pump's leakage follows from the Fisher
-information of both steps.
+with the standard error s of a step at the median onset, the threshold of the likelihood ratio at the false-alarm
+probability, and the quantile z_detection of the standard normal distribution at the probability `detection`. Duties
+are compared by the conductance of the leak; flows are stated at the mean pressure difference of the usual duty. The
+smallest step that can be told from a step of the pump's leakage follows from the Fisher information of both steps.
 """
 
 from __future__ import annotations
@@ -46,9 +46,9 @@ _MAX_CENTRING_SECONDS = 1000.0
 
 
 class PlannedDuty(NamedTuple):
-    """The duty of a planned recording, that is its voltage command and its load.
+    """The duty of a planned recording: its command, a text such as '3 sin(4t)' [V], and its load, such as '2 kN'.
 
-    Both are texts, such as '3 sin(4t)', in volts, and '2 kN'; "" means no load.
+    The load "" means no load.
     """
 
     command: str
@@ -65,10 +65,14 @@ USUAL = PlannedDuty(COMMANDS[0])
 class DetectableLeak(NamedTuple):
     """The smallest leaks that are detected with the wanted probability in recordings of one duty and duration.
 
-    `duty`: command and load; `duration` [s]; `conductance` [m^3/(s Pa)]: smallest step (sudden increase) of the leak's
-    conductance that is detected, inf if there is none; `separable` [m^3/(s Pa)]: smallest step that can also be told
-    from a step of the pump's leakage, inf if there is none; `pressure` [Pa]: mean |p_A - p_B|; `note`: reason if the
-    numbers could not be computed, else ""; `flow` [m^3/s]: mean flow of the pump.
+    - `duty`: command and load
+    - `duration` [s]
+    - `conductance` [m^3/(s Pa)]: smallest step (sudden increase) of the leak's conductance that is detected, inf if no
+      step is detected
+    - `separable` [m^3/(s Pa)]: smallest step that can also be told from a step of the pump's leakage, inf if none can
+    - `pressure` [Pa]: mean |p_A - p_B|
+    - `note`: reason why the numbers could not be computed, "" if they could
+    - `flow` [m^3/s]: mean flow of the pump
     """
 
     duty: PlannedDuty
@@ -83,11 +87,14 @@ class DetectableLeak(NamedTuple):
 class RecordingPlan(NamedTuple):
     """A planned recording, and the duties (commands and loads) that were compared for it.
 
-    `target` [m^3/(s Pa)]: conductance of the leak to detect, None to detect the smallest possible; `for_detection`: the
-    shortest recording that detects it, or the best that was tried; `for_separation`: the shortest recording that also
-    tells it from a leak of the pump, or the best that was tried; `compared`: results of all duties; `usual_pressure`
-    [Pa]: mean pressure difference under the usual command and load, at which flows are stated; `false_alarm`,
-    `detection`: the wanted probabilities; `hold`: the locked hold that detects the target, None if none was planned.
+    - `rig`: name of the rig
+    - `target` [m^3/(s Pa)]: conductance of the leak to detect, None to detect the smallest possible leak
+    - `for_detection`: the shortest recording that detects this leak, or the last one tried if none does
+    - `for_separation`: the shortest recording that also tells this leak from a leak of the pump, or the last one tried
+    - `compared`: results of all duties, the usual duty first
+    - `usual_pressure` [Pa]: mean pressure difference under the usual duty, at which flows are stated
+    - `false_alarm`, `detection`: wanted probabilities of an alarm without the leak and with it
+    - `hold`: a planned locked hold, in which valves shut the cylinder off from its pump, None if none was planned
     """
 
     rig: str
@@ -137,7 +144,7 @@ class RecordingPlan(NamedTuple):
         }
 
     def text(self) -> str:
-        """Format the planned recording as lines of text, the best command and load with its smallest leak first."""
+        """Format the planned recording as lines of text: its duty, its smallest leak, and a table of all duties."""
         best, separating = self.for_detection, self.for_separation
         at_pressure = f"at {self.usual_pressure / 1e6:.2g} MPa"
         target = "" if self.target is None else f"{self.lpm(self.target):.2g} L/min {at_pressure}: "
@@ -171,8 +178,8 @@ class RecordingPlan(NamedTuple):
 def duty_experiment(rig: Rig, duty: PlannedDuty, duration: float, seed: int = 0) -> Experiment:
     """Build a leak-free experiment with the command and load of a duty; the piston's motion is centred in the stroke.
 
-    `duration`: length of the recording [s]; `seed`: of the sensor noise. Raises InputError if the command is a target
-    of the position and not a voltage.
+    `duration` [s]: length of the recording; `seed`: seed of the sensor noise. Raises InputError if the command is a
+    target of the position and not a voltage.
     """
     command = command_or_target(duty.command)
     if isinstance(command, Position):
@@ -188,8 +195,8 @@ def detectable_leak(
     """Compute the smallest leak that is detected in recordings with the command and load `duty`, of `duration` [s].
 
     The numbers are medians of `N_RECORDS` simulated recordings. `false_alarm`: probability of an alarm without a
-    leak; `detection`: probability of an alarm with it. If a simulation fails, or the volume balance of its recording,
-    the smallest leak is inf, with the reason in `note`.
+    leak; `detection`: probability of an alarm with it. If a recording cannot be simulated, or its volume balance cannot
+    be computed, the smallest leak is inf, with the reason in `note`.
     """
     steps = []
     try:
@@ -228,10 +235,10 @@ def _detectable_steps(recording: Recording, rig: Rig, false_alarm: float, detect
     balance = detector.balance(recording)
     if balance is None or balance.test is None:
         raise InputError("no balance: too short, or no block says anything of a leak")
-    # with a known healthy leakage, a part of the false-alarm probability goes to the test of the level against it
+    # if the healthy leakage is known, a part of the false-alarm probability goes to a test of the level against it
     level_fraction: float = DECISION.questions.within
     step_false_alarm = false_alarm * (1.0 - level_fraction if healthy_leakage(rig) > 0.0 else 1.0)
-    scale = balance.size.scale  # of the machine's size, to which the conductances are relative
+    scale = balance.size.scale  # conductances and flows of the balance are relative to the size of the machine
     step = balance.test.detectable_step(step_false_alarm, detection) * scale
     separable_step = step * _separation_ratio(balance.blocks, balance.columns)
     return _DetectableSteps(step, separable_step, balance.mean_pressure(), balance.mean_flow * scale)
@@ -240,22 +247,25 @@ def _detectable_steps(recording: Recording, rig: Rig, false_alarm: float, detect
 def _separation_ratio(blocks: Blocks, columns: Sequence[ColumnRoles]) -> float:
     """Compute the factor by which an unknown step of the pump's leakage raises the standard error of the leak's step.
 
-    With I the Fisher information (2, 2) of both steps, the leak's first, the factor is sqrt(I_11 / (I_11 - I_12^2 /
-    I_22)). Both steps are at the middle block of the recording; the constant coefficients of the volume balance are
-    unknown, too. `blocks`: Gram matrices of the balance's columns, one for each part of the recording; `columns`: for
-    each equation of the balance, the roles of its columns. The factor is inf if the balance has several equations or
-    no column for the pump's leakage, or if the two steps cannot be told apart.
+    The factor is sqrt(I_11 / (I_11 - I_12^2 / I_22)), with the Fisher information I (2, 2) of the leak's step (1) and
+    the pump's step (2). Both steps are at the middle block of the recording; the constant coefficients of the volume
+    balance are unknown, too. `blocks`: Gram matrices of the balance's columns, one for each block of time; `columns`:
+    for each equation of the balance, the roles of its columns. The factor is inf if the balance has several equations
+    or no column for the pump's leakage, or if the two steps cannot be told apart.
     """
     column = columns[0]
     if PUMP not in column.names or len(columns) > 1:
         return np.inf
-    gram, gram_after_step = (blocks.gram[first:, 0].sum(axis=0) for first in (0, len(blocks) // 2))
-    constants, steps = np.array(column.nuisance), np.array([column.leak, column.names.index(PUMP)])
+    middle = len(blocks) // 2
+    gram = blocks.gram[:, 0].sum(axis=0)
+    gram_after_step = blocks.gram[middle:, 0].sum(axis=0)
+    constants = np.array(column.nuisance)
+    steps = np.array([column.leak, column.names.index(PUMP)])
     cross = gram_after_step[np.ix_(constants, steps)]
     # Fisher information of both steps with the constant terms eliminated (Schur complement)
     information = gram_after_step[np.ix_(steps, steps)] - cross.T @ solve(gram[np.ix_(constants, constants)], cross)
     known_pump = information[0, 0]
-    unknown_pump = known_pump - information[0, 1] ** 2 / max(information[1, 1], 1e-300)
+    unknown_pump = known_pump - information[0, 1] ** 2 / max(information[1, 1], 1e-300)  # 1e-300: no division by 0
     is_separable = unknown_pump > 1e-9 * known_pump  # beyond rounding
     return float(np.sqrt(known_pump / unknown_pump)) if is_separable else np.inf
 
@@ -273,14 +283,18 @@ def plan_recording(
 ) -> RecordingPlan:
     """Find the shortest recording that detects a leak with a flow of `find` [m^3/s].
 
-    The flow is that at the mean |p_A - p_B| of the machine's usual duty, i.e. its usual command and load.
+    All duties are first compared in recordings of `COMPARISON_SECONDS`; the best duty is then tried for `DURATIONS`.
 
-    If `find` is None, the recording of `COMPARISON_SECONDS` that detects the smallest leak is planned. `usual`: the
-    usual duty; `duties`: others to try, by default all combinations of `COMMANDS` and `LOADS`; `false_alarm`:
-    probability of an alarm without a leak; `detection`: probability of an alarm with it; `held` [N]: force that the
-    cylinder holds in a locked hold, with its valves shut, by default the last of `LOADS` if the rig has such valves;
-    `progress`: called with a label and the completed fraction. Raises InputError if the usual duty cannot be simulated
-    or judged.
+    - `find`: flow of the leak at the mean |p_A - p_B| of the usual duty; None to plan the recording of
+      `COMPARISON_SECONDS` that detects the smallest leak
+    - `usual`: usual duty (command and load) of the machine
+    - `duties`: other duties to try, by default all combinations of `COMMANDS` and `LOADS`
+    - `false_alarm`, `detection`: probabilities of an alarm without the leak and with it
+    - `held` [N]: force that the cylinder holds in a locked hold, with its valves shut; None for the last of `LOADS` if
+      the rig has such valves, and otherwise for no hold
+    - `progress`: called with a label and the completed fraction
+
+    Raises InputError if the usual duty cannot be simulated or judged.
     """
     choices = [PlannedDuty(command, load) for load in LOADS for command in COMMANDS] if duties is None else list(duties)
     compared_duties = [usual, *(duty for duty in choices if duty != usual)]
@@ -296,7 +310,8 @@ def plan_recording(
     for field in ("conductance", "separable"):
         best = min(compared, key=lambda leak: float(getattr(leak, field)))
         if target is not None and np.isfinite(getattr(best, field)):
-            # the standard error of a step falls with the square root of the duration
+            # the standard error of a step falls with the square root of the duration; durations far below the
+            # predicted one are not tried
             predicted_duration = COMPARISON_SECONDS * (getattr(best, field) / target) ** 2
             durations = [seconds for seconds in DURATIONS if seconds >= 0.5 * predicted_duration] or DURATIONS[-1:]
             for duration in durations:

@@ -24,8 +24,8 @@ SAMPLES = "samples"
 POINTS, STILL_POINTS = 16_000, 800
 #: Samples around the onset that are all drawn, so that the ringing is visible.
 NEAR_SAMPLES = 6_000
-#: Largest value drawn. Values count as constant if their range is below the second number, or below the third
-#: relative to their size.
+#: Largest magnitude that is drawn. Values count as constant if their range is at most `_MIN_EXTENT`, or at most
+#: `_MIN_RELATIVE_EXTENT` times their largest magnitude.
 _MAX_DRAWN, _MIN_EXTENT, _MIN_RELATIVE_EXTENT = 1e100, 1e-100, 1e-12
 #: Unit of wavelet details, by the unit of the pressures.
 _DETAIL_UNITS = {"bar": "kPa", "MPa": "kPa", "kPa": "kPa", "psi": "psi"}
@@ -52,7 +52,7 @@ class Mark:
 
 
 class ChartLine(NamedTuple):
-    """One line of a chart: its label, its style's name in the style sheet, and its values in the chart's unit."""
+    """One line of a chart: label, name of the style in the style sheet, and values in the chart's unit."""
 
     label: str
     style: str
@@ -62,10 +62,14 @@ class ChartLine(NamedTuple):
 class Chart(NamedTuple):
     """One chart of the page.
 
-    `key`: its identifier; `group`: section of the page in which it is shown; `base`: name of the time axis of its
-    lines. The axis has the times of all samples, the centres of the RMS windows, or the times of the leak's estimates
-    over the recording. `height` in pixels; `band`: True if the second and third line are the interval of the first;
-    `limits`: ends of the y axis, None to show all values; `level`: repair limit, None if there is none.
+    - `key`: identifier of the chart
+    - `group`: section of the page in which the chart is shown
+    - `base`: name of the time axis, which has the times of all samples, the centres of the RMS windows, or the times at
+      which the leak is estimated
+    - `height`: height in pixels
+    - `band`: True if the second and third line are the interval of the first
+    - `limits`: ends of the y axis, None to show all values
+    - `level`: repair limit, None if there is none
     """
 
     key: str
@@ -96,7 +100,7 @@ def display_values(recording: Recording, name: str, pressure_unit: str) -> tuple
     """Convert a channel of a recording to its display unit; return the unit and the values (n,).
 
     `name`: name of the channel. Pressures are in `pressure_unit`, and raw counts of a sensor in counts. Other
-    channels are in the unit of the log file, or if it states none, in degC, mm, rpm, L/min or SI.
+    channels are in the unit of the log file. If the file states no unit, they are in degC, mm, rpm, L/min or SI.
     """
     si_unit = recording.units[name]
     unit = None if si_unit in ("Pa", COUNTS) else recording.unit_in_log(name)
@@ -108,10 +112,11 @@ def display_values(recording: Recording, name: str, pressure_unit: str) -> tuple
 
 
 def display_unit(unit: str, pressure_unit: str, *, detail: bool = False) -> tuple[str, float]:
-    """Choose the unit in which values in the SI unit `unit` are displayed; return it, and its size in SI.
+    """Choose the unit in which values in the SI unit `unit` are displayed; return this unit and its size in SI.
 
     Values are divided by this size for display. `pressure_unit`: display unit of pressures; `detail`: True for a
-    wavelet detail of a pressure, which has a smaller unit. Raises InputError for an unknown pressure unit.
+    wavelet detail of a pressure, whose unit may be smaller (`_DETAIL_UNITS`). Raises InputError for an unknown pressure
+    unit.
     """
     if pressure_unit not in _DETAIL_UNITS:
         raise InputError(f"pressure unit must be one of {', '.join(_DETAIL_UNITS)}, got {pressure_unit!r}")
@@ -123,10 +128,10 @@ def display_unit(unit: str, pressure_unit: str, *, detail: bool = False) -> tupl
 
 
 def detail_unit(unit: str, name: str, pressure_unit: str) -> tuple[str, float]:
-    """Choose the unit in which a wavelet detail is displayed; return it, and its size in the units of the values.
+    """Choose the unit in which a wavelet detail is displayed; return this unit and its size in the values' unit.
 
-    Values are divided by this size for display. Both are squared for d3d4, the product of two details. `unit`: unit
-    of the channel; `name`: name of the detail, such as "d3".
+    Values are divided by this size for display. Unit and size are squared for d3d4, the product of two details.
+    `unit`: unit of the channel; `name`: name of the detail, such as "d3"; `pressure_unit`: display unit of pressures.
     """
     display, scale = display_unit(unit, pressure_unit, detail=True)
     return (f"{display}²", scale**2) if name == PRODUCT else (display, scale)
@@ -146,7 +151,7 @@ def channel_charts(recording: Recording, pressure_unit: str) -> list[Chart]:
     charts = []
     for key, title, height, members in _CHANNELS:
         units: dict[str, list[ChartLine]] = {}
-        for name, style in zip(members, "ab", strict=False):
+        for name, style in zip(members, "ab", strict=False):  # "a", "b": styles of the first and second line
             if name in recording and np.isfinite(recording[name]).any():
                 unit, values = display_values(recording, name, pressure_unit)
                 units.setdefault(unit, []).append(ChartLine(name, style, values))
@@ -182,7 +187,7 @@ def rms_charts(chambers: list[ChamberDetails], pressure_unit: str) -> list[Chart
             if not chamber.window_t.size:
                 continue
             channel = chamber.channel
-            unit, scale = detail_unit(chamber.unit, names[0], pressure_unit)
+            unit, scale = detail_unit(chamber.unit, names[0], pressure_unit)  # the same for all names of a chart
             lines = tuple(ChartLine(detail_label(name), name, chamber.window_rms[name] / scale) for name in names)
             title = f"RMS of {quantity} of {channel}"
             charts.append(Chart(f"rms-{channel}{suffix}", "rms", title, unit, lines, f"windows-{channel}", height))
@@ -199,8 +204,8 @@ _MAX_LIMIT_RATIO = 4.0
 def course_charts(diagnosis: Diagnosis, *, height: int = 190) -> list[Chart]:
     """Build the chart of the leak flow [L/min] over the time of the recording, with its interval and the repair limit.
 
-    If only the total leakage of pump and piston is known over time, the chart shows that. Returns a list with this
-    chart, empty if neither is known. `height`: height of the chart in pixels.
+    If only the total leakage of pump and piston is known over time, the chart shows this flow. Returns a list with the
+    chart, empty if neither flow is known. `height`: height of the chart in pixels.
     """
     course = diagnosis.course
     if course is None or not np.isfinite(course.lpm).any():
@@ -232,12 +237,13 @@ def _y_limits(values: Array, low: Array, high: Array) -> tuple[float, float]:
     """Compute the limits of the y axis, which include zero, all estimates `values` and their intervals.
 
     `low`, `high`: ends of the intervals, not finite if unknown. The lowest 10 % of the lower ends and the highest 10 %
-    of the upper ends are left out if this more than halves the range, because a few wide intervals would flatten the
-    curve.
+    of the upper ends are ignored if this more than halves the range, because a few wide intervals would flatten the
+    curve. A margin is added at both ends.
     """
     required_values = [0.0, float(np.nanmin(values)), float(np.nanmax(values))]
     low_ends, high_ends = low[np.isfinite(low)], high[np.isfinite(high)]
-    with_all, with_most = [*required_values, *low_ends, *high_ends], [*required_values]
+    with_all = [*required_values, *low_ends, *high_ends]
+    with_most = [*required_values]
     with_most += [np.quantile(low_ends, 0.1)] if low_ends.size else []
     with_most += [np.quantile(high_ends, 0.9)] if high_ends.size else []
     levels = with_all if max(with_all) - min(with_all) <= 2.0 * (max(with_most) - min(with_most)) else with_most
@@ -246,7 +252,7 @@ def _y_limits(values: Array, low: Array, high: Array) -> tuple[float, float]:
 
 
 def detail_charts(chambers: list[ChamberDetails], pressure_unit: str) -> list[Chart]:
-    """Build a chart for each wavelet detail of each chamber; the charts of the same detail follow each other.
+    """Build a chart for each wavelet detail of each chamber, ordered by detail.
 
     `chambers`: wavelet details of the pressure of each cylinder chamber; `pressure_unit`: display unit of pressures.
     """
@@ -268,9 +274,9 @@ Moment = tuple[str, float, float | None]
 class DrawnCharts(NamedTuple):
     """All charts in the form that a page needs.
 
-    `data`: plain JSON values for the script that draws the charts; `still`: still picture of each chart, by its key,
-    for readers without scripts; `base`: times at which the channels are drawn; `span` [s]: first and last of these
-    times; `fine` [s]: ends of the interval in which all samples are drawn.
+    `data`: plain JSON values for the script that draws the charts; `still`: by key of the chart, a still picture for
+    readers without scripts; `base`: times at which the channels are drawn; `span` [s]: first and last of these times;
+    `fine` [s]: ends of the interval in which all samples are drawn.
     """
 
     data: dict[str, Any]
@@ -298,7 +304,8 @@ def draw(
     base = choose_drawn_times(recording.t, recording.rate, POINTS, near=near, near_samples=NEAR_SAMPLES)
     still_base = choose_drawn_times(recording.t, recording.rate, STILL_POINTS)
     span = (float(base.t[0]), float(base.t[-1]))
-    axes: dict[str, Array] = {SAMPLES: base.t} | {f"windows-{c.channel}": c.window_t for c in chambers}
+    axes: dict[str, Array] = {SAMPLES: base.t}
+    axes |= {f"windows-{chamber.channel}": chamber.window_t for chamber in chambers}
     if diagnosis.course is not None:
         axes[COURSE] = diagnosis.course.t
     onset, interval = _clip_onset(diagnosis, span)
@@ -325,8 +332,9 @@ def draw(
         "marks": [{"t": mark.t, "label": mark.label, "known": mark.known} for mark in marks],
         "charts": encoded_charts,
     }
-    t = ordered_time(recording.t, recording.rate)[0]
-    return DrawnCharts(data, still, base, span, (float(t[base.fine.start]), float(t[base.fine.stop - 1])))
+    t, _ = ordered_time(recording.t, recording.rate)
+    fine = (float(t[base.fine.start]), float(t[base.fine.stop - 1]))
+    return DrawnCharts(data, still, base, span, fine)
 
 
 def _clip_values(values: Array) -> Array:
@@ -337,7 +345,7 @@ def _clip_values(values: Array) -> Array:
 def _clip_onset(diagnosis: Diagnosis, span: tuple[float, float]) -> tuple[float | None, tuple[float, float] | None]:
     """Return the onset of the leak [s], and its confidence interval (low, high) cut off at the ends of `span` [s].
 
-    `span`: first and last time on the charts. The onset itself is not cut off. Each is None if it is not known.
+    `span`: first and last time on the charts. The onset itself is not cut off. An unknown onset or interval is None.
     """
     onset, interval = diagnosis.onset_s, diagnosis.onset_interval_s
     if onset is None or not isfinite(onset):
@@ -378,7 +386,8 @@ def render_still(
         else:
             picture.box(style, begin, end)
     if chart.band:
-        picture.area("interval", t, *lines[1:3])
+        _value, low_end, high_end, *_ = lines
+        picture.area("interval", t, low_end, high_end)
     if chart.level is not None and chart.level <= high:
         picture.level("level", chart.level)
     drawn_lines = chart.lines[:1] if chart.band else chart.lines

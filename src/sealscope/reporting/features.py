@@ -23,8 +23,8 @@ class ChamberDetails(NamedTuple):
 
     `values`: by name, each detail (n,) over the whole recording, NaN where it depends on samples beyond an end or on
     a defect of the data; `window_t` (w,) [s]: centres of the windows over which the RMS is computed; `window_rms`: by
-    name, the RMS (w,), NaN between two usable parts of the recording. d1..d4 are in the channel's unit, d3d4 in its
-    square.
+    name, the RMS (w,) in each window, NaN between two usable parts of the recording. d1..d4 have the `unit` of the
+    channel, d3d4 has the square of this unit.
     """
 
     channel: str
@@ -37,7 +37,8 @@ class ChamberDetails(NamedTuple):
 class DetailChange(NamedTuple):
     """The RMS of one wavelet detail in two parts of a recording.
 
-    `before`, `after`: in the unit of the channel, for d3d4 in its square; None if it cannot be computed.
+    `name`: name of the detail; `before`, `after`: RMS in the unit of the channel (of d3d4, in the square of this unit),
+    None if it cannot be computed.
     """
 
     channel: str
@@ -59,13 +60,14 @@ class DetailChange(NamedTuple):
 def chamber_details(recording: Recording, channel: str) -> tuple[ChamberDetails | None, str]:
     """Compute the wavelet details of the pressure of one chamber; return them with a note on omitted samples.
 
-    `channel`: "p_A" or "p_B". Only parts of the recording that are long enough and without a defect are transformed.
-    If there are none, the details are None, and the note is the reason. The note is "" if no samples are omitted.
+    `channel`: "p_A" or "p_B". Only parts of the recording that are long enough and without a defect are transformed. If
+    there are no such parts, or the transform fails, the details are None, and the note is the reason. The note is "" if
+    no samples are omitted and there is an RMS window.
     """
     if channel not in recording:
         return None, f"{channel} is not in this recording."
     n, signal = len(recording), recording[channel]
-    t = ordered_time(recording.t, recording.rate)[0]
+    t, _ = ordered_time(recording.t, recording.rate)
     n_needed = min_samples()
     parts = uniform_segments(recording, [channel])
     usable_parts = [part for part in parts if part.stop - part.start >= n_needed]
@@ -106,8 +108,8 @@ def chamber_details(recording: Recording, channel: str) -> tuple[ChamberDetails 
 class Parts(NamedTuple):
     """Two parts of a recording that are compared on the page.
 
-    `end` [s]: end of the first part; `start` [s]: start of the second part; `heads`: their headings in the table;
-    `text`: sentence that explains the choice.
+    `end` [s]: end of the first part; `start` [s]: start of the second part; `heads`: headings of both parts in the
+    table; `text`: sentence that explains the choice.
     """
 
     end: float
@@ -119,11 +121,11 @@ class Parts(NamedTuple):
 def parts_to_compare(diagnosis: Diagnosis, recording: Recording) -> Parts:
     """Choose the parts of a recording to compare: before and after the interval of the onset, or the two halves.
 
-    The halves are compared if no onset was found. If they are too short for `HALF_WINDOWS` RMS windows each, the
-    first part is the whole recording and the second is empty: a difference of short halves would reflect the stroke
-    and not the seal.
+    The halves are compared if no onset was found. If the halves are too short for `HALF_WINDOWS` RMS windows each, the
+    first part is the whole recording and the second is empty, because a difference of short halves would reflect the
+    motion of the piston and not the seal.
     """
-    t = ordered_time(recording.t, recording.rate)[0]
+    t, _ = ordered_time(recording.t, recording.rate)
     if diagnosis.onset_s is not None:
         low, high = diagnosis.onset_interval_s or (diagnosis.onset_s, diagnosis.onset_s)
         text = f"Before and after the onset at {low:.1f} s."
@@ -144,7 +146,7 @@ def changes(recording: Recording, chambers: list[ChamberDetails], parts: Parts) 
     `chambers`: wavelet details of each chamber's pressure; `parts`: end of the first part and start of the second.
     The RMS is None for a part without finite values.
     """
-    t = ordered_time(recording.t, recording.rate)[0]
+    t, _ = ordered_time(recording.t, recording.rate)
     first, second = t < parts.end, t >= parts.start
     series = ((chamber.channel, name, values) for chamber in chambers for name, values in chamber.values.items())
     return [DetailChange(channel, name, _rms(values[first]), _rms(values[second])) for channel, name, values in series]

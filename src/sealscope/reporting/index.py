@@ -18,11 +18,15 @@ _ORDER = ("leak", "cannot tell", "no leak")
 def severity_key(diagnosis: Diagnosis) -> tuple[int, float, float, str]:
     """Compute a sort key that puts the most severe diagnosis first.
 
-    It consists of the number of the verdict (0 leak, 1 cannot tell, 2 no leak), minus the leak as a fraction of the
-    repair limit, minus the flow of the leak [L/min] or else of the total leakage, and the name of the file. Unknown
-    numbers are 0.
+    Diagnoses are ordered by the first of these entries in which they differ; unknown numbers are 0:
+
+    - verdict: 0 for leak, 1 for cannot tell, 2 for no leak
+    - negative ratio of the leak to the repair limit
+    - negative flow [L/min] of the leak, or of the total leakage if the leak has none
+    - name of the file
     """
     severity = diagnosis.severity
+    # of the ratio and its interval, the ratio
     limit_ratio = 0.0 if severity is None or severity.of_limit is None else severity.of_limit[0]
     total_lpm = None if diagnosis.total_leakage is None else diagnosis.total_leakage.lpm
     lpm = total_lpm if diagnosis.leak_lpm is None else diagnosis.leak_lpm

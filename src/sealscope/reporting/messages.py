@@ -40,9 +40,9 @@ def say(name: str, /, **values: Any) -> str:
 
 
 def number(value: float | None, digits: int = 3) -> str:
-    """Format a number with `digits` significant digits; a dash for None or NaN, and the sign for infinity.
+    """Format a number with `digits` significant digits; a dash stands for None or NaN, "∞" for infinity.
 
-    Between 1e-6 and 1e9 it is written without an exponent.
+    Magnitudes from 1e-6 to 1e9 are written without an exponent, and without zeros at the end of the decimals.
     """
     if value is None or isnan(value):
         return ABSENT
@@ -69,18 +69,19 @@ def clock(seconds: float | None) -> str:
 
 def headline(diagnosis: Diagnosis) -> str:
     """Format the verdict as a sentence for the heading of the page, or of the card, a picture of the diagnosis."""
+    texts = _texts()["headline"]
     key = diagnosis.summary
-    if diagnosis.verdict == "leak" and diagnosis.cause in _texts()["headline"]:
+    if diagnosis.verdict == "leak" and diagnosis.cause in texts:
         key = diagnosis.cause
     elif key == "no leak" and not diagnosis.known_healthy:  # a leak from the start cannot be excluded
         key = "none began"
-    return _texts()["headline"].get(key, key[0].upper() + key[1:])
+    return texts.get(key, key[0].upper() + key[1:])
 
 
 def cause(diagnosis: Diagnosis) -> str | None:
-    """Return the named cause of the change, or None if there is none.
+    """Return the named cause of the change in a recording, or None if no cause is named.
 
-    A kind of leak is returned only if the verdict is "leak".
+    A leak of `LEAKS`, such as "piston leak", is returned only if the verdict is "leak".
     """
     if diagnosis.cause in LEAKS and diagnosis.verdict != "leak":
         return None
@@ -90,7 +91,7 @@ def cause(diagnosis: Diagnosis) -> str | None:
 def shows_reason(diagnosis: Diagnosis) -> bool:
     """Return True if the short text of a diagnosis must show the reason of its verdict.
 
-    This is so for the verdict `cannot tell`, and for a change whose named cause is no leak.
+    This is the case for the verdict `cannot tell`, and for a change whose named cause is not a leak.
     """
     return diagnosis.verdict == "cannot tell" or (diagnosis.verdict != "leak" and cause(diagnosis) is not None)
 
@@ -104,8 +105,8 @@ def state_text(machine_state: MachineState) -> str:
 def since(diagnosis: Diagnosis) -> str | None:
     """Format the time since which the machine leaks, with its interval.
 
-    If the onset is not known, the text says that the leak is older than the recording or rises within it. Returns
-    None if the verdict is not "leak".
+    If the onset is not known, the text says that the leak is older than the recording or that it rises within the
+    recording. Returns None if the verdict is not "leak".
     """
     if diagnosis.verdict != "leak":
         return None
@@ -134,19 +135,21 @@ def how_much(diagnosis: Diagnosis) -> str | None:
         return _why_no_flow(diagnosis) if fraction is None else f"{fraction}; {_why_no_flow(diagnosis)}"
     if interval is None:
         return f"{number(leak)} L/min"
-    return say("how_much.interval", leak=number(leak), low=number(interval[0]), high=number(interval[1]))
+    low, high = map(number, interval)
+    return say("how_much.interval", leak=number(leak), low=low, high=high)
 
 
 def _pump_fraction(diagnosis: Diagnosis) -> str | None:
-    """Format the leak as a fraction of the pump's flow; return None if this is not known."""
+    """Format the leak as a fraction of the pump's flow; return None if the fraction is not known."""
     severity = diagnosis.severity
     if severity is None or severity.pump_share is None:
         return None
-    return f"{_format_percent(severity.pump_share[0])} of the pump's flow in this duty"
+    fraction, _low, _high = severity.pump_share
+    return f"{_format_percent(fraction)} of the pump's flow in this duty"
 
 
 def _why_no_flow(diagnosis: Diagnosis) -> str:
-    """Return the reason why the leak cannot be stated in L/min, with its remedy, as text."""
+    """Return the reason why the leak cannot be stated in L/min, and what would remedy it, as text."""
     if "leak_lpm" not in diagnosis.refuses:
         is_too_small = diagnosis.total_leakage is not None and diagnosis.total_leakage.lpm is not None
         return say(f"how_much.{'too_small' if is_too_small else 'channels'}")
@@ -158,7 +161,7 @@ def _why_no_flow(diagnosis: Diagnosis) -> str:
 
 
 def flow_basis(diagnosis: Diagnosis) -> str | None:
-    """Format the piston area and pump displacement that a diagnosis needs for flows [L/min]; None if unknown."""
+    """Format the piston area and pump displacement on which a diagnosis bases flows [L/min]; None if unknown."""
     return None if diagnosis.machine is None else machine_text(diagnosis.machine)
 
 
@@ -179,11 +182,11 @@ def machine_text(machine: AssumedMachine) -> str:
 
 
 def how_bad(diagnosis: Diagnosis) -> str | None:
-    """Format the severity of the leak: its flow or creep speed as a percentage or multiple of the repair limit.
+    """Format the severity of the leak: its size as a percentage or multiple of the repair limit.
 
-    If this is not known but the user stated a limit, the text says that the comparison needs the piston area. Without
-    a stated limit the leak is given as a fraction of the pump's flow. Returns None if that is not known either, or if
-    there is no leak.
+    If this ratio is not known but the user stated a limit, the text says that the comparison needs the piston area.
+    Without a stated limit, the text is the leak as a fraction of the pump's flow; this is left out if the leak has no
+    flow in L/min. Returns None if there is no leak or nothing to state.
     """
     severity, limit = diagnosis.severity, diagnosis.limit
     if severity is None:
@@ -206,7 +209,7 @@ def _format_range(low: float, high: float) -> str:
 def other_sizes(diagnosis: Diagnosis) -> str | None:
     """Format the leak in mL/min, as a fraction of the pump's flow, and as a creep speed of the piston in mm/min.
 
-    Forms that are not known are left out; None is returned if all are unknown.
+    Unknown quantities are left out; None is returned if all are unknown.
     """
     severity = diagnosis.severity
     if severity is None:
@@ -221,9 +224,10 @@ def other_sizes(diagnosis: Diagnosis) -> str | None:
 
 
 def total_leakage(diagnosis: Diagnosis, *, basis: bool = True) -> str | None:
-    """Format the total leakage past pump and piston, and the smallest change of it that could be detected.
+    """Format the total leakage past pump and piston, and the smallest change of this leakage that could be detected.
 
-    `basis`: True to add the machine data on which flows are based. Returns None if the total leakage is not known.
+    `basis`: True to add the machine data on which flows are based, unless the verdict is "leak". Returns None if the
+    total leakage is not known.
     """
     leakage = diagnosis.total_leakage
     if leakage is None:
@@ -245,7 +249,7 @@ def total_leakage(diagnosis: Diagnosis, *, basis: bool = True) -> str | None:
 def _leakage_fraction(leakage: TotalLeakage, pressure: str) -> str:
     """Format a total leakage as a fraction of the pump's flow, with the smallest change that could be detected.
 
-    `pressure`: text of the pressure at which the leakage is stated.
+    An unknown fraction is called "not measured". `pressure`: text of the pressure at which the leakage is stated.
     """
     is_known = leakage.pump_share is not None
     key = "share" if is_known else "not_measured"
@@ -258,16 +262,14 @@ def _leakage_fraction(leakage: TotalLeakage, pressure: str) -> str:
 
 
 def leakage_in_short(diagnosis: Diagnosis) -> str | None:
-    """Format the total leakage past pump and piston in a few words.
-
-    Returns None if it is not known, or if the verdict is "leak".
-    """
+    """Format the total leakage past pump and piston in short; None if it is not known or the verdict is "leak"."""
     leakage = diagnosis.total_leakage
     if leakage is None or diagnosis.verdict == "leak":
         return None
     if leakage.lpm is None or leakage.interval_lpm is None:
-        percent = _format_percent(leakage.pump_share)
-        return None if leakage.pump_share is None else f"in all {percent} of the pump's flow"
+        if leakage.pump_share is None:
+            return None
+        return f"in all {_format_percent(leakage.pump_share)} of the pump's flow"
     low, high = leakage.interval_lpm
     return f"in all {number(leakage.lpm, 2)} L/min" if low > 0.0 else f"in all at most {number(high, 2)} L/min"
 
@@ -286,8 +288,8 @@ def _format_percent(fraction: float | None) -> str:
 def how_sure(diagnosis: Diagnosis) -> str:
     """Format the strength of the evidence for the verdict.
 
-    It states the odds that a healthy recording looks like this one, the score and threshold of the deciding detector,
-    and the false-alarm probability. Without a score, the text says so.
+    The text states the odds that a healthy recording looks like this recording, the score and threshold of the deciding
+    detector, and the false-alarm probability. If there is no score or threshold, the text says only that.
     """
     if diagnosis.score is None or diagnosis.threshold is None:
         return say("how_sure.no_score")
@@ -296,7 +298,7 @@ def how_sure(diagnosis: Diagnosis) -> str:
     relation = "over" if diagnosis.score > diagnosis.threshold else "not over"
     if diagnosis.verdict != "leak" and found_cause is not None and diagnosis.alarmed:
         odds, relation = f"that something changed: {odds}", f"for {found_cause}, over"
-    detector = diagnosis.methods[0].detector if diagnosis.methods else ""
+    detector = diagnosis.methods[0].detector if diagnosis.methods else ""  # the deciding one is first
     return say(
         "how_sure.score", odds=odds, score=number(diagnosis.score), relation=relation,
         threshold=number(diagnosis.threshold), judge=f" of {detector}" if detector else "",
@@ -305,7 +307,7 @@ def how_sure(diagnosis: Diagnosis) -> str:
 
 
 def odds_or_false_alarms(diagnosis: Diagnosis) -> str:
-    """Format the odds that a healthy recording looks like this one; if unknown, the false-alarm probability."""
+    """Format the odds that a healthy recording looks like this recording; if unknown, the false-alarm probability."""
     return diagnosis.odds or false_alarms(diagnosis)
 
 
@@ -321,7 +323,7 @@ def false_alarms(diagnosis: Diagnosis) -> str:
 def next_steps(diagnosis: Diagnosis) -> tuple[str, ...]:
     """List the recommended next steps as sentences, most useful first."""
     severity_level = None if diagnosis.severity is None else diagnosis.severity.level
-    deciding_detector = diagnosis.methods[0].detector if diagnosis.methods else ""
+    deciding_detector = diagnosis.methods[0].detector if diagnosis.methods else ""  # the deciding one is first
     step_once_confirmed = say(f"once_confirmed.{severity_level or 'plan'}", limit=diagnosis.limit)
     has_named_cause = diagnosis.named_cause is not None
     if diagnosis.verdict == "leak":
@@ -342,10 +344,13 @@ def next_steps(diagnosis: Diagnosis) -> tuple[str, ...]:
     defects = [finding for finding in findings if finding.severity != "note"]
     if defects:
         names = [f"{entry.code.replace('_', ' ')}{f' ({entry.channel})' if entry.channel else ''}" for entry in defects]
-        key, position = ("rule_out" if has_named_cause or diagnosis.verdict == "leak" else "care"), 0
-        if not has_named_cause and diagnosis.verdict == "cannot tell":
-            key, position = "findings", 1
-        steps.insert(position, say(f"next.{key}", faults=", ".join(dict.fromkeys(names))))
+        faults = ", ".join(dict.fromkeys(names))
+        if has_named_cause or diagnosis.verdict == "leak":
+            steps.insert(0, say("next.rule_out", faults=faults))
+        elif diagnosis.verdict == "cannot tell":
+            steps.insert(1, say("next.findings", faults=faults))
+        else:
+            steps.insert(0, say("next.care", faults=faults))
     return tuple(steps)
 
 
@@ -357,15 +362,15 @@ def quality_summary(diagnosis: Diagnosis) -> str:
 
 
 def raw_counts(diagnosis: Diagnosis) -> str | None:
-    """Format a note on pressures that are recorded in raw counts, with the remedy; return None if there are none."""
+    """Format a note on channels recorded in raw counts, with the remedy; return None if there are no such channels."""
     names = [finding.channel for finding in diagnosis.quality if finding.code == "raw_counts" and finding.channel]
     return f"{' and '.join(names)} in raw counts: state the unit, or a leak's size stays relative" if names else None
 
 
 def format_unused_columns(diagnosis: Diagnosis) -> str | None:
-    """Format a note on unused columns of the file that could be channels, with the options --map that use them.
+    """Format a note on unused columns of the file that could be channels; None if there are no such columns.
 
-    Returns None if there are none.
+    The note has the options --map by which the first four of them would be used.
     """
     if not diagnosis.unused:
         return None
@@ -374,7 +379,7 @@ def format_unused_columns(diagnosis: Diagnosis) -> str | None:
 
 
 def short_text(diagnosis: Diagnosis, *, width: int = WIDTH) -> str:
-    """Format a diagnosis in short: the verdict, its numbers and the next step; `width`: columns of a line."""
+    """Format a short text of a diagnosis: the verdict, its numbers and the next step; `width`: columns of a line."""
     odds = odds_or_false_alarms(diagnosis) if diagnosis.odds or diagnosis.score is not None else None
     rows = [
         ("state", state_text(diagnosis.state)),
@@ -424,7 +429,7 @@ def _figure_rows(diagnosis: Diagnosis) -> list[tuple[str, str | None]]:
 
 
 def _format_lines(diagnosis: Diagnosis, rows: list[tuple[str, str | None]], width: int) -> str:
-    """Format a line with the file and the verdict, and a paragraph for each row (label, text) that has a text."""
+    """Format a line with the file and the verdict, then a paragraph for each row (label, text) that has a text."""
     first = say("terminal.diagnosis", file=printable(diagnosis.file), summary=diagnosis.summary)
     return "\n".join((first, *paragraphs(rows, 12, width)))
 
@@ -432,7 +437,7 @@ def _format_lines(diagnosis: Diagnosis, rows: list[tuple[str, str | None]], widt
 def format_leak_flow(diagnosis: Diagnosis) -> str:
     """Format the leak flow with its interval or, if the verdict is not "leak", the upper bound of a leak.
 
-    If this is not known, the text says that no flow is stated.
+    If the flow or the bound is not known, the text says that no flow is stated.
     """
     if diagnosis.verdict == "leak" and diagnosis.leak_lpm is not None:
         low, high = diagnosis.leak_interval_lpm or (diagnosis.leak_lpm,) * 2
@@ -454,9 +459,9 @@ _FILE_COLUMNS = 22
 def table_line(diagnosis: Diagnosis, start_s: float | None = None) -> str:
     """Format a diagnosis as a line of a table: file, date, verdict and leak flow in L/min.
 
-    A second line states the named cause and the next step; it is left out for `no leak` without a cause. The name of
-    a file longer than its column stands on a line of its own. `start_s`: start of the recording [s since 1970], None
-    to leave the date blank.
+    Further lines state the next step or, for `cannot tell`, the reason; a named cause comes first unless the verdict is
+    `leak`. They are left out for `no leak` without a cause. A file name that is longer than its column stands on a line
+    of its own. `start_s`: start of the recording [s since 1970], None to leave the date blank.
     """
     file = PurePath(diagnosis.file).name
     date = "" if start_s is None else datetime.fromtimestamp(start_s, UTC).date().isoformat()

@@ -21,8 +21,8 @@ CURVE_WIDTH = 20
 def draw_curve(values: Array, width: int = CURVE_WIDTH) -> str:
     """Draw values (n,) as a line of at most `width` bar characters, scaled between minimum and maximum.
 
-    The values are divided into as many parts as there are characters, and each shows the middle value of its part. A
-    blank stands for missing samples.
+    The values are divided into as many parts as there are characters, and each character shows the middle one of the
+    finite values in its part. A blank stands for a part without finite values.
     """
     finite = values[np.isfinite(values)]
     if not finite.size:
@@ -48,9 +48,9 @@ def _format_short(value: float) -> str:
 
 
 def overview_text(name: str, recording: Recording, findings: Sequence[Finding]) -> str:
-    """Format an overview of a recording: its clock, its channels with range and small curve, notes and findings.
+    """Format an overview of a recording: length, channels with range and small curve, remarks, notes and findings.
 
-    `name`: name of the recording; `findings`: defects of its data.
+    `name`: name of the recording; `findings`: defects of its data. The text also lists unused columns of the file.
     """
     provenance = recording.provenance
     start = f", from {provenance['start']}" if "start" in provenance else ""

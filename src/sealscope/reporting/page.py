@@ -27,7 +27,7 @@ from sealscope.signals.windows import WINDOW_SIZE, WINDOW_STEP
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-#: Size of a card, and height of the curve on it, in pixels.
+#: Width and height of a card (a picture that sums up a diagnosis), and height of the curve on it, in pixels.
 WIDTH, HEIGHT, _CURVE_HEIGHT = 1200, 630, 190
 
 
@@ -51,11 +51,11 @@ def report(
     recording : Recording
         The recording that was judged.
     path : str or path-like
-        The page, ending in .html, .htm or .pdf, or its card, ending in .png. It is written atomically. A PDF is
+        The page, ending in .html, .htm or .pdf, or its card, ending in .png. The file is written atomically. A PDF is
         printed by a browser of Chromium's family or by WeasyPrint, whichever is installed. The card is a picture of
-        1200 x 630 pixels with machine, date, verdict, L/min and its curve, which is drawn by a browser.
+        1200 x 630 pixels with machine, date, verdict, leak flow and its curve; a browser draws it.
     diagnosis : Diagnosis, optional
-        Its diagnosis; by default that of `sealscope.diagnose` with the `rig`.
+        The diagnosis of the recording; by default the result of `sealscope.diagnose` with the `rig`.
     rig : Rig, str or path-like, optional
         A Rig, the name of a packaged rig or the path of a TOML file; its values label the schematic.
     marks : sequence of Mark, optional
@@ -65,7 +65,7 @@ def report(
     title : str, optional
         Title of the page; by default the name of the recording.
     pressure_unit : {"bar", "MPa", "kPa", "psi"}, optional
-        Unit of the pressures on the page; by default that of the log, or bar if it states none.
+        Unit of the pressures on the page; by default the unit of the log, or bar if the log states none.
 
     Returns
     -------
@@ -111,8 +111,8 @@ def write_page(path: str | os.PathLike[str], recording: Recording, diagnosis: Di
 def _choose_rig(diagnosis: Diagnosis, rig: Rig | str | os.PathLike[str] | None) -> Rig | None:
     """Choose the rig whose values the page shows: `rig` if given, else the packaged rig stated for the diagnosis.
 
-    `rig`: a Rig, the name of a packaged rig or the path of a TOML file. Returns None if it is merely the default rig,
-    which nobody stated, or without `rig`, if the diagnosis names no packaged rig.
+    `rig`: a Rig, the name of a packaged rig or the path of a TOML file. Returns None if this is the default rig,
+    which nobody stated (`states_rig`), or without `rig`, if the rig of the diagnosis is not stated or not packaged.
     """
     from sealscope.parameters import load_rig, rig_names
 
@@ -126,9 +126,9 @@ def _choose_rig(diagnosis: Diagnosis, rig: Rig | str | os.PathLike[str] | None) 
 
 
 def _all_marks(recording: Recording, marks: Sequence[Mark], truth_onset_s: float | None) -> list[Mark]:
-    """Collect the moments to mark on all charts: `marks`, and the true onset [s] if it is known.
+    """Collect the moments to mark on all charts: `marks`, and the true onset [s] unless that is None.
 
-    Raises InputError if the recording is empty, as no page can be made of it.
+    Raises InputError if the recording is empty, since it cannot have a page.
     """
     if len(recording) == 0:
         raise InputError("recording must have at least 1 sample to be reported, got 0")
@@ -146,7 +146,7 @@ def render_card(
 ) -> str:
     """Render the card, a picture of the diagnosis, as HTML of `WIDTH` x `HEIGHT` pixels.
 
-    The arguments and errors are those of `report`.
+    Arguments and errors are the same as for `report`.
     """
     card_charts = charts.course_charts(diagnosis, height=_CURVE_HEIGHT)
     all_marks = _all_marks(recording, marks, truth_onset_s)
@@ -179,7 +179,7 @@ def render_page(
     title: str | None = None,
     pressure_unit: str | None = None,
 ) -> str:
-    """Render the page of a diagnosis as HTML; the arguments and errors are those of `report`."""
+    """Render the page of a diagnosis as HTML; arguments and errors are the same as for `report`."""
     from markupsafe import Markup
 
     pressure_unit = pressure_unit or recording.pressure_unit
@@ -227,9 +227,11 @@ def _change_rows(
 ) -> dict[str, Any]:
     """Build the template's values for the table that compares the details' RMS in two parts of the recording.
 
-    `chambers`: wavelet details of each chamber's pressure. Returns `changes`, rows of (channel, detail, unit, RMS
-    before, RMS after, change [%]); `bar_limit` [%], the largest change that the table's bars show; and `parts`, the
-    two parts.
+    `chambers`: wavelet details of each chamber's pressure. Returns a dictionary:
+
+    - `changes`: rows (channel, detail, unit, RMS in the first part, RMS in the second part, change [%])
+    - `bar_limit`: largest change [%] that the table's bars show
+    - `parts`: the two parts
     """
     parts = features.parts_to_compare(diagnosis, recording)
     rows = []

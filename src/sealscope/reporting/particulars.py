@@ -29,5 +29,5 @@ def collect_particulars(recording: Recording, rig: Rig | None = None) -> dict[st
         matches = (name for pattern in patterns for name in remarks if re.fullmatch(pattern, name, re.IGNORECASE))
         name = next(matches, None)
         if name is not None:
-            facts[label] = remarks.pop(name)
+            facts[label] = remarks.pop(name)  # no remark is used for two facts
     return {label: facts[label] for label in patterns_by_label if label in facts}

@@ -30,7 +30,7 @@ class SvgPath(NamedTuple):
 
 
 class SvgText(NamedTuple):
-    """A text at the position `x`, `y` of a picture, from its frame's top left corner.
+    """A text of a picture at the position `x`, `y`, in pixels from the top left corner of the frame.
 
     `anchor`: the "start", "middle" or "end" of the text is at this position; `turned`: True if the text reads upwards.
     """
@@ -46,9 +46,10 @@ class SvgText(NamedTuple):
 class Picture:
     """A chart as SVG shapes and texts, in a frame of `width` x `height` pixels.
 
-    `shapes` are drawn in their order, then the `labels`. `x_ends`, `y_ends`: values at the ends of the axes; `log`:
-    True for a logarithmic x axis, for which `x_ends` are decimal logarithms, such as (-2, 1) for 0.01 to 10;
-    `margins`: free space in pixels left of the frame, above, right of it and below.
+    - `x_ends`, `y_ends`: values at the ends of the axes
+    - `log`: True for a logarithmic x axis, whose `x_ends` are decimal logarithms, such as (-2, 1) for 0.01 to 10
+    - `margins`: space outside the frame in pixels: left, above, right, below
+    - `shapes`, `labels`: shapes, drawn in this order, and texts, drawn over them
     """
 
     width: float
@@ -68,11 +69,11 @@ class Picture:
 
     @property
     def styles(self) -> set[str]:
-        """Names of the styles of all its shapes."""
+        """Names of the styles of all shapes in the picture."""
         return {shape.style for shape in self.shapes}
 
     def x(self, values: Array | float) -> Array:
-        """Convert values of the x axis to distances from the left of the frame, in pixels."""
+        """Convert values of the x axis to distances from the left side of the frame, in pixels."""
         start, stop = self.x_ends
         positions = np.log10(values) if self.log else np.asarray(values)
         return np.asarray((positions - start) / (stop - start) * self.width)
@@ -85,32 +86,33 @@ class Picture:
     def draw(self, style: str, path: str, title: str = "") -> None:
         """Add an SVG path to the picture, with coordinates in pixels from the frame's top left corner.
 
-        `style`: its name in the style sheet; `title`: its tooltip, "" for none.
+        `style`: name of the shape's style in the style sheet; `title`: tooltip, "" for none.
         """
         self.shapes.append(SvgPath(style, path, title))
 
     def line(self, style: str, x: Array, y: Array, title: str = "", digits: int = 1) -> None:
-        """Draw the line through points (n,) in values of the axes, interrupted where y is missing (NaN).
+        """Draw a line through points (n,), given as values of the axes; a missing y (NaN) interrupts the line.
 
-        `style`: its name in the style sheet; `title`: its tooltip; `digits`: decimals of the coordinates in the SVG
-        path.
+        `style`: name of the line's style in the style sheet; `title`: tooltip, "" for none; `digits`: decimals of the
+        coordinates in the SVG path.
         """
         self.draw(style, self._path(x, y, digits), title)
 
     def _path(self, x: Array, y: Array, digits: int = 1) -> str:
-        """Format the line through points (n,) as an SVG path, interrupted at a missing y (NaN).
+        """Format the line through points (n,) as an SVG path; a missing y (NaN) interrupts the line.
 
         `x`, `y`: values of the axes; `digits`: decimals of the coordinates in pixels.
         """
         is_drawn = np.isfinite(y)
-        is_first = is_drawn & ~np.append(False, is_drawn[:-1])
+        is_first = is_drawn & ~np.append(False, is_drawn[:-1])  # of each uninterrupted piece
         points = zip(is_first[is_drawn], self.x(x[is_drawn]), self.y(y[is_drawn]), strict=True)
-        return "".join(f"{'M' if first else 'L'}{a:.{digits}f} {b:.{digits}f}" for first, a, b in points)
+        return "".join(f"{'M' if first else 'L'}{left:.{digits}f} {top:.{digits}f}" for first, left, top in points)
 
     def area(self, style: str, x: Array, low: Array, high: Array) -> None:
-        """Draw the area between the lines `low` and `high` (n,) in values of the axes.
+        """Draw the area between two lines, which are given as values of the axes.
 
-        Points at which one of them is NaN are left out. `style`: its name in the style sheet.
+        `x`, `low`, `high` (n,): points of both lines; a point is left out if either line is NaN there. `style`:
+        name of the area's style in the style sheet.
         """
         is_known = np.isfinite(low) & np.isfinite(high)
         if is_known.any():
@@ -118,9 +120,10 @@ class Picture:
             self.draw(style, self._path(*outline) + "z")
 
     def box(self, style: str, begin: float, end: float, low: float | None = None, high: float | None = None) -> None:
-        """Draw a box from x = `begin` to `end` and from y = `low` to `high`; None means the end of the frame.
+        """Draw a box from x = `begin` to `end` and from y = `low` to `high`, but at least `_MIN_BOX` pixels in size.
 
-        `style`: name of the style in the style sheet.
+        `low`, `high`: None to extend the box to the bottom or the top of the frame; `style`: name of the box's style in
+        the style sheet.
         """
         left, top = float(self.x(begin)), 0.0 if high is None else float(self.y(high))
         bottom = self.height if low is None else float(self.y(low))
@@ -128,23 +131,23 @@ class Picture:
         self.draw(style, f"M{left:.1f} {top:.1f}H{right:.1f}V{bottom:.1f}H{left:.1f}z")
 
     def mark(self, style: str, x: float) -> None:
-        """Draw a vertical line at `x` over the whole height of the frame; `style`: its name in the style sheet."""
+        """Draw a vertical line at the value `x` over the height of the frame; `style`: its name in the style sheet."""
         self.draw(style, f"M{self.x(x):.1f} 0V{self.height:g}")
 
     def level(self, style: str, y: float) -> None:
-        """Draw a horizontal line at `y` over the whole width of the frame; `style`: its name in the style sheet."""
+        """Draw a horizontal line at the value `y` over the width of the frame; `style`: its name in the style sheet."""
         self.draw(style, f"M0 {self.y(y):.1f}H{self.width:g}")
 
     def symbol(self, style: str, x: float, down: float, title: str = "") -> None:
         """Draw a symbol, such as a dot or a cross, at the value `x` of the x axis.
 
-        The first word of `style` names one of the `SYMBOLS`. `down`: distance from the top of the frame in pixels;
-        `title`: tooltip, "" for none.
+        `style`: name of the symbol's style in the style sheet, which begins with the name of one of the `SYMBOLS`;
+        `down`: distance from the top of the frame in pixels; `title`: tooltip, "" for none.
         """
         self.draw(style, f"M{self.x(x):.1f} {down:.1f}{SYMBOLS[style.split(maxsplit=1)[0]]}", title)
 
     def point(self, style: str, x: float, y: float, ends: tuple[float, float], title: str = "") -> None:
-        """Draw a point at (`x`, `y`), and a vertical line over its interval `ends` of y.
+        """Draw a point at the values `x` and `y`, and a vertical line over its interval `ends` of y values.
 
         `style`: name of the point's style in the style sheet; `title`: tooltip, "" for none.
         """
@@ -171,8 +174,9 @@ def ticks(low: float, high: float, count: int) -> list[float]:
     min_step = (high - low) / count
     power = 10.0 ** np.floor(np.log10(min_step))
     step = float(next(m for m in (1, 2, 5, 10) if m * power >= min_step * 0.999) * power)
-    first = int(np.ceil(low / step - 1e-9))
-    return [float(f"{i * step:.12g}") for i in range(first, int(np.floor(high / step + 1e-9)) + 1)]
+    first = int(np.ceil(low / step - 1e-9))  # 1e-9: rounding
+    last = int(np.floor(high / step + 1e-9))
+    return [float(f"{i * step:.12g}") for i in range(first, last + 1)]
 
 
 def log_ticks(low: float, high: float) -> list[float]:

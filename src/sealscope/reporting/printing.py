@@ -90,7 +90,7 @@ def _find_browser() -> str | None:
 
 
 def _is_complete_pdf(data: bytes) -> bool:
-    """Return True if the bytes of a PDF are complete: their end points to a cross-reference table.
+    """Return True if the bytes of a PDF are complete: the offset at the end must lead to a cross-reference table.
 
     Source: ISO 32000-1, 7.5.5.
     """
@@ -109,8 +109,8 @@ def _write_by_browser(
 ) -> None:
     """Run a browser that converts the page (HTML) to a file; raise InputError unless the file is complete.
 
-    `target`: the file that the browser writes; `options`: command-line options that make it write this file; `kind`:
-    name of the kind of file, for the error message; `is_complete`: function that tests the bytes of the file.
+    `target`: the file that the browser writes; `options`: command-line options by which the browser writes this file;
+    `kind`: description of the file for the error message; `is_complete`: function that tests the bytes of the file.
     """
     with tempfile.TemporaryDirectory(prefix="sealscope-", ignore_cleanup_errors=True) as folder:
         source = Path(folder) / "page.html"

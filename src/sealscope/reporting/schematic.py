@@ -30,11 +30,13 @@ _BORE, _ROD = 78.0, 18.0
 class Circuit(NamedTuple):
     """The parts of a machine that the schematic shows.
 
-    `cylinder`: kind of the cylinder, such as "double-rod cylinder"; `rods`: sides with a rod, "A", "B" or "AB";
-    `rod`: height of the drawn rod, for a single rod sqrt(1 - A_small / A_large) of the drawn bore, but at most 0.8 of
-    it; `throttles`, `make_up`, `bypass`: True if the machine has throttles in its lines, make-up valves, or a bypass
-    with a flow meter; `valve`: True if a servo valve drives the cylinder; `values`: by label, the value with its
-    unit, "" if it is not known.
+    - `cylinder`: name of the cylinder's type, such as "double-rod cylinder"
+    - `rods`: sides of the piston with a rod, "A", "B" or "AB"
+    - `rod`: height of the rod in the drawing
+    - `throttles`, `make_up`: True if the machine has throttles in its lines, or make-up valves
+    - `bypass`: True if the machine has a bypass with a flow meter, which measures the leak
+    - `valve`: True if a servo valve drives the cylinder
+    - `values`: by label, the value with its unit, "" if it is not known
     """
 
     cylinder: str
@@ -50,11 +52,12 @@ class Circuit(NamedTuple):
 def build_circuit(rig: Rig | None, recorded: Container[str], machine: AssumedMachine | None = None) -> Circuit:
     """Choose the parts of a machine to draw in the schematic.
 
-    `rig`: the rig, None if it is not known: then only the parts that every pump-controlled actuator has are drawn;
-    `recorded`: recorded channels; with `q_leak` among them a bypass is drawn; `machine`: areas and displacement that
-    are known without a rig, None for none.
+    - `rig`: the rig; if it is None, only the parts that every pump-controlled actuator has are drawn
+    - `recorded`: recorded channels; a bypass is drawn if `q_leak` is among them
+    - `machine`: areas and displacement that may be stated without a rig, None if they are not known
     """
-    bypass, values = "q_leak" in recorded, dict.fromkeys(_VALUES, "")
+    bypass = "q_leak" in recorded
+    values = dict.fromkeys(_VALUES, "")
     if rig is None:
         cylinder: tuple[str, str, float] = ("cylinder", "AB", _ROD)
         if machine is not None and machine.area_stated and machine.areas is not None:
@@ -74,9 +77,10 @@ def build_circuit(rig: Rig | None, recorded: Container[str], machine: AssumedMac
 
 
 def _cylinder_parts(areas: tuple[float, float]) -> tuple[str, str, float]:
-    """Determine the kind of a cylinder, its sides with a rod ("A", "B" or "AB"), and the height of the drawn rod.
+    """Determine the type of a cylinder, its sides with a rod ("A", "B" or "AB"), and the drawn height of the rod.
 
-    `areas`: piston areas of the sides A and B, in any common unit.
+    `areas`: piston areas of the sides A and B, in any common unit. The drawn height of a single rod is the rod's
+    diameter over the bore's, sqrt(1 - smaller area / larger area), times the height of the drawn bore.
     """
     ratio = min(areas) / max(areas)
     if ratio > _MIN_DOUBLE_ROD_RATIO:

@@ -19,12 +19,15 @@ _MISSING = -32768
 class DrawnTimes:
     """The times at which the channels of a recording are drawn.
 
-    Samples are divided into buckets, groups of successive samples of which only the minimum and the maximum are
-    drawn. `t` (m,) [s]: times of the drawn points, never decreasing; `starts`, `stops` (k,): first sample of each
-    bucket, and the one after its last; `width`: number of samples in a full bucket, 1 if all samples are drawn;
-    `fine`: range of samples that are all drawn, whatever the width; `breaks`: indices at which a point is inserted to
-    interrupt the line at a gap in time; `by_sample`: True if the time stamps do not increase; the times are then the
-    number of the sample over the sampling rate.
+    Samples are divided into buckets, groups of successive samples of which only the minimum and the maximum are drawn.
+
+    - `t` (m,) [s]: times of the drawn points, never decreasing
+    - `starts`, `stops` (k,): samples [start, stop) of each bucket
+    - `width`: number of samples in a full bucket, 1 if all samples are drawn
+    - `fine`: range of samples that are all drawn, whatever the width
+    - `breaks`: indices, before the insertion, at which points are inserted that interrupt the line at gaps in time
+    - `by_sample`: True if the time stamps do not increase; the times are then the numbers of the samples over the
+      sampling rate
     """
 
     t: Array
@@ -73,13 +76,13 @@ def ordered_time(t: Array, rate: float) -> tuple[Array, bool]:
 def choose_drawn_times(
     t: Array, rate: float, points: int, *, near: float | None = None, near_samples: int = 0
 ) -> DrawnTimes:
-    """Choose the times at which a chart draws a recording, about `points` in all.
+    """Choose the times at which a chart draws a recording: about `points`, and the samples around the time `near`.
 
-    There are two for each bucket, a group of successive samples of which only minimum and maximum are drawn. `t` (n,)
-    [s]: time stamps; `rate` [Hz]: nominal sampling rate; `near` [s]: time around which `near_samples` samples are all
-    drawn, None for no such time. Buckets have equal numbers of samples, so a drawn peak is at most one bucket away
-    from its true time. A gap in time starts a new bucket, and an additional point there interrupts the line; if there
-    are many gaps, only the longest ones do.
+    There are two times for each bucket, a group of successive samples of which only minimum and maximum are drawn.
+    Full buckets have equal numbers of samples, so a drawn peak is at most one bucket away from its true time. A gap in
+    time starts a new bucket, and an additional point at the gap interrupts the line; of many gaps, only the longest
+    are treated so. `t` (n,) [s]: time stamps; `rate` [Hz]: nominal sampling rate; `near` [s]: time around which
+    `near_samples` samples are all drawn, None for the start of the recording.
     """
     n = t.size
     t, by_sample = ordered_time(t, rate)
@@ -91,7 +94,7 @@ def choose_drawn_times(
     max_gaps = points // 20
     if gaps.size > max_gaps:
         gaps = np.sort(gaps[np.argsort(steps[gaps - 1])[-max_gaps:]])
-    single_samples = np.arange(fine.start, min(fine.stop + 1, n))  # each is a bucket; the one after the last starts one
+    single_samples = np.arange(fine.start, min(fine.stop + 1, n))  # a bucket each, and the start of the next bucket
     starts = np.unique(np.concatenate([np.arange(0, n, width), gaps, single_samples])).astype(np.int64)
     stops = np.append(starts[1:], n)
     sizes = stops - starts
@@ -104,11 +107,13 @@ def choose_drawn_times(
 def encode_values(values: Array) -> dict[str, Any]:
     """Encode values as base64 text of 16-bit integers, for the script of the page.
 
-    The integers q are a grid of 65 534 steps from the minimum `low` to the maximum, and are decoded as `low + (q +
-    32767) * step`; q = -32768 stands for a value that is not finite. Returns `low`, `step` and the text `q`.
+    The integers q divide the range from the minimum `low` to the maximum into 65 534 equal steps. They are decoded as
+    `low + (q + 32767) * step`; q = -32768 stands for a value that is not finite. Returns `low`, `step` and `q` as text.
     """
     is_finite = np.isfinite(values)
-    low, high = (float(values[is_finite].min()), float(values[is_finite].max())) if is_finite.any() else (0.0, 0.0)
+    low, high = 0.0, 0.0
+    if is_finite.any():
+        low, high = float(values[is_finite].min()), float(values[is_finite].max())
     step = (high - low) / 65534
     codes = np.full(values.shape, _MISSING, dtype="<i2")
     if step > 0:

@@ -89,7 +89,7 @@ def _script_json(value: Any) -> Markup:
 def parse_page_path(path: str | os.PathLike[str], *, card: bool = True) -> Path:
     """Convert the path of a page to a Path, and check its suffix; raise InputError for any other suffix.
 
-    A page ends in .html, .htm or .pdf, and if `card` is True, also in .png, a picture that sums up the page.
+    Pages end in .html, .htm or .pdf. If `card` is True, .png is accepted, too, for a picture that sums up the page.
     """
     suffixes = _SUFFIXES if card else _SUFFIXES[:-1]
     if Path(path).suffix.lower() not in suffixes:
@@ -100,7 +100,7 @@ def parse_page_path(path: str | os.PathLike[str], *, card: bool = True) -> Path:
 def write(path: str | os.PathLike[str], page: str) -> Path:
     """Write a page (HTML) to a file atomically, as UTF-8, or as a PDF if the name ends in .pdf; return the path.
 
-    Raises InputError if it cannot be written, MissingExtra if no program for printing a PDF is installed.
+    Raises InputError if the file cannot be written, MissingExtra if no program for printing a PDF is installed.
     """
     if Path(path).suffix.lower() == ".pdf":
         print_page(page, path)

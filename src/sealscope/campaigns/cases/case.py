@@ -39,10 +39,12 @@ _NOT_IN_ROWS = (
 class CaseInputs:
     """The inputs of one record of a campaign.
 
-    `use`: `calibrate` if the record sets thresholds, `judge` if verdicts are given on it; `leak_lpm` [L/min]: mean
-    flow of the leak after the plan's onset, 0 for none; `law`: relation of the leak's flow and pressure; `fault`:
-    another fault as text, "" for none; `levels`: value (level) of each factor of the plan; `replicate`: number of the
-    record among those with the same levels.
+    - `use`: `calibrate` if thresholds are set from the record, `judge` if it is to be judged
+    - `leak_lpm` [L/min]: mean flow of the leak after the plan's onset, 0 for none
+    - `law`: relation of the leak's flow and pressure
+    - `fault`: text of a fault other than this leak, "" for none
+    - `levels`: value (level) of each factor of the plan
+    - `replicate`: number of the record, from 0, among those that agree in all other inputs
     """
 
     id: str
@@ -59,8 +61,8 @@ class CampaignCase(CaseInputs):
     """One record to simulate and judge.
 
     `machine_seed`: seed by which the record's machine is drawn from the plan's profile; `noise_seed`: seed of the
-    sensors' noise. `id` and the seeds are computed from a hash of the record's inputs and of those that all records of
-    the plan share.
+    sensors' noise. The seeds and `id` are computed from a hash of the record's own inputs and of the inputs that all
+    records of the plan share (`shared_inputs`).
     """
 
     machine_seed: int
@@ -84,7 +86,7 @@ def profile_key(name: str) -> str:
 
 
 def shared_inputs(plan: SimulatedPlan) -> dict[str, Any]:
-    """Collect the inputs that all records of a plan share: rig and profile (as hashes), length, onset and base seed."""
+    """Collect the inputs that all records of a plan share: hashes of rig and profile, length, onset and base seed."""
     return {
         "rig": digest({name: repr(value) for name, value in plan.rig.present_values().items() if name not in _PRIORS}),
         "profile": profile_key(plan.profile) if plan.profile else "",
@@ -112,9 +114,11 @@ def _level_digests(plan: SimulatedPlan) -> dict[str, dict[str, str]]:
 def list_cases(plan: SimulatedPlan) -> list[CampaignCase]:
     """List all cases of a plan, one for each record.
 
-    The records of a group are assigned to the combinations of the factors' levels one after the other, in cycles.
+    Successive records of a group get successive combinations of the factors' levels. After the last combination the
+    first one follows again, with the next number `replicate`.
     """
-    cells = [dict(zip(plan.factors, levels, strict=True)) for levels in itertools.product(*plan.factors.values())]
+    combinations = itertools.product(*plan.factors.values())
+    cells = [dict(zip(plan.factors, levels, strict=True)) for levels in combinations]
     shared = shared_inputs(plan)
     digests_by_factor = _level_digests(plan)
     cases = []
@@ -142,17 +146,17 @@ def list_cases(plan: SimulatedPlan) -> list[CampaignCase]:
 
 
 def interleave_cases(cases: Sequence[CampaignCase]) -> list[CampaignCase]:
-    """Reorder the cases of a campaign, with each kind of case spread evenly over the list.
+    """Reorder the cases of a campaign, with each group of the plan spread evenly over the list.
 
-    Cases are of one kind if they have the same use, leak, law of the leak, and fault. A campaign that is ended early
-    then has each kind in nearly its planned proportion.
+    A group has the same use, leak, law of the leak, and fault. If a campaign is ended early, the completed cases are
+    from all groups, in nearly the planned proportions.
     """
-    kinds = [(case.use, case.leak_lpm, case.law, case.fault) for case in cases]
-    n_total, n_listed = Counter(kinds), Counter[Any]()
-    positions = []  # of each case within its kind, from 0 to 1
-    for kind in kinds:
-        positions.append((n_listed[kind] + 0.5) / n_total[kind])
-        n_listed[kind] += 1
+    groups = [(case.use, case.leak_lpm, case.law, case.fault) for case in cases]
+    n_total, n_listed = Counter(groups), Counter[Any]()
+    positions = []  # of each case within its group, from 0 to 1
+    for group in groups:
+        positions.append((n_listed[group] + 0.5) / n_total[group])
+        n_listed[group] += 1
     return [cases[k] for k in sorted(range(len(cases)), key=positions.__getitem__)]
 
 
@@ -160,7 +164,8 @@ def iter_sources() -> Iterator[Path]:
     """Yield the package's source files on which the result of a record may depend."""
     for path in sorted(_PACKAGE.rglob("*")):
         name = path.relative_to(_PACKAGE).as_posix()
-        if path.suffix in (".py", ".toml") and not f"{name}/".startswith(tuple(f"{part}/" for part in _NOT_IN_ROWS)):
+        is_left_out = any(f"{name}/".startswith(f"{part}/") for part in _NOT_IN_ROWS)
+        if path.suffix in (".py", ".toml") and not is_left_out:
             yield path
 
 

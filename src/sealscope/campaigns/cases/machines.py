@@ -20,17 +20,17 @@ from sealscope.simulation.leaks import Leak, opening_from
 from sealscope.simulation.targets_and_loads import command_or_target, parse_force
 from sealscope.units import LITRE_PER_MINUTE
 
-#: Length [s] of the run in which a leak's coefficient is found; two periods of the slowest of the thesis's commands.
+#: Length [s] of the run in which a leak's coefficient is found: over two periods of the thesis's slowest command.
 SIZING_SECONDS = 13.0
-#: Command of a plan without profile and without commands: that of the thesis.
+#: Command of a plan without profile and without commands, as in the thesis [V]: 3 sin(4 t).
 USUAL = Sine(3.0, 4.0)
 
 
 def case_leaks(plan: SimulatedPlan, case: CampaignCase) -> tuple[Leak, ...]:
     """Build the leaks of a case, which open at the plan's onset.
 
-    Their size is the planned mean flow; the coefficient that gives it is not yet known. A `mixture` gives two leaks
-    with half of the flow each. Returns () for a case without a leak.
+    A leak states its planned mean flow, but not yet the leak coefficient that gives this flow. The law `mixture` gives
+    two leaks with half of the flow each. Returns () for a case without a leak.
     """
     if not case.leak_lpm:
         return ()
@@ -40,11 +40,11 @@ def case_leaks(plan: SimulatedPlan, case: CampaignCase) -> tuple[Leak, ...]:
 
 
 def experiment_with_flow_leak(plan: SimulatedPlan, case: CampaignCase, profile: Profile | None = None) -> Experiment:
-    """Build the experiment of a case with its leak given by the mean flow, as the leak coefficient is not yet known.
+    """Build the experiment of a case, whose leak states its mean flow but not yet its coefficient (`case_leaks`).
 
     The machine is drawn from the plan's profile with the seed of the case, or is the plan's rig if there is no
-    profile. The levels (values) of the plan's factors in this case replace its parameters, command, controller and
-    load. `profile`: the plan's profile, if it is already loaded.
+    profile. The levels (values) of the plan's factors in this case replace the machine's parameters, command,
+    controller and load. `profile`: the plan's profile, if it is already loaded.
     """
     if plan.profile:
         family = str(case.levels.get(FAMILY, ""))
@@ -64,7 +64,7 @@ def experiment_with_flow_leak(plan: SimulatedPlan, case: CampaignCase, profile: 
         elif name == LOAD:
             machine = replace(machine, load=parse_force(str(level)))
         elif name == "closed":
-            # a level of 0 leaves out `line.orifices`: then the plan's rig, not the drawn machine, states it
+            # for a level of 0 `throttle_values` lacks `line.orifices`, which is then taken from the plan's rig
             values |= {"line.orifices": str(plan.rig["line.orifices"])} | throttle_values(level)
         elif name != FAMILY:
             values[name] = level
@@ -80,14 +80,14 @@ def case_experiment(plan: SimulatedPlan, case: CampaignCase) -> Experiment:
 
 
 def _expand_names(values: Mapping[str, str | float]) -> dict[str, str | float]:
-    """Replace short parameter names by full ones; of two entries for the same parameter the later one counts."""
+    """Replace short parameter names by full ones; if two entries are for the same parameter, the later one counts."""
     return {resolve_name(name, declared_names()): value for name, value in values.items()}
 
 
 def sizing_experiment(experiment: Experiment) -> Experiment:
-    """Shorten an experiment to `SIZING_SECONDS`, with its leaks open from the start.
+    """Shorten an experiment to at most `SIZING_SECONDS`, with its leaks open from the start.
 
-    In this short run the coefficients that give the planned mean flows of the leaks are found.
+    This short run is used to find the leak coefficients that give the planned mean flows.
     """
     return replace(
         experiment,
@@ -97,10 +97,10 @@ def sizing_experiment(experiment: Experiment) -> Experiment:
 
 
 def size_leaks_on_short_run(experiment: Experiment) -> tuple[Leak, ...]:
-    """Find the coefficients of an experiment's leaks that give their planned mean flows; return the leaks with them.
+    """Find the coefficients of an experiment's leaks that give their planned mean flows; return the completed leaks.
 
-    They are found in a short run (`sizing_experiment`), because on the whole record it would have to be simulated two
-    or three times. The true mean flow of the record may differ a little; it is stated in the record's row.
+    The search simulates two or three times, so it uses a short run (`sizing_experiment`) and not the whole record. The
+    true mean flow of the record may therefore differ a little; the record's row states it.
     """
     if not experiment.leaks:
         return ()

@@ -31,7 +31,7 @@ ProgressCallback = Callable[[int, int, int], None]
 
 
 def _iter_files(plan: RecordedPlan, folder: Path) -> Iterator[tuple[RecordingSet, Path]]:
-    """Yield each file of a plan of recordings, with the entry of the plan (a set of recordings) to which it belongs.
+    """Yield pairs of a set of recordings and one of its files, for all sets of a plan.
 
     `folder`: folder in which the files are searched. Raises InputError if a set has no files.
     """
@@ -48,8 +48,8 @@ def judge_recordings(plan: RecordedPlan, folder: Path, progress: ProgressCallbac
     """Judge each recording of a plan in a folder, and return the rows with the results in the order of their ids.
 
     A recording that cannot be judged gives a row with its error. `progress`: called after each recording with the
-    numbers of recordings done, of all, and of failed ones. Raises InputError if a file is in two sets, or a set has
-    no files.
+    numbers of recordings done, of all recordings, and of failed ones. Raises InputError if a file is in several sets,
+    or a set has no files.
     """
     files = list(_iter_files(plan, folder))
     for path, count in Counter(path for _, path in files).items():
@@ -80,10 +80,10 @@ def _stroke_direction(recording: Recording) -> str:
 def _judge_file(plan: RecordedPlan, recordings: RecordingSet, path: Path, name: str) -> CaseRow:
     """Read and judge one recording, and return the row with its results, or with the error that prevented them.
 
-    `recordings`: set to which it belongs; `name`: its path within the folder, from which the id of the row is
-    computed.
+    `recordings`: set to which the recording belongs; `name`: path of the recording within the folder, from which the id
+    of the row is computed.
     """
-    levels = {"set": recordings.label or recordings.files, STROKE: "unknown"}
+    levels = {"set": recordings.label or recordings.files, STROKE: "unknown"}  # the stroke is filled in once known
     make_row = partial(
         CaseRow,
         id=hashlib.sha256(os.fsencode(name)).hexdigest()[:16],

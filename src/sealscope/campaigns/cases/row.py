@@ -20,24 +20,25 @@ from sealscope.storage.plain_values import convert_type
 PISTON_LEAK, NO_CAUSE = "piston leak", "none"
 #: Factor of recordings: the direction of the piston's stroke.
 STROKE = "stroke"
-#: By the cause that a detector names if its channels cannot distinguish several causes: those causes.
+#: Names of ambiguous causes, for detectors whose channels cannot distinguish several causes, with these causes.
 _AMBIGUOUS_CAUSES = {
     "piston or pump leak": (PISTON_LEAK, "pump leak"),
     "internal or external leak": (PISTON_LEAK, "pump leak", "external leak"),
     **joint_causes(),
 }
-#: By detector: its score, None for `cannot tell`, and the onset [s] that it estimates, None for none.
+#: By detector, the pair of its score, None for `cannot tell`, and the onset [s] that it estimates, None for no onset.
 Scores = Mapping[str, tuple[float | None, float | None]]
 
 
 @dataclass(frozen=True)
 class Statement:
-    """The statement of a detector on a record, i.e. the fields of `Evidence` that are stored with the record.
+    """The stored statement of a detector on a record: fields of `Evidence`, None if not stated or not finite.
 
-    `verdict`: `leak`, `no leak` or `cannot tell`; `score`, `threshold`: the detector's statistic, and the value above
-    which it reports a leak; `onset_s` [s]: time at which the leak began; `leak_lpm` [L/min]: flow of the leak;
-    `onset_interval_s`, `leak_interval_lpm`: their 95 % intervals; `cause`: cause that the detector names, a kind of
-    leak or another fault. A number is None if it is not stated or not finite.
+    - `verdict`: `leak`, `no leak` or `cannot tell`
+    - `score`, `threshold`: the detector's statistic, and the value above which the detector reports a leak
+    - `onset_s`, `onset_interval_s` [s]: time at which the leak began, and its 95 % interval
+    - `leak_lpm`, `leak_interval_lpm` [L/min]: flow of the leak, and its 95 % interval
+    - `cause`: cause that the detector names, a type of leak or another fault
     """
 
     verdict: Verdict
@@ -71,18 +72,18 @@ def expected_cause(fault: str) -> str:
 
 
 def duty_label(levels: Mapping[str, str | float]) -> str:
-    """Format the duty of a record, i.e. its command and its direction of stroke, as far as `levels` has them.
+    """Format the duty of a record, i.e. its command and its direction of stroke, if `levels` has them.
 
-    Scores are compared with a threshold from records of the same duty only.
+    A score is compared only with a threshold from records of the same duty.
     """
     return ", ".join(str(levels[name]) for name in (COMMAND, STROKE) if name in levels)
 
 
 def matches_cause(named: str, true_cause: str) -> bool:
-    """Return True if the cause that a detector names is the true one, or an ambiguous one that includes it.
+    """Return True if the cause that a detector names is the true cause, or an ambiguous cause that includes it.
 
-    "piston or pump leak" includes both kinds of leak, "internal or external leak" also one to the outside, and a joint
-    cause each of its causes (`joint_causes`).
+    "piston or pump leak" includes these two leaks, "internal or external leak" also the external leak, and a joint cause
+    each of its causes (`joint_causes`).
     """
     return named == true_cause or true_cause in _AMBIGUOUS_CAUSES.get(named, ())
 
@@ -95,10 +96,11 @@ def finite_or_none(value: float | None) -> float | None:
 def named_cause(evidence: Evidence | Statement) -> str:
     """Determine the cause that a detector names: a leak of `LEAKS`, another fault, "none" or "cannot tell".
 
-    `LEAKS` has the causes for which the verdict is `leak`; an external leak alone is another fault. With the verdict
-    `leak` the result is `evidence.cause` if that is in `LEAKS`, else "piston leak". With the verdicts `no leak` and
-    `cannot tell` it is `evidence.cause` if that is another fault. Without such a fault it is "none" for `no leak`, and
-    "cannot tell" for `cannot tell`.
+    `LEAKS` has the causes for which the verdict is `leak`. An external leak counts as another fault. The result is
+
+    - for the verdict `leak`: `evidence.cause` if `LEAKS` has it, else "piston leak"
+    - for the other verdicts: `evidence.cause` if it is another fault, else "none" for `no leak` and "cannot tell" for
+      `cannot tell`
     """
     if evidence.verdict == "leak":
         return evidence.cause if evidence.cause in LEAKS else PISTON_LEAK
@@ -129,10 +131,11 @@ def error_text(error: Exception) -> str:
 class CaseRow(CaseInputs):
     """The stored result of one record: its inputs, and either scores or the error that prevented them.
 
-    `flow_lpm` [L/min]: simulated mean flow of the leak while it is open, None if it is not known; `scores`: by
-    detector, its score and the onset that it estimates; `statements`: by detector, its verdict and estimates, without
-    the scorers, which compute a score only; `error`: text of the error, None for none; `seconds`: processor time,
-    which differs between runs and is not part of the result.
+    - `flow_lpm` [L/min]: simulated mean flow of the leak while it is open, None if it is not known
+    - `scores`: by detector, its score and the onset that it estimates
+    - `error`: text of the error, None if there was no error
+    - `seconds`: processor time, which differs between runs and is not part of the result
+    - `statements`: by detector, its verdict and estimates; scorers, which only compute a score, have none
     """
 
     flow_lpm: float | None = None
@@ -142,7 +145,7 @@ class CaseRow(CaseInputs):
     statements: Mapping[str, Statement] = field(default_factory=dict)
 
     def score(self, detector: str) -> float | None:
-        """Return the score of the detector with a given name; None if it stated no score or has no result."""
+        """Return the score of a detector, given by its name; None if the detector has no result or stated no score."""
         return self.scores[detector][0] if detector in self.scores else None
 
     def as_dict(self) -> dict[str, Any]:

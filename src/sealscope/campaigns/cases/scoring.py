@@ -1,4 +1,4 @@
-"""Run the detectors of a plan on one record: their scores, and what they state of a leak."""
+"""Run the detectors of a plan on one record, and collect their scores and statements."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ def judge_record(
 ) -> tuple[Scores, dict[str, Statement]]:
     """Run each detector of a plan on a recording; return scores and statements by detector.
 
-    The first result has each detector's score and the onset [s] that it estimates. The second has what each detector
-    states; scorers, which compute a score only, are not in it. `split_s` [s]: time at which scorers split the
-    recording into two parts, None for its middle; `rig`: the rig that detectors may assume. Raises InputError if the
-    recording has a defect that rules out any verdict.
+    The scores are pairs of the detector's score and the onset [s] that it estimates. The statements have verdict and
+    estimates of each detector, without the scorers, which only compute a score. `split_s` [s]: time at which scorers
+    split the recording into two parts, None for its middle; `rig`: the rig that detectors may assume. Raises InputError
+    if the recording has a defect that rules out any verdict.
     """
     record = inspect_recording(recording, INSPECTED)
     if record.defect is not None:
@@ -70,9 +70,9 @@ def score_details(
 ) -> dict[str, tuple[float | None, float | None]]:
     """Compute the score of each scorer among the detectors `names`; return (score, None) by detector.
 
-    A scorer computes a score from wavelet details, but no verdict. The score is None if it cannot be computed; the
-    second value stands for the onset, which a scorer does not estimate. `split_rms`: RMS of the wavelet details of
-    both parts of the record; `views`: sets of channels, by the name that follows "@" in a detector's name.
+    A scorer computes a score from wavelet details, but no verdict. The score is None if it cannot be computed. The
+    second value is always None, because a scorer estimates no onset. `split_rms`: RMS of the wavelet details in both
+    parts of the record; `views`: sets of channels, by the name that follows "@" in a detector's name.
     """
     scores: dict[str, tuple[float | None, float | None]] = {}
     for name in names:
@@ -84,12 +84,11 @@ def score_details(
 
 
 def _score_over_threshold(statement: Statement) -> float | None:
-    """Compute a score of `diagnose` that can be compared between records: its score divided by its threshold.
+    """Compute the score of `diagnose` divided by its threshold, which can be compared between records.
 
-    The score alone cannot be compared, because another detector of `diagnose` may decide each record. If the threshold
-    is not > 0, the result is the score minus the threshold. Returns None if one of them is missing, if the verdict is
-    `cannot tell`, or if the detector explains the record by a cause that is not in `LEAKS`, such as a sensor fault or
-    an external leak. A record for which it names no cause has a score.
+    The detector that decides, and with it the scale of the score, may differ from record to record. If the threshold is
+    not positive, the result is the score minus the threshold. Returns None if the score or the threshold is missing, or
+    if the record has no ranking score: for the verdict `cannot tell`, and for a cause other than the leaks of `LEAKS`.
     """
     score, threshold = ranking_score(statement), statement.threshold
     if score is None or threshold is None:
@@ -104,6 +103,6 @@ def run_watch(recording: Recording, rig: Rig | str | os.PathLike[str], false_ala
     raises an alarm within the recording.
     """
     alarms_per_1000_hours = false_alarm * 3.6e6 / recording.duration  # 1000 hours are 3.6e6 s
-    watch = Watch(load_rig(rig), alarms_per_1000_hours, learn_hours=1000.0)
+    watch = Watch(load_rig(rig), alarms_per_1000_hours, learn_hours=1000.0)  # longer than any recording
     watch.update(recording)
     return watch.evidence

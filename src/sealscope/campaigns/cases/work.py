@@ -29,10 +29,7 @@ def run_case(plan: SimulatedPlan, case: CampaignCase, folder: Path | None = None
 
 
 def _simulate_and_judge(plan: SimulatedPlan, case: CampaignCase, folder: Path | None) -> CaseRow:
-    """Simulate the record of a case, write it into `folder` unless that is None, and judge it.
-
-    Errors of any kind are raised.
-    """
+    """Simulate and judge the record of a case, and return its row; the record is written into `folder` unless None."""
     simulated = simulate_experiment(case_experiment(plan, case))
     if folder is not None:
         from sealscope.recordings import write

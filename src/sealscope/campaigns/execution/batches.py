@@ -1,6 +1,6 @@
 """Simulate many cases of a plan side by side, and score them from the RMS of the wavelet details around the onset.
 
-The scores are computed by the same functions and from the same samples as those of a recording (`scorers.SplitRms`).
+The same functions compute the scores from the same samples as for a recording (`scorers.SplitRms`).
 A batch stores nothing else of a record, so a plan that needs more is refused. The solver's step of a case is chosen
 on short runs of machines with the same levels of the factors.
 """
@@ -39,16 +39,16 @@ from sealscope.simulation.targets_and_loads import loaded_rig_numbers
 BATCH_SIZE = 256
 #: Mode of rows from batches. Their noise differs from that of single runs, so the two are not combined.
 IN_BATCHES = "in batches"
-#: Number of machines on which the step of a cell (a combination of levels) is chosen, and the length [s] of their
-#: runs: three of the windows in which `integrate_run` checks its error.
+#: The solver's step of a cell (a combination of levels) is chosen on a few "scout" machines: their number, and the
+#: length [s] of their runs, three of the windows in which `integrate_run` checks its error.
 N_SCOUT_MACHINES, SCOUT_SECONDS = 4, 4.0
 
 
 def scored_bounds(plan: SimulatedPlan) -> IntArray:
     """Compute the usable samples before and after the planned onset, whose wavelet details scorers compare.
 
-    Returns an array (2, 2) with [begin, end) of the range before the onset and of that after it. Samples whose details
-    depend on the other side of the onset or on padding are left out, and so is the machine's start.
+    Returns an array (2, 2) with [begin, end) of the range before the onset and of the range after the onset. Samples
+    whose details depend on the other range or on padding are left out, and so is the machine's start.
     """
     rate = plan.rig.daq.sample_rate
     return split_bounds(round(plan.duration_s * rate), rate, round(plan.onset_s * rate))
@@ -57,9 +57,13 @@ def scored_bounds(plan: SimulatedPlan) -> IntArray:
 def check_plan(plan: SimulatedPlan, cases: Sequence[CampaignCase]) -> None:
     """Check that batches can simulate and score all cases of a plan; raise InputError otherwise.
 
-    All detectors must be scorers, which need only the RMS of wavelet details before and after the onset. The plan may
-    not keep recordings, and its leaks must have one law each. There must be usable samples on both sides of the onset,
-    no fault of a sensor, one sampling rate, and only runs that can be simulated side by side (`refuse_unbatchable`).
+    Batches need a plan with these properties:
+
+    - all detectors are scorers, which need only the RMS of wavelet details before and after the onset
+    - no recordings are kept, and both sides of the onset have usable samples (`scored_bounds`)
+    - each leak has a single law, and no sensor has a fault
+    - no factor changes the sampling rate, and the runs can be simulated side by side (`refuse_unbatchable`); only the
+      first case of each combination of levels is tested for this, unless its experiment cannot be built
     """
 
     def refusal(rule: str) -> InputError:
@@ -82,10 +86,11 @@ def check_plan(plan: SimulatedPlan, cases: Sequence[CampaignCase]) -> None:
         fault = parse_plan_fault(group.fault, plan.onset_s) if group.fault else None
         if fault is not None and fault.row.is_sensor_fault:
             raise refusal(f"no fault of a sensor, got {group.fault!r}")
-    for case in {repr(case.levels): case for case in reversed(cases)}.values():  # the first case of each cell
+    first_cases = {repr(case.levels): case for case in reversed(cases)}  # by combination of levels
+    for case in first_cases.values():
         try:
             experiment = experiment_with_flow_leak(plan, case)
-        except SealscopeError:  # the case's row will carry the error
+        except SealscopeError:  # the row of the case will state the error
             continue
         rate = plan.rig.daq.sample_rate
         if experiment.rate != rate:
@@ -97,9 +102,9 @@ def check_plan(plan: SimulatedPlan, cases: Sequence[CampaignCase]) -> None:
 
 
 def iter_batch_rows(plan: SimulatedPlan, cases: Sequence[CampaignCase], threads: int) -> Generator[CaseRow, None, None]:
-    """Simulate the cases of a plan batch by batch, and yield the row of each with its scores.
+    """Simulate the cases of a plan batch by batch, and yield a row with the scores for each case.
 
-    An error of a case is stored in its row. A row depends on its case only, not on the other cases of its batch.
+    An error of a case is stored in its row. A row depends only on its own case, not on the other cases of the batch.
     `threads`: number of threads of the simulation.
     """
     profile = load_profile(plan.profile) if plan.profile else None
@@ -120,10 +125,10 @@ def iter_batch_rows(plan: SimulatedPlan, cases: Sequence[CampaignCase], threads:
 
 
 def _run_batch(plan: SimulatedPlan, pairs: Sequence[tuple[CampaignCase, Experiment]], threads: int) -> list[CaseRow]:
-    """Simulate and score one batch of cases, given with their experiments, and return their rows.
+    """Simulate and score one batch of cases, and return their rows.
 
-    `pairs`: the cases, each with its experiment. If the batch fails, each half of it is run alone, and so on. In the
-    end only the cases that fail by themselves have a row with an error.
+    `pairs`: the cases, each with its experiment. If the batch fails, its two halves are run separately, and so on. In
+    the end only the cases that fail by themselves have a row with an error.
     """
     if not pairs:
         return []
@@ -132,7 +137,7 @@ def _run_batch(plan: SimulatedPlan, pairs: Sequence[tuple[CampaignCase, Experime
         experiments = _size_leaks([experiment for _, experiment in pairs], threads)
         batch = simulate_batch(experiments, bounds=bounds.ravel() / plan.rig.daq.sample_rate, threads=threads)
         for (case, _), rms, flow in zip(pairs, batch.rms, batch.mean_leak_lpm, strict=True):
-            # intervals 0 and 2 are the parts; 1 is the gap between them
+            # of the three intervals between bounds, 0 and 2 are the two parts, and 1 is the gap between them
             split_rms = SplitRms.from_squares(dict(zip(CHAMBERS, rms[:, [0, 2]] ** 2, strict=True)), bounds)
             scores = score_details(split_rms, plan.detectors, plan.views)
             rows.append(CaseRow.from_case(case, flow_lpm=float(flow) if case.leak_lpm else 0.0, scores=scores))
@@ -145,10 +150,10 @@ def _run_batch(plan: SimulatedPlan, pairs: Sequence[tuple[CampaignCase, Experime
 
 
 def _size_leaks(experiments: Sequence[Experiment], threads: int) -> list[Experiment]:
-    """Find the leak coefficients that give the planned mean flows, in short runs; return the experiments with them.
+    """Find the leak coefficients that give the planned mean flows, in short runs; return the completed experiments.
 
-    The solver's step of an experiment is shortened if it is too long for the leak. If a short run fails, the error is
-    raised, unless there is only one experiment: this is tried once more with a step that `integrate_run` chooses.
+    The solver's step of an experiment is shortened if it is too long to be stable with the leak. If a short run fails,
+    the error is raised. A single experiment is first tried once more, with a step that `integrate_run` chooses.
     """
     sized_experiments = list(experiments)
     leaky = [k for k, experiment in enumerate(experiments) if experiment.leaks]
@@ -163,6 +168,7 @@ def _size_leaks(experiments: Sequence[Experiment], threads: int) -> list[Experim
         coefficients = [leak.coefficient for leak in size_leaks_on_short_run(replace(experiments[0], step=None))]
     for k, coefficient in zip(leaky, coefficients, strict=True):
         experiment = with_leak_coefficient(experiments[k], coefficient)
+        # coefficients of a laminar leak and of an orifice
         G, C = (coefficient, 0.0) if experiment.leaks[0].law == "laminar" else (0.0, coefficient)
         limit = longest_step(loaded_rig_numbers(experiment.rig, experiment.load), G, C)
         if experiment.step is not None and experiment.step > limit:
@@ -176,16 +182,16 @@ def make_step_chooser(
 ) -> Callable[[CampaignCase, Experiment], float]:
     """Build the function that chooses the solver's step [s] of a case from the case and its experiment.
 
-    Finding the step for each case alone would take too long, so cases of a cell, i.e. a combination of the factors'
-    levels, share it. `N_SCOUT_MACHINES` machines are drawn for a cell; on short runs of each, `integrate_run` chooses
-    the longest step that passes its check of the error. The step of a case is the shortest of those found with the
+    A search for each case would take too long, so the cases of a cell, i.e. a combination of the factors' levels, share
+    the result. `N_SCOUT_MACHINES` scout machines are drawn for the cell. On a short run of each, `integrate_run`
+    chooses the longest step that passes its check of the error. A case gets the shortest of the steps chosen with the
     case's solver, limited to the longest stable step of the case's machine. It does not depend on the other cases.
     """
     shared = digest(shared_inputs(plan))
 
     @cache
     def cell_steps(*levels: tuple[str, str | float]) -> dict[str, float]:
-        """Compute the shortest step [s] that `integrate_run` chooses on machines drawn for a cell, by solver.
+        """Compute the shortest step [s] that `integrate_run` chooses on the scout machines of a cell, by solver.
 
         `levels`: pairs (factor, level), which define the cell. Machines that cannot be simulated are left out, so the
         mapping may lack a solver or be empty.
@@ -203,13 +209,13 @@ def make_step_chooser(
         return steps
 
     def choose_step(case: CampaignCase, experiment: Experiment) -> float:
-        """Choose the solver's step [s] of a case: that of its cell and solver, limited to the longest stable step.
+        """Choose the solver's step [s] of a case: the step of its cell, limited to the longest stable step.
 
-        If no machine drawn for the cell has this solver, the step is chosen on the experiment itself.
+        If no scout machine of the cell has the case's solver, the step is chosen on the case's experiment.
         """
         method = choose_method(experiment.rig, experiment.method)
         step = cell_steps(*case.levels.items()).get(method)
-        if step is None:  # no scout machine has this method
+        if step is None:
             _, step = _choose_method_and_step(experiment)
         stable_step = longest_step(loaded_rig_numbers(experiment.rig, experiment.load))
         limit = max(stable_step, LONGEST_STEP / MAX_STEP_REFINEMENT)
@@ -219,11 +225,12 @@ def make_step_chooser(
 
 
 def dividing_step(rate: float, limit: float) -> float:
-    """Compute the longest step 1/(n rate) [s] with a whole number n that is at most `limit` [s]; `rate` in Hz."""
+    """Compute the longest step [s] <= `limit` [s] that divides the interval 1/`rate` [s] into equal parts."""
     return 1.0 / (rate * steps_per_output(rate, limit))
 
 
 def _choose_method_and_step(experiment: Experiment) -> tuple[str, float]:
     """Choose the solver's method and step [s] by running the first `SCOUT_SECONDS` of an experiment without leaks."""
-    run = integrate_run(replace(experiment, duration=min(experiment.duration, SCOUT_SECONDS), leaks=()), ())
+    duration = min(experiment.duration, SCOUT_SECONDS)
+    run = integrate_run(replace(experiment, duration=duration, leaks=()), leaks=())
     return run.method, run.step

@@ -41,9 +41,9 @@ def run(
 
     `jobs`: number of processes, by default one per core and at most two per core, 1 for this process only; `cluster`:
     address of a Dask scheduler to use instead; `retry`: True to run failed cases again; `progress`: called with the
-    numbers of cases done, of all, and of failed ones; `task`: function that runs one case; `batch`: True to simulate
-    cases side by side (`batches`) with `jobs` threads; `trust`: True to run controllers that the plan names by file
-    or module, whose code may be hostile.
+    numbers of cases done, of all cases, and of failed ones; `task`: function that runs one case; `batch`: True to
+    simulate cases side by side (`batches`) with `jobs` threads; `trust`: True to run controllers that the plan names by
+    file or module, whose code may be hostile.
 
     The results depend neither on the process, nor on the order of the cases, nor on the other cases of a batch.
     Raises InputError for an untrusted controller, for a folder that has another campaign or is in use by another run,
@@ -84,10 +84,7 @@ def run(
 
 
 def _iter_rows(results: Generator[tuple[CampaignCase, CaseRow | None], None, None]) -> Generator[CaseRow, None, None]:
-    """Yield the row of each case from pairs of case and row.
-
-    A row of None means that the process of the case died; it is replaced by a row with that error.
-    """
+    """Yield the row of each pair of case and row; in place of None, a row with the error that its process died."""
     with closing(results):
         for case, row in results:
             yield row or CaseRow.from_case(case, error="the process that carried it out died")

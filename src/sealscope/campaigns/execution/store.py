@@ -85,7 +85,7 @@ def collect_row_inputs(plan: SimulatedPlan, mode: str = RUN_BY_RUN) -> dict[str,
 
 
 def _plug_ins(plan: SimulatedPlan) -> dict[str, str]:
-    """Collect the plug-in detectors that a plan runs; return a hash of the source of each, by its name.
+    """Collect the plug-in detectors that a plan runs, as a mapping of the detector's name to a hash of its source.
 
     A plan with `diagnose` runs all plug-ins.
     """
@@ -155,7 +155,7 @@ def read_head(folder: Path) -> dict[str, Any] | None:
             tree = parse_json(file.read(_MAX_HEAD_BYTES))
     except FileNotFoundError:
         return None
-    except InputError:
+    except InputError:  # also a ValueError, but its message already names the cause
         raise
     except (OSError, ValueError, RecursionError):
         tree = None

@@ -19,8 +19,8 @@ from sealscope.errors import InputError, MissingExtra
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
-#: Environment of a process: one thread for linear algebra, as there is a process per core, and no modules from the
-#: working folder, which may be hostile.
+#: Environment variables of a worker process. There is a process per core, so each uses one thread for linear algebra;
+#: it imports no modules from the working folder, which may be hostile.
 _ENVIRONMENT = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS", "PYTHONSAFEPATH"), "1"
 )
@@ -34,9 +34,8 @@ def iter_results(
     """Run `task` on each item in several processes, and yield pairs of item and result in the order of completion.
 
     `jobs`: number of processes to start, 1 for this process only; `cluster`: address of a Dask scheduler whose
-    workers are used instead. An item is taken from `items` when a process is free. Items and `task` are pickled,
-    `task` once per process. Processes ignore the keyboard interrupt; they end with the generator or with the parent
-    process.
+    workers are used instead. An item is taken from `items` when a worker can take it. Items and `task` are pickled.
+    Processes on this machine ignore the keyboard interrupt; they end with the generator or with the parent process.
 
     If a process dies, for example because it needs too much memory, its item is run once more, alone, after all
     others. If it dies again, the result is None. Exceptions of `task` are raised here. Raises MissingExtra if a
@@ -46,12 +45,15 @@ def iter_results(
     if jobs == 1 and cluster is None:
         yield from ((item, task(item)) for item in items)
         return
-    waiting, lost_items, is_retry = iter(items), list[Item](), False
+    waiting = iter(items)
+    lost_items: list[Item] = []  # whose process died
+    is_retry = False
     idle: list[Executor] = []
     busy: dict[Future[Result], tuple[Executor, Item]] = {}
     with _local_processes(task, jobs) if cluster is None else _cluster_workers(task, cluster) as pools:
         while True:
-            for item in islice(waiting, (1 if is_retry else pools.max_items) - len(busy)):
+            max_busy = 1 if is_retry else pools.max_items
+            for item in islice(waiting, max_busy - len(busy)):
                 pool = idle.pop() if idle else pools.start_pool()
                 try:
                     future = pools.submit(pool, item)
@@ -83,9 +85,9 @@ def iter_results_in_order(
 ) -> Iterator[tuple[Item, Result | None]]:
     """Run `task` on each item in `jobs` processes, and yield pairs of item and result in the order of the items.
 
-    The result is None if the process that ran it died twice (`iter_results`).
+    The result is None if the process of the item died twice (`iter_results`).
     """
-    results: dict[int, Result | None] = {}
+    results: dict[int, Result | None] = {}  # by number of the item; not yielded yet
     next_number = 0
     for (number, _), result in iter_results(partial(_run_numbered, task), enumerate(items), jobs):
         results[number] = result
@@ -97,9 +99,9 @@ def iter_results_in_order(
 class _Pools(NamedTuple):
     """Access to worker processes, on this machine or on a cluster.
 
-    `start_pool`: function that starts a pool of processes; `max_items`: largest number of items that may run or wait
-    in pools at a time; `submit`: function that gives an item to a pool and returns its future; `death`: exception
-    that the future raises if the process died.
+    `start_pool`: function that starts a pool of processes; `max_items`: largest number of items that run or wait in
+    all pools at a time; `submit`: function that gives an item to a pool and returns its future; `death`: exception
+    that the future raises if its process died.
     """
 
     start_pool: Callable[[], Executor]
@@ -112,8 +114,8 @@ class _Pools(NamedTuple):
 def _local_processes(task: Callable[[Any], Any], max_items: int) -> Iterator[_Pools]:
     """Provide worker processes of this machine, and end them when the context ends.
 
-    Each process is a pool of its own, because a process that dies breaks its whole pool. `task`: function that they
-    run on items; `max_items`: largest number of processes.
+    Each process is a pool of its own, because a process that dies breaks its whole pool. `task`: function that the
+    processes run on items; `max_items`: largest number of processes, each of which has one item at a time.
     """
     context = get_context("spawn")
     lifeline, parent_end = context.Pipe(duplex=False)
@@ -139,8 +141,8 @@ def _local_processes(task: Callable[[Any], Any], max_items: int) -> Iterator[_Po
 def _cluster_workers(task: Callable[[Any], Any], address: str) -> Iterator[_Pools]:
     """Provide the workers of a Dask scheduler as one pool.
 
-    `task`: function that they run on items; `address`: of the scheduler. Raises MissingExtra if Dask is not
-    installed, and InputError if the scheduler does not answer, has no workers, or a worker has another version of
+    `task`: function that the workers run on items; `address`: address of the scheduler. Raises MissingExtra if Dask is
+    not installed, and InputError if the scheduler does not answer, has no workers, or a worker has another version of
     Sealscope.
     """
     try:
@@ -167,12 +169,13 @@ def _cluster_workers(task: Callable[[Any], Any], address: str) -> Iterator[_Pool
         yield _Pools(lambda: pool, max_items, lambda pool, item: pool.submit(task, item), dask.KilledWorker)
 
 
-def _run_numbered(task: Callable[[Item], Result], numbered: tuple[int, Item]) -> Result:
-    """Run `task` on an item that is given as a pair (number, item), and return the task's result."""
-    return task(numbered[1])
+def _run_numbered(task: Callable[[Item], Result], numbered_item: tuple[int, Item]) -> Result:
+    """Run `task` on the item of a pair (number, item), and return the task's result."""
+    _, item = numbered_item
+    return task(item)
 
 
-#: The task of this worker process, set by `_initialise_worker`.
+#: The task of this worker process, as a list of one task, which `_initialise_worker` fills.
 _task: list[Callable[[Any], Any]] = []
 
 

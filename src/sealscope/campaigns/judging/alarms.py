@@ -23,16 +23,17 @@ ALL, ANY_LAW = "all", "any"
 class AlarmFractions:
     """Fractions of alarms, missing verdicts and correct statements of one detector on a group of records.
 
-    The group is defined by `leak_lpm` (0: no leak, nan: any size), `law`, `fault`, `family` and `levels`. `alarms`:
-    fraction with the verdict `leak`; `cannot_tell`: fraction with the verdict `cannot tell`, which includes the
-    records without a result; `failed`: number of records without a result. `coverage`: of the intervals stated for
-    the leak flow, fraction that contains the true flow. `named`: fraction of all records of the group on which the
-    detector raises an alarm and names the cause of the fault (`matches_cause`), None if it states no causes; it has a
-    meaning only for a group with a `fault`.
+    The group is defined by `leak_lpm` (0: no leak, nan: any size), `law`, `fault`, `family` and `levels`.
 
-    Results by size of the leak also have `false_alarm`, the fraction of leak-free records with an alarm, and
-    `per_hour`, the false alarms per operating hour. Both are None in other results and if there are no leak-free
-    records; `per_hour` is also None if the operating time is not known.
+    - `alarms`: fraction with the verdict `leak`
+    - `cannot_tell`: fraction with the verdict `cannot tell`, which includes the records without a result
+    - `failed`: number of records without a result
+    - `coverage`: of the intervals stated for the leak flow, fraction that contains the true flow
+    - `named`: fraction with an alarm that names the cause of the group's `fault` (`matches_cause`), without meaning for
+      a group without a fault; None if the detector states no verdicts of its own
+    - `false_alarm`: fraction of leak-free records with an alarm; `per_hour`: false alarms per operating hour. Both are
+      stated only in results by size of the leak, and are None if there are no leak-free records. `per_hour` is also
+      None if the operating time is not known.
     """
 
     detector: str
@@ -56,9 +57,9 @@ class AlarmFractions:
 
     @property
     def informedness(self) -> float:
-        """Fraction of alarms in the group minus `false_alarm` (Youden's J): 1 if perfect, 0 for mere guesses.
+        """Youden's J of a group with a leak: fraction of alarms minus `false_alarm`, 1 if perfect, 0 for mere guesses.
 
-        It is meant for a group of records with a leak, and nan if `false_alarm` is None.
+        It is nan if `false_alarm` is None.
         """
         return self.alarms.value - self.false_alarm.value if self.false_alarm else math.nan
 
@@ -67,7 +68,8 @@ class AlarmFractions:
 class Alarms:
     """The verdicts of all detectors, with methods that summarise the alarms among them.
 
-    `verdicts`: by detector, its verdict on each record; `confidence`: of the intervals of all fractions.
+    `verdicts`: by detector, its verdict on each record; `confidence`: confidence level of the intervals of all
+    fractions.
     """
 
     verdicts: Verdicts
@@ -75,7 +77,7 @@ class Alarms:
 
     def _with_references(self) -> Verdicts:
         """Collect the verdicts of all detectors, and of two references that always or never raise an alarm."""
-        rows = [record.row for record in next(iter(self.verdicts.values()), ())]
+        rows = [record.row for record in next(iter(self.verdicts.values()), ())]  # the same for all detectors
         references = {name: [JudgedRow(row, verdict, None) for row in rows]
                       for name, verdict in ((ALWAYS, "leak"), (NEVER, "no leak"))}  # fmt: skip
         return {**self.verdicts, **references}
@@ -85,8 +87,8 @@ class Alarms:
 
         The size is the planned mean flow, in the unit of the plan. Records with other faults are left out. Two
         reference detectors, which always or never raise an alarm, come last. `hours`: operating time of one record [h],
-        None to omit false alarms per hour. If there are no records with a leak, each detector has one result, with
-        alarms in 0 of 0 records.
+        None to omit false alarms per hour. If all records are leak-free, each detector has one result, with alarms in 0
+        of 0 records.
         """
         for name, records in drop_other_faults(self._with_references()).items():
             leak_free = [record for record in records if not record.size]
@@ -95,7 +97,8 @@ class Alarms:
             per_hour = None
             if false_alarm and hours:
                 per_hour = events_per_hour(false_alarm.count, hours * false_alarm.n, self.confidence)
-            for size, group in group_by(leaky or leak_free, lambda record: math.nan if pooled else record.size).items():
+            groups = group_by(leaky or leak_free, lambda record: math.nan if pooled else record.size)
+            for size, group in groups.items():
                 fractions = self._summarise(name, group, leak_lpm=size)
                 detected = fractions.alarms if leaky else self._proportion(())
                 yield replace(fractions, alarms=detected, false_alarm=false_alarm, per_hour=per_hour)
@@ -125,17 +128,19 @@ class Alarms:
     def by_family(self) -> Iterator[AlarmFractions]:
         """Yield each detector's fractions of alarms for each family of machines, size of leak and law of the leak.
 
-        A family is a group of machines that a plan's profile defines; the size of a leak is its planned mean flow, its
-        law the relation of flow and pressure. The results of all families together come first. A size that occurs with
-        several laws also has a result for all of them together. Records with faults other than a leak are left out. If
-        the records have no families, nothing is yielded.
+        A family is a group of machines that a plan's profile defines. The size of a leak is its planned mean flow; the
+        law is the relation of its flow and pressure. The results of all families together come first. A size that
+        occurs with several laws also has a result for all laws together, and leak-free records have only this result.
+        Records with faults other than a leak are left out. If the records have no families, nothing is yielded.
         """
         for name, records in drop_other_faults(self.verdicts).items():
             members = (record for record in records if FAMILY in record.row.levels)
             families = group_by(members, lambda record: str(record.row.levels[FAMILY]))
-            for family, family_records in {ALL: records, **families}.items() if families else ():
+            if not families:
+                continue
+            for family, family_records in {ALL: records, **families}.items():
                 for size, group in group_by(family_records, lambda record: record.size).items():
-                    laws = group_by(group, lambda record: record.row.law) if size else {}
+                    laws = group_by(group, lambda record: record.row.law) if size else {}  # size 0: leak-free
                     by_law = laws if len(laws) == 1 else {ANY_LAW: group, **laws}
                     for law, law_records in by_law.items():
                         yield self._summarise(name, law_records, family=family, leak_lpm=size, law=law)

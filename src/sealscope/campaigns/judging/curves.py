@@ -17,8 +17,8 @@ class DetectorPod:
     """One detector's probability of detection (POD) over the size of the leak, i.e. over its planned mean flow.
 
     `sizes`: detections at each size; `curve`: logistic curve fitted to hits and misses, None if it cannot be fitted;
-    `why`: reason why there is no curve. `proven`: smallest tested size from which on, at this and all larger tested
-    sizes, the lower confidence bound of the counted detections is at least 90 %; inf if there is none.
+    `why`: reason why there is no curve, "" if there is one. `proven`: smallest tested size such that, for it and for
+    all larger tested sizes, the lower confidence bound of the detected fraction is at least 90 %; inf if there is none.
     """
 
     detector: str
@@ -57,9 +57,11 @@ def iter_pods(verdicts: Verdicts, confidence: float) -> Iterator[DetectorPod]:
         leaky = [record for record in records if record.size > 0]
         if not leaky:
             continue
-        sizes, hits = [record.size for record in leaky], [record.alarm for record in leaky]
+        sizes = [record.size for record in leaky]
+        hits = [record.alarm for record in leaky]
         detections = detection_by_size(sizes, hits, confidence)
-        curve, why = None, ""
+        curve = None
+        why = ""
         try:
             curve = fit_hit_miss(sizes, hits)
         except InputError as error:
@@ -70,8 +72,9 @@ def iter_pods(verdicts: Verdicts, confidence: float) -> Iterator[DetectorPod]:
 def iter_rocs(verdicts: Verdicts, confidence: float) -> Iterator[SizeRoc]:
     """Yield ROC curves of each detector that has scores: for all leaks together, and for each planned mean flow.
 
-    `verdicts`: by detector, its verdict on each record. A record without a score counts as lower than all others. A
-    curve needs two records with a leak and two without. `confidence`: that of the curves' intervals.
+    `verdicts`: by detector, its verdict on each record; `confidence`: confidence level of the curves' intervals. A
+    record without a score counts as if its score were the lowest. A curve needs two records with a leak and two
+    without; if there are fewer, it is left out.
     """
     for name, records in verdicts.items():
         scores = [record.row.score(name) if record.row.error is None else None for record in records]

@@ -34,13 +34,18 @@ from sealscope.evaluation.thresholds import Promise
 class Judgement:
     """The statistics of a campaign's verdicts.
 
-    `thresholds`: thresholds of the scorers (detectors that only compute a score), set from a number `leak_free` of
-    leak-free records; `judged`: number of judged records that have a result; `failed`: rows with an error, on which
-    the verdict of every detector is `cannot tell`; `table`: alarms by size of the leak; `overall`: alarms of all
-    sizes together; `onsets`, `flows`, `causes`: errors of the onsets, leak flows and causes that detectors state;
-    `pods`: probability of detection over the size; `rocs`: ROC curves; `cells`, `faults`, `families`: alarms by
-    combination of the factors' levels, by other fault, and by family of machines; `achieved_flows`: by planned size
-    of the leak, mean and standard deviation of the simulated leak flow [L/min].
+    - `thresholds`: thresholds of the scorers (detectors that only compute a score)
+    - `leak_free`: number of leak-free records from which the thresholds are set, 0 if none is set
+    - `judged`: number of judged records that have a result
+    - `failed`: rows with an error, on which the verdict of every detector is `cannot tell`
+    - `table`, `overall`: fractions of alarms for each size of the leak, and for all sizes together
+    - `onsets`, `flows`: errors of the onsets and leak flows that detectors state
+    - `causes`: confusion matrices of the causes that detectors name
+    - `pods`: probability of detection over the size of the leak
+    - `rocs`: ROC curves
+    - `cells`, `faults`, `families`: fractions of alarms for each combination of the factors' levels, for each fault
+      other than a leak, and for each family of machines
+    - `achieved_flows`: by planned size of the leak, mean and standard deviation of the simulated leak flow [L/min]
     """
 
     thresholds: Thresholds
@@ -73,15 +78,17 @@ def judge(
 ) -> Judgement:
     """Collect the verdicts of all detectors on the rows with `use` "judge", and compute their statistics.
 
-    A detector states its verdict itself, or is a scorer: it computes a score only, which is compared with a threshold.
-    The thresholds are `limits`, by detector, if given; otherwise a scorer's fixed threshold, or one set from the
-    leak-free rows with the same command and stroke direction (`compute_thresholds`).
+    A detector states its verdict itself, or it is a scorer, whose score is compared with a threshold. Without a fixed
+    threshold, one is set from the leak-free rows with the same command and stroke direction (`compute_thresholds`).
+    Raises InputError if there is no row to judge, or too few leak-free rows to set a threshold.
 
-    `false_alarm`: wanted false-alarm probability; `promise`: "average" if that is kept on average over sets of
-    leak-free records, "bound" if the true one is at most `false_alarm` with the probability `confidence`
-    (`quantile_threshold`); `confidence`: also of all intervals; `onset_s` [s]: true onset of the leaks, None to compute
-    no errors of onsets; `hours`: operating time of a record, None to compute no false alarms per hour. Raises
-    InputError if there is no row to judge, or too few leak-free rows to set a threshold.
+    - `false_alarm`: wanted false-alarm probability
+    - `promise`: "average" if the thresholds keep it on average over sets of leak-free records, "bound" if they keep it
+      with the probability `confidence` (`quantile_threshold`)
+    - `confidence`: also the confidence level of all intervals
+    - `limits`: thresholds by detector, in place of all fixed and computed ones
+    - `onset_s` [s]: true onset of the leaks, None to compute no errors of onsets
+    - `hours`: operating time of a record, None to compute no false alarms per hour
     """
     judged = sorted((row for row in rows if row.use == "judge"), key=lambda row: row.id)
     if not judged:

@@ -1,4 +1,4 @@
-"""Compare what detectors state of a leak, its onset, flow and cause, with the truth."""
+"""Compare the onset, flow and cause of a leak that detectors state with the true ones."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from sealscope.evaluation.table import CANNOT_TELL, Confusion, confusion_matrix
 class StatedErrors:
     """Errors (estimate minus true value) of one detector's estimates on the records with one size of leak.
 
-    `leak_lpm`: size of the leak, i.e. its planned mean flow [L/min], 0 for leak-free records; `errors`: those of
-    estimated onsets [s], over the records with an alarm, or those of estimated leak flows [L/min], over all records.
+    `leak_lpm`: size of the leak, i.e. its planned mean flow [L/min], 0 for leak-free records; `errors`: errors of the
+    estimated onsets [s] on records with an alarm, or of the estimated leak flows [L/min] on all records.
     """
 
     detector: str
@@ -33,8 +33,8 @@ class StatedErrors:
 class NamedCauses:
     """The confusion matrix of one detector: how often it names each cause, for each true cause of a record.
 
-    The cause of a record without leak and fault is `none`. `covered`: fraction of records in which the detector names
-    the true cause, or an ambiguous cause that includes it.
+    The true cause of a record without leak and fault is "none". `covered`: fraction of records for which the detector
+    names the true cause, or an ambiguous cause that includes the true one.
     """
 
     detector: str
@@ -45,27 +45,26 @@ class NamedCauses:
 def onset_errors(verdicts: Verdicts, onset_s: float, confidence: float) -> Iterator[StatedErrors]:
     """Yield the errors [s] of the estimated onsets for each detector and each planned mean flow of the leak.
 
-    Only records with a leak and an alarm count; detectors that estimate no onset are skipped. `verdicts`: by detector,
-    its verdict on each record; `onset_s` [s]: true onset of all leaks. `confidence`: that of the errors' intervals.
+    Only records with a leak, an alarm and an estimated onset count. `verdicts`: by detector, its verdict on each
+    record; `onset_s` [s]: true onset of all leaks; `confidence`: confidence level of the errors' intervals.
     """
     for name, records in verdicts.items():
-        for size, group in group_by(
-            (record for record in records if record.size > 0 and record.alarm), attrgetter("size")
-        ).items():
-            estimates = [
-                (onset, onset_s, None if record.statement is None else record.statement.onset_interval_s)
-                for record in group
-                for _score, onset in [record.row.scores[name]]
-                if onset is not None
-            ]
+        detected = (record for record in records if record.size > 0 and record.alarm)
+        for size, group in group_by(detected, attrgetter("size")).items():
+            estimates = []
+            for record in group:
+                _score, onset = record.row.scores[name]
+                interval = None if record.statement is None else record.statement.onset_interval_s
+                if onset is not None:
+                    estimates.append((onset, onset_s, interval))
             yield from _iter_errors(name, size, estimates, confidence)
 
 
 def flow_errors(verdicts: Verdicts, confidence: float) -> Iterator[StatedErrors]:
     """Yield the errors of the estimated leak flows [L/min] for each detector and each planned mean flow.
 
-    `verdicts`: by detector, its verdict on each record. Detectors that estimate no flow are skipped. `confidence`: that
-    of the errors' intervals.
+    `verdicts`: by detector, its verdict on each record; `confidence`: confidence level of the errors' intervals.
+    Detectors that estimate no flow are skipped.
     """
     for name, records in verdicts.items():
         for size, group in group_by(records, attrgetter("size")).items():
@@ -80,30 +79,28 @@ def flow_errors(verdicts: Verdicts, confidence: float) -> Iterator[StatedErrors]
 def _iter_errors(
     detector: str,
     leak_lpm: float,
-    stated: Sequence[tuple[float | None, float, tuple[float, float] | None]],
+    estimates: Sequence[tuple[float | None, float, tuple[float, float] | None]],
     confidence: float,
 ) -> Iterator[StatedErrors]:
     """Yield the errors of one detector's estimates on the records of one planned mean flow `leak_lpm` [L/min].
 
-    `stated`: for each record (estimate, true value, interval), with None for a missing estimate or interval. Nothing is
-    yielded if all estimates are missing. `confidence`: that of the errors' intervals.
+    `estimates`: for each record (estimate, true value, interval), with None for a missing estimate or interval. Nothing
+    is yielded if all estimates are missing. `confidence`: confidence level of the errors' intervals.
     """
-    estimates = [math.nan if value is None else value for value, _, _ in stated]
-    if np.isfinite(estimates).any():
-        low, high = zip(
-            *((math.nan, math.nan) if interval is None else interval for _, _, interval in stated), strict=True
-        )
-        truth = [value for _, value, _ in stated]
-        yield StatedErrors(detector, leak_lpm, estimate_errors(estimates, truth, low, high, confidence))
+    values = [math.nan if value is None else value for value, _, _ in estimates]
+    if np.isfinite(values).any():
+        true_values = [true_value for _, true_value, _ in estimates]
+        intervals = [interval or (math.nan, math.nan) for _, _, interval in estimates]
+        low, high = zip(*intervals, strict=True)
+        yield StatedErrors(detector, leak_lpm, estimate_errors(values, true_values, low, high, confidence))
 
 
 def iter_cause_confusions(verdicts: Verdicts, confidence: float) -> Iterator[NamedCauses]:
     """Yield the confusion matrix of true and named causes for each detector that names causes.
 
-    `verdicts`: by detector, its verdict on each record. Nothing is yielded if no record has a fault other than a leak.
-    A record with a leak and another fault has two true causes and is left out. A record without a result counts as
-    `cannot tell`.
-    `confidence`: that of the fractions' intervals.
+    `verdicts`: by detector, its verdict on each record; `confidence`: confidence level of the fractions' intervals. A
+    record with a leak and another fault has two true causes and is left out. A record without a result counts as
+    `cannot tell`. Nothing is yielded if no record has a fault other than a leak.
     """
     for name, records in verdicts.items():
         single_cause_records = [record for record in records if not (record.size > 0 and record.row.fault)]

@@ -17,7 +17,7 @@ from sealscope.storage.csv_file import write_csv
 Value = str | float | int | None
 #: Values of one row by name of the column; every row of a table has the same columns.
 TableRow = dict[str, Value]
-#: Columns into which a proportion is written.
+#: Columns into which a proportion is written: `count` of the number `of` records, their fraction and its interval.
 _PROPORTION = ("count", "of", "fraction", "low", "high")
 
 
@@ -25,8 +25,8 @@ _PROPORTION = ("count", "of", "fraction", "low", "high")
 class PriorKnowledge:
     """The information that a detector is given before it judges a record.
 
-    `onset`: True if it knows the true onset of the leak; `channels`: the channels that it reads; `rig`: name of the
-    rig that it assumes, "" for none.
+    `onset`: True if the detector knows the true onset of the leak; `channels`: channels that the detector may read;
+    `rig`: name of the rig that the detector assumes, "" if it assumes no rig.
     """
 
     onset: bool
@@ -64,13 +64,14 @@ def resolve_attribute(source: Any, path: str) -> Any:
 
 
 def _build_cells(column: str, content: str, row: Any, factors: Sequence[str]) -> TableRow:
-    """Build the cells of one row of a table that one entry of `tables.toml` describes, by name of the column.
+    """Build those cells of a table's row that one entry of `tables.toml` describes, by name of the column.
 
-    `column`: name of the entry; `content`: its text, which is flags followed by the dotted path of an attribute of
-    `row`, such as "share alarms". The flag "share" means that the attribute is a proportion, which fills five columns
-    (count, number, fraction and its interval). With the flag "stated" too, they are empty for a proportion of no
-    records. The flag "size" means a size of leak, for which nan is written as "any". The path "levels" fills one column
-    for each of the plan's `factors`.
+    `column`: name of the entry; `content`: text of the entry, such as "share alarms": flags, and the dotted path of an
+    attribute of `row`. The path "levels" fills one column for each of the plan's `factors`. Flags:
+
+    - "share": the attribute is a proportion, which fills the five columns `_PROPORTION`; they are empty for None
+    - "stated", together with "share": the columns are also empty for a proportion of no records
+    - "size": the attribute is a size of leak, for which nan is written as "any"
     """
     *flags, path = content.split(" ")
     value = resolve_attribute(row, path)
@@ -88,9 +89,9 @@ def build_tables(
 ) -> dict[str, list[TableRow]]:
     """Build the tables of a judgement, with the columns that `tables.toml` lists, by name of the table.
 
-    The name is also that of the table's file. `unit`: unit of the leaks' sizes; `known`: by detector, the information
-    that it was given, None to leave out the columns for it; `part`: purpose of the plan, such as development or
-    judging.
+    The name of a table is also the name of its file. `unit`: unit of the leaks' sizes; `known`: by detector, the
+    information that it was given, None to leave out the columns with this information; `part`: purpose of the plan,
+    such as development or judging.
     """
     knowledge = {name: row.as_row() for name, row in (known or {}).items()}
     factors = list(dict.fromkeys(name for cell in judgement.cells for name in cell.levels))
@@ -138,8 +139,8 @@ def build_tables(
 def records_table(rows: Iterable[CaseRow], detectors: Sequence[str], unit: str = "L/min") -> list[TableRow]:
     """Build the table of all records, with their inputs, scores and statements, in the order of their ids.
 
-    Run times are left out, because they would differ between two runs of the same campaign. `detectors`: those whose
-    scores are included; `unit`: unit of the leak sizes, for the heads of columns.
+    Run times are left out, because they would differ between two runs of the same campaign. `detectors`: names of the
+    detectors whose scores are included; `unit`: unit of the leak sizes, for the heads of columns.
     """
     ordered = sorted(rows, key=lambda row: row.id)
     factors = list(dict.fromkeys(name for row in ordered for name in sorted(row.levels)))

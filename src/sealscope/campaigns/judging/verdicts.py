@@ -19,8 +19,8 @@ Thresholds = Mapping[tuple[str, str], Threshold]
 class JudgedRow(NamedTuple):
     """The result of a record (`row`) with the verdict of one detector on it.
 
-    `statement`: what the detector states of a leak, None for a scorer, which only computes a score, and for a record
-    without a result.
+    `statement`: verdict and estimates as the detector states them, None for a scorer, which only computes a score, and
+    for a record without a result.
     """
 
     row: CaseRow
@@ -34,7 +34,7 @@ class JudgedRow(NamedTuple):
 
     @property
     def flow_lpm(self) -> float:
-        """Simulated mean flow [L/min] of the true leak while open, or the planned one if it was not simulated."""
+        """Simulated mean flow [L/min] of the true leak while open, or the planned flow without a simulation."""
         return self.size if self.row.flow_lpm is None else self.row.flow_lpm
 
     @property
@@ -57,10 +57,11 @@ def compute_thresholds(
     """Compute the threshold of each scorer that needs one, for each duty with enough leak-free rows.
 
     The duty of a row is its command and stroke direction (`duty_label`). A row without a score (a record that could not
-    be scored) cannot raise an alarm, so it counts as the lowest score. `false_alarm`: wanted false-alarm probability.
-    With the `promise` "average" it is kept on average over sets of leak-free rows, with "bound" with the probability
-    `confidence`. Returns thresholds by (detector, duty). Raises InputError if no duty has enough rows for
-    `false_alarm`.
+    be scored) cannot raise an alarm, so it counts as the lowest score.
+
+    `false_alarm`: wanted false-alarm probability; `promise`: "average" if it is kept on average over sets of leak-free
+    rows, "bound" if it is kept with the probability `confidence`. Returns thresholds by (detector, duty). Raises
+    InputError if a scorer needs a threshold and no duty has enough rows for `false_alarm`.
     """
     scorers = [name for name in detectors if parse_detector_name(name).needs_threshold]
     leak_free: dict[str, list[CaseRow]] = {}
@@ -76,7 +77,7 @@ def compute_thresholds(
         for duty, group in leak_free.items():
             scores = [score for row in group if (score := row.score(name)) is not None]
             if scores and len(group) >= needed:
-                scores += [min(scores)] * (len(group) - len(scores))
+                scores += [min(scores)] * (len(group) - len(scores))  # for the rows without a score
                 thresholds[name, duty] = quantile_threshold(scores, false_alarm, confidence, promise)
     return thresholds
 
@@ -86,10 +87,10 @@ def collect_verdicts(
 ) -> dict[str, list[JudgedRow]]:
     """Collect the verdict of each detector on each row; return them by detector, in the order of `rows`.
 
-    If the detector states a verdict, this is used. Otherwise its score is compared with its limit in `limits`, or if
-    it has none there, with the threshold in `thresholds` for the row's duty: the verdict is `leak` if the score is
-    higher, else `no leak`. It is `cannot tell` if the record has no result, if there is no score, or if there is
-    neither limit nor threshold.
+    If the detector states a verdict, this verdict is used. Otherwise its score is compared with its limit in `limits`
+    or, if `limits` lacks the detector, with the threshold in `thresholds` for the row's duty: the verdict is `leak` if
+    the score is higher, else `no leak`. The verdict is `cannot tell` if the record has no result, if there is no score,
+    or if there is neither limit nor threshold.
     """
 
     def judge_row(row: CaseRow, detector: str) -> JudgedRow:

@@ -32,10 +32,11 @@ ALL_CHANNELS = tuple(name for name in CHANNEL_UNITS if name != "q_leak")
 class PlanDetector:
     """A detector that a plan names, such as "diagnose @ pressures", split into its parts.
 
-    `name`: the full name; `base`: the part before "@", which is the name of a scorer or of a registered detector,
-    `diagnose`, or `watch` for the continuous watch of a machine; `view`: the part after "@", which names the set of
-    channels that the detector may use, "" if there is none; `scorer`: the scorer, a rule that computes only a score to
-    be compared with a threshold; None for a detector that states verdicts itself.
+    - `name`: the full name
+    - `base`: the part before "@": the name of a scorer or of a registered detector, `diagnose`, or `watch` for the
+      continuous watch of a machine
+    - `view`: the part after "@", which names the set of channels that the detector may use, "" if there is no "@"
+    - `scorer`: the scorer, a rule that only computes a score; None for a detector that states verdicts itself
     """
 
     name: str
@@ -45,7 +46,7 @@ class PlanDetector:
 
     @property
     def needs_threshold(self) -> bool:
-        """True if the detector states only a score, whose threshold must be set from leak-free records."""
+        """True if the detector is a scorer without a fixed threshold, so that leak-free records must set it."""
         return self.scorer is not None and self.scorer.threshold is None
 
 
@@ -56,9 +57,7 @@ def parse_detector_name(name: str) -> PlanDetector:
     Names of detectors or views that do not exist are accepted; `check_detector` refuses them.
     """
     base, _, view = name.partition(_VIEW)
-    if base in SCORERS:
-        return PlanDetector(name, base, view, SCORERS[base])
-    return PlanDetector(name, base, view)
+    return PlanDetector(name, base, view, SCORERS.get(base))
 
 
 def check_detector(name: str, views: Views) -> None:
@@ -74,7 +73,7 @@ def check_detector(name: str, views: Views) -> None:
     names = [DIAGNOSE, WATCH, *detectors()]
     if parsed.scorer is not None or parsed.base in names:
         return
-    near = nearest(name.partition(_VIEW)[0], [*SCORERS, *names], share=0.6)
+    near = nearest(parsed.base, [*SCORERS, *names], share=0.6)
     hint = f"; did you mean {near[0]!r}?" if near else ""
     raise InputError(
         f"a detector must be one of {', '.join(names)}, or a scorer's name such as 'd3 of p_A fell', got {name!r}{hint}"

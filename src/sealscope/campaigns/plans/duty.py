@@ -1,7 +1,7 @@
 """Check and parse the texts in a plan: commands, controllers, loads, closed throttles and faults.
 
-The texts have the form of the options of `sealscope simulate`: `command` that of `--command` (a voltage, or a target
-of the piston's position), `controller` that of `--controller`, `load` that of `--load`.
+A text has the same form as the option of `sealscope simulate` with the same name, such as `--command` (a voltage, or
+a target of the piston's position), `--controller` or `--load`.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ _TARGET_CHECK_RATE = 50.0
 def check_duty(name: str, level: str | float, rig: Rig, duration: float) -> None:
     """Check a level (value) of a plan's factor `command`, `controller` or `load`; raise InputError if it is invalid.
 
-    `name`: the factor. A command that is a target of the piston's position must stay within the rig's stroke during
-    the `duration` [s] of a record. A built-in controller must be one that can be built for the rig; of others, only
-    the form of the name is checked.
+    `name`: the factor; `duration` [s]: length of a record, during which a command that is a target of the piston's
+    position must stay within the rig's stroke. A built-in controller must fit the rig. Of any other controller, only
+    the form of its name is checked.
     """
     examples = {COMMAND: "'3 sin(4t)' or 'position 50 mm sin(2t)'", CONTROLLER: "'pi'", LOAD: "'2 kN'"}
     if not isinstance(level, str):
@@ -41,14 +41,15 @@ def check_duty(name: str, level: str | float, rig: Rig, duration: float) -> None
     elif name == LOAD:
         parse_force(level)
     elif isinstance(command := command_or_target(level), Position):
-        check_target(command, np.arange(0.0, duration, 1.0 / _TARGET_CHECK_RATE), rig.cylinder.L / 2)
+        times = np.arange(0.0, duration, 1.0 / _TARGET_CHECK_RATE)
+        check_target(command, times, rig.cylinder.L / 2)  # the position is 0 at mid-stroke
 
 
 def check_controllers(plan: SimulatedPlan, trust: bool) -> None:
-    """Check that every controller of a plan is trusted and can be built; raise InputError otherwise.
+    """Check that every controller of a plan is trusted, and build those that are not built in.
 
     A plan may be hostile, so code that it names (`FILE.py:NAME`, `MODULE:NAME`) is run only if `trust` is True.
-    Built-in and installed controllers are always trusted.
+    Built-in and installed controllers are always trusted. Raises InputError if one is untrusted or cannot be built.
     """
     names = [str(level) for level in plan.factors.get(CONTROLLER, ())]
     if plan.profile:
@@ -71,11 +72,11 @@ def find_voltage_command(commands: tuple[str | float, ...]) -> str | None:
 
 
 def throttle_values(level: str | float) -> dict[str, str | float]:
-    """Compute the rig's parameters that close the throttles of both lines by the fraction `level` of their area.
+    """Compute the parameters of a rig whose throttles, one in each line, are closed by a fraction of their area.
 
-    `level`: a number or a text, such as 0.25 or '25 %'. Returns the values by name of the parameter. At a level above 0
-    they include `line.orifices`, which gives the rig throttles. Raises InputError for a level below 0, or of 100 % and
-    more.
+    `level`: the fraction as a number or a text, such as 0.25 or '25 %'. Returns values by name of the parameter. If the
+    fraction is above 0, they include `line.orifices`, because the rig must have throttles. Raises InputError for a
+    negative fraction, or one of 100 % or more.
     """
     fraction = parse_quantity(level, "1") if isinstance(level, str) else float(level)
     if not 0.0 <= fraction < 1.0:
@@ -87,8 +88,8 @@ def throttle_values(level: str | float) -> dict[str, str | float]:
 def parse_plan_fault(text: str, onset_s: float) -> Fault:
     """Parse the text of a fault other than a piston leak, such as "pump leak x3".
 
-    It starts at `onset_s` [s] unless the text states a time itself ("... from 20 s"). Raises InputError if the text
-    names no fault.
+    The fault starts at `onset_s` [s] unless the text states a time itself, as in "pump leak x3 from 20 s". Raises
+    InputError if the text names no fault.
     """
     has_time = any(f" {word} " in f" {text} " for word in ("from", "growing"))
     fault = parse_fault(text if has_time else f"{text} from {onset_s:g} s")

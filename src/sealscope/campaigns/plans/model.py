@@ -27,7 +27,7 @@ _MAX_NAME_LENGTH = 80
 
 
 def _quantity_validator(unit: str) -> BeforeValidator:
-    """Build a pydantic validator that converts a text such as '20 s' to a number in `unit`, and keeps numbers."""
+    """Build a pydantic validator that converts a text such as '20 s' to a number in `unit`; numbers stay unchanged."""
     return BeforeValidator(lambda value: parse_quantity(value, unit) if isinstance(value, str) else value)
 
 
@@ -38,21 +38,21 @@ def _validate_file_name(name: str) -> str:
     return name
 
 
-def _validate_pattern(files: str) -> str:
+def _validate_pattern(pattern: str) -> str:
     """Check a pattern of file names, and return it; raise ValueError if it is invalid.
 
-    It must be relative and without "..", and may have one `**`, which must be a whole part of the path.
+    The pattern must be a relative path without "..". One component of the path may be `**`, for any subfolders.
     """
-    parts = Path(files).parts
-    if not parts or Path(files).is_absolute() or ".." in parts:
+    parts = Path(pattern).parts
+    if not parts or Path(pattern).is_absolute() or ".." in parts:
         raise ValueError("must be a pattern within the folder")
-    if "\0" in files or any("**" in part and part != "**" for part in parts) or files.count("**") > 1:
+    if "\0" in pattern or any("**" in part and part != "**" for part in parts) or pattern.count("**") > 1:
         raise ValueError("must be a pattern of names, with ** once at most")
-    return files
+    return pattern
 
 
 def _validate_level(value: Any) -> Any:
-    """Check that a level, a value of a factor, is a text or a finite number, and return it; else raise ValueError."""
+    """Return a level (a value of a factor) unchanged; raise ValueError unless it is a text or a finite number."""
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
     if isinstance(value, str) or (is_number and math.isfinite(value)):
         return value
@@ -103,10 +103,12 @@ class RecordGroup(_TomlTable):
     """A group of simulated records with the same leak and fault, spread evenly over the conditions of the plan.
 
     The conditions are all combinations of the levels (values) of the plan's factors, such as command and load.
-    `count`: number of records; `use`: `calibrate` for leak-free records from which thresholds are set, `judge` for
-    records on which verdicts are given; `leak_lpm` [L/min]: mean flow of the leak after the plan's onset, 0 for none;
-    `law`: its relation of flow and pressure, `mixture` for half of the flow by each of the other laws; `fault`:
-    another fault as text, "" for none.
+
+    - `count`: number of records
+    - `use`: `calibrate` for leak-free records from which thresholds are set, `judge` for records to be judged
+    - `leak_lpm` [L/min]: mean flow of the leak after the plan's onset, 0 for none
+    - `law`: relation of the leak's flow and pressure; a `mixture` is half `laminar` flow and half `orifice` flow
+    - `fault`: text of a fault other than this leak, "" for none
     """
 
     count: Annotated[Count, Field(ge=1)]
@@ -139,13 +141,15 @@ class _Plan(_TomlTable):
 class _JudgedPlan(_Plan):
     """The fields that plans of simulated records and plans of recordings have in common.
 
-    `false_alarm`: wanted false-alarm probability of each detector; `promise`: "average" if a threshold set from
-    leak-free records keeps it on average over sets of such records, "bound" if it keeps it with the probability
-    `confidence` (`quantile_threshold`); `detectors`: names of the detectors to evaluate, such as "diagnose @
-    pressures"; `unit`: unit of the leaks' sizes; `views`: sets of channels, by the name that follows the "@" in a
-    detector's name; `channels`: channels of the detectors without "@", None for the usual ones; `assume`: name or file
-    of the rig that detectors may assume, None for the default of the plan's type; `assume_set`: values that replace
-    some parameters of this rig.
+    - `false_alarm`: wanted false-alarm probability of each detector
+    - `promise`: "average" if thresholds keep this probability on average over sets of leak-free records, "bound" if
+      they keep it with the probability `confidence` (`quantile_threshold`)
+    - `detectors`: names of the detectors to evaluate, such as "diagnose @ pressures"
+    - `unit`: unit of the leaks' sizes
+    - `views`: sets of channels, by the name that follows the "@" in a detector's name
+    - `channels`: channels of the detectors without "@", None for all but the flow meter of the leak
+    - `assume`: name or file of the rig that detectors may assume, None for the default of the plan's type
+    - `assume_set`: values that replace some parameters of this rig
     """
 
     false_alarm: Fraction = 0.01
@@ -157,13 +161,13 @@ class _JudgedPlan(_Plan):
     assume: Text | None = None
     assume_set: Values = field(default_factory=dict)
 
-    def _load_assumed(self, rig: Rig | None) -> Rig | None:
-        """Load the rig that detectors may assume, with the parameter values `assume_set` of the plan.
+    def _load_assumed(self, default: Rig | None) -> Rig | None:
+        """Load the rig `assume` of the plan, or else take `default`, and replace parameters by the plan's `assume_set`.
 
-        It is the rig named by `assume` or, without this entry, the argument `rig`. If both are None, it is the packaged
-        rig `thesis` where `assume_set` has values, and otherwise None.
+        If there is neither rig, the packaged rig `thesis` is used for the values in `assume_set`; without such values,
+        the result is None.
         """
-        rig = rig if self.assume is None else load_rig(self.assume)
+        rig = default if self.assume is None else load_rig(self.assume)
         if not self.assume_set:
             return rig
         return (rig or load_rig("thesis")).with_overrides(self.assume_set, source="assumed by the plan")
@@ -173,16 +177,21 @@ class _JudgedPlan(_Plan):
 class SimulatedPlan(_JudgedPlan):
     """The plan of a simulated campaign.
 
-    `rig_name`: name or file of the rig; `rig_set`: values that replace some of its parameters; `rate`: sampling rate of
-    its data acquisition, a number in Hz or a text with a unit, None for the rig's own; `profile`: name of the profile
-    (a distribution of machines) from which the machine of each record is drawn, "" for the rig itself; `duration_s`
-    [s]: length of a record; `onset_s` [s]: start of the leaks, nan for half of the duration; `records`: groups of
-    records; `seed`: number from which the seeds of all records derive; `keep_recordings`: True to store the
-    recordings; `part`: purpose of the plan, such as development or judging.
+    - `rig_name`, `rig_set`: name or file of the rig, and values that replace some of its parameters
+    - `rate`: sampling rate of the data acquisition, a number in Hz or a text with a unit, None for the rig's own
+    - `profile`: name of the profile (a distribution of machines) from which the machine of each record is drawn, ""
+      to simulate the rig itself
+    - `duration_s` [s]: length of a record
+    - `onset_s` [s]: start of the leaks, nan for half of the duration
+    - `seed`: number from which the seeds of all records derive
+    - `keep_recordings`: True to store the recordings
+    - `records`: groups of records
+    - `factors`: by name, the levels (values) of each factor; records are made for every combination of levels
+    - `part`: purpose of the plan, such as development or judging
 
-    `factors`: by name, the levels (values) of each factor; records are made for every combination of levels. The
-    factors `command`, `controller`, `load` and `closed` set how the machine is moved and loaded, `family` selects
-    groups of the profile's machines, and other names are parameters of the rig.
+    The factors `command`, `controller` and `load` set how the machine is moved and loaded, `closed` how far the
+    throttles of its lines are closed, and `family` which groups of the profile's machines are drawn. Any other factor
+    is a parameter of the rig.
     """
 
     rig_name: Annotated[Text, Field(alias="rig")] = "thesis"
@@ -207,7 +216,7 @@ class SimulatedPlan(_JudgedPlan):
     @cached_property
     def assumed(self) -> Rig:
         """The rig that detectors may assume, by default the simulated one."""
-        return self._load_assumed(self.rig) or self.rig
+        return self._load_assumed(self.rig) or self.rig  # with a default never None; `or` satisfies type checkers
 
     @property
     def size(self) -> int:
@@ -219,10 +228,12 @@ class SimulatedPlan(_JudgedPlan):
 class RecordingSet(_TomlTable):
     """A set of recordings with a leak of the same size, such as the same mean flow.
 
-    `files`: pattern of their file names; the files are ordered by the numbers in their names, and only those from
-    number `first` to `end` - 1, counted from 1, belong to the set. `use`: `calibrate` for healthy recordings from
-    which thresholds are set, `judge` for recordings on which verdicts are given; `size`: size of the leak in the
-    plan's `unit`, 0 for healthy recordings; `label`: name of the set in tables, by default the pattern.
+    - `files`: pattern of the file names
+    - `use`: `calibrate` for healthy recordings from which thresholds are set, `judge` for recordings to be judged
+    - `size`: size of the leak in the plan's `unit`, 0 for healthy recordings
+    - `first`, `end`: the matching files are ordered by the numbers in their names; those from position `first` to
+      `end` - 1, counted from 1, belong to the set
+    - `label`: name of the set in tables, by default the pattern
     """
 
     files: Annotated[Text, AfterValidator(_validate_pattern)]
@@ -241,8 +252,8 @@ class RecordingSet(_TomlTable):
 class RecordedPlan(_JudgedPlan):
     """The plan of a campaign over recordings of real machines, which are files in a folder.
 
-    `channel_map`: names of columns by channel; `rate_hz` [Hz]: sampling rate for files without times; `sets`: sets of
-    recordings with the same size of leak.
+    `channel_map`: by channel, the name of its column in the files; `rate_hz` [Hz]: sampling rate for files without
+    times; `sets`: sets of recordings, each with one size of leak.
     """
 
     channel_map: Annotated[Mapping[str, str], Field(alias="map")] = field(default_factory=dict)

@@ -33,8 +33,8 @@ _T = TypeVar("_T")
 _PACKAGED = Path(__file__).parent / "packaged"
 #: Limits of records and of combinations of levels, so that a mistyped count does not plan a year of computing.
 MAX_RECORDS, MAX_CELLS = 1_000_000, 100_000
-#: By the name of the table that lists a plan's records: class of the plan, all its tables, and the entries of that
-#: table (none for a list of tables).
+#: By the name of the table that lists a plan's records: the class of the plan, the names of all its tables, and the
+#: entries of the table that lists the records. [[records]] is an array of tables, which has no entries of its own.
 _KINDS: Mapping[str, tuple[type[AnyPlan], tuple[str, ...], tuple[str, ...]]] = {
     "recordings": (RecordedPlan, ("campaign", "views", "recordings"), ("map", "rate", "unit", "sets")),
     "records": (SimulatedPlan, ("campaign", "factors", "views", "records"), ()),
@@ -49,7 +49,7 @@ def plan_names() -> tuple[str, ...]:
 def load_plan(name_or_path: str | os.PathLike[str]) -> AnyPlan:
     """Load a packaged plan by its name, or a plan from a TOML file by its path.
 
-    Raises InputError, with the rule that is broken and its place, if the plan is invalid.
+    Raises InputError, which names the broken rule and the file, if the plan is invalid.
     """
     text = os.fspath(name_or_path)
     if text in plan_names():
@@ -62,14 +62,16 @@ def load_plan(name_or_path: str | os.PathLike[str]) -> AnyPlan:
 def read_plan(tree: Mapping[str, Any], place: str = "plan") -> AnyPlan:
     """Build a plan from the parsed tables of a TOML file, and check it; raise InputError if it is invalid.
 
-    A plan with the table [recordings] is one of recordings, any other is one of simulated records. `place`: path of
-    the file, for messages; files that the plan names are relative to its folder.
+    A file with the table [recordings] gives a plan of recordings, any other a plan of simulated records. `place`: path
+    of the file, for messages; files that the plan names are relative to its folder.
     """
     plan = _parse_tables(tree, place)
-    plan = replace(plan, title=plan.title or plan.name)
-    without_view = {} if plan.channels is None else {"": plan.channels}
+    default_view = {} if plan.channels is None else {"": plan.channels}  # of detectors without "@"
     plan = replace(
-        plan, views={**plan.views, **without_view}, assume=plan.assume and _path_in_plan_folder(plan.assume, place)
+        plan,
+        title=plan.title or plan.name,
+        views={**plan.views, **default_view},
+        assume=plan.assume and _path_in_plan_folder(plan.assume, place),
     )
     if isinstance(plan, SimulatedPlan):
         plan = _complete_simulated_plan(plan)
@@ -86,8 +88,9 @@ def read_plan(tree: Mapping[str, Any], place: str = "plan") -> AnyPlan:
 
 
 def _parse_tables(tree: Mapping[str, Any], place: str) -> AnyPlan:
-    """Build a plan from the entries of all tables of its file, before the checks of `read_plan`.
+    """Build a plan from all tables of its file; its files and factors are not checked yet.
 
+    The entries of [campaign] and of [recordings] become fields of the plan, and so does each other table as a whole.
     Raises InputError, with the name of the entry and its table, if an entry is unknown or has a wrong value.
     """
     source = next((name for name in _KINDS if name in tree), "records")
@@ -96,7 +99,8 @@ def _parse_tables(tree: Mapping[str, Any], place: str) -> AnyPlan:
         if key not in tables:
             table_names = ", ".join(f"[{name}]" for name in tables)
             raise InputError(f"[{key}] is not known; a plan with [{source}] has {table_names} ({place})")
-    entries, full_names = {**tree, "place": place}, {name: name for name in tables}
+    entries = {**tree, "place": place}
+    full_names = {name: name for name in tables}  # by entry, its name in messages
     for table in ("campaign", source) if source_entries else ("campaign",):
         values = entries.pop(table, {})
         if not isinstance(values, Mapping):
@@ -120,7 +124,7 @@ def _call_for_entry(entry: str, place: str, function: Callable[[], _T]) -> _T:
 def _path_in_plan_folder(name: str, place: str) -> str:
     """Complete the path of a TOML file that a plan names, relative to the plan's folder.
 
-    A name without the ending .toml is that of a packaged file, and is returned unchanged.
+    A name without the ending .toml is the name of a packaged file, and is returned unchanged.
     """
     return os.fspath(Path(place).parent / name) if name.endswith(".toml") else name
 
@@ -128,7 +132,8 @@ def _path_in_plan_folder(name: str, place: str) -> str:
 def _complete_simulated_plan(plan: SimulatedPlan) -> SimulatedPlan:
     """Fill in the paths and default onset of a simulated plan, and check it; raise InputError if it is invalid.
 
-    Paths of the plan's rig and profile are completed by its folder; the default onset is half of the duration.
+    Files of the plan's rig and profile are looked for in the plan's folder. The profile "none" becomes "", and the
+    default onset is half of the duration.
     """
     place = plan.place
     profile = "" if plan.profile == "none" else _path_in_plan_folder(plan.profile, place)
@@ -170,14 +175,14 @@ def _check_factors(plan: SimulatedPlan) -> None:
 def _commands(plan: SimulatedPlan) -> tuple[str | float, ...]:
     """List the commands of a plan's records.
 
-    They are the levels of the factor `command`, else the commands of the plan's families of machines, else those of
-    its profile. A plan without this factor and without a profile has the command '3 sin(4t)'.
+    These are the levels of the factor `command`. Without this factor, they are the commands of the families of machines
+    in the factor `family` or, if there are no families, of the whole profile. Without a profile it is '3 sin(4t)'.
     """
     if COMMAND in plan.factors or not plan.profile:
         return plan.factors.get(COMMAND, ("3 sin(4t)",))
     profile = load_profile(plan.profile)
-    kinds = [profile.of_family(str(family)) for family in plan.factors.get("family", ())] or [profile]
-    return tuple(command for kind in kinds for command in kind.duty.commands)
+    profiles = [profile.of_family(str(family)) for family in plan.factors.get("family", ())] or [profile]
+    return tuple(command for family_profile in profiles for command in family_profile.duty.commands)
 
 
 def _check_level(plan: SimulatedPlan, name: str, level: str | float) -> None:
@@ -197,14 +202,15 @@ def _check_records(plan: SimulatedPlan) -> None:
 
     No two groups may agree in use, leak, law and fault; each fault must be known; and at least one group must be
     judged. If a detector needs a threshold, there must be enough leak-free records for the plan's false-alarm
-    probability (`records_needed`), times the number of commands, as each command has thresholds of its own.
+    probability (`records_needed`). The required number is multiplied by the number of commands, as each command has
+    its own thresholds.
     """
-    kinds = [(group.use, group.leak_lpm, group.law, group.fault) for group in plan.records]
-    for number, (kind, group) in enumerate(zip(kinds, plan.records, strict=True), 1):
+    contents = [(group.use, group.leak_lpm, group.law, group.fault) for group in plan.records]
+    for number, (content, group) in enumerate(zip(contents, plan.records, strict=True), 1):
         if group.fault:
             parse_group_fault = partial(parse_plan_fault, group.fault, plan.onset_s)
             _call_for_entry(f"records[{number}].fault", plan.place, parse_group_fault)
-        if kind in kinds[: number - 1]:
+        if content in contents[: number - 1]:
             rule = "records must differ from the others in use, leak, law or fault"
             raise InputError(f"records[{number}].{rule} ({plan.place})")
     if not any(group.use == "judge" for group in plan.records):
@@ -213,7 +219,7 @@ def _check_records(plan: SimulatedPlan) -> None:
         return
     count = sum(group.count for group in plan.records if group.use == "calibrate")
     needed = records_needed(plan.false_alarm, plan.confidence if plan.promise == "bound" else None)
-    n_commands = len(plan.factors.get("command", ("",)))  # thresholds are set for each command separately
+    n_commands = len(plan.factors.get(COMMAND, ("",)))  # 1 without this factor
     if count < needed * n_commands:
         per_command = f" ({needed} for each of {n_commands} commands)" if n_commands > 1 else ""
         raise InputError(

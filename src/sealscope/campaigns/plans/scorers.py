@@ -1,7 +1,7 @@
 """The decision rules of the thesis as scorers: they compute a score of a record, which is high if there is a leak.
 
 The score is computed from the RMS of the pressures' wavelet details d1 to d4 and d3d4, the product of d3 and d4. The
-threshold of a scorer is set from a plan's leak-free records; that of a sign rule is 0.
+threshold of a scorer is set from a plan's leak-free records, except that sign rules have the threshold 0.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ def split_bounds(n: int, rate: float, split: int) -> IntArray:
 
     Returns an array (2, 2) with [begin, end) of each part. Samples are left out if their wavelet details depend on
     the other part or on padding. At the start of the record, `START_SECONDS` at the sampling rate `rate` [Hz] are
-    left out, too, but at most `START_FRACTION` of the part. A part without usable samples has end <= begin.
+    left out, too, but at most `START_FRACTION` of the first part. A part without usable samples has end <= begin.
     """
-    before, after = (int(samples) for samples in edge_samples()[-1])
+    before, after = (int(samples) for samples in edge_samples()[-1])  # of the last level, whose filter is longest
     begin = max(before, int(min(START_SECONDS * rate, START_FRACTION * split)))
     return np.array([[begin, split - after], [split + before, n - after]])
 
@@ -49,8 +49,8 @@ def split_bounds(n: int, rate: float, split: int) -> IntArray:
 class SplitRms:
     """The natural logarithms of the RMS of the pressures' wavelet details, before and after the split of a record.
 
-    `log_rms`: by chamber, "p_A" or "p_B", three arrays (5,): before the split, after it, and over both parts. Their
-    entries are those of d1, d2, d3, d4, in Pa before the logarithm, and of the product d3d4, in Pa^2.
+    `log_rms`: by chamber, "p_A" or "p_B", three arrays (5,): before the split, after it, and over both parts. Each
+    has the log RMS of d1 to d4, with the RMS in Pa, and of d3d4, the product of d3 and d4, with the RMS in Pa^2.
     """
 
     log_rms: Mapping[str, tuple[Array, Array, Array]]
@@ -59,8 +59,8 @@ class SplitRms:
     def from_recording(cls, recording: Recording, split_s: float) -> SplitRms:
         """Compute the log RMS of the pressures' wavelet details before and after the time `split_s` [s].
 
-        The recording must be uniformly sampled without missing samples. If one of the parts is too short, the result
-        has no chamber.
+        The recording must be uniformly sampled without missing samples. A chamber whose pressure was not recorded is
+        left out; if one of the parts is too short, the result has no chamber.
         """
         rate = recording.rate
         bounds = split_bounds(len(recording), rate, round((split_s - float(recording.t[0])) * rate))
@@ -94,7 +94,7 @@ class SplitRms:
         """Return one statistic of a wavelet detail's natural log RMS: its change at the split, or its overall value.
 
         `chamber`: "p_A" or "p_B"; `quantity`: "d1" to "d4" or "d3d4"; `statistic`: "change" for the log RMS after the
-        split minus that before it, "level" for the log RMS over both parts. Returns None if the chamber is missing or
+        split minus the one before, "level" for the log RMS over both parts. Returns None if the chamber is missing or
         the number is not finite.
         """
         if chamber not in self.log_rms:
@@ -108,27 +108,34 @@ class SplitRms:
 class Scorer:
     """A decision rule of the thesis that computes a score of a record, to be compared with a threshold.
 
-    `parts`: one condition or several, each with a quantity, a chamber and a direction, such as ("d3", "p_A", "fell").
-    The score of a condition is the change of the log RMS of the quantity from the first to the second part of the
-    record: as it is for "rose", negative for "fell", absolute for "changed". For "high" it is the log RMS over both
-    parts, for "low" its negative. The rule's score is the smallest score of its conditions. `threshold`:
-    fixed threshold, None if it is to be set from leak-free records.
+    `conditions`: one or several, each a wavelet detail, a chamber and a direction, such as ("d3", "p_A", "fell");
+    `threshold`: fixed threshold, None if it is to be set from leak-free records. The record is split into two parts.
+    The score of a condition depends on its direction:
+
+    - "rose": change of the detail's log RMS from the first to the second part
+    - "fell": the negative of this change
+    - "changed": the magnitude of this change
+    - "high": log RMS over both parts
+    - "low": the negative of this log RMS
+
+    The rule's score is the smallest score of its conditions.
     """
 
     name: str
-    parts: tuple[tuple[str, str, str], ...]
+    conditions: tuple[tuple[str, str, str], ...]
     threshold: float | None = None
 
     @property
     def compares_parts(self) -> bool:
         """True if the rule compares the parts of a record before and after a time at which it is split."""
-        return all(_DIRECTIONS[direction][0] == "change" for _, _, direction in self.parts)
+        statistics = [_DIRECTIONS[direction][0] for _, _, direction in self.conditions]
+        return all(statistic == "change" for statistic in statistics)
 
     @property
     def description(self) -> str:
         """Description of the score in words, such as "the RMS of d3 of p_A fell over the record, ..."."""
         text = " and ".join(
-            f"the RMS of {quantity} of {chamber} {direction}" for quantity, chamber, direction in self.parts
+            f"the RMS of {quantity} of {chamber} {direction}" for quantity, chamber, direction in self.conditions
         )
         ending = " over the record, as its logarithm"
         if self.compares_parts:
@@ -139,29 +146,29 @@ class Scorer:
         """Compute the score of a record, which is high if there is a leak.
 
         `split_rms`: log RMS of the wavelet details in the two parts of the record. Returns None if the record is too
-        short, if it lacks a chamber, or if a constant reading makes a logarithm infinite.
+        short, if it lacks a chamber's pressure, or if a constant pressure makes a logarithm infinite.
         """
         scores = []
-        for quantity, chamber, direction in self.parts:
+        for quantity, chamber, direction in self.conditions:
             statistic, sign = _DIRECTIONS[direction]
             value = split_rms.value(chamber, quantity, statistic)
             if value is None:
                 return None
-            scores.append(sign * value if sign else abs(value))
+            scores.append(sign * value if sign else abs(value))  # sign 0: the magnitude
         return min(scores)  # every condition must be met
 
 
 def _iter_scorers() -> Iterator[Scorer]:
     """Yield all scorers: rules on one wavelet detail of one chamber, and the thesis's rule on both chambers.
 
-    For rules on a fall or a rise there is also a sign rule, with the threshold 0: it raises an alarm at any change in
-    that direction.
+    Each rule on a fall or a rise, and the thesis's rule, also occurs as a sign rule, whose threshold is 0. It raises an
+    alarm at any change in the tested direction.
     """
     for chamber, quantity, direction in product(CHAMBERS, QUANTITIES, _DIRECTIONS):
         rule = Scorer(f"{quantity} of {chamber} {direction}", ((quantity, chamber, direction),))
         yield rule
         if direction in ("fell", "rose"):
-            yield Scorer(f"sign rule: {rule.name}", rule.parts, threshold=0.0)
+            yield Scorer(f"sign rule: {rule.name}", rule.conditions, threshold=0.0)
     conditions = (("d3d4", "p_A", "fell"), ("d3d4", "p_B", "rose"))  # d3d4: product of the details of levels 3 and 4
     yield Scorer(_BOTH, conditions)
     yield Scorer(f"sign rule: {_BOTH}", conditions, threshold=0.0)

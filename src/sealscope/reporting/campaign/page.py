@@ -30,11 +30,12 @@ from sealscope.reporting.picture import Picture, SvgText, log_ticks, ticks
 PAGE = "report.html"
 #: If there are more sizes of leaks than this, one column shows all of them together.
 _MAX_SIZES = 8
-#: Size of a picture; points of a fitted curve; limits of points of any curve, and of measured fractions.
-WIDTH, HEIGHT = 460.0, 300.0
+#: Size of a picture in pixels, and number of the styles s0, s1, ... of lines in the style sheet.
+WIDTH, HEIGHT, _N_STYLES = 460.0, 300.0, 6
+#: Number of points of a fitted curve; largest number of points of any curve, and of measured fractions in a picture.
 _CURVE_POINTS, _MAX_CURVE_POINTS, _MAX_FRACTIONS = 120, 400, 60
-#: Number of the best detectors that the summary describes.
-_MAX_NAMED = 3
+#: Largest numbers of detectors in the summary, and of parameters in the description of the assumed rig.
+_MAX_NAMED, _MAX_PARAMETERS = 3, 6
 
 
 def _format_area(area: Area) -> str:
@@ -45,37 +46,44 @@ def _format_area(area: Area) -> str:
 def column_sizes(judgement: Judgement) -> list[float]:
     """List the leak sizes for the columns of the main table, in the unit of the plan.
 
-    If there are more than `_MAX_SIZES` sizes or none, the list is [nan], for one column of all sizes together.
+    If there are no sizes, or more than `_MAX_SIZES`, the list is [nan], for one column of all sizes together.
     """
     sizes = sorted({row.leak_lpm for row in judgement.table if row.leak_lpm > 0})
     return sizes if 0 < len(sizes) <= _MAX_SIZES else [math.nan]
 
 
 def main_table(result: CampaignResult) -> tuple[list[str], list[list[str]]]:
-    """Build the main table of a campaign as text: the headings of its columns, and a row for each detector.
+    """Build the main table of a campaign as text: the headings of its columns, and a row of cells for each detector.
 
-    A row has the information that the detector was given, if any was, the fractions of false alarms and of detected
-    leaks of each size, the area under the ROC curve, a90, the leak size that is detected with a probability of 90 %,
-    and a90/95, its upper 95 % confidence bound. The detectors of the plan come first, then two for comparison that
-    always or never raise an alarm.
+    The detectors of the plan come first, then two for comparison that always or never raise an alarm. The columns are:
+
+    - name of the detector
+    - information that the detector was given; without this column if the campaign states none
+    - fraction of false alarms
+    - fraction of detected leaks, with a column for each size of leak (`column_sizes`)
+    - area under the ROC curve of all leaks
+    - a90, the leak size that is detected with a probability of 90 %
+    - a90/95, the upper 95 % confidence bound of a90
     """
     judgement = result.judgement
     sizes = column_sizes(judgement)
     rows = judgement.overall if math.isnan(sizes[0]) else judgement.table
     by_detector: dict[str, dict[str, AlarmFractions]] = defaultdict(dict)
-    for row in rows:  # sizes as text, since nan (all sizes) does not equal itself
-        by_detector[row.detector][f"{row.leak_lpm}"] = row
+    for row in rows:
+        by_detector[row.detector][str(row.leak_lpm)] = row  # sizes as text, since nan (all sizes) does not equal itself
     pods = {pod.detector: pod for pod in judgement.pods}
     areas = {roc.detector: _format_area(roc.area) for roc in judgement.rocs if math.isnan(roc.leak_lpm)}
     table = []
     for name, by_size in by_detector.items():
-        detections = [percent(by_size[f"{size}"].alarms) if f"{size}" in by_size else "–" for size in sizes]
         knowledge = [_format_knowledge(result.known.get(name))] if result.known else []
-        false_alarms = percent(next(iter(by_size.values())).false_alarm)  # the same for all sizes
-        a90_texts = _format_a90(pods.get(name))
-        table.append([name, *knowledge, false_alarms, *detections, areas.get(name, "–"), *a90_texts])
-    size_heads = ["any leak" if math.isnan(size) else f"{size:g} {result.plan.unit}" for size in sizes]
+        first_row, *_ = by_size.values()
+        false_alarms = percent(first_row.false_alarm)  # the same for all sizes
+        detections = [percent(by_size[str(size)].alarms) if str(size) in by_size else "–" for size in sizes]
+        area = areas.get(name, "–")
+        a90, a90_95 = _format_a90(pods.get(name))
+        table.append([name, *knowledge, false_alarms, *detections, area, a90, a90_95])
     knowledge_head = ["given"] if result.known else []
+    size_heads = ["any leak" if math.isnan(size) else f"{size:g} {result.plan.unit}" for size in sizes]
     return ["detector", *knowledge_head, "false alarms", *size_heads, "AUC, any leak", "a90", "a90/95"], table
 
 
@@ -83,14 +91,15 @@ def _format_knowledge(known: PriorKnowledge | None) -> str:
     """Format the information that a detector was given as "true onset", "rig", both, or a dash."""
     if known is None:
         return "–"
-    return ", ".join(word for word, is_known in (("true onset", known.onset), ("rig", known.rig)) if is_known) or "–"
+    facts = [*(["true onset"] if known.onset else []), *(["rig"] if known.rig else [])]
+    return ", ".join(facts) or "–"
 
 
 def _format_a90(pod: DetectorPod | None) -> tuple[str, str]:
     """Format the leak sizes a90 and a90/95 of a detector.
 
-    The size a90 is detected with a probability of 90 %, and a90/95 is its upper 95 % confidence bound. A size above
-    all tested ones is written "> SIZE" with the largest of these; a dash stands for an unknown size.
+    The size a90 is detected with a probability of 90 %, and a90/95 is its upper 95 % confidence bound. A size above the
+    largest tested size is written "> LARGEST"; a dash stands for an unknown size.
     """
     if pod is None or pod.curve is None:
         return "–", "–"
@@ -105,9 +114,9 @@ def _format_a90(pod: DetectorPod | None) -> tuple[str, str]:
 def result_text(result: CampaignResult) -> str:
     """Summarise a campaign in a few sentences: the leaks that the best detectors find, and their false alarms.
 
-    The best detectors, up to `_MAX_NAMED`, are those with the smallest a90, the leak size that is detected with a
-    probability of 90 %. Detectors whose a90 is unknown or above the largest tested size come last, in the order of the
-    fraction of the largest leaks that they find.
+    At most `_MAX_NAMED` detectors are described, in the order of a90, the leak size that is detected with a probability
+    of 90 %. Detectors whose a90 is unknown or above the largest tested size come last, in the order of the fraction of
+    the largest leaks that they find.
     """
     judgement, unit = result.judgement, result.plan.unit
     ranked_findings: list[tuple[float, float, str]] = []
@@ -143,7 +152,7 @@ def campaign_text(result: CampaignResult) -> str:
 
 
 def _notes(result: CampaignResult) -> list[str]:
-    """List the notes under the main table as sentences, such as those on thresholds and on missing records."""
+    """List the notes under the main table as sentences, such as the notes on thresholds and on missing records."""
     judgement, plan = result.judgement, result.plan
     notes = [_say("intervals", share=100 * plan.confidence, unit=plan.unit)]
     percentage = 100 * plan.false_alarm
@@ -227,10 +236,17 @@ def render_campaign_page(result: CampaignResult, files: Sequence[str] = ()) -> s
 
 
 def _facts(result: CampaignResult) -> list[tuple[str, str]]:
-    """List the conditions of a campaign for the head of its page, as pairs of label and text.
+    """List the conditions of a campaign for its page, as pairs of label and text.
 
-    For simulated records they are rig, length and sampling rate, levels of the factors, seed, channels, the rig that
-    detectors assume, and the simulated leak flows. For recordings of machines they are use and leak size of each set.
+    For recordings of machines there is a pair for each set, with its use and leak size. For simulated records there are
+
+    - the rig, and the profile from which machines are drawn
+    - length and sampling rate of the records, and onset of the leaks
+    - the levels of each factor
+    - the base seed, and a mode other than "run by run"
+    - the channels of each view, a set of channels that detectors are given
+    - the rig that detectors assume, if any of them states verdicts of its own
+    - for each planned leak flow, the simulated flow
     """
     plan, judgement = result.plan, result.judgement
     if isinstance(plan, RecordedPlan):
@@ -254,7 +270,7 @@ def _facts(result: CampaignResult) -> list[tuple[str, str]]:
 
 
 def _describe_assumed_machine(plan: SimulatedPlan) -> str:
-    """Describe the rig that the detectors assume, and up to six parameters that differ from the simulated rig.
+    """Describe the rig that the detectors assume, and its first parameters that differ from the simulated rig.
 
     If the two rigs are equal, the text says so.
     """
@@ -263,15 +279,17 @@ def _describe_assumed_machine(plan: SimulatedPlan) -> str:
     simulated_values = {row.name: row.value for row in plan.rig.table()}
     different_values = [f"{row.name} {row.value:g}" if isinstance(row.value, float) else f"{row.name} {row.value}"
                         for row in plan.assumed.table() if simulated_values.get(row.name) != row.value]  # fmt: skip
-    more = f" and {len(different_values) - 6} more" if len(different_values) > 6 else ""
-    return f"{plan.assumed.name}, which differs from the rig: {', '.join(different_values[:6])}{more}"
+    n_more = len(different_values) - _MAX_PARAMETERS
+    more = f" and {n_more} more" if n_more > 0 else ""
+    return f"{plan.assumed.name}, which differs from the rig: {', '.join(different_values[:_MAX_PARAMETERS])}{more}"
 
 
 def _detector_section(pod: DetectorPod, judgement: Judgement, unit: str) -> dict[str, Any]:
     """Build the template's values for the section of one detector on a campaign's page.
 
-    They are its plots, the areas under its ROC curves, and the fractions of detections for each combination of the
-    levels of the plan's factors. `unit`: unit of the leak sizes.
+    The section has the detector's plots, the areas under its ROC curves, and a table of its fractions of alarms, with a
+    row for each combination of the factors' levels and a column for each leak size. The table is empty without factors,
+    or if there are too many sizes. `unit`: unit of the leak sizes.
     """
     name = pod.detector
     rocs = [roc for roc in judgement.rocs if roc.detector == name]
@@ -282,7 +300,7 @@ def _detector_section(pod: DetectorPod, judgement: Judgement, unit: str) -> dict
     factors = list(cells[0].levels) if cells else []
     sizes = sorted({cell.leak_lpm for cell in cells})
     by_levels: dict[tuple[str, ...], dict[float, str]] = defaultdict(dict)
-    if factors and len(sizes) <= _MAX_SIZES + 1:
+    if factors and len(sizes) <= _MAX_SIZES + 1:  # 1 for leak-free records
         for cell in cells:
             by_levels[tuple(map(str, cell.levels.values()))][cell.leak_lpm] = percent(cell.alarms)
     return {
@@ -303,7 +321,7 @@ def _size_text(roc: SizeRoc, unit: str) -> str:
 
 
 def _describe_score(name: str) -> str:
-    """Describe in words which score the ROC curve of a detector is computed from; "" if it is not installed.
+    """Describe the score from which the ROC curve of a detector is computed; "" if the detector is not installed.
 
     `name`: name of the detector in the plan, such as "diagnose @ pressures".
     """
@@ -317,7 +335,7 @@ def _describe_score(name: str) -> str:
 
 
 class _PlotCurve(NamedTuple):
-    """A curve y(x) with its label, and the lower and upper end of its confidence band, None for none."""
+    """A curve y(x) with a label; `band`: lower and upper end of its confidence band, None for a curve without band."""
 
     label: str
     x: Array
@@ -336,7 +354,7 @@ def _pod_plot(pod: DetectorPod, unit: str) -> dict[str, Any] | None:
     first, last = pod.sizes[0].size, pod.sizes[-1].size
     ends, curves, marks = (first, last), [], []
     if pod.curve is not None:
-        ends = first / 1.5, last * 1.5
+        ends = first / 1.5, last * 1.5  # so that the curve extends beyond the tested sizes
         grid = np.geomspace(*ends, _CURVE_POINTS)
         band = pod.curve.detection_band(grid)
         curves = [_PlotCurve("hits and misses", grid, pod.curve.detection(grid), band)]
@@ -381,12 +399,13 @@ def _draw_detection_curves(picture: Picture, x_label: str, curves: Sequence[_Plo
         indices = np.unique(np.linspace(0, x.size - 1, min(x.size, _MAX_CURVE_POINTS)).round().astype(np.int64))
         thinned_curves.append((label, x[indices], y[indices]))
         if band is not None:
-            picture.area("band", x[indices], band[0][indices], band[1][indices])
+            low, high = band
+            picture.area("band", x[indices], low[indices], high[indices])
     for value in log_ticks(*picture.x_ends) if picture.log else ticks(*picture.x_ends, 5):
         picture.mark("grid", value)
         picture.below(value, f"{value:g}")
     picture.frame(5)
     for k, (label, x, y) in enumerate(thinned_curves):
-        picture.line(f"path s{k % 6}", x, y, label, digits=2)
+        picture.line(f"path s{k % _N_STYLES}", x, y, label, digits=2)
     picture.labels.append(SvgText(WIDTH / 2, HEIGHT + 32.0, x_label))
     picture.labels.append(SvgText(-34.0, HEIGHT / 2, "detected", turned=True))

@@ -24,7 +24,8 @@ def percent(proportion: Proportion | None) -> str:
 def _format_percent(fraction: float) -> str:
     """Format a fraction as a percentage without the sign %.
 
-    It has two decimals below 9.95 %; from there on none if it is a whole number or above 99.95 %, otherwise one.
+    Percentages below 9.95 have two decimals. Larger percentages have one decimal, but none if they are whole numbers or
+    above 99.95.
     """
     value = 100.0 * fraction
     digits = 2 if value < 9.95 else 0 if value > 99.95 or value == round(value) else 1
@@ -34,8 +35,8 @@ def _format_percent(fraction: float) -> str:
 class PageTable(NamedTuple):
     """A table of the campaign's page.
 
-    `id`: its identifier in the HTML; `about`: description of its content; `heads`: headings of the columns; `rows`:
-    cells as text; `words`: number of leading columns with text instead of numbers.
+    `id`: identifier of the table in the HTML; `about`: description of the content; `heads`: headings of the columns;
+    `rows`: cells as text; `words`: number of columns with text, which stand left of the columns with numbers.
     """
 
     id: str
@@ -65,8 +66,8 @@ def page_tables(judgement: Judgement, unit: str, part: str = "") -> dict[str, Pa
 def _format_cell(row: Any, content: str) -> str:
     """Format one cell of a table as text.
 
-    `content`: kind of format, a space, and the dotted path of the value in `row`. The kind is an entry of `_FORMATS`,
-    such as "percent", or a format specification of Python.
+    `content`: name of a format, a space, and the dotted path of the value in `row`. The format is an entry of
+    `_FORMATS`, such as "percent", or a format specification of Python; without a format, `str` is used.
     """
     format_name, _, path = content.rpartition(" ")
     value = resolve_attribute(row, path)
@@ -76,9 +77,9 @@ def _format_cell(row: Any, content: str) -> str:
 class CauseTable(NamedTuple):
     """The table of the causes that one detector names, as text.
 
-    `columns`: the named causes; `rows`: for each true cause, its name, the number of its records, and the fraction of
-    them for which each cause is named; `right`: fraction of all records for which exactly the true cause is named;
-    `covered`: the same, also counting ambiguous causes that include the true one.
+    `columns`: causes that are named; `rows`: for each true cause, its name, its number of records, and for each column
+    the fraction of these records with the column's cause named; `right`, `covered`: fraction of all records for which
+    exactly the true cause is named, and for which the true cause or an ambiguous cause that includes it is named.
     """
 
     detector: str

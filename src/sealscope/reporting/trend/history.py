@@ -41,8 +41,8 @@ def write_history_page(
 ) -> Path:
     """Write the page of a machine as .html, .htm or .pdf, and return its path.
 
-    `judged`: its recordings with their diagnoses; `title`: name of the machine; `left_out`: number of files that
-    could not be read. Raises InputError if `judged` is empty, or if the page cannot be written.
+    `judged`: the machine's recordings with their diagnoses; `title`: name of the machine; `left_out`: number of files
+    that could not be read. Raises InputError if `judged` is empty, or if the page cannot be written.
     """
     return template.write(template.parse_page_path(path, card=False), render_history_page(judged, title, left_out))
 
@@ -84,8 +84,8 @@ def history_pictures(ordered: Sequence[Judged]) -> dict[str, Picture] | None:
     """Draw each recording's leak flow [L/min] over time, as a picture for each of the `SIZES`, "wide" and "narrow".
 
     `ordered`: recordings in order of their starts; if one has no date, all are drawn over their numbers, from 1. A
-    diagnosis that finds no leak is drawn with the upper bound of a leak. Returns None if no recording has a leak flow
-    or a bound.
+    diagnosis without the verdict `leak` is drawn with the upper bound of a leak. Returns None if no recording has a
+    leak flow or a bound.
     """
     levels = [_leak_level(entry.diagnosis) for entry in ordered]
     known_levels = [level for level in levels if level is not None]
@@ -94,7 +94,7 @@ def history_pictures(ordered: Sequence[Judged]) -> dict[str, Picture] | None:
     has_dates = all(entry.start_s is not None for entry in ordered)
     days = [(entry.start_s or 0.0) / DAY if has_dates else float(k + 1) for k, entry in enumerate(ordered)]
     limit = ordered[-1].diagnosis.limit_lpm
-    # larger values are drawn as a symbol at the top, as they would flatten the others
+    # values above `max_shown` would flatten the others; they are drawn as a symbol at the top
     max_shown = 8.0 * float(np.median([lpm for lpm, *_ in known_levels])) or math.inf
     shown_values = [value for lpm, _, high in known_levels for value in (lpm, high)]
     shown_values = [value for value in shown_values if value <= max_shown and value < math.inf]
@@ -158,8 +158,8 @@ def _dates(ordered: Sequence[Judged]) -> list[str]:
 def _draw_comparison(ordered: Sequence[Judged]) -> tuple[list[charts.Chart], charts.DrawnCharts | None, list[str]]:
     """Draw the channels of the newest recording and of an earlier one in the same charts, from a common start.
 
-    The earlier recording is the last one with the verdict `no leak`, or if there is none, the last one before the
-    newest. Returns the charts, the charts as drawn, and the names of the two files. Returns ([], None, []) if there
+    The earlier recording is the last one with the verdict `no leak` or, without such a recording, the last one before
+    the newest. Returns the charts, the charts as drawn, and the names of the two files. Returns ([], None, []) if there
     is no earlier recording, no common channel, or a clock that does not increase.
     """
     *earlier, newest = ordered
@@ -179,7 +179,7 @@ def _draw_comparison(ordered: Sequence[Judged]) -> tuple[list[charts.Chart], cha
         pressure_unit = latest.pressure_unit
         unit, values = charts.display_values(latest, name, pressure_unit)
         samples = np.interp(latest.t, other_t, other[name], left=np.nan, right=np.nan)
-        resampled = replace(latest, channels={name: samples})
+        resampled = replace(latest, channels={name: samples})  # to be displayed in the units of the newest recording
         other_values = charts.display_values(resampled, name, pressure_unit)[1]
         lines = (charts.ChartLine(files[0], "a", values), charts.ChartLine(files[1], "b", other_values))
         comparison.append(charts.Chart(f"over-{name}", "channels", name, unit, lines))

@@ -57,9 +57,10 @@ def level_pictures(
 ) -> dict[str, Picture]:
     """Draw the leakage of a machine over time, as one picture for each of the `SIZES`, "wide" and "narrow".
 
-    `days`: times of the first and last recording [d]; `levels`: ends of the axis of leakage, in the unit in which it is
-    drawn; `limit`: repair limit, which is drawn if it is on the axis, None for none; `format_day`: function that
-    formats a time [d] on the axis; `draw`: function that draws the recordings into a picture.
+    - `days` [d]: times of the first and last recording
+    - `levels`: ends of the leakage axis; `limit`: repair limit, drawn unless it lies above this axis, None for none
+    - `format_day`: function that formats a time [d] for the labels of the time axis
+    - `draw`: function that draws the recordings into a picture
     """
     margin = 0.02 * (days[1] - days[0]) or 0.5
     first, last = days[0] - margin, days[1] + margin
@@ -86,16 +87,18 @@ def trend_pictures(trend: Trend) -> dict[str, Picture] | None:
     """
     if trend.wear is None or all(point.value is None for point in trend.points):
         return None
-    ends, format_day = (trend.points[0].day, trend.points[-1].day), partial(text.moment, trend)
-    return level_pictures(ends, _y_limits(trend), trend.limit, format_day, partial(_draw_trend, trend))
+    days = trend.points[0].day, trend.points[-1].day
+    return level_pictures(
+        days, _y_limits(trend), trend.limit, format_day=partial(text.moment, trend), draw=partial(_draw_trend, trend)
+    )
 
 
 def _draw_trend(trend: Trend, picture: Picture) -> None:
     """Draw a trend into a picture, in the trend's unit of leakage over days since the first recording.
 
-    There are the range of healthy recordings and the fitted line of each period between repairs, each recording as a
-    point with its interval, and a vertical mark at each alarm and repair. A recording without an estimate of the
-    leakage has a symbol at the bottom.
+    - each episode (the recordings from one repair to the next): the range of healthy recordings, and the fitted line
+    - each recording: a point with its interval, or a symbol at the bottom if its leakage could not be estimated
+    - each alarm and repair: a vertical line
     """
     days = [trend.points[row].day for row in trend.rows]
     for episode in trend.episodes:
@@ -120,8 +123,8 @@ def _draw_trend(trend: Trend, picture: Picture) -> None:
 def _y_limits(trend: Trend) -> tuple[float, float]:
     """Compute the limits (low, high) of the leakage axis in a trend's picture, in the trend's unit.
 
-    They include the intervals of all recordings, the healthy ranges and, if the unit is L/min, zero. The repair limit
-    is included if it is below 2.5 times the largest of these values.
+    The limits include the intervals of all recordings, the healthy ranges and, if the unit is L/min, zero. The repair
+    limit is included if it is below 2.5 times the largest of these values. A margin is added at both ends.
     """
     ends = [value for point in trend.points for value in (point.low, point.high) if value is not None]
     ends += [end for episode in trend.episodes for end in (episode.wear.healthy.low, episode.wear.healthy.high)]
@@ -137,9 +140,10 @@ def _y_limits(trend: Trend) -> tuple[float, float]:
 def _fitted_line(days: list[float], episode: Episode) -> list[tuple[float, float]]:
     """Compute the vertices (day, leakage) of the line fitted to an episode, the recordings from one repair to the next.
 
-    The leakage is in the unit of the trend. Without an alarm or an onset, the line is straight, with the fitted growth,
-    and ends at the present leakage. Otherwise it is at the healthy level until the onset, and then rises to the present
-    leakage: linearly up to the last recording, or at once if the change is a step. `days`: times of all recordings [d].
+    The leakage is in the unit of the trend. If there is no alarm or no onset, the line is straight, has the fitted
+    growth, and ends at the present leakage. Otherwise it stays at the healthy level until the onset, and then rises to
+    the present leakage: linearly up to the last recording, or at once if the change is a step. `days` [d]: times of the
+    compared recordings (`Trend.rows`).
     """
     first, last, wear = days[episode.begin], days[episode.end - 1], episode.wear
     if episode.alarm is None or wear.onset is None:

@@ -19,10 +19,10 @@ from sealscope.units import BAR, DAY, DAYS_PER_YEAR
 
 
 def level_name(trend: Trend) -> str:
-    """Return the label of a trend's present state: "total" or "now".
+    """Return the label of a trend's present level: "total" or "now".
 
-    It is "total" if the trend follows the leakage of pump and piston together, and "now" if it follows the damping of
-    the pressures' ringing instead, which is measured by the RMS of their wavelet details.
+    The label is "total" if the trend follows the leakage of pump and piston together, and "now" if it follows the
+    ringing of the pressures instead, which is measured by the RMS of their wavelet details.
     """
     return "now" if trend.basis == "ringing" else "total"
 
@@ -43,8 +43,11 @@ def stamp(seconds: float, span_days: float) -> str:
 
 def recordings_text(trend: Trend) -> str:
     """Format the number of recordings of a trend, and the dates of the first and the last one."""
-    count, ends = len(trend.points), [moment(trend, trend.points[k].day) for k in (0, -1) if trend.points]
-    return ", ".join([format_count(count, "recording"), *([" to ".join(ends)] if ends else [])])
+    count = format_count(len(trend.points), "recording")
+    if not trend.points:
+        return count
+    first, last = (moment(trend, point.day) for point in (trend.points[0], trend.points[-1]))
+    return f"{count}, {first} to {last}"
 
 
 def headline(trend: Trend) -> str:
@@ -52,11 +55,14 @@ def headline(trend: Trend) -> str:
 
     If a repair ended an earlier leak and the verdict is `no leak`, the date of the last repair replaces the onset.
     """
-    wear, key, since = trend.wear, "trend", ""
+    key = "trend"
+    since = ""
     if trend.verdict == "no leak" and trend.repairs:  # a repair ended the earlier leak
-        key, since = "trend_fell", moment(trend, trend.repairs[-1].day)
-    elif wear is not None and wear.onset is not None:
-        key, since = "trend_since", moment(trend, wear.onset.value)
+        key = "trend_fell"
+        since = moment(trend, trend.repairs[-1].day)
+    elif trend.wear is not None and trend.wear.onset is not None:
+        key = "trend_since"
+        since = moment(trend, trend.wear.onset.value)
     return say(f"terminal.{key}", verdict=trend.decision.summary, since=since, recordings=recordings_text(trend))
 
 
@@ -71,15 +77,19 @@ def verdict_sentence(trend: Trend) -> str:
         key = "cannot tell"
     elif trend.verdict == "leak":
         key = "grows" if trend.wear.step is None else "stepped"
-    return say(f"trend_headline.{key}", since=moment(trend, trend.repairs[-1].day) if trend.repairs else "")
+    last_repair = moment(trend, trend.repairs[-1].day) if trend.repairs else ""
+    return say(f"trend_headline.{key}", since=last_repair)
 
 
 def figures(trend: Trend) -> dict[str, str]:
     """Format the numbers of a trend as text, by name; the text is "" or a remark if a number is not known.
 
-    They are `total`, the present leakage of pump and piston together; `leak`, its rise above the healthy level;
-    `healthy`, the range of 95 % of the healthy recordings; `since`, the onset of the rise; `growth`, the rise in a
-    month or in a sudden step; and `limit`, the date at which the leakage reaches the repair limit.
+    - `total`: present leakage of pump and piston together
+    - `leak`: rise of the leakage above the healthy level, if the verdict is `leak`
+    - `healthy`: range of 95 % of the healthy recordings
+    - `since`: onset of the rise
+    - `growth`: rise in a month, or in a sudden step
+    - `limit`: repair limit, and the date at which the leakage reaches it
     """
     wear = trend.wear
     if wear is None:
@@ -111,14 +121,14 @@ def figures(trend: Trend) -> dict[str, str]:
 def healthy_end(wear: Wear) -> float:
     """Compute the upper end of the healthy range for display, cut off at the repair limit.
 
-    It is at least the mean level of healthy recordings, even if that exceeds the limit.
+    If even the mean level of healthy recordings exceeds the limit, the range ends at this level.
     """
     high = wear.healthy.high
     return high if wear.limit is None else min(high, max(wear.limit, wear.healthy.value))
 
 
 def _format_estimate(interval: Interval, unit: str) -> str:
-    """Format an estimate with its interval and unit; "not known" if it is not finite.
+    """Format an estimate with its interval and unit; "not known" if the estimate is not finite.
 
     The word "open" stands for an infinite end of the interval.
     """
@@ -131,11 +141,12 @@ def _format_estimate(interval: Interval, unit: str) -> str:
 def _format_reach(trend: Trend, limit: float, reach: Interval) -> str:
     """Format the repair limit, and the predicted date at which the leakage reaches it.
 
-    `limit`: in the unit of the trend; `reach` [d]: time from the last recording until then, with its interval. After an
-    alarm the date is stated with its interval, without one only the earliest date (95 %). No date is stated if the
-    recordings are too few or the date is too far away.
+    `limit`: repair limit in the unit of the trend; `reach` [d]: time from the last recording until this date, with its
+    interval. After an alarm the date is stated with its interval, without an alarm only the earliest date (95 %). No
+    date is stated if the recordings are too few or the date is too far away.
     """
-    limit_text, first, last = f"{number(limit, 2)} {trend.unit} in all", trend.points[0].day, trend.points[-1].day
+    limit_text = f"{number(limit, 2)} {trend.unit} in all"
+    first, last = trend.points[0].day, trend.points[-1].day
     max_days = TREND.history.furthest
     expected, earliest, latest = (moment(trend, last + days) if days <= max_days else "later" for days in reach)
     if reach.value == 0.0:
