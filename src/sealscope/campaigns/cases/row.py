@@ -82,8 +82,8 @@ def duty_label(levels: Mapping[str, str | float]) -> str:
 def matches_cause(named: str, true_cause: str) -> bool:
     """Return True if the cause that a detector names is the true cause, or an ambiguous cause that includes it.
 
-    "piston or pump leak" includes these two leaks, "internal or external leak" also the external leak, and a joint cause
-    each of its causes (`joint_causes`).
+    "piston or pump leak" includes these two leaks, "internal or external leak" also the external leak. A joint cause
+    includes each of its causes (`joint_causes`).
     """
     return named == true_cause or true_cause in _AMBIGUOUS_CAUSES.get(named, ())
 
