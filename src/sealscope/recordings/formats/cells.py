@@ -76,7 +76,7 @@ def parse_numbers(cells: Sequence[str], decimal: str, format_place: Callable[[in
     NaN. `decimal`: decimal separator; `format_place`: function from the index of a cell to its place, for messages.
     Returns the numbers and the indices of the words. Raises InputError for an infinite number.
     """
-    # with a decimal comma a point is no decimal separator: `?` makes `float` refuse the cell
+    # with a decimal comma a point is not a decimal separator: `?` makes `float` refuse the cell
     texts = [cell.replace(".", "?").replace(",", ".") for cell in cells] if decimal == "," else cells
     try:
         if any("_" in text for text in texts):  # Python takes 1_000 for a number
@@ -110,8 +110,8 @@ def _parse_number(cell: str, cell_with_point: str, decimal: str) -> float:
 def has_prefixes(rows: Sequence[Sequence[str]]) -> bool:
     """Test whether the numbers in `rows` of cells end in SI prefixes, such as `170.3m`, and not in units.
 
-    The endings are prefixes if a column has several different ones, where no ending counts as one, too; or if an ending
-    is `k` or `u`, which are not units.
+    They do if numbers in one column have different endings, also if some have an ending and others, not zero, have
+    none; or if an ending is `k` or `u`, which are not units.
     """
     prefixes_by_column: dict[int, set[str]] = {}
     for row in rows:

@@ -218,12 +218,8 @@ def _parse_mapping(labels: Sequence[Label], channel: str, column_text: str) -> F
     """
     description = f"{column_text}, mapped to {channel},"
     name_before_blank, _, unit_after_blank = column_text.rpartition(" ")
-    names_and_units = (  # without a unit, as `name [unit]`, and as `name unit`
-        (column_text, None),
-        split_square_brackets(column_text),
-        (name_before_blank, unit_after_blank),
-    )
-    for name, unit in names_and_units:
+    # without a unit, as `name [unit]`, and as `name unit`
+    for name, unit in ((column_text, None), split_square_brackets(column_text), (name_before_blank, unit_after_blank)):
         column = _find_column(labels, name, description) if name else None
         if column is not None:
             return Formula({column: 1.0}, 0.0, _find_unit(labels[column], channel) if unit is None else unit)
@@ -452,7 +448,7 @@ def choose_columns(labels: Sequence[Label], request: Request, stated_rate: float
     if rate is not None:  # the time is named in the notes, but not read
         choice.time = choice.time_label = choice.date = None
     elif "t" not in columns and not choice.parts and choice.time is not None:
-        # a time column with the name of a date may hold dates alone
+        # a time column with the name of a date may contain only dates
         is_date = labels[choice.time].name.casefold() in WORDS["date"]
         choice.date = choice.time if is_date else choice.date
     # channels in the order of their columns

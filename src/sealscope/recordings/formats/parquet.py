@@ -48,8 +48,10 @@ def read_parquet(path: Path, request: Request) -> RecordingFields:
             return file.read(columns=[name]).column(name)
 
     encoded = (schema.metadata or {}).get(_DESCRIPTION_KEY)
-    description, remarks = parse_description(encoded) if encoded else None, _read_remarks(schema)
-    series, size = _list_series(schema, read_column, rows), path.stat().st_size
+    description = parse_description(encoded) if encoded else None
+    remarks = _read_remarks(schema)
+    series = _list_series(schema, read_column, rows)
+    size = path.stat().st_size
     return build_fields(series, request, "Parquet", remarks, stated_rate(remarks), description=description, size=size)
 
 

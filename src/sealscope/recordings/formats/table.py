@@ -45,7 +45,7 @@ from sealscope.units import to_si
 MAX_VALUES = 2**28
 #: Most bytes of a table: the larger of _MIN_LIMIT and _MAX_EXPANSION times its file's size, as fill values expand.
 _MIN_LIMIT, _MAX_EXPANSION = 2**26, 4096
-#: Most texts in a column, most bytes of one, and most bytes of all.
+#: Most texts in a column, most bytes of each text, and most bytes of all texts together.
 _MAX_TEXTS, _MAX_TEXT_WIDTH, _MAX_TEXT_BYTES = 2**22, 400, 2**29
 FORMAT_VERSION = 1
 #: Label of a file's own clock, added to the columns if none of them is the time.
@@ -56,7 +56,7 @@ _BASE_CHANNELS = ("p_A", "p_B", "p_1", "p_2")
 _MAX_INTERVAL = 3.0
 #: Largest difference of equal clocks, as a fraction of an interval.
 _SAME_CLOCK = 1e-2
-#: Relative difference up to which the written rate of a recording takes precedence over that of its time stamps.
+#: Relative difference up to which the written rate of a recording takes precedence over the rate of its time stamps.
 _SAME_RATE = 0.01
 #: Most names in a long table.
 _MAX_NAMES = 4096
@@ -102,7 +102,7 @@ class Series:
 
     @property
     def path(self) -> str:
-        """Name of the series with that of its group, `group/name`, as a user's map may give it."""
+        """Names of the group and the series, as `group/name`, which a user's map may contain."""
         return f"{self.group}/{self.label.whole}" if self.group else self.label.whole
 
 

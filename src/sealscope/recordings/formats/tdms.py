@@ -34,8 +34,9 @@ def read_tdms(path: Path, request: Request) -> RecordingFields:
             for channel in group.channels():
                 properties, count = channel.properties, len(channel)
                 unit = next((str(properties[key]) for key in _UNITS if properties.get(key)), None)
-                values, clock = partial(channel.__getitem__, slice(None)), _waveform_clock(properties, count)
-                series.append(Series(group.name, Label.parse(channel.name, unit), count, values, clock))
+                read_values = partial(channel.__getitem__, slice(None))
+                clock = _waveform_clock(properties, count)
+                series.append(Series(group.name, Label.parse(channel.name, unit), count, read_values, clock))
         # remarks on the file, and on each group
         remarks, *group_remarks = (
             collect_remarks(

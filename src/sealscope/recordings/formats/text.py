@@ -1,7 +1,7 @@
 """Text logs: CSV files written by Sealscope, and logs of other programs.
 
-A log is read in blocks of complete lines. Blocks with numbers alone are read by pyarrow if it is installed, others
-row by row.
+A log is read in blocks of complete lines. Blocks that contain only numbers are read by pyarrow if it is installed,
+others row by row.
 """
 
 from __future__ import annotations
@@ -154,8 +154,8 @@ def read_text_parts(path: Path, request: Request, every: float) -> Iterator[Reco
 def _read_several_clocks(path: Path, layout: Layout, time_columns: Sequence[int], request: Request) -> RecordingFields:
     """Read a log whose channels have sampling times of their own.
 
-    `time_columns`: numbers of the time columns, each of which stands before its channels. Without any, the log is read
-    as a long table, in which each row is one sample of a named channel.
+    `time_columns`: numbers of the time columns, each of which stands before its channels. If there are none, the log is
+    read as a long table, in which each row is one sample of a named channel.
     """
     cells_by_column: dict[int, NDArray[Any]] = {}
     columns = [column for column in range(len(layout.labels)) if column not in time_columns]
@@ -564,8 +564,8 @@ class _Log:
     def _detect_day_first(self) -> bool:
         """Detect if the day precedes the month in the dates of the log, such as 05/06/2024.
 
-        The log is read up to the first date that decides this. Without one, the order is guessed (`is_day_first`), and
-        `order_note` says so.
+        The log is read up to the first date that decides this. Without such a date, the order is guessed
+        (`is_day_first`), and `order_note` says so.
         """
         log = _Log(self.path, self.layout, self.kinds, self.date)
         columns = [column for column, kind in self.kinds.items() if kind == "time"]
@@ -614,7 +614,7 @@ class _Log:
             if self.has_stamps and self.kinds[column] == "time":  # blocks before the first stamp were read as numbers
                 parts = [np.full(part.shape, "NaT", "M8[ns]") if part.dtype.kind == "f" else part for part in parts]
             cells = np.concatenate(parts)
-            # rows with a word in place of the time are those of a summary
+            # rows with a word in place of the time belong to a summary
             if word_rows[last_column] and self.kinds[last_column] == "time":
                 cells = np.delete(cells, word_rows[last_column])
             cells.setflags(write=False)  # so that the recording does not copy it

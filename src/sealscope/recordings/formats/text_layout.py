@@ -88,8 +88,8 @@ class Layout:
 def detect_encoding(head: bytes) -> str | None:
     """Detect the encoding of a text from the first bytes of its file; None if they are not text.
 
-    The encodings are tried in this order: that of a byte order mark; UTF-16; UTF-8; gb18030 and Shift-JIS, if the text
-    then has a known word; cp1252, if few bytes are control characters.
+    The encodings are tried in this order: the one that a byte order mark states; UTF-16; UTF-8; gb18030 and Shift-JIS,
+    if the text then has a known word; cp1252, if few bytes are control characters.
     """
     for mark, name in (
         (codecs.BOM_UTF8, "utf-8-sig"),
@@ -344,7 +344,8 @@ def detect_layout(head: bytes, encoding: str, place: str, *, is_complete: bool) 
         raise InputError("a recording must have samples, got an empty file")
     # rows for the detection: the second half, or the last 20 if these are more, as remarks and a heading come first
     rows = content[max(1, min(len(content) // 2, len(content) - 20)) :] or content
-    body, original_lines = rows[-_N_ROWS:], lines
+    body = rows[-_N_ROWS:]
+    original_lines = lines
     if prefixed := _has_prefixes(rows):
         body = [expand_prefixes(line) for line in body]
         lines = [_expand_sample_prefixes(line) for line in lines]

@@ -36,7 +36,7 @@ _EITHER_DATE = re.compile(rf"\s*(?P<date>{_EITHER})")
 _LAST_MONTH = 12
 #: Hour of a wrong time on a 12-hour clock, such as 13 PM; numpy refuses it.
 _WRONG_HOUR = 99
-#: A number, which is no stamp unless it has eight digits.
+#: A number, which is a stamp only if it has eight digits.
 _BARE_NUMBER = re.compile(r"[+-]?\d*(?:[.,]\d*)?")
 _CLOCK = r"\d{1,2}:\d{2}(?::\d{2}(?:[.,:]\d{1,9})?|[.,]\d{1,9})?|\d{6}(?:[.,]\d{1,9})?"
 _STAMPS = [
@@ -82,9 +82,9 @@ _Seconds = tuple[Array, dict[str, Any], list[str]]
 class TimeState:
     """State of a log's time column between two parts of the log, which are read one after the other.
 
-    `head`: first times of a column without a unit; `rate`: sampling rate [Hz]; `resolution`: step [s] of coarse times
-    that several samples share; `last_time`: last time as in the file; `last_seconds`: the same in seconds. Values are
-    None, or 0.0 for `last_seconds`, where they are not known.
+    `head`: numbers in the first part, if the column has no unit; `rate`: sampling rate [Hz]; `resolution`: step [s] of
+    coarse times that several samples share; `last_time`: last time as in the file; `last_seconds`: the same time in
+    seconds. Values that are not known are None, except `last_seconds`, which is then 0.0.
     """
 
     head: Array | None = None
@@ -123,7 +123,7 @@ def parse_stamps(cells: Sequence[str], day_first: bool | None = None) -> NDArray
     """Parse stamps (ISO, day.month.year, month/day/year) and times of day to datetime64[ns], NaT for empty cells.
 
     `day_first`: True if the day precedes the month in dates such as 05/06/2024 and 05-06-2024; by default decided
-    from these cells (`is_day_first`). Raises ValueError with the index of the first cell that is no stamp.
+    from these cells (`is_day_first`). Raises ValueError with the index of the first cell that is not a stamp.
     """
     if day_first is None:
         day_first = is_day_first([ambiguous_dates(cells)])

@@ -83,7 +83,7 @@ def _split_brackets_or_slash(text: str) -> tuple[str, str | None]:
         depth += {")": 1, "(": -1}.get(text[index], 0)
         n_opened += text[index] == "("
         if depth == 0:
-            if n_opened <= 2:  # `name (m/(s V))`; deeper brackets are no unit
+            if n_opened <= 2:  # `name (m/(s V))`; deeper brackets do not contain a unit
                 splits.append((len(text[:index].rstrip()), index))
             break
     end, begin = min(splits, default=(0, 0))

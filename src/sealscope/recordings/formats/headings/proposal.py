@@ -25,7 +25,7 @@ _UNITS = {kind: {**CHANNEL_UNITS, "t": "s"}[channel] for kind, channel in _CHANN
 _FRACTION_UNITS = frozenset(("%", "percent", "pct", "Prozent", "prozent"))
 _PRESSURES = {"A": "p_A", "B": "p_B", "1": "p_1", "2": "p_2", "pump 1": "p_1", "pump 2": "p_2"}
 _TOKEN = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+|[^\W\d_a-zA-Z]+")
-#: The last capitalised word of a name: `Bar` of `MainPaBar`; two letters are no unit, as `MainPa` is pressure A.
+#: The last capitalised word of a name: `Bar` of `MainPaBar`; two letters are not a unit, as `MainPa` is pressure A.
 _LAST_WORD = re.compile(r"(?<=[a-z\d])[A-Z]+[a-z]*$")
 #: The number at the end of repeated names of columns, as in `X_Value.1`.
 _COUNTED = re.compile(r"[. _]?\d{1,3}$")
@@ -63,7 +63,7 @@ def proposed_map(labels: Sequence[Label]) -> dict[str, str]:
     candidates: dict[str, list[tuple[Label, _Guess]]] = {}
     for label in labels:
         guess = None if label.name.casefold() in channel_names else _guess_meaning(label, head)
-        if guess is None or (_is_named_time(label) and guess.kind != "time"):  # X_Value is no position
+        if guess is None or (_is_named_time(label) and guess.kind != "time"):  # X_Value is a time, not a position
             continue
         if guess.channel is not None:
             candidates.setdefault(guess.channel, []).append((label, guess))
@@ -108,7 +108,7 @@ def _is_named_time(label: Label) -> bool:
 
 
 def unit_of_time(label: Label) -> str | None:
-    """Find the unit of a time column in its heading or at the end of its name; None if it has none or is no time."""
+    """Find the unit of a time column, in its heading or name; None if it has no unit, or is not a time."""
     guess = _guess_meaning(label)
     return guess.unit if guess is not None and guess.kind == "time" else None
 
@@ -243,7 +243,7 @@ def _guess_meaning(label: Label, head: str = "") -> _Guess | None:
     if unit is not None and same_dimension(unit, "m^3/s"):
         kind = "leak" if words & _MEASURED["leak"] else "flow"
         return _Guess(kind, side, unit) if words & _MEASURED[kind] else None
-    # a word such as "desired" may name a command, but not a measured quantity
+    # a command may be called `setpoint`, a measured quantity may not
     is_measured_quantity = any(words & _MEASURED[kind] for kind in ("pressure", "position", "speed", "angle"))
     if words & _KIND["other"] or (words & _KIND["wanted"] and is_measured_quantity):
         return None
