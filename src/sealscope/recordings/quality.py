@@ -228,14 +228,15 @@ def _channel_findings(recording: Recording, name: str, values: Array) -> list[Fi
         report.add("constant", readings.size, int(present[0]), text, "note" if may_rest else "warning")
         return report.findings
     stuck = find_stuck(readings)
-    for rail in find_rails(readings, stuck, low_end=is_pressure) if is_pressure or name == "q_leak" else ():
+    may_be_clipped = is_pressure or name == "q_leak"
+    for rail in find_rails(readings, stuck, low_end=is_pressure) if may_be_clipped else ():
         n_clipped = format_count(rail.samples, "sample")
         text = f"{n_clipped} at the {rail.side} end, {report.format_value(rail.value)}: clipped"
         report.add("clipped", rail.samples, int(present[rail.first]), text)
-    if is_pressure:  # runs at an end of its values are reported as clipped
+    if is_pressure:  # runs at the smallest or largest value are reported as clipped
         stuck = stuck[(readings[stuck[:, 0]] > readings.min()) & (readings[stuck[:, 0]] < readings.max())]
     if stuck.size and not may_rest:
-        start, length = (int(v) for v in stuck[0])
+        start, length = map(int, stuck[0])
         times = _format_repetitions(len(stuck))
         text = f"does not move {times} while it should, first for {length / recording.rate:g} s"
         report.add("stuck", int(stuck[:, 1].sum()), int(present[start]), text)

@@ -51,14 +51,16 @@ class CorrectedSamples(NamedTuple):
 def correct_samples(recording: Recording) -> CorrectedSamples:
     """Correct the samples of a recording for the defects of loggers.
 
-    The defects are treated in this order; those with an asterisk are also reported as findings:
+    The defects are treated in this order:
 
     1. impossible values, and dropouts, i.e. rows with zeros in both chamber pressures;
     2. rows, and then single pressures, that repeat one value for a long time;
-    3. spikes *, and samples that repeat the previous one *;
+    3. spikes, and samples that repeat the previous one;
     4. uneven sampling times;
-    5. speeds without a sign *;
-    6. gaps *, and incomplete rows at the ends *, which are cut off.
+    5. speeds without a sign;
+    6. gaps, and incomplete rows at the ends, which are cut off.
+
+    Steps 3, 5 and 6 are reported as findings.
     """
     part, findings = remove_dropouts(remove_impossible(recording)), list[Finding]()
     is_frozen = flag_frozen_rows(part)

@@ -320,7 +320,7 @@ class _Log:
             line_blocks = _iter_line_blocks(file, self.layout.encoding, self.place, n_bytes)
             for first_line, content, end, is_cut in line_blocks:
                 block = self._read_by_arrow(first_line, content, end) if self.uses_arrow and not is_cut else None
-                if is_first and block is None:  # in a later block, it may be a single comment or word
+                if is_first and block is None:  # later blocks may only have a comment or word that pyarrow cannot read
                     self.uses_arrow = False
                 is_first = False
                 if block is None:
@@ -471,8 +471,8 @@ class _Log:
         """Parse rows of cells to a block of values.
 
         `line_numbers`: number of each row's line in the file; `is_cut`: the last row is incomplete. Words, i.e. texts
-        in place of numbers or time stamps, become NaN or NaT, and are counted in `n_words`. Only in a column of the
-        kind "any" they become inf, and are not counted.
+        in place of numbers or time stamps, become NaN or NaT, and are counted in `n_words`. In a column of the kind
+        "any" words become inf instead, and are not counted.
         """
         block = _Block()
         for column, kind in self.kinds.items():
