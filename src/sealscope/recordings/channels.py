@@ -29,7 +29,7 @@ CHANNEL_UNITS: Mapping[str, str] = MappingProxyType(
 )
 #: Channels from which the flow to the cylinder is computed, best first: pump angle, speed, flow meter, command.
 FLOW_SOURCES = ("theta", "omega", "q_pump", "u")
-#: Channels that change slowly, over minutes: constant or mostly missing values are no defect in them.
+#: Channels that change slowly, over minutes, in which constant or mostly missing values are not defects.
 SLOW = frozenset({"T_oil"})
 #: What each channel, and the time, measures.
 LONG_NAMES: Mapping[str, str] = MappingProxyType(

@@ -22,9 +22,9 @@ _EQUAL_PEAKS = 0.05
 def find_cycle(recording: Recording) -> float | None:
     """Find the period of the duty cycle [s], with which the machine's motion repeats; None if nothing repeats.
 
-    It is estimated from the command if that moves, else from the difference of the chamber pressures, or from a single
-    one (`estimate_period`). The result is cached with the recording, and shared by its copies with fewer channels
-    (`Recording.only`).
+    The period is estimated (`estimate_period`) from the command if the command moves, else from the difference of the
+    chamber pressures, or the only one. The result is cached with the recording, and shared by its copies with fewer
+    channels (`Recording.only`).
     """
     names = ("u",) if "u" in recording and is_moving(recording["u"]) else chambers_of(recording)
 
@@ -38,8 +38,7 @@ def find_cycle(recording: Recording) -> float | None:
 def duty_signal(channels: Sequence[Array]) -> Array:
     """Compute the signal (n,) in which the duty cycle shows.
 
-    `channels`: the command alone, or one or both chamber pressures (n,). The signal is the only channel, or the first
-    minus the second.
+    `channels`: the command (n,), or one or both chamber pressures (n,). The result is the only channel, or p_A - p_B.
     """
     return channels[0] - channels[1] if len(channels) == 2 else channels[0]
 
@@ -47,8 +46,8 @@ def duty_signal(channels: Sequence[Array]) -> Array:
 def estimate_period(signal: Array, rate: float) -> float | None:
     """Estimate the period [s] of a signal (n,) sampled at `rate` [Hz]; None if nothing repeats.
 
-    The period is the lag at which the autocorrelation, which is 1 at lag 0, has its first maximum that is nearly as
-    high as the highest one. Maxima before its first negative value do not count. The lag is refined by a parabola. The
+    The period is the lag of a maximum of the autocorrelation, which is 1 at lag 0. Of the maxima after the first
+    negative value, the first that is nearly as high as the highest is taken, and its lag is refined by a parabola. The
     maximum must reach 0.6, and the period must be between 0.2 s and 20 s and at most a fifth of the signal.
     """
     stride = max(1, int(rate / _CYCLE.rate))
@@ -60,7 +59,7 @@ def estimate_period(signal: Array, rate: float) -> float | None:
     if not np.any(resampled):
         return None
     spectrum = np.abs(np.fft.rfft(resampled, 2 * n)) ** 2
-    correlation = np.fft.irfft(spectrum)[:n] / np.arange(n, 0, -1)  # each lag has another number of products
+    correlation = np.fft.irfft(spectrum)[:n] / np.arange(n, 0, -1)  # divided by the number of products at each lag
     correlation = correlation / correlation[0]
     max_lag = min(n // _MIN_REPETITIONS, int(_CYCLE.longest * rate / stride))
     negative = np.flatnonzero(correlation[:max_lag] < 0)
@@ -75,8 +74,8 @@ def estimate_period(signal: Array, rate: float) -> float | None:
     # the first of the nearly highest peaks: later ones are at multiples of the period
     first_high = peaks[tail[peaks] >= tail[peaks].max() - _EQUAL_PEAKS][0]
     k = int(first + 1 + first_high)
-    left, peak, right = correlation[k - 1 : k + 2]  # the vertex of the parabola through them
-    lag = (k + 0.5 * (left - right) / (left - 2 * peak + right)) * stride / rate
+    left, peak, right = correlation[k - 1 : k + 2]
+    lag = (k + 0.5 * (left - right) / (left - 2 * peak + right)) * stride / rate  # vertex of the parabola through these
     return float(lag) if lag >= _MIN_PERIOD else None
 
 
@@ -90,10 +89,8 @@ def fundamental_frequency(signal: Array, t: Array, period: float) -> float:
     n_period = max(1, round(period / (t[1] - t[0])))
     n_periods = t.size // n_period
     demodulated = (signal - signal.mean()) * np.exp(-2j * np.pi * t / period)
-    # one phasor a period: its phase drifts with the difference from 1 / period
-    phasors = demodulated[: n_periods * n_period].reshape(n_periods, n_period).mean(axis=1)
+    phasors = demodulated[: n_periods * n_period].reshape(n_periods, n_period).mean(axis=1)  # one for each period
+    times = t[: n_periods * n_period].reshape(n_periods, n_period).mean(axis=1)
     phase = np.unwrap(np.angle(phasors))
-    slope = np.polyfit(
-        t[: n_periods * n_period].reshape(n_periods, n_period).mean(axis=1), phase, 1, w=np.abs(phasors)
-    )[0]
+    slope, _ = np.polyfit(times, phase, 1, w=np.abs(phasors))
     return 1.0 / period + float(slope) / (2.0 * np.pi)

@@ -32,13 +32,14 @@ _FORMATS, _PROPRIETARY = _TABLES["read"], _TABLES["proprietary"]
 _BEGINS = {kind: re.compile(entry["begins"].encode()) for kind, entry in _FORMATS.items() if "begins" in entry}
 _ARCHIVES = {kind: re.compile(begins.encode()) for kind, begins in _TABLES["archives"].items()}
 _FOREIGN = {re.compile(begins.encode()): words for begins, words in _TABLES["foreign"].items()}
-#: Suffix -> format, of all files and of files to write.
+#: Suffix -> format, of all files that are read.
 _SUFFIXES = {suffix: kind for kind, entry in _FORMATS.items() for suffix in entry["suffixes"]}
+#: Suffix -> format, of files that can be written.
 SUFFIXES = {suffix: kind for suffix, kind in _SUFFIXES.items() if _FORMATS[kind].get("written")}
 #: Formats read in this process.
 _SAFE_FORMATS = tuple(kind for kind, entry in _FORMATS.items() if entry.get("safe"))
-#: Limits for reading a file of another format: time _BASE_TIME [s] + size / _MIN_SPEED [bytes/s], memory
-#: _BASE_MEMORY [bytes] + _MEMORY_RATIO * size.
+#: Limits for reading a file of any other format: time _BASE_TIME [s] + size / speed, memory _BASE_MEMORY [bytes] +
+#: _MEMORY_RATIO * size. The speed [bytes/s] is _MIN_SPEED_SLOW for formats that `formats.toml` calls slow.
 _BASE_TIME, _MIN_SPEED, _MIN_SPEED_SLOW = 10.0, 20e6, 5e5
 _BASE_MEMORY, _MEMORY_RATIO = 2**31, 64
 #: Deepest nesting of archives that is unpacked.
@@ -80,7 +81,7 @@ def _detect_format(path: Path) -> str:
 def _find_format(head: bytes, *, is_text: bool) -> str | None:
     """Find the format whose function `recognise` (`formats.toml`) returns True for the first bytes `head` of a file.
 
-    `is_text`: true to ask the formats that are text, false to ask the others. None if no function returns True.
+    `is_text`: True to test only formats that are text, False to test all others. None if no function returns True.
     """
     candidates = {kind: entry["recognise"] for kind, entry in _FORMATS.items() if "recognise" in entry}
     for kind, function in candidates.items():
@@ -226,7 +227,7 @@ def _unpacked_file(file: Path) -> Iterator[tuple[Path, str]]:
         inner, kind = file, _detect_format(file)
         max_bytes = max_unpacked_size(file) if kind in _ARCHIVES else 0
         try:
-            for _ in range(_MAX_NESTING):  # a .tar.gz is an archive in an archive
+            for _ in range(_MAX_NESTING):  # such as a .tar.gz, an archive in an archive
                 if kind in _ARCHIVES:
                     inner = folders.enter_context(unpack(inner, kind, max_bytes))
                     kind = _detect_format(inner)

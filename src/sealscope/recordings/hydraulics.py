@@ -1,4 +1,4 @@
-"""Check that readings can come from a hydraulic machine: no noise alone, no copied channel, no wrong unit of time."""
+"""Check that readings can come from a hydraulic machine: no mere noise, no copied channel, no wrong unit of time."""
 
 from __future__ import annotations
 
@@ -18,10 +18,14 @@ _COPY_TOLERANCE = 1e-6
 def find_implausibility(recording: Recording) -> str | None:
     """Find a reason, in words, why the channels cannot come from one hydraulic machine; None if there is none.
 
-    Three defects are recognised: p_B is a copy of p_A; the motor speed differs from the rate of the motor angle by a
-    constant factor; or p_A - p_B, or the only pressure that varies, is nothing but noise. One chamber may rest at the
-    charge pressure, as in a lift. Unit, offset and range of the pressures do not matter; constant and absent channels
-    are ignored.
+    Three defects are recognised:
+
+    - p_B is a copy of p_A;
+    - the motor speed differs from the rate of the motor angle by a constant factor;
+    - p_A - p_B, or the only chamber pressure that varies, is nothing but noise.
+
+    Unit, offset and range of the pressures do not matter. Constant and absent channels are ignored, as one chamber may
+    rest at the charge pressure.
     """
     names = [name for name in chambers_of(recording) if len(recording) > 3 and not is_constant(recording[name])]
     signals = {name: recording[name] for name in names}
@@ -40,9 +44,9 @@ def find_implausibility(recording: Recording) -> str | None:
 def _describe_speed_mismatch(recording: Recording) -> str | None:
     """Describe a motor speed that differs from the rate of the motor angle by a constant factor, as by a wrong unit.
 
-    The factor is the least-squares ratio of the speed to the rate. None if it is within 1 / m and m (`readings.misfit`
-    of `priors.toml`), if the two do not correlate, if one of them is absent or in raw counts, or if there are too few
-    samples.
+    The factor is the least-squares ratio of the speed to the rate. None if the factor is between 1 / m and m, with m
+    = `readings.misfit` of `priors.toml`. None, too, if speed and rate do not correlate, if the speed or the angle is
+    absent or in raw counts, or if there are too few samples.
     """
     if not {"theta", "omega"} <= {name for name, unit in recording.units.items() if unit != "count"}:
         return None

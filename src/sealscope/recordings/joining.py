@@ -32,9 +32,9 @@ _TWELVE_HOURS = re.compile(
 def start_seconds(recording: Recording, file: str = "") -> float | None:
     """Find the time of a recording's first sample [s since 1970]; None if it is not known.
 
-    It is the time of t = 0 plus the first time `t`. The time of t = 0 is the start in the provenance, else the date in
-    the name of the file. The name is that in the provenance, else `file`. Dates and times count as UTC; a date without
-    a time of day means midnight.
+    The first time `t` is added to the time of t = 0, which is the start in the provenance, else the date in the name of
+    the file. This name is that in the provenance, else `file`. Dates and times are taken as UTC; a date without a time
+    of day means midnight.
     """
     start = parse_epoch(str(recording.provenance.get("start", "")))
     if start is None:
@@ -45,8 +45,8 @@ def start_seconds(recording: Recording, file: str = "") -> float | None:
 def file_seconds(recording: Recording, path: Path) -> float:
     """Find the time of the first sample [s since 1970] of the recording in the file `path`.
 
-    It is taken from the provenance, else from the file's name. Without either, the last sample has the time at which
-    the file was last modified.
+    The time is taken from the provenance, else from the file's name (`start_seconds`). If neither states it, the last
+    sample is assumed to have the time at which the file was last modified.
     """
     start = start_seconds(recording, path.name)
     if start is not None:
@@ -71,7 +71,7 @@ def _parse_file_name(name: str) -> float | None:
 
 
 def _time_zero(recording: Recording) -> float | None:
-    """Find the time of t = 0 [s since 1970] in the provenance of a recording; None if it states none."""
+    """Find the time of t = 0 [s since 1970] in the provenance of a recording; None if it is not stated."""
     epoch = recording.provenance.get("start_epoch_s")
     return parse_epoch(str(recording.provenance.get("start", ""))) if epoch is None else float(epoch)
 

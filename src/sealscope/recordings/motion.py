@@ -20,9 +20,10 @@ from sealscope.recordings.recording import Recording
 #: Changes up to this fraction of a reading's largest value are rounding errors: the reading does not move.
 ROUNDING = 1e-9
 _HOLD = RECORDINGS.hold
-#: Shortest run of equal values that can be stuck [samples]; number of samples on either side with which it is
-#: compared; expected number of such runs in a channel below which a run is stuck.
-_MIN_STUCK, _NEIGHBOURHOOD, _MAX_EXPECTED = 5, 100, 1e-6
+#: Shortest run of equal values that can be stuck, and number of samples on either side with which it is compared.
+_MIN_STUCK, _NEIGHBOURHOOD = 5, 100
+#: Expected number of such long runs in a channel below which a run is stuck.
+_MAX_EXPECTED = 1e-6
 #: Smallest jump at an end of a stuck run, in quantisation steps: more than three.
 _MIN_JUMP = 3.5
 #: Most samples from which the quantisation step is estimated.
@@ -53,10 +54,10 @@ class Holds(NamedTuple):
 def find_holds(values: Array, rate: float, before: float = math.nan) -> Holds:
     """Find the samples at which a pressure `values` (n,) repeats one value for longer than its noise allows.
 
-    A run of equal samples is a hold if it is longer than 1.5 s and 64 samples; `rate` [Hz]. Its first sample is a
-    reading and is not flagged. If a hold at the value `before` precedes the samples (NaN: none), a run of this value
-    at their beginning continues it and is flagged as a whole. A run at the end that is still too short may become a
-    hold with later samples.
+    A run of equal samples is a hold if it is longer than 1.5 s and 64 samples. Its first sample is a reading and is not
+    flagged. `rate` [Hz]: sampling rate; `before`: value of a hold that ends just before `values`, NaN if there is none.
+    A run of this value at the beginning continues that hold, and is flagged as a whole. A run at the end that is still
+    too short may become a hold with later samples.
     """
     max_length = max(round(_HOLD.seconds * rate), _HOLD.samples)
     edges = np.concatenate([[0], np.flatnonzero(values[1:] != values[:-1]) + 1, [len(values)]])
@@ -73,7 +74,7 @@ def find_holds(values: Array, rate: float, before: float = math.nan) -> Holds:
 def describe_hold(recording: Recording) -> str | None:
     """Describe a chamber pressure that does not move, although its noise should move it; None if there is none.
 
-    It repeats one value for too long (`find_holds`), in which case the longest such time is stated, or it is a
+    Such a pressure repeats one value for too long (`find_holds`), and the longest such time is stated; or it is a
     straight line to within `ROUNDING`. No sample may be missing. Short recordings and constant channels, which
     `inspect` reports, are not described.
     """
@@ -117,17 +118,17 @@ def estimate_quantum(values: Array) -> float:
 def find_stuck(values: Array) -> NDArray[np.intp]:
     """Find runs of equal values that are too long for the signal around them: first index and length of each (k, 2).
 
-    Let p be the fraction of unchanged samples among the 100 samples before or after a run, whichever is larger. A run
-    of length m then begins at a given sample with the probability p^(m-1). It is too long if fewer than 1e-6 such runs
-    are expected in the channel `values` (n,), and if the value jumps by more than 3.5 quantisation steps at its
-    beginning or end. A slow quantised signal at a turning point does not move either, but leaves in single steps. Runs
-    of fewer than 5 samples, and runs near the ends of the channel, are not found.
+    Let p be the fraction of samples that equal the previous one among the 100 samples before or after a run, whichever
+    fraction is larger. A run of length m then begins at a given sample with the probability p^(m-1). The run is too
+    long if fewer than 1e-6 such runs are expected in the channel `values` (n,), and if the value jumps by more than 3.5
+    quantisation steps at the beginning or end. A slow quantised signal at a turning point does not move either, but
+    leaves in single steps. Runs of fewer than 5 samples, and runs near the ends of the channel, are not found.
     """
     no_runs = np.empty((0, 2), dtype=np.intp)
     if values.size < 2 * _NEIGHBOURHOOD:
         return no_runs
     is_same = np.diff(values) == 0
-    runs = find_runs(is_same)  # one shorter than the runs of equal values
+    runs = find_runs(is_same)  # each is one shorter than the run of equal values
     runs = runs[runs[:, 1] >= _MIN_STUCK - 1]
     first, last = runs[:, 0], runs.sum(axis=1)  # the samples first..last are equal
     # runs near an end of the recording have too few neighbours

@@ -11,7 +11,7 @@ def oil_temperature(recording: Recording) -> float | None:
     """Compute the mean oil temperature [deg C] of a recording; None if it is not known.
 
     The channel T_oil is averaged, without readings that no hydraulic oil can have (`oil` in `priors.toml`). Without
-    such a channel the temperature in the file's header is taken.
+    such readings the temperature in the file's header is taken.
     """
     if "T_oil" in recording and recording.units["T_oil"] == "K":
         limits = RECORDINGS.oil

@@ -76,7 +76,7 @@ class UnsignedPriors(PriorTable):
     - `error`: relative error of the flow computed from the position.
     - `changes` [1/s]: usual number of reversals per second.
     - `least`: smallest ratio of the motions in the two directions.
-    - `correlation`: smallest correlation of the magnitude with that of the piston speed or command.
+    - `correlation`: smallest correlation of the magnitude with the absolute piston speed or command.
     """
 
     noise: float
@@ -130,7 +130,8 @@ class RailPriors(PriorTable):
     - `samples` [samples]: fewest samples there.
     - `crowd`: smallest ratio of these samples to those at any of the values next to it.
     - `jump` [quantisation steps]: smallest jump to or from it.
-    - `run` [samples], `long_jump` [quantisation steps]: length of a run from which a smaller jump suffices; this jump.
+    - `run` [samples]: length of a run from which a smaller jump suffices.
+    - `long_jump` [quantisation steps]: smallest jump to or from such a long run.
     """
 
     samples: int
@@ -141,7 +142,7 @@ class RailPriors(PriorTable):
 
 
 class HoldPriors(PriorTable):
-    """Lengths beyond which equal samples of a pressure are no readings; a run must exceed both.
+    """Lengths beyond which a run of equal samples of a pressure is not a reading; the run must exceed both.
 
     - `seconds` [s]: time.
     - `samples` [samples]: number of samples.
@@ -154,7 +155,7 @@ class HoldPriors(PriorTable):
 class ReadingPriors(PriorTable):
     """Limits beyond which pressures and speeds cannot come from one hydraulic machine.
 
-    - `noise`: share of the variance of a pressure that is white noise, above which it is taken for noise alone.
+    - `noise`: fraction of white noise in the variance of a pressure above which the pressure is taken for mere noise.
 
     The motor speed is compared with the rate of the motor angle:
 

@@ -71,7 +71,7 @@ def inspect(recording: Recording) -> tuple[Finding, ...]:
     Raises
     ------
     InputError
-        If the argument is missing, or there is another one.
+        If the argument is missing, or there are other arguments.
 
     Examples
     --------
@@ -105,10 +105,11 @@ def _time_findings(recording: Recording) -> list[Finding]:
     """
     t, findings, step = recording.t, list[Finding](), 1.0 / recording.rate
 
-    def add(code: str, where: NDArray[Any], text: str, severity: Severity = "warning") -> None:
-        """Add a finding on the samples or intervals with the indices `where`, unless there are none."""
-        if where.size:
-            findings.append(Finding(code, severity, None, where.size, _sample_time(recording, int(where[0])), text))
+    def add(code: str, indices: NDArray[Any], text: str, severity: Severity = "warning") -> None:
+        """Add a finding on the samples, or intervals, with these indices, unless there are none."""
+        if indices.size:
+            first_t = _sample_time(recording, int(indices[0]))
+            findings.append(Finding(code, severity, None, indices.size, first_t, text))
 
     timed, untimed = np.flatnonzero(np.isfinite(t)), np.flatnonzero(~np.isfinite(t))
     steps = np.diff(t[timed])
@@ -125,7 +126,8 @@ def _time_findings(recording: Recording) -> list[Finding]:
     )
     if positive_steps.size:
         median_step = float(np.median(positive_steps))
-        is_coarse = equal_steps.size and median_step < 2.5 * step  # stamps repeat, and then step by two samples
+        # coarse stamps repeat, and then step by two sampling steps
+        is_coarse = equal_steps.size and median_step < 2.5 * step
         if abs(median_step / step - 1.0) > _CLOCK.rate and not is_coarse:
             text = f"time stamps tell {1.0 / median_step:.6g} Hz, the recording's rate is {recording.rate:g} Hz"
             add("rate_mismatch", timed[:1], text, "fatal")
@@ -157,9 +159,9 @@ def _format_repetitions(count: int) -> str:
 def _creep_findings(recording: Recording) -> list[Finding]:
     """Find a steady drift of the mean chamber pressure over a whole recording, which a sealed circuit does not show.
 
-    The means of equal parts of the recording are compared. Their steps from part to part must be alike, and the drift
+    The recording is cut into equal parts. The steps of the mean pressure from part to part must be alike, and the drift
     fast enough (`creep` in `priors.toml`). The list is empty if there is no drift, if the recording is too short, or if
-    a chamber pressure is not in Pa.
+    a chamber pressure is absent or not in Pa.
     """
     duration = len(recording) / recording.rate
     if duration < _CREEP.seconds or any(recording.units.get(name) != "Pa" for name in ("p_A", "p_B")):
@@ -199,8 +201,10 @@ class _ChannelReport:
 
 def _channel_findings(recording: Recording, name: str, values: Array) -> list[Finding]:
     """Find the defects in the values (n,) of the channel `name`."""
-    report, unit = _ChannelReport(recording, name), recording.units[name]
-    is_pressure, may_rest = name.startswith("p_"), name in ("u", "q_leak", "q_comp")
+    report = _ChannelReport(recording, name)
+    unit = recording.units[name]
+    is_pressure = name.startswith("p_")
+    may_rest = name in ("u", "q_leak", "q_comp")
     if is_pressure and unit == COUNTS:
         text = f"is in raw counts: state the unit (--map '{name}=COLUMN bar'), or a leak's size stays relative"
         report.add("raw_counts", values.size, 0, text, "note")
@@ -224,14 +228,15 @@ def _channel_findings(recording: Recording, name: str, values: Array) -> list[Fi
         report.add("constant", readings.size, int(present[0]), text, "note" if may_rest else "warning")
         return report.findings
     stuck = find_stuck(readings)
-    for rail in find_rails(readings, stuck, low_end=is_pressure) if is_pressure or name == "q_leak" else ():
+    may_be_clipped = is_pressure or name == "q_leak"
+    for rail in find_rails(readings, stuck, low_end=is_pressure) if may_be_clipped else ():
         n_clipped = format_count(rail.samples, "sample")
         text = f"{n_clipped} at the {rail.side} end, {report.format_value(rail.value)}: clipped"
         report.add("clipped", rail.samples, int(present[rail.first]), text)
-    if is_pressure:  # runs at an end of its values are reported as clipped
+    if is_pressure:  # runs at the smallest or largest value are reported as clipped
         stuck = stuck[(readings[stuck[:, 0]] > readings.min()) & (readings[stuck[:, 0]] < readings.max())]
     if stuck.size and not may_rest:
-        start, length = (int(v) for v in stuck[0])
+        start, length = map(int, stuck[0])
         times = _format_repetitions(len(stuck))
         text = f"does not move {times} while it should, first for {length / recording.rate:g} s"
         report.add("stuck", int(stuck[:, 1].sum()), int(present[start]), text)
@@ -248,8 +253,7 @@ def _channel_findings(recording: Recording, name: str, values: Array) -> list[Fi
 def _report_missing(report: _ChannelReport, values: Array) -> None:
     """Add a finding on missing samples to a channel's report, if there are any.
 
-    `values` (n,): samples of the channel, NaN where missing. If it has a value on every k-th row only, the finding
-    says so.
+    `values` (n,): samples of the channel, NaN where missing. If only every k-th row has a value, the finding says so.
     """
     is_missing, rate = np.isnan(values), report.recording.rate
     if not is_missing.any():
@@ -277,7 +281,7 @@ def flag_impossible(values: Array, unit: str) -> NDArray[np.bool_]:
 
 
 def _row_period(present: NDArray[np.intp]) -> int:
-    """Find the k >= 2 for which a channel has a value on every k-th row only; 0 if there is none.
+    """Find the k >= 2 for which a channel has a value on every k-th row only; 0 if there is no such k.
 
     `present`: indices of the rows with a value, in increasing order.
     """
@@ -344,19 +348,19 @@ def is_mostly_clipped(values: Array) -> bool:
 def find_rails(values: Array, stuck: NDArray[np.intp] | None = None, low_end: bool = True) -> list[Rail]:
     """Find the ends of a channel's range at which its finite values (n,) are clipped.
 
-    With `low_end` False only the high end is examined. At a clipped end many samples have the same value: far more than
-    any of the five nearest values has. They form runs which the signal enters or leaves by a jump of more than 3.5
-    quantisation steps, or 1.5 for a long run. The crest of a slow quantised signal does not count: its neighbours have
-    nearly as many samples, and it is entered step by step. Nor does a square wave, which has as many samples at its
-    other level. An end is also clipped if one of the runs `stuck` (first index and length, as from `find_stuck`) has
-    this value.
+    With `low_end` False only the high end is examined. An end is clipped in two cases:
+
+    - Far more samples have this value than any of the five nearest values, and the signal enters or leaves the longest
+      run of them by a jump of more than 3.5 quantisation steps, or 1.5 for a long run. This excludes the crest of a
+      slow quantised signal, whose nearest values have nearly as many samples, and a square wave.
+    - One of the runs `stuck` (first index and length, as from `find_stuck`) has this value.
     """
     if not values.size:
         return []
     stuck_values = np.empty(0) if stuck is None else values[stuck[:, 0]]
     ends = values.min(), values.max()
-    at_ends = max(np.count_nonzero(values == end) for end in ends)
-    if at_ends < _RAIL.samples and not np.isin(stuck_values, ends).any():
+    max_count = max(np.count_nonzero(values == end) for end in ends)
+    if max_count < _RAIL.samples and not np.isin(stuck_values, ends).any():
         return []
     distinct, counts = np.unique(values, return_counts=True)
     if distinct.size < 3:
@@ -381,8 +385,8 @@ def find_rails(values: Array, stuck: NDArray[np.intp] | None = None, low_end: bo
 def fast_length(count: int) -> int:
     """Find the smallest length n >= `count` for which a fast Fourier transform is fast.
 
-    It is a product of powers of 2, 3 and 5. Equals `scipy.fft.next_fast_len(count, real=True)`, without loading
-    scipy.fft.
+    Such a length is a product of powers of 2, 3 and 5. The result equals `scipy.fft.next_fast_len(count, real=True)`,
+    but scipy.fft is not loaded.
     """
     odd_factors = (3**i * 5**j for i in range(40) for j in range(28) if 3**i * 5**j < 2 * count)
     # times the smallest power of two >= count / factor
@@ -418,7 +422,7 @@ def find_hum(values: Array, rate: float) -> list[HumLine]:
     spectrum = np.fft.rfft(detrended, n_fft)
     squared_amplitudes = (spectrum.real**2 + spectrum.imag**2) * (2.0 / window.sum()) ** 2
     bin_width = rate / n_fft
-    # a Hann window spreads a line over bins: the sum of amplitude^2 / 2 counts its power 1.5 n_fft / n times
+    # a Hann window spreads a line over bins: the sum of amplitude^2 / 2 over these is 1.5 n_fft / n times its power
     power = float(squared_amplitudes[math.ceil(_HUM.lowest / bin_width - 1e-9) :].sum()) / 2 / (1.5 * n_fft / n)
     lines = []
     for mains in (50.0, 60.0):

@@ -42,7 +42,7 @@ _PLOT_UNITS = {"m": "mm", "rad/s": "rpm", "m^3/s": "L/min", "K": "degC"}
 def _freeze(values: Any) -> Array:
     """Convert values to a read-only array of doubles.
 
-    They are copied, unless they already are such an array that owns its memory.
+    The values are copied, unless they already are a read-only array of doubles that owns its memory.
     """
     if type(values) is np.ndarray and values.dtype == np.float64 and values.base is None and not values.flags.writeable:
         return values
@@ -218,7 +218,7 @@ class Recording:
         unit = self.units[name]
         display_unit = self.unit_in_log(name) or unit
         if display_unit != unit:
-            offset = from_si(0.0, display_unit, unit) if is_span else 0.0  # as that of degC
+            offset = from_si(0.0, display_unit, unit) if is_span else 0.0  # such as that of degC
             value = from_si(value, display_unit, unit) - offset
         return f"{value:.{digits}g} {display_unit}"
 
@@ -246,9 +246,12 @@ class Recording:
         return replace(self, t=self.t[rows], channels=channels, history=(*self.history, note), bridged=bridged)
 
     def only(self, names: Iterable[str]) -> Recording:
-        """Return a recording with the named channels only; it shares cached results with this one (`compute_once`)."""
+        """Return a recording with the named channels only, which shares the cached results of this recording.
+
+        The results are those of `compute_once`.
+        """
         part = replace(self, channels={name: self[name] for name in names})
-        object.__setattr__(part, "_results", self._results)  # shared, see `compute_once`
+        object.__setattr__(part, "_results", self._results)
         return part
 
     def series(self) -> tuple[dict[str, Array], dict[str, str], dict[str, Any]]:
@@ -298,7 +301,7 @@ class Recording:
         Raises
         ------
         InputError
-            The recording has no such channel, or none at all.
+            The recording lacks one of the channels, or has no channels.
         MissingExtra
             matplotlib is not installed.
         """

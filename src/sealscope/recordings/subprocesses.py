@@ -79,7 +79,7 @@ class _Process:
         """
         process = self._process
         assert process.stdin is not None and process.stdout is not None
-        # in case the alarm of the process itself does not end it
+        # kills the process if its own alarm does not end it; a fresh one also needs time to start
         killer = Timer(limit + 1.0 + _MAX_START_TIME * self._is_fresh, process.kill)
         killer.daemon = True
         killer.start()
@@ -161,10 +161,10 @@ def run_on_file(work: Callable[..., T], file: Path, *arguments: Any, **limits: A
 
 
 def _set_limits(seconds: float, memory: int, disk: int) -> None:
-    """Limit the time [s] (0: no limit), memory [bytes] and size of written files [bytes] of this process.
+    """Limit the time, memory [bytes] and size of written files (`disk`) [bytes] of this process.
 
-    A timer of the operating system ends the process when the time is over, even if its parent is dead. Systems
-    without such limits are left without.
+    `seconds`: time [s] after which a timer of the operating system ends the process, even if its parent is dead; 0 for
+    no limit. On a system without such limits nothing is limited.
     """
     with suppress(ImportError, AttributeError, OSError, ValueError):
         signal.setitimer(signal.ITIMER_REAL, seconds)
@@ -182,7 +182,7 @@ def _set_limits(seconds: float, memory: int, disk: int) -> None:
 def _is_spent() -> bool:
     """Test whether this process occupies too much memory to serve another request (`_MAX_IDLE_MEMORY`).
 
-    False if that cannot be found out.
+    False on a system that does not state the memory of processes in `/proc`.
     """
     try:
         pages = int(Path("/proc/self/statm").read_text().split()[5])  # data pages, which RLIMIT_DATA limits
@@ -217,7 +217,7 @@ def _serve() -> None:
 def _run_work(work: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[Any, str | None]:
     """Call `work` in this process; return (result, None), or (error, traceback as text) if it fails.
 
-    The error is one that the program can unpickle.
+    Errors other than SealscopeError and MemoryError become a RuntimeError, which the program can unpickle.
     """
     try:
         return work(*arguments), None

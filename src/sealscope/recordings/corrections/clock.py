@@ -19,8 +19,10 @@ from sealscope.recordings.recording import Recording
 _PRIORS = RECORDINGS.clock
 #: Longest interval that is interpolated, in median intervals.
 MAX_INTERVAL: float = _PRIORS.near
-#: Largest fraction of the samples that gaps may take before the recording is cut, and that may be out of order.
-MAX_GAP_FRACTION, MAX_LATE_FRACTION = _PRIORS.lost, _PRIORS.late
+#: Largest fraction of lost samples before the recording is cut.
+MAX_GAP_FRACTION: float = _PRIORS.lost
+#: Largest fraction of rows that are not later than all rows before; with more, one run of rows is used.
+MAX_LATE_FRACTION: float = _PRIORS.late
 
 
 def resample_evenly(recording: Recording) -> Recording:
@@ -48,8 +50,8 @@ def resample_evenly(recording: Recording) -> Recording:
 def _ordered_rows(t: Array) -> NDArray[np.intp]:
     """Find the indices of the rows that are later than all rows before.
 
-    `t` (n,): times [s], NaN where unknown, in which case the row is left out. If more than the fraction
-    `MAX_LATE_FRACTION` of the rows is not later, only the longest run of rows without a step back in time is used.
+    `t` (n,): times [s]; rows with NaN are left out. If more than the fraction `MAX_LATE_FRACTION` of the rows is not
+    later, only the longest run of rows without a step back in time is used, without repeated times.
     """
     timed = np.flatnonzero(np.isfinite(t))
     if timed.size < 2:
@@ -68,11 +70,12 @@ def _longest_dense_stretch(t: Array, rate: float) -> slice:
 
     `t` (n,): increasing times [s]; `rate` [Hz]: number of samples that a complete recording has per second.
     """
-    # samples beyond the fewest allowed since the first row: a stretch is dense enough if it does not decrease
-    first_time = t[:1].sum()  # 0 if there is none
+    # number of rows since the first one, less the fewest permitted: a stretch is dense enough if its last row has at
+    # least the surplus of its first row
+    first_time = t[:1].sum()  # 0 if there are no rows
     surplus = np.arange(t.size) - (1.0 - MAX_GAP_FRACTION) * rate * (t - first_time)
     max_later_surplus = np.maximum.accumulate(surplus[::-1])[::-1]
-    # per row, the last row to which the stretch from it is dense enough
+    # for each first row, the last row of the longest stretch that is dense enough
     last = np.searchsorted(-max_later_surplus, -surplus, side="right") - 1
     first = int(np.argmax(last - np.arange(t.size))) if t.size else 0
     return slice(first, int(last[first]) + 1 if t.size else 0)
@@ -81,7 +84,8 @@ def _longest_dense_stretch(t: Array, rate: float) -> slice:
 def _insert_lost_rows(recording: Recording, rows: NDArray[np.intp], steps: NDArray[np.int64]) -> Recording:
     """Insert rows of NaN for the samples that were lost between recorded ones.
 
-    `rows` (k,): indices of the recorded rows; `steps` (k - 1,): number of sampling steps from each of them to the next.
+    `rows` (k,): indices of the recorded rows; `steps` (k - 1,): number of sampling steps from each recorded row to the
+    next.
     """
     row_index = np.concatenate([[0], np.cumsum(steps)])
     n = int(row_index[-1]) + 1

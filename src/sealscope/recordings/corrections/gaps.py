@@ -4,7 +4,7 @@ A gap is a run of rows in which a needed channel has no value. The logger may ha
 (`corrections.clock`), or may have written zeros for both chamber pressures (`remove_dropouts`). Up to `SPLINE`
 samples are bridged by a cubic spline. A longer gap is bridged by the channel's values whole duty cycles before or
 after, with an offset so that both ends meet, or by a straight line if the motion does not repeat. `Recording.bridged`
-marks these rows, which are no readings. The flow balance gives less weight to blocks of samples with long gaps
+marks these rows, as they are not readings. The flow balance gives less weight to blocks of samples with long gaps
 (`flag_holes`); other detectors omit the blocks that `flag_bridged` marks.
 """
 
@@ -28,9 +28,12 @@ from sealscope.recordings.recording import Recording
 
 Flags = NDArray[np.bool_]
 
-#: Longest gaps bridged by a spline [samples] and by another cycle (fraction of the recording); largest fraction of
-#: impossible samples in a channel with the right unit.
-SPLINE, MAX_CYCLE_GAP, _MAX_IMPOSSIBLE_FRACTION = 3, 0.1, 0.1
+#: Longest gap bridged by a spline [samples].
+SPLINE = 3
+#: Longest gap bridged by another cycle, as a fraction of the recording.
+MAX_CYCLE_GAP = 0.1
+#: Largest fraction of impossible samples in a channel with the right unit.
+_MAX_IMPOSSIBLE_FRACTION = 0.1
 _GAPS = RECORDINGS.gaps
 #: Largest fraction of bridged samples in a block: so few change the sums over the block less than its noise does.
 MAX_BRIDGED_FRACTION = 0.01
@@ -51,7 +54,7 @@ def remove_dropouts(recording: Recording) -> Recording:
     chambers = chambers_of(recording)
     if len(chambers) < 2:
         return recording
-    is_dropout = np.logical_not(recording["p_A"]) & np.logical_not(recording["p_B"])
+    is_dropout = np.logical_not(recording["p_A"]) & np.logical_not(recording["p_B"])  # both are 0, not NaN
     if not is_dropout.any():
         return recording
     channels = {name: np.where(is_dropout, np.nan, values) for name, values in recording.channels.items()}
@@ -61,7 +64,8 @@ def remove_dropouts(recording: Recording) -> Recording:
 def remove_impossible(recording: Recording) -> Recording:
     """Set samples to NaN whose magnitude no sensor can read, such as over 1e10 Pa (`quality.flag_impossible`).
 
-    A channel with many of them, over a tenth, has a wrong unit and stays. Returns the same recording if there are none.
+    A channel stays as it is if over a tenth of its samples are impossible, because its unit is then wrong. Returns the
+    same recording if there is nothing to remove.
     """
     flags = {name: flag_impossible(values, recording.units[name]) for name, values in recording.channels.items()}
     is_removed = {name: mask & (np.mean(mask) <= _MAX_IMPOSSIBLE_FRACTION) for name, mask in flags.items() if len(mask)}
@@ -132,10 +136,10 @@ def interpolate_short_gaps(recording: Recording, needed: Sequence[str]) -> Recor
 
 
 def flag_bridged(recording: Recording, bounds: Array | NDArray[np.integer]) -> Flags:
-    """Flag the blocks of samples of which too many were missing and have been filled.
+    """Flag the blocks (n,) in which too many samples are filled in place of missing ones (`Recording.bridged`).
 
     `bounds` (n + 1,): sample indices at which the blocks begin and end. A block is flagged if more than the fraction
-    `MAX_BRIDGED_FRACTION` of its samples is filled (`Recording.bridged`). Returns the flags (n,).
+    `MAX_BRIDGED_FRACTION` of its samples is filled.
     """
     bounds = np.asarray(bounds)
     if recording.bridged is None:
@@ -164,11 +168,11 @@ def _finite_mean(values: Array) -> float:
 
 
 def _copy_other_cycle(channels: dict[str, Array], needed: Sequence[str], first: int, stop: int, period: float) -> bool:
-    """Fill a gap in all channels, in place, from a nearby cycle of motion; return True if there is a similar one.
+    """Fill a gap in all channels, in place, from a nearby cycle of motion; return False if no cycle is similar enough.
 
     The gap has the samples `first` to `stop` - 1. `period`: length of a cycle [samples], known to within `_SLACK`. The
-    nearest two cycles on either side of the gap are tried. A cycle is similar if the motion around the gap differs from
-    it, in relative rms, by at most `_MAX_MISMATCH` (`_cycle_mismatch`). Without a similar cycle nothing is filled.
+    nearest two cycles on either side of the gap are tried. A cycle is similar enough if the motion around the gap
+    differs from that in the cycle by at most `_MAX_MISMATCH` (`_cycle_mismatch`). Otherwise nothing is filled.
     """
     half_cycle = round(0.5 * period)
     min_cycles = math.ceil((stop - first + half_cycle) / period)
@@ -186,15 +190,16 @@ def _copy_other_cycle(channels: dict[str, Array], needed: Sequence[str], first: 
 def _cycle_mismatch(
     channels: dict[str, Array], needed: Sequence[str], first: int, stop: int, shift: int, half_cycle: int
 ) -> float:
-    """Compute how much the machine's motion around a gap differs from its motion `shift` samples away.
+    """Compute how much the machine's motion around a gap differs from its motion `shift` samples later.
 
-    The motion is shown by one signal: the command, else p_A - p_B or the only chamber pressure (`duty_signal`). The gap
-    has the samples `first` to `stop` - 1. Both stretches extend up to `half_cycle` samples beyond it on either side.
-    The result is the rms difference of the two, without their means, divided by the standard deviation of the shifted
-    one. It is infinite if too few samples are known, or if a `needed` channel lacks samples to copy.
+    The motion is that in the command, else in p_A - p_B or the only chamber pressure (`duty_signal`). Two stretches of
+    this signal are compared: one has the gap, i.e. the samples `first` to `stop` - 1, and up to `half_cycle` samples on
+    either side; the other is shifted by `shift`. The result is the rms difference of the stretches, after their means
+    are removed, divided by the standard deviation of the shifted stretch. It is infinite if too few samples are known,
+    or if a `needed` channel lacks samples to copy.
     """
     n = next(iter(channels.values())).size
-    # half a cycle on either side of the gap, as far as it exists here and there
+    # half a cycle on either side of the gap, as far as both stretches lie within the recording
     window = slice(max(first - half_cycle, -shift, 0), min(stop + half_cycle, n - shift, n))
     if window.start > first - _N_END or window.stop < stop + _N_END:
         return math.inf
@@ -213,8 +218,8 @@ def _cycle_mismatch(
 def _copy_shifted(values: Array, first: int, stop: int, shift: int) -> None:
     """Fill the missing values from index `first` to `stop` - 1, in place, by the values `shift` samples later.
 
-    `shift` is negative for earlier values. A linear offset is added, with which both ends meet the values around the
-    gap.
+    `shift` is negative for earlier values. A linear offset is added to the copied values, so that they meet the means
+    of the values before and after the gap.
     """
     ends = (slice(first - _N_END, first), slice(stop, stop + _N_END))
     offset_before, offset_after = (
@@ -226,7 +231,10 @@ def _copy_shifted(values: Array, first: int, stop: int, shift: int) -> None:
 
 
 def _fill_by_line(values: Array, rows: Flags) -> None:
-    """Fill missing values (n,) in the flagged `rows` (n,), in place, by linear interpolation, except at the ends."""
+    """Fill the missing values in the flagged `rows` (n,) of `values` (n,), in place, by linear interpolation.
+
+    Values before the first and after the last known value stay missing.
+    """
     known = np.flatnonzero(np.isfinite(values))
     missing = np.flatnonzero(rows & np.isnan(values))
     if missing.size and known.size:
@@ -235,7 +243,10 @@ def _fill_by_line(values: Array, rows: Flags) -> None:
 
 
 def _fill_by_spline(values: Array, rows: Flags) -> None:
-    """Fill missing values (n,) in the flagged `rows` (n,), in place, by a cubic spline through the known values."""
+    """Fill the missing values in the flagged `rows` (n,) of `values` (n,), in place, by a cubic spline.
+
+    The spline passes through the known values. With up to `_N_END` known values nothing is filled.
+    """
     from scipy.interpolate import CubicSpline
 
     known = np.flatnonzero(np.isfinite(values))

@@ -37,7 +37,7 @@ class CorrectedSamples(NamedTuple):
 
     - `recording`: the samples at evenly spaced times, from the first to the last row with all chamber pressures and
       the command.
-    - `findings`: the corrections made.
+    - `findings`: the corrections that `correct_samples` reports.
     - `stuck`: names of chamber pressures that repeat one value for too long to be used.
     - `used_fraction`: fraction of the original samples within the time span of `recording`.
     """
@@ -49,11 +49,18 @@ class CorrectedSamples(NamedTuple):
 
 
 def correct_samples(recording: Recording) -> CorrectedSamples:
-    """Correct the samples of a recording for the defects of loggers, and report each correction as a finding.
+    """Correct the samples of a recording for the defects of loggers.
 
-    The defects are treated in this order: impossible values; dropouts, i.e. rows of zeros; rows, and then single
-    pressures, that repeat one value for a long time; spikes; samples that repeat the previous one; uneven sampling
-    times; speeds without a sign; gaps.
+    The defects are treated in this order:
+
+    1. impossible values, and dropouts, i.e. rows with zeros in both chamber pressures;
+    2. rows, and then single pressures, that repeat one value for a long time;
+    3. spikes, and samples that repeat the previous one;
+    4. uneven sampling times;
+    5. speeds without a sign;
+    6. gaps, and incomplete rows at the ends, which are cut off.
+
+    Steps 3, 5 and 6 are reported as findings.
     """
     part, findings = remove_dropouts(remove_impossible(recording)), list[Finding]()
     is_frozen = flag_frozen_rows(part)
@@ -71,7 +78,8 @@ def correct_samples(recording: Recording) -> CorrectedSamples:
         findings += new_findings
     part = interpolate_short_gaps(bridge(part, needed), needed)
     if part.bridged is not None:
-        bridged, gaps = np.flatnonzero(part.bridged), format_count(len(find_runs(part.bridged)), "gap")
+        bridged = np.flatnonzero(part.bridged)
+        gaps = format_count(len(find_runs(part.bridged)), "gap")
         text = f"{format_count(bridged.size, 'missing sample')} in {gaps} bridged: what a long one touches counts less"
         findings.append(Finding("gaps_bridged", "note", None, bridged.size, float(part.t[bridged[0]]), text))
     part = _cut_to_complete(part, needed)
@@ -90,7 +98,10 @@ def _set_missing(recording: Recording, flags: Mapping[str, NDArray[np.bool_]]) -
 
 
 def _cut_to_complete(recording: Recording, needed: Sequence[str]) -> Recording:
-    """Cut a recording to its rows from the first to the last one with values in all `needed` channels."""
+    """Cut a recording to the rows from the first to the last row with values in all `needed` channels.
+
+    The result is empty if no row has values in all of them.
+    """
     is_complete = np.all([np.isfinite(recording[name]) for name in needed], axis=0) if needed else np.array([True])
     if is_complete.all():
         return recording
@@ -111,8 +122,8 @@ def remove_holes(recording: Recording) -> Recording:
 
 
 def _resample(recording: Recording) -> tuple[Recording, list[Finding]]:
-    """Resample a recording to evenly spaced times (`resample_evenly`); also return findings, of which there are none.
+    """Resample a recording to evenly spaced times (`resample_evenly`).
 
-    The signature is that of the other corrections.
+    Also returns an empty list, so that the signature is that of corrections with findings.
     """
     return resample_evenly(recording), []

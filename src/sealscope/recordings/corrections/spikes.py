@@ -19,7 +19,7 @@ from sealscope.recordings.quality import Finding
 from sealscope.recordings.recording import Recording
 
 _PRIORS = RECORDINGS.spike
-#: Leaps on either side that a spike is compared with, and fewest samples of a channel.
+#: Number of leaps on either side with which a spike is compared, and fewest samples of a channel.
 _NEIGHBOURS, _MIN_SAMPLES = 10, 50
 #: Smallest spike, in quantisation steps.
 _MIN_QUANTA = 10.0
@@ -60,11 +60,11 @@ def find_spikes(values: Array) -> NDArray[np.intp]:
         return np.empty(0, dtype=np.intp)
     steps = np.diff(values[known])
     step_sizes = np.abs(steps)
-    # of a sample that leaps and returns, the smaller of its two changes
+    # for a sample that leaps and returns, the smaller of its two changes; 0 for other samples
     jumps = np.where(steps[:-1] * steps[1:] < 0.0, np.minimum(step_sizes[:-1], step_sizes[1:]), 0.0)
     usual_step = float(np.quantile(step_sizes[:: max(1, step_sizes.size // _N_CHANGES)], 0.9))
     threshold = _PRIORS.times * usual_step + _MIN_QUANTA * estimate_quantum(values[known])
-    # of the neighbouring samples: over the leap, before and after it
+    # changes before and after the leap; the slope is the largest of these and of the mean change across the leap
     outer_steps = np.maximum(np.append(0.0, step_sizes[:-2]), np.append(step_sizes[2:], 0.0))
     slopes = np.maximum(0.5 * np.abs(steps[:-1] + steps[1:]), outer_steps)
     rows = []

@@ -1,6 +1,6 @@
 """Stale samples: a slow channel, or a logger that got no new value, repeats the previous sample.
 
-Repeated samples are no readings. They are interpolated between fresh ones; otherwise a channel that repeats each
+Repeated samples are not readings. They are interpolated between fresh ones; otherwise a channel that repeats each
 sample for 0.1 s would be 0.05 s late on average. A quantised channel at rest also repeats its value. The time for
 which a channel repeats its samples is therefore estimated from runs that begin and end with a jump of more than a
 quantisation step. Called by the inspection.
@@ -65,9 +65,9 @@ def flag_stuck_rows(recording: Recording, name: str) -> NDArray[np.bool_]:
     """Flag the rows (n,) in which the chamber pressure `name` repeats one value for too long while the machine moves.
 
     The time is too long for the way in which the pressure changes around it (`motion.find_stuck`). Motion is seen in
-    the position, else in the pump's angle. Without both, a change of the other chamber pressure counts as motion,
-    though it may change while valves hold the cylinder. If none of them is recorded, all such rows are flagged. Rows at
-    the smallest or largest value of the channel are clipped, and not flagged.
+    the position, else in the pump's angle, else in the other chamber pressure, although this pressure may also change
+    while valves hold the cylinder. If no such channel is recorded, the machine is assumed to move. Rows at the smallest
+    or largest value of the channel are clipped, and not flagged.
     """
     values, flags = recording[name], np.zeros(len(recording), dtype=bool)
     known = np.flatnonzero(np.isfinite(values))
@@ -85,19 +85,19 @@ def flag_frozen_rows(recording: Recording) -> NDArray[np.bool_]:
     """Flag the rows (n,) in which a logger repeats its last row for a long time.
 
     In such rows all channels are constant or missing, and both chamber pressures keep one value for longer than their
-    noise allows (`motion.find_holds`). No channel jumps where they begin, and at least one does where they end. A
-    machine at rest would continue smoothly.
+    noise allows (`motion.find_holds`). No channel jumps at the first of these rows. After the last one at least one
+    channel jumps, because the machine has moved on; a machine at rest would continue smoothly.
     """
     flags = np.zeros(len(recording), dtype=bool)
     pressures = [recording[name] for name in CHAMBERS if name in recording]
     if len(pressures) < len(CHAMBERS) or len(recording) < _PRIORS.runs:
         return flags
-    holds = [find_runs(find_holds(values, recording.rate).flags) for values in pressures]
+    holds_a, holds_b = (find_runs(find_holds(values, recording.rate).flags) for values in pressures)
+    begins_b, ends_b = holds_b[:, 0], holds_b.sum(axis=1)
     channels = list(recording.channels.values())
-    for first, length in holds[0].tolist():
+    for first, length in holds_a.tolist():
         stop = first + length
-        begins, ends = holds[1][:, 0], holds[1].sum(axis=1)
-        coincide = np.any((np.abs(begins - first) <= _MAX_REPEAT) & (np.abs(ends - stop) <= _MAX_REPEAT))
+        coincide = np.any((np.abs(begins_b - first) <= _MAX_REPEAT) & (np.abs(ends_b - stop) <= _MAX_REPEAT))
         inner = slice(first + _MAX_REPEAT, stop - _MAX_REPEAT)
         if (
             coincide
@@ -119,8 +119,8 @@ def _is_constant_or_missing(values: Array) -> bool:
 def _jumps_at(values: Array, row: int) -> bool:
     """Return True if a channel (n,) changes across the index `row` by more than it usually does.
 
-    The change is that over `2 * _MAX_REPEAT + 1` samples around the row. The usual change is a high quantile
-    (`stale.leap` of `priors.toml`) of the absolute changes of the channel over as many samples.
+    All changes are taken over `2 * _MAX_REPEAT + 1` samples. The usual change is a high quantile (`stale.leap` of
+    `priors.toml`) of the absolute changes of the channel.
     """
     change = np.abs(values[min(row + _MAX_REPEAT, len(values) - 1)] - values[max(row - _MAX_REPEAT - 1, 0)])
     usual_change = np.nanquantile(np.abs(values[2 * _MAX_REPEAT + 1 :] - values[: -2 * _MAX_REPEAT - 1]), _PRIORS.leap)
@@ -152,9 +152,10 @@ def estimate_holding_period(t: Array, values: Array) -> float | None:
     """Estimate the time [s] for which a channel (n,) repeats each reading; None if it does not.
 
     A sensor that is slower than the logger causes this. `t` (n,): times [s]. The runs of equal values that begin and
-    end with a jump (`_find_equal_runs`) are used. The period is the mean duration of those near the median duration,
-    within a relative `stale.spread` (`priors.toml`). None if fewer than the fraction `stale.share` is near it, if the
-    median run has one sample, if there are fewer than `stale.runs` runs, or if the period is below `stale.shortest`.
+    end with a jump (`_find_equal_runs`) are used. A run is regular if its duration differs from the median duration by
+    at most the fraction `stale.spread` of `priors.toml`. The period is the mean duration of the regular runs. None if
+    there are fewer than `stale.runs` runs or too few regular ones (`stale.share`), if the median run is shorter than
+    two samples, or if the period is shorter than `stale.shortest`.
     """
     t, values = t[:_N_ESTIMATE], values[:_N_ESTIMATE]
     known = np.isfinite(values) & np.isfinite(t)
@@ -163,7 +164,8 @@ def estimate_holding_period(t: Array, values: Array) -> float | None:
     t, values = t[known], values[known]
     starts, is_bounded = _find_equal_runs(values)
     ends = np.r_[starts[1:], values.size]
-    lengths, durations = (ends - starts)[is_bounded], (t[np.minimum(ends, t.size - 1)] - t[starts])[is_bounded]
+    lengths = (ends - starts)[is_bounded]
+    durations = (t[np.minimum(ends, t.size - 1)] - t[starts])[is_bounded]
     if lengths.size < _PRIORS.runs or np.median(lengths) < 2:
         return None
     median_duration = float(np.median(durations))
@@ -192,11 +194,11 @@ def _flag_held(t: Array, values: Array, period: float) -> NDArray[np.bool_]:
 def _flag_repeated_rows(channels: list[Array]) -> NDArray[np.bool_]:
     """Flag the rows (n,) in which a logger got no new readings and repeated the previous row.
 
-    Each of `channels` (n,) that varies must repeat its sample there. A run of such rows is flagged if three conditions
-    are met. It has at most two rows. One channel jumps by more than `_MIN_JUMP` quantisation steps both to the repeated
-    reading and to the row after the run. The number of runs that meet these two is at least `stale.repeats`
-    (`priors.toml`) times the number of repeated rows that chance would make, if channels repeated samples
-    independently, and at least that factor times the fraction `stale.fewest` of all rows.
+    Each of `channels` (n,) that varies repeats its sample in such a row. A run of such rows is a candidate if it has at
+    most two rows, and one channel jumps by more than `_MIN_JUMP` quantisation steps both to the repeated reading and to
+    the row after the run. The candidates are flagged if their number is at least `stale.repeats` (`priors.toml`) times
+    the number of repeated rows expected by chance. The expected number assumes that channels repeat samples
+    independently, and is at least the fraction `stale.fewest` of all rows.
     """
     moving = [values for values in channels if np.isfinite(values).any() and np.nanmax(values) > np.nanmin(values)]
     if not moving or moving[0].size < _PRIORS.runs:
@@ -208,16 +210,16 @@ def _flag_repeated_rows(channels: list[Array]) -> NDArray[np.bool_]:
     first, stop = runs[:, 0], runs.sum(axis=1)
     is_short = (stop - first < _MAX_REPEAT) & (first > 1) & (stop < is_same.size)
     first, stop = first[is_short], stop[is_short]
-    jumps = np.zeros(first.size, dtype=bool)
+    is_candidate = np.zeros(first.size, dtype=bool)
     for values in moving:
         min_jump = _MIN_JUMP * estimate_quantum(values[np.isfinite(values)])
-        jumps |= (np.abs(values[first - 1] - values[first - 2]) > min_jump) & (
-            np.abs(values[stop] - values[stop - 1]) > min_jump
-        )
+        jumps_before = np.abs(values[first - 1] - values[first - 2]) > min_jump
+        jumps_after = np.abs(values[stop] - values[stop - 1]) > min_jump
+        is_candidate |= jumps_before & jumps_after
     repeated = np.zeros(is_same.size, dtype=bool)
-    # no more than expected by chance
-    if np.count_nonzero(jumps) < _PRIORS.repeats * max(p_equal, _PRIORS.fewest) * is_same.size:
+    # the product of the last two factors is the number of repeated rows expected by chance
+    if np.count_nonzero(is_candidate) < _PRIORS.repeats * max(p_equal, _PRIORS.fewest) * is_same.size:
         return repeated
-    for begin, end in zip(first[jumps].tolist(), stop[jumps].tolist(), strict=True):
+    for begin, end in zip(first[is_candidate].tolist(), stop[is_candidate].tolist(), strict=True):
         repeated[begin:end] = True
     return repeated

@@ -49,8 +49,8 @@ def restore_speed_sign(recording: Recording) -> tuple[Recording, list[Finding]]:
 def _has_one_sign(values: Array) -> bool:
     """Return True if a channel (n,) stays on one side of zero, to within its noise.
 
-    The largest magnitude on the other side may be at most the fraction `unsigned.noise` of `priors.toml` of the largest
-    on this side.
+    The largest magnitude on the other side may be at most the largest magnitude on this side times `unsigned.noise` of
+    `priors.toml`.
     """
     finite = values[np.isfinite(values)]
     if not finite.size:
@@ -63,8 +63,8 @@ def _find_sign(recording: Recording, magnitude: Array) -> tuple[Array | None, st
     """Find the signs (n,), +1 or -1, of the flow into chamber A; also return the source of the signs, in words.
 
     `magnitude` (n,): absolute speed or flow. The signs are fitted to the position (`_fit_signs`); in a recording
-    without one they are those of the command. Returns (None, "") if there is neither, if the magnitude of the piston
-    speed or command does not correlate with `magnitude`, or if the motion is in one direction only.
+    without a position they are those of the command. Returns (None, "") if neither is recorded, if the absolute piston
+    speed or command does not correlate with `magnitude`, or if the piston moves in one direction only.
     """
     if "x" in recording:
         speed = _piston_speed(recording["x"], recording.rate)
@@ -80,8 +80,8 @@ def _find_sign(recording: Recording, magnitude: Array) -> tuple[Array | None, st
 def _piston_speed(x: Array, rate: float) -> Array:
     """Compute the piston speed (n,) [m/s] from the position `x` (n,) [m] sampled at `rate` [Hz].
 
-    It is the central difference of the positions half a window before and after a sample; half a window is
-    `unsigned.half` [s] of `priors.toml`. Missing positions are interpolated linearly.
+    The speed is the central difference of the positions `unsigned.half` [s] of `priors.toml` before and after a sample.
+    Missing positions are interpolated linearly.
     """
     n_half = max(1, round(_PRIORS.half * rate))
     known = np.isfinite(x)
@@ -143,8 +143,9 @@ def _fit_signs(recording: Recording, speed: Array, magnitude: Array) -> Array:
         predicted = by_motion + conductance * difference
         # log of the ratio of two normal densities, of a positive over a negative sign
         log_odds = 2.0 * magnitude * predicted / variance
-        sign, previous = _most_likely_signs(log_odds, cost_of_change), sign
-        if np.array_equal(sign, previous):
+        previous_sign = sign
+        sign = _most_likely_signs(log_odds, cost_of_change)
+        if np.array_equal(sign, previous_sign):
             break
         leak_flow = sign * magnitude - by_motion
     return sign
@@ -153,9 +154,9 @@ def _fit_signs(recording: Recording, speed: Array, magnitude: Array) -> Array:
 def _noise_variance(speed: Array, rate: float) -> float:
     """Estimate the noise variance [(m/s)^2] of a piston speed (n,) sampled at `rate` [Hz].
 
-    It is half the mean square of the difference of two speeds that are computed from different positions, i.e. of
-    speeds a window apart (`_piston_speed`). The mean square is taken over a short time around each sample, and the
-    median of these values makes the estimate robust to motion.
+    Speeds are compared that are so far apart in time that they are computed from different positions (`_piston_speed`).
+    The variance is half the mean square of their difference. The mean square is taken over a short time around each
+    sample, and the median of the mean squares makes the estimate robust to motion.
     """
     n_lag = max(1, round(2.0 * _PRIORS.half * rate))
     steps = speed[n_lag:] - speed[:-n_lag]
@@ -163,7 +164,10 @@ def _noise_variance(speed: Array, rate: float) -> float:
 
 
 def _average_nearby(values: Array, rate: float) -> Array:
-    """Average values (n,) sampled at `rate` [Hz] over `unsigned.nearby` [s] of `priors.toml` on either side of each."""
+    """Average values (n,) over the time `unsigned.nearby` [s] of `priors.toml` on either side of each value.
+
+    `rate` [Hz]: sampling rate.
+    """
     n_half = max(1, round(_PRIORS.nearby * rate))
     sums = np.concatenate([[0.0], np.cumsum(values)])
     first = np.maximum(np.arange(values.size) - n_half, 0)
@@ -179,7 +183,8 @@ def _most_likely_signs(log_odds: Array, cost_of_change: Array) -> Array:
     min(max(o_(k-1), -c_(k-1)), c_(k-1)). From the end backwards, the sign of sample k is that of o_k if |o_k| > c_k,
     else that of sample k + 1.
     """
-    path_odds, odds = np.empty(log_odds.size), 0.0
+    path_odds = np.empty(log_odds.size)
+    odds = 0.0
     for k, (evidence, cost) in enumerate(zip(log_odds.tolist(), [0.0, *cost_of_change.tolist()], strict=True)):
         odds = min(max(odds, -cost), cost) + evidence
         path_odds[k] = odds

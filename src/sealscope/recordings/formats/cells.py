@@ -25,6 +25,7 @@ from sealscope.units import parse_unit
 MISSING = frozenset({"", *WORDS["missing"]})
 #: Largest fraction of a column's cells that may be words, as loggers write on overflow.
 MAX_WORD_FRACTION = 0.01
+#: Longest number, and longest number with its unit [characters].
 _MAX_NUMBER, _MAX_QUANTITY = 400, 80
 _NUMBER = {
     ".": re.compile(r"[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eEdD][+-]?\d+)?|[+-]?inf(?:inity)?", re.IGNORECASE),
@@ -68,14 +69,14 @@ def is_value(cell: str, decimal: str) -> bool:
     return is_number(cell, decimal) or is_stamp(cell)
 
 
-def parse_numbers(cells: Sequence[str], decimal: str, where: Callable[[int], str]) -> tuple[Array, list[int]]:
+def parse_numbers(cells: Sequence[str], decimal: str, format_place: Callable[[int], str]) -> tuple[Array, list[int]]:
     """Parse the cells of a column to an array of doubles (n,), and find the cells that contain words.
 
     A word is any text that is neither a number nor a mark of a missing sample; both words and missing samples become
-    NaN. `decimal`: decimal separator; `where`: function from the index of a cell to its place, for messages. Returns
-    the numbers and the indices of the words. Raises InputError for an infinite number.
+    NaN. `decimal`: decimal separator; `format_place`: function from the index of a cell to its place, for messages.
+    Returns the numbers and the indices of the words. Raises InputError for an infinite number.
     """
-    # with a decimal comma a point is no decimal separator: `?` makes `float` refuse the cell
+    # with a decimal comma a point is not a decimal separator: `?` makes `float` refuse the cell
     texts = [cell.replace(".", "?").replace(",", ".") for cell in cells] if decimal == "," else cells
     try:
         if any("_" in text for text in texts):  # Python takes 1_000 for a number
@@ -83,20 +84,21 @@ def parse_numbers(cells: Sequence[str], decimal: str, where: Callable[[int], str
         values = np.fromiter(map(float, texts), np.float64, len(texts))
     except ValueError:
         values = np.fromiter(map(_parse_number, cells, texts, repeat(decimal)), np.float64, len(cells))
-    words = [index for index in np.flatnonzero(~np.isfinite(values)).tolist() if not is_missing(cells[index])]
-    for index in words:
+    word_indices = [index for index in np.flatnonzero(~np.isfinite(values)).tolist() if not is_missing(cells[index])]
+    for index in word_indices:
         if is_number(cells[index], decimal):
-            raise InputError(f"a sample must be a finite number, got {cells[index].strip()[:40]!r} {where(index)}")
-    return values, words
+            text = cells[index].strip()[:40]
+            raise InputError(f"a sample must be a finite number, got {text!r} {format_place(index)}")
+    return values, word_indices
 
 
-def _parse_number(cell: str, pointed: str, decimal: str) -> float:
+def _parse_number(cell: str, cell_with_point: str, decimal: str) -> float:
     """Parse a cell to a double; NaN if it is not a number.
 
-    `pointed`: the cell with "." in place of the decimal separator `decimal`.
+    `decimal`: decimal separator; `cell_with_point`: the cell with "." as the decimal separator.
     """
     with suppress(ValueError):
-        return np.nan if "_" in pointed else float(pointed)
+        return np.nan if "_" in cell_with_point else float(cell_with_point)
     text = cell.strip().replace("\u2212", "-")
     if match := _GROUPED[decimal].fullmatch(text):
         text = text.replace(match["separator"], "")
@@ -108,8 +110,8 @@ def _parse_number(cell: str, pointed: str, decimal: str) -> float:
 def has_prefixes(rows: Sequence[Sequence[str]]) -> bool:
     """Test whether the numbers in `rows` of cells end in SI prefixes, such as `170.3m`, and not in units.
 
-    The endings are prefixes if a column has several different ones, or if one of them is `k` or `u`, neither of which
-    is a unit.
+    They do if numbers in one column have different endings, also if some have an ending and others, not zero, have
+    none; or if an ending is `k` or `u`, which are not units.
     """
     prefixes_by_column: dict[int, set[str]] = {}
     for row in rows:
@@ -132,7 +134,7 @@ def expand_prefixes(line: str) -> str:
 
 
 def _trailing_unit(cell: str) -> str | None:
-    """Find the text after the number in a cell such as `20 bar`, whether it is a known unit or not.
+    """Find the text after the number in a cell such as `20 bar`; it need not be a known unit.
 
     None if the cell is not a number with a short text after it.
     """
@@ -184,12 +186,12 @@ def add_units(labels: Sequence[Label], units: Mapping[int, str], place: str) -> 
     return result
 
 
-def strip_unit(cells: Sequence[str], unit: str, is_cut: bool, where: Callable[[int], str]) -> list[str]:
+def strip_unit(cells: Sequence[str], unit: str, is_cut: bool, format_place: Callable[[int], str]) -> list[str]:
     """Remove the unit after the number from each cell of a column.
 
     Words, and zeros without a unit, stay as they are. `is_cut`: the last cell may be incomplete, and becomes empty if
-    it does not end in `unit`; `where`: function from the index of a cell to its place, for messages. Raises
-    InputError for a number with another unit, and for one without a unit.
+    it does not end in `unit`; `format_place`: function from the index of a cell to its place, for messages. Raises
+    InputError for a number with another unit, and for a number other than zero without a unit.
     """
     result = [cell.strip() for cell in cells]
     for index, text in enumerate(result):
@@ -199,5 +201,6 @@ def strip_unit(cells: Sequence[str], unit: str, is_cut: bool, where: Callable[[i
             result[index] = ""
         elif _trailing_unit(text) is not None or (text[:1] in "+-\u2212.,0123456789" and text.strip("+-\u22120.,")):
             # another unit, or a number other than zero without a unit
-            raise InputError(f"a cell must be in {unit}, as others of its column, got {text[:40]!r} {where(index)}")
+            place = format_place(index)
+            raise InputError(f"a cell must be in {unit}, as others of its column, got {text[:40]!r} {place}")
     return result

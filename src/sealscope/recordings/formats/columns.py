@@ -30,6 +30,8 @@ from sealscope.recordings.formats.headings.split_time import find_time_parts
 from sealscope.recordings.formats.headings.words import WORDS
 from sealscope.units import same_dimension, to_si
 
+#: Most digits of a column's number; no log has as many columns.
+_MAX_DIGITS = 9
 #: Separators of the parts of a path such as `Rig.Cyl.p_A`.
 _PATH_SEPARATORS = re.compile(r"[./\\:<>]")
 #: Units of a rotational speed that are revolutions a minute, not frequencies.
@@ -57,10 +59,10 @@ class Request:
 
     @property
     def infers_rate(self) -> bool:
-        """True if the sampling rate is computed from the times, even if a file that Sealscope wrote states it.
+        """True if the sampling rate must be computed from the times, even if a file that Sealscope wrote states it.
 
-        This holds with a map, which may choose another column of times, and for a data frame, which may lack rows and
-        has no `file`.
+        With a map the rate is computed because the map may choose another time column. For a data frame, i.e. without
+        a `file`, it is computed because rows may have been removed.
         """
         return bool(self.map) or not self.file
 
@@ -74,8 +76,8 @@ class ColumnMap:
     - `time`: the time column, or None; `time_label`: name and unit used for it.
     - `channels`: channel -> formula of columns.
     - `parts`: part of the time, such as "hour" -> its column, if several columns form the time.
-    - `date`: column of the date, which is needed if the time column contains times of day only; the time column itself
-      if its name means a date, because it may then contain dates alone.
+    - `date`: column of the date, in case the time column contains only times of day. If the name of the time column
+      means a date, `date` is the time column itself, which may then contain only dates.
     - `names`: channel -> its name in the file, if that differs.
     - `unused`: names of columns with measured pressures, positions, speeds and flows that are in no channel.
     - `notes`: lines for the history of the recording.
@@ -101,10 +103,10 @@ class ColumnMap:
     def columns(self) -> dict[int, str]:
         """Mapping from each column to read to its kind, "numbers" or "time".
 
-        The time column is the last. It is read as numbers if it is also part of a channel.
+        The time column comes last. It is read as numbers if it is also part of a channel.
         """
-        read = {*self.channel_of, *self.parts.values()} - {self.time}
-        columns = dict.fromkeys(sorted(read), "numbers")
+        number_columns = {*self.channel_of, *self.parts.values()} - {self.time}
+        columns = dict.fromkeys(sorted(number_columns), "numbers")
         if self.time is not None:
             columns[self.time] = "numbers" if self.time in self.channel_of else "time"
         return columns
@@ -131,7 +133,7 @@ def _check_channel(channel: str) -> None:
 def check_request(channel_map: ChannelMap, rate: float | None) -> None:
     """Raise InputError for an invalid map from channels to columns, and for a sampling rate that is not positive.
 
-    A map is invalid if it has an unknown channel, or a word other than "auto" in place of columns.
+    A map is invalid if it names an unknown channel, or if it is a text other than "auto", or maps `REST` to one.
     """
     if isinstance(channel_map, str) and channel_map != "auto":
         raise InputError(f"map must be a mapping or the word auto, got {channel_map!r}")
@@ -150,16 +152,16 @@ def uses_names(channel_map: ChannelMap) -> bool:
 
 def explicit_columns(channel_map: ChannelMap) -> dict[str, str]:
     """Return the entries of a map, channel -> column, that name a column; empty for the map "auto"."""
-    return (
-        {} if isinstance(channel_map, str) else {name: column for name, column in channel_map.items() if name != REST}
-    )
+    if isinstance(channel_map, str):
+        return {}
+    return {name: column for name, column in channel_map.items() if name != REST}
 
 
 def reconstruct_map(provenance: Mapping[str, object]) -> dict[str, str]:
     """Reconstruct the map, channel -> column, with which a recording was read, from its provenance.
 
-    The provenance has the heading of each channel's column, where that differs from the channel's name. The map adds a
-    unit that a heading has at the end of its name, as in `PA_bar`. Empty if the provenance names no columns.
+    The provenance has the heading of each channel's column, if the heading differs from the channel's name. A unit at
+    the end of a heading's name, as in `PA_bar`, is added in the map. Empty if the provenance names no columns.
     """
     names = provenance.get("columns")
     columns = {str(channel): str(heading) for channel, heading in names.items()} if isinstance(names, Mapping) else {}
@@ -183,13 +185,14 @@ def _format_columns(labels: Sequence[Label]) -> str:
 
 
 def _find_column(labels: Sequence[Label], name: str, description: str, mapped: bool = False) -> int | None:
-    """Find the index of the column with a name, or with a number such as `#4`, counted from 1.
+    """Find the index, from 0, of the column with a name, or with a number such as `#4`, counted from 1.
 
-    The index itself counts from 0. None if there is no such column. If `mapped`, the last words of a column's name are
-    enough, such as `ch2`. Raises InputError if several columns match; `description` begins the message.
+    A name is compared by several criteria; the strictest that any column meets counts. If `mapped`, the last words of a
+    column's name are enough, such as `ch2`. None if there is no such column. Raises InputError if several columns meet
+    the criterion; `description` begins the message.
     """
     folded = name.casefold()
-    for matches_name in (  # strict criteria first
+    for matches_name in (  # from strict to loose
         lambda label: label.whole == name,
         lambda label: label.name == name,
         lambda label: label.called and label.called == name,
@@ -204,21 +207,22 @@ def _find_column(labels: Sequence[Label], name: str, description: str, mapped: b
             )
         if matches:
             return matches[0]
-    number = name[1:] if name.startswith("#") else ""
-    return int(number) - 1 if number.isascii() and number.isdigit() and 1 <= int(number[:9]) <= len(labels) else None
+    number = name[1:].lstrip("0") if name.startswith("#") else ""
+    is_number = number.isascii() and number.isdigit() and len(number) <= _MAX_DIGITS
+    return int(number) - 1 if is_number and int(number) <= len(labels) else None
 
 
 def _parse_mapping(labels: Sequence[Label], channel: str, column_text: str) -> Formula[int]:
     """Parse the column that a user's map gives for a channel to a formula of column numbers.
 
-    `column_text`: the name of a column, or a formula of several. A unit in it takes precedence over one in the
-    heading, and that over one at the end of the column's name.
+    `column_text`: the name of a column, possibly with a unit, or a formula of several columns. The unit is that in
+    `column_text`, else that in the heading, else that at the end of the column's name. Raises InputError if a column
+    does not exist, or if a formula without a unit has columns in different units.
     """
     description = f"{column_text}, mapped to {channel},"
     name_before_blank, _, unit_after_blank = column_text.rpartition(" ")
-    for name, unit in (
-        (column_text, None), split_square_brackets(column_text), (name_before_blank, unit_after_blank)
-    ):  # fmt: skip
+    # without a unit, as `name [unit]`, and as `name unit`
+    for name, unit in ((column_text, None), split_square_brackets(column_text), (name_before_blank, unit_after_blank)):
         column = _find_column(labels, name, description) if name else None
         if column is not None:
             return Formula({column: 1.0}, 0.0, _find_unit(labels[column], channel) if unit is None else unit)
@@ -244,10 +248,13 @@ def _parse_mapping(labels: Sequence[Label], channel: str, column_text: str) -> F
 def _choose_unit(channel: str, unit: str | None, description: str) -> tuple[str, str | None]:
     """Choose the unit in which the values of a column are read as a channel; return it with a note for the history.
 
-    It is the column's `unit`, with three exceptions. A column without a unit (None) is read as raw counts, i.e. numbers
-    of an unknown scale, and so is a command u in a unit of current or in per cent; the note says so. A speed omega in a
-    unit of rotation, such as "1/min", is read in rpm. Without a remark the note is None. `description`: the column in
-    words, with which the note begins. Raises InputError for a unit of the wrong dimension.
+    The result is (the column's `unit`, None), with three exceptions:
+
+    - A column without a unit (None) is read as raw counts, i.e. numbers of an unknown scale; the note says so.
+    - A command u in a unit of current or in per cent is read as raw counts; the note says so.
+    - A speed omega in a unit of rotation, such as "1/min", is read in rpm, without a note.
+
+    `description`: the column in words, with which the note begins. Raises InputError for a unit of the wrong dimension.
     """
     if unit is None:
         return COUNTS, f"{description} has no unit: taken as raw counts"
@@ -282,7 +289,7 @@ def _apply_map(choice: ColumnMap, columns: Mapping[str, str]) -> None:
 def _apply_names(choice: ColumnMap) -> None:
     """Add the channels and the time that are found by the names of columns to `choice`.
 
-    Those that a map has already set stay.
+    Channels and a time that a map has already set stay as they are.
     """
     labels = choice.labels
     for channel in CHANNEL_UNITS:
@@ -322,7 +329,11 @@ def _find_embedded_name(labels: Sequence[Label], channel: str) -> int | None:
 
 
 def _find_time(labels: Sequence[Label]) -> int | None:
-    """Find the time column by its name, preferably one with a unit; None if there is none."""
+    """Find the time column by its name; None if there is none.
+
+    A column called `t` comes first, then columns with usual names of a time. Of several columns with one name, the
+    first with a unit is preferred. Raises InputError if several columns are called `t`.
+    """
     if (exact := next((i for i, label in enumerate(labels) if label.name == "t"), None)) is not None:
         _find_column(labels, "t", "t")  # raises if there are several
         return exact
@@ -340,9 +351,12 @@ def _find_time(labels: Sequence[Label]) -> int | None:
 def _choose_time_columns(choice: ColumnMap) -> None:
     """Choose the time of a table if it is in several columns, or in columns whose names do not mean the time.
 
-    The result is stored in `choice`. Columns of hours, minutes and seconds form the time, alone or with a date. If
-    there is no time column and the file states no rate, a date is the time, or the only column in a unit of time.
-    Columns with parts of a second are added to the time.
+    The result is stored in `choice`:
+
+    - Columns of hours, minutes and seconds form the time, alone or with a date.
+    - Otherwise, without a time column and a rate in the file, the time is a column of dates, or else the only column in
+      a unit of time.
+    - Columns with parts of a second are added to the time.
     """
     labels, used = choice.labels, choice.channel_of
     parts = find_time_parts(labels, used)
@@ -373,9 +387,9 @@ def _date_columns(choice: ColumnMap) -> list[int]:
 
 
 def _note_unused(choice: ColumnMap, used: Container[int | None]) -> None:
-    """Note the unused columns for the history, and collect the measured ones in `choice.unused`.
+    """Add a note on unused columns to `choice`, and collect those with measured quantities in `choice.unused`.
 
-    `used`: numbers of the used columns. The note proposes a map that would read the unused ones.
+    `used`: numbers of the used columns. The note proposes a map with which unused columns would be read.
     """
     unused = [label for i, label in enumerate(choice.labels) if i not in used and label.whole]
     choice.unused = tuple(label.whole for label in unused if is_measured(label))
@@ -393,17 +407,19 @@ def _note_unused(choice: ColumnMap, used: Container[int | None]) -> None:
 def choose_columns(labels: Sequence[Label], request: Request, stated_rate: float | None = None) -> ColumnMap:
     """Choose the columns of a table to read, and the channel of each.
 
-    Without a time column the sampling rate is the requested one, else the `stated_rate` [Hz] of the file. "auto" in a
-    map stands for the channels that are guessed from the names and units of the columns that the map does not use
-    (`proposed_map`). A column in the map takes precedence over a column with the channel's name. Raises InputError if a
-    column in the map does not exist, if no column is a channel, if there is neither time nor rate, and for a unit of
-    the wrong dimension.
+    With a requested sampling rate no time is read. Without a time column the rate is the `stated_rate` [Hz] of the
+    file. "auto" in a map stands for the channels that are guessed from the names and units of the columns that the map
+    does not use (`proposed_map`). A column in the map takes precedence over a column with the channel's name. Raises
+    InputError if a column in the map does not exist, if no column is a channel, if there is neither time nor rate, and
+    for a unit of the wrong dimension.
     """
-    choice, columns, rate = ColumnMap(labels, stated_rate), explicit_columns(request.map), request.rate
+    choice = ColumnMap(labels, stated_rate)
+    columns = explicit_columns(request.map)
+    rate = request.rate
     if uses_names(request.map):
         mapped_columns: set[int] = set()
         for channel, column_text in columns.items():
-            with suppress(InputError):  # `_apply_map` raises it
+            with suppress(InputError):  # raised again by `_apply_map`
                 mapped_columns.update(_parse_mapping(labels, channel, column_text).factors)
         other_labels = [Label("", "") if column in mapped_columns else label for column, label in enumerate(labels)]
         columns = {**proposed_map(other_labels), **columns}
@@ -435,7 +451,7 @@ def choose_columns(labels: Sequence[Label], request: Request, stated_rate: float
     if rate is not None:  # the time is named in the notes, but not read
         choice.time = choice.time_label = choice.date = None
     elif "t" not in columns and not choice.parts and choice.time is not None:
-        # a time column with the name of a date may hold dates alone
+        # a time column with the name of a date may contain only dates
         is_date = labels[choice.time].name.casefold() in WORDS["date"]
         choice.date = choice.time if is_date else choice.date
     # channels in the order of their columns

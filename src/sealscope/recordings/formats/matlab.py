@@ -31,19 +31,19 @@ _STREAMS, _REFERENCES = "#sigstream#", "#refs#"
 def is_matlab_4(head: bytes) -> bool:
     """Return True if `head`, the first bytes of a file, begins a MATLAB 4 file.
 
-    Such a file begins with five integers and a name that ends in a zero byte.
+    Such a file begins with five integers and the name of a variable, which ends in a zero byte.
     """
-    for machine, order in enumerate("<>" if len(head) > 20 else ""):  # little and big endian
-        kind, rows, columns, imaginary, length = struct.unpack(f"{order}5i", head[:20])
-        if (
-            kind // 1000 == machine
-            and kind // 100 % 10 == 0  # reserved
-            and kind // 10 % 10 <= 5  # precision
-            and kind % 10 <= 2  # storage
+    for byte_order, order_sign in enumerate("<>" if len(head) > 20 else ""):  # little and big endian
+        type_code, rows, columns, imaginary, name_length = struct.unpack(f"{order_sign}5i", head[:20])
+        if (  # the decimal digits of the type code
+            type_code // 1000 == byte_order
+            and type_code // 100 % 10 == 0  # reserved
+            and type_code // 10 % 10 <= 5  # precision
+            and type_code % 10 <= 2  # storage
             and min(rows, columns) >= 0
             and imaginary in (0, 1)
-            and 1 < length <= 64
-            and head[20 : 20 + length].find(b"\0") == length - 1
+            and 1 < name_length <= 64
+            and head[20 : 20 + name_length].find(b"\0") == name_length - 1
         ):
             return True
     return False
@@ -92,7 +92,7 @@ def _check_links(file: Any) -> None:
 def _read_streams(file: Any) -> Iterator[Series]:
     """Yield the signals of an open HDF5 file that stores them as streams of doubles.
 
-    In the file `CompressedTime` contains first time, step and number of samples, and `DataR2` the number of the
+    For each signal, `CompressedTime` contains first time, step and number of samples, and `DataR2` the number of the
     stream.
     """
     import h5py
@@ -112,7 +112,7 @@ def _read_streams(file: Any) -> Iterator[Series]:
 
 
 def _decode_utf16(characters: Any) -> str:
-    """Decode a MATLAB text, an array of UTF-16 code units; the result is empty for None and other arrays."""
+    """Decode a MATLAB text, an array of UTF-16 code units; the result is "" for None and for any other array."""
     if characters is None or characters.dtype != np.uint16:
         return ""
     return np.ravel(characters[()]).tobytes().decode("utf-16-le", errors="replace")

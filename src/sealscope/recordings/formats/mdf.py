@@ -26,13 +26,13 @@ def read_mdf(path: Path, request: Request) -> RecordingFields:
     """
     with _open_file(import_library("asammdf", "MDF", "asammdf").MDF, path) as file:
         start_time = np.datetime64(file.header.start_time.astimezone(UTC).replace(tzinfo=None), "us")
-        # a file without a date has 1980 or before
+        # a file without a date states 1980 or before
         start = start_time if start_time > np.datetime64("1980-01-02") else None
         series = []
         groups: list[Any] = file.groups
         for number, group in enumerate(groups):
             count = int(group.channel_group.cycles_nr)
-            master = file.masters_db.get(number)
+            master = file.masters_db.get(number)  # index of the group's time channel
 
             def read_seconds(number: int = number) -> Any:
                 """Read the times (n,) [s] of a group of channels, and the time stamp of 0 s.
@@ -55,7 +55,8 @@ def read_mdf(path: Path, request: Request) -> RecordingFields:
 def _open_file(MDF: Any, path: Path) -> Any:
     """Open an MDF file with `MDF`, the class of asammdf.
 
-    If that fails, the object is marked as closed, because its destructor would print an error.
+    If opening fails, the incomplete object is found in the traceback and marked as closed, because its destructor would
+    print an error.
     """
     try:
         return MDF(path)
@@ -68,10 +69,10 @@ def _open_file(MDF: Any, path: Path) -> Any:
 
 
 def _read_values(file: Any, group: int, index: int) -> NDArray[Any]:
-    """Read the samples (n,) of a channel, given the number of its group in the file and its index in the group.
+    """Read the samples (n,) of the channel `index` of a `group` in the file.
 
-    A conversion may give a few texts among the numbers, such as `SNA`; these become NaN. With more than 1 % of texts
-    the samples are returned as texts.
+    A conversion may give a few texts among the numbers, such as `SNA`; these become NaN. With more than the fraction
+    `MAX_WORD_FRACTION` of texts the samples are returned as texts.
     """
     values = np.asarray(file.get(group=group, index=index).samples)
     if values.dtype.kind not in "OSU":

@@ -29,7 +29,7 @@ from sealscope.recordings.formats.table import (
 
 #: Most fill values of a data set: the CF conventions have one, a few tools write two.
 _MAX_FILLS = 16
-#: Most bytes, and most texts, of a data set of texts that are read at a time.
+#: Most bytes, and most texts, that are read at a time from a data set of texts.
 _CHUNK_BYTES, _CHUNK_TEXTS = 500_000_000, 4096
 #: Attribute of files written by Sealscope: the version of their format.
 FORMAT_ATTRIBUTE = "sealscope_format"
@@ -86,7 +86,7 @@ def _read_field(data: Any, name: str, field: str) -> NDArray[Any]:
 def _is_series(item: Any) -> bool:
     """Return True if an item of a file is a one-dimensional data set with samples.
 
-    The placeholder that NetCDF writes for a dimension without values does not count.
+    False for the placeholder that NetCDF writes for a dimension without values.
     """
     import h5py
 
@@ -104,9 +104,9 @@ def check_internal(name: str, data: Any) -> None:
 
 
 def _decode_text(value: Any) -> str | None:
-    """Decode an attribute or cell that contains a single text; None for others.
+    """Decode an attribute or cell that contains a single text: a str, UTF-8 bytes, or an array with one of these.
 
-    The text is a str, UTF-8 bytes, or an array of one of them.
+    None for any other value.
     """
     if isinstance(value, np.ndarray) and value.size == 1:
         value = value.reshape(-1)[0]
@@ -155,10 +155,10 @@ def _read_values(data: Any, name: str, file_size: int) -> NDArray[Any]:
 
 
 def _read_texts(data: Any, name: str, file_size: int) -> list[str]:
-    """Read a data set of texts (n,), in chunks if their length varies, to bound the memory.
+    """Read a data set of texts (n,), in chunks if the lengths of the texts vary, to bound the memory.
 
-    Many cells may refer to one text of the file, and a text can be as long as the file. The number of cells in a chunk
-    is therefore `_CHUNK_BYTES` over `file_size` [bytes], at least 1 and at most `_CHUNK_TEXTS`. `name`: the data set in
+    Many cells may refer to the same text, which can be as long as the file. A chunk therefore has at most
+    `_CHUNK_BYTES` / `file_size` [bytes] cells, but at least 1 and at most `_CHUNK_TEXTS`. `name`: the data set in
     messages. Raises InputError for too many or too long texts, and for lists or references.
     """
     import h5py

@@ -48,13 +48,15 @@ def read_parquet(path: Path, request: Request) -> RecordingFields:
             return file.read(columns=[name]).column(name)
 
     encoded = (schema.metadata or {}).get(_DESCRIPTION_KEY)
-    description, remarks = parse_description(encoded) if encoded else None, _read_remarks(schema)
-    series, size = _list_series(schema, read_column, rows), path.stat().st_size
+    description = parse_description(encoded) if encoded else None
+    remarks = _read_remarks(schema)
+    series = _list_series(schema, read_column, rows)
+    size = path.stat().st_size
     return build_fields(series, request, "Parquet", remarks, stated_rate(remarks), description=description, size=size)
 
 
 def _read_remarks(schema: Any) -> dict[str, str]:
-    """Read the remarks in a table's metadata, without the JSON that libraries write for themselves."""
+    """Read the remarks in a table's metadata, without empty texts and the JSON that libraries write for themselves."""
     pairs = ((name.decode(errors="replace"), text) for name, text in (schema.metadata or {}).items())
     return collect_remarks((name, text.decode(errors="replace")) for name, text in pairs if text[:1] not in b"{")
 
@@ -85,7 +87,7 @@ def _is_text(field: Any) -> bool:
 def _read_values(read_column: Callable[[], Any], field: Any, n_rows: int) -> NDArray[Any]:
     """Read a column as doubles, datetime64, timedelta64 or texts (n,); raise InputError for other types.
 
-    `read_column`: function that reads it; `field`: the column in pyarrow's schema; `n_rows`: number of rows.
+    `read_column`: function that reads the column; `field`: the column in pyarrow's schema; `n_rows`: number of rows.
     """
     import pyarrow
     from pyarrow import compute, types

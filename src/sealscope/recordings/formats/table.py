@@ -45,7 +45,7 @@ from sealscope.units import to_si
 MAX_VALUES = 2**28
 #: Most bytes of a table: the larger of _MIN_LIMIT and _MAX_EXPANSION times its file's size, as fill values expand.
 _MIN_LIMIT, _MAX_EXPANSION = 2**26, 4096
-#: Most texts in a column, most bytes of one, and most bytes of all.
+#: Most texts in a column, most bytes of each text, and most bytes of all texts together.
 _MAX_TEXTS, _MAX_TEXT_WIDTH, _MAX_TEXT_BYTES = 2**22, 400, 2**29
 FORMAT_VERSION = 1
 #: Label of a file's own clock, added to the columns if none of them is the time.
@@ -56,12 +56,12 @@ _BASE_CHANNELS = ("p_A", "p_B", "p_1", "p_2")
 _MAX_INTERVAL = 3.0
 #: Largest difference of equal clocks, as a fraction of an interval.
 _SAME_CLOCK = 1e-2
-#: Relative difference up to which the written rate of a recording takes precedence over that of its time stamps.
+#: Relative difference up to which the written rate of a recording takes precedence over the rate of its time stamps.
 _SAME_RATE = 0.01
 #: Most names in a long table.
 _MAX_NAMES = 4096
-#: Reads columns before their values are used, and returns lines for the history. Arguments: column -> kind ("numbers";
-#: "any": numbers, words as inf; "time"; "texts"), and the column of the date that belongs to the time, or None.
+#: Function that reads columns before their values are used, and returns lines for the history. Arguments: column ->
+#: kind of its values, as for `text._Log`; and the column of the date that belongs to the time, or None.
 Prepare = Callable[[Mapping[int, str], int | None], Sequence[str]]
 
 
@@ -69,8 +69,8 @@ Prepare = Callable[[Mapping[int, str], int | None], Sequence[str]]
 class Clock:
     """Sampling times that one or more series of samples have in common.
 
-    `key`: equal for series that are sampled together; `read`: function that returns the times (n,) [s] and the time
-    stamp of 0 s, None if that is not known.
+    `key`: equal for series that are sampled together; `read`: function that returns the times (n,) [s], and the time
+    stamp of 0 s or None if this stamp is not known.
     """
 
     key: Hashable
@@ -89,9 +89,9 @@ class Clock:
 class Series:
     """A named column of samples in a file, which are read when they are needed.
 
-    `group`: name of the group that it is in, or ""; `label`: its name and unit; `count`: number of samples; `values`:
-    function that reads the samples (n,) as doubles, texts or datetime64; `clock`: sampling times, None if the file
-    does not state them.
+    `group`: name of the series' group, or ""; `label`: name and unit of the series; `count`: number of samples;
+    `values`: function that reads the samples (n,) as doubles, texts, datetime64 or timedelta64; `clock`: sampling
+    times, None if the file does not state them.
     """
 
     group: str
@@ -102,7 +102,7 @@ class Series:
 
     @property
     def path(self) -> str:
-        """Name of the series with that of its group, `group/name`, as a user's map may give it."""
+        """Names of the group and the series, as `group/name`, which a user's map may contain."""
         return f"{self.group}/{self.label.whole}" if self.group else self.label.whole
 
 
@@ -145,6 +145,8 @@ def build_fields(
 ) -> RecordingFields:
     """Build the fields of a recording from the series in a file; raise InputError if they do not fit together.
 
+    If no columns can be chosen but the series form a long table, each name in that table is read as a column.
+
     - `series`: named columns of samples.
     - `request`: the user's choice of the columns.
     - `kind`: format of the file in words.
@@ -172,14 +174,14 @@ def build_fields(
     if prepare is not None:
         notes += prepare(kinds, choice.date)
     check_size(max(member.count for member in members.values()), len(choice.columns), size)
-    if choice.time == len(candidates):  # the file's own clock, not a column
+    if choice.time == len(candidates):  # `_CLOCK_LABEL`: sampling times of the series, not a column
         columns, more_notes = _align_clocks(choice, members)
         notes = [*notes, *more_notes]
         return convert_columns(choice, columns, kind, request, notes, remarks=remarks, description=description)
-    time_series = members[[*kinds][-1]]  # the last column, whether it is a time or not
+    last = members[[*kinds][-1]]  # the time, if there is one
     for member in members.values():
-        if member.count != time_series.count:
-            required = f"{time_series.path} ({time_series.count})"
+        if member.count != last.count:
+            required = f"{last.path} ({last.count})"
             raise InputError(f"{member.path} must have as many samples as {required}, got {member.count}")
     columns = {column: _read_samples(members[column], as_time=kinds[column] == "time") for column in kinds}
     return convert_columns(choice, columns, kind, request, notes, remarks=remarks, description=description)
@@ -203,8 +205,11 @@ def convert_columns(
     - `kind`, `request`, `remarks`, `description`: as for `build_fields`.
     - `notes`: lines for the history.
     - `state`: state of the time column after the previous part of a text log, which is updated; None for a whole log.
+
+    Raises InputError if there are no rows, or only dates in place of times.
     """
-    label, start, remarks = choice.time_label, dict[str, Any](), remarks or {}
+    label, start = choice.time_label, dict[str, Any]()
+    remarks = remarks or {}
     count = len(next(iter(columns.values())))
     if count == 0:
         raise InputError("a recording must have samples, got a header and no rows")
@@ -250,8 +255,8 @@ def _convert_channels(
 ) -> tuple[dict[str, Array], dict[str, str], dict[str, str]]:
     """Convert the chosen channels of a table to SI units or counts.
 
-    Returns (values (n,), units, units in the log where they differ), each a mapping from the names of channels.
-    `columns`: column -> values (n,).
+    Returns three mappings from the names of channels: to values (n,), to units, and to units in the log where these
+    differ. `columns`: column -> values (n,).
     """
     channels, units, log_units = {}, {}, {}
     for name, formula in choice.channels.items():
@@ -266,10 +271,10 @@ def _convert_channels(
 
 
 def _join_time(choice: ColumnMap, columns: Mapping[int, NDArray[Any]], label: Label, notes: list[str]) -> NDArray[Any]:
-    """Combine the columns that form the time, such as date and hours, and add a line on it to `notes`.
+    """Combine the columns that form the time, such as date and hours, and add a line for the history to `notes`.
 
-    `label`: name and unit of the time. Returns the time column alone if the other columns are no parts of its time.
-    Raises InputError if that is a column of hours.
+    `label`: name and unit of the time. If the values of the other columns cannot be parts of this time, the time column
+    is returned unchanged; if it contains hours, InputError is raised instead.
     """
     assert choice.time is not None
     parts = {part: np.asarray(columns[column], dtype=np.float64) for part, column in choice.parts.items()}
@@ -289,23 +294,24 @@ def _join_time(choice: ColumnMap, columns: Mapping[int, NDArray[Any]], label: La
 def _has_time_of_day(time: NDArray[Any]) -> bool:
     """Return True if any date stamp in `time` (n,) has a time of day other than midnight.
 
-    False if the values are no stamps.
+    False if the values are not stamps.
     """
     known = time[~np.isnat(time)] if time.dtype.kind == "M" else time[:0]
     return not (known == known.astype("datetime64[D]").astype(known.dtype)).all()
 
 
 def _assign_clocks(series: Sequence[Series]) -> list[Series]:
-    """Give each series without sampling times those of the time series (a column of times) in its group.
+    """Give the series without sampling times the times in the time series (column of times) of their group.
 
-    Returns the series without these time series. If the file has only one of them, it stays, as a column. A series
-    with a name such as `data` or `value` that is alone in its group gets the name of the group.
+    Returns the series without the time series. If a file has only one time series, it is kept, as the time column of
+    the whole file, and no times are assigned. A series with a name such as `data` or `value` that is alone in its group
+    gets the name of the group.
     """
     time_series: dict[str, Series] = {}
     for member in series:
         if member.clock is None and is_time(member.label):
             time_series.setdefault(member.group, member)
-    time_series = time_series if len(time_series) > 1 else {}  # a single one is the time column of all
+    time_series = time_series if len(time_series) > 1 else {}  # a single one is the time column of the file
     members = [member for member in series if member is not time_series.get(member.group)]
     group_sizes = Counter(member.group for member in members)
     result = []
@@ -324,9 +330,9 @@ def _assign_clocks(series: Sequence[Series]) -> list[Series]:
 def read_times(time: Series, start: np.datetime64 | None = None) -> tuple[Array, np.datetime64 | None]:
     """Read the times (n,) [s] of a series that contains times, and the time stamp of 0 s.
 
-    If the series has date stamps, the times count from the first one. It is also the returned stamp, unless the series
-    is in a group; then that is None. For other times the returned stamp is `start`. Raises InputError if no row has a
-    time.
+    If the series contains date stamps, the times count from the first stamp, which is also the time stamp of 0 s; for a
+    series in a group None is returned instead. If the series contains numbers or timedelta64, the time stamp of 0 s is
+    `start`, None if it is not known. Raises InputError if no row has a time.
     """
     values = time.values()
     if values.dtype.kind == "m":
@@ -349,8 +355,9 @@ def timedelta_seconds(times: Any) -> Array:
 def _make_names_unique(series: Sequence[Series]) -> tuple[list[Series], list[str]]:
     """Give each series of a file a unique name; return the series, and lines for the history.
 
-    If several groups have series of one name, the group with most series named like channels, or else with most
-    samples, keeps it. The others are called by their paths, `group/name`. A file without groups is returned unchanged.
+    If several groups have series of one name, the group with most series named like channels keeps the name; of groups
+    with equally many, that with most samples. The other series are called by their paths, `group/name`. A file without
+    groups is returned unchanged.
     """
     if all(member.group == "" for member in series):
         return list(series), []
@@ -364,7 +371,8 @@ def _make_names_unique(series: Sequence[Series]) -> tuple[list[Series], list[str
     # a name goes to the series in the group with most channels, then with most samples
     for member in sorted(series, key=lambda member: (-n_channels[member.group], -n_samples[member.group])):
         preferred.setdefault(member.label.name.casefold(), member)
-    ambiguous, notes = {name for name, count in Counter(names).items() if count > 1} & channel_names, []
+    ambiguous = {name for name, count in Counter(names).items() if count > 1} & channel_names
+    notes = []
     if ambiguous:
         group = preferred[min(ambiguous)].group
         other_groups = join_names(dict.fromkeys(member.group for member in series if member.group != group), 4)
@@ -377,10 +385,10 @@ def _make_names_unique(series: Sequence[Series]) -> tuple[list[Series], list[str
 
 
 def _read_samples(series: Series, *, as_time: bool = False) -> NDArray[Any]:
-    """Read the samples (n,) of a series as doubles.
+    """Read the samples (n,) of a series as doubles, or date stamps as datetime64 with `as_time`.
 
-    With `as_time`, date stamps are read as datetime64. Words in a column of texts become NaN if they are few, at most 1
-    % of the cells; raises InputError for more, and for other types.
+    Words in a column of texts become NaN if they are at most the fraction `MAX_WORD_FRACTION` of its cells. Raises
+    InputError if there are more, and for types other than numbers, texts and times.
     """
     values = series.values()
     if values.dtype.kind in "OSU":
@@ -406,7 +414,8 @@ def _align_clocks(choice: ColumnMap, used: dict[int, Series]) -> tuple[dict[int,
 
     Without chamber pressures these are the times of the pressures at the pump, or of the longest series. `used`: column
     -> series. Returns column -> values (n,), including the time, and lines for the history. Raises InputError if no
-    series has sampling times, or if one without them has another number of samples.
+    series has sampling times. A series without sampling times must have as many samples as the common times, else
+    InputError is raised.
     """
     channel_of = choice.channel_of
     rank = {channel: number for number, channel in enumerate(_BASE_CHANNELS)}
@@ -441,9 +450,10 @@ def _align_clocks(choice: ColumnMap, used: dict[int, Series]) -> tuple[dict[int,
 def _resample(values: Array, member: Series, t: Array, start: np.datetime64 | None) -> tuple[Array, str]:
     """Resample the samples `values` of the series `member` to the times `t` (n,) [s] after `start`.
 
-    Also returns a note for the history, which is empty if the series is sampled at these times already. A series with a
-    lower sampling rate is interpolated linearly, except over long intervals, where the result is NaN. One with a higher
-    rate is averaged over the intervals around the times. Raises InputError if the times of the series do not increase.
+    Also returns a note for the history, which is empty if the series is sampled at these times already. A series with
+    the same or a lower sampling rate is interpolated linearly, except within long intervals, where the result is NaN. A
+    series with a higher rate is averaged over intervals around the times. Raises InputError if the times of the series
+    do not increase.
     """
     assert member.clock is not None
     times, member_start = member.clock.read()
@@ -501,9 +511,9 @@ def _find_long_columns(labels: Sequence[Label]) -> dict[str, int] | None:
 class _LongTable:
     """A table in which each row is one sample of a named channel.
 
-    `choice`, `request`: meaning of the columns; `columns`: column -> cells (n,); `value`, `time`: the columns of the
-    samples and their times. The rows of each name are read as a recording with a single channel in counts, which is
-    called `u`.
+    `choice`, `request`: meaning of the columns; `columns`: column -> cells (n,); `value`, `time`: numbers of the
+    columns with the samples and their times. The rows of each name are read like a recording with a single channel,
+    which is called `u` and in counts, so that its values are not converted.
     """
 
     choice: ColumnMap
@@ -515,9 +525,8 @@ class _LongTable:
     def make_series(self, number: int, label: Label, rows: NDArray[np.intp]) -> Series:
         """Make the series of one channel of the table, whose samples are read when they are needed.
 
-        `number`: number of the channel, which identifies its sampling times (`Clock.key`), as channels of such a table
-        are sampled at times of their own; `label`: name and unit of the channel; `rows` (k,): indices of the table's
-        rows that have a sample of this channel.
+        `number`: number of the channel, the key of its clock, because each channel has its own sampling times; `label`:
+        name and unit of the channel; `rows` (k,): indices of the table's rows with a sample of this channel.
         """
         read_rows = cache(partial(self._read_rows, label, rows))
         clock = Clock(number, lambda: self._read_clock(read_rows(), rows))
@@ -532,7 +541,7 @@ class _LongTable:
         times = self.columns[self.time][rows]
         timed_rows = rows[~np.isnat(times) if times.dtype.kind == "M" else np.isfinite(times)]
         columns = {column: cells[timed_rows] for column, cells in self.columns.items()}
-        is_word = np.isinf(columns[self.value])  # `Prepare` reads words as inf
+        is_word = np.isinf(columns[self.value])  # a column of the kind "any" has inf in place of words
         if np.count_nonzero(is_word) > MAX_WORD_FRACTION * is_word.size:
             raise InputError(f"{label.whole[:40]} must hold numbers, got text")
         columns[self.value][is_word] = np.nan
@@ -543,12 +552,12 @@ class _LongTable:
 
         `fields`: the recording of the channel; `rows` (k,): indices of its rows in the table.
         """
-        start, times = fields.provenance, self.columns[self.time][rows]
-        if "start_epoch_s" in start:
-            return fields.t, np.datetime64(round(start["start_epoch_s"] * 1e9), "ns")
-        if "start" in start:
-            return fields.t, np.datetime64(start["start"]).astype("datetime64[ns]")
-        is_time_of_day = times.dtype.kind == "M" and times.size > 0
+        provenance, times = fields.provenance, self.columns[self.time][rows]
+        if "start_epoch_s" in provenance:
+            return fields.t, np.datetime64(round(provenance["start_epoch_s"] * 1e9), "ns")
+        if "start" in provenance:
+            return fields.t, np.datetime64(provenance["start"]).astype("datetime64[ns]")
+        is_time_of_day = times.dtype.kind == "M" and times.size > 0  # without a date, hence without a start
         return fields.t, np.nanmin(times) if is_time_of_day else None
 
 
@@ -558,7 +567,8 @@ def _pivot_long_table(
     """Make a series for each channel of a table in which each row is one sample of a named channel.
 
     `series`: columns of the table; `column_by_kind`: as from `_find_long_columns`; `prepare`: as for `build_fields`.
-    Samples that the file calls invalid become NaN. Also returns lines for the history.
+    Samples that the file calls invalid become NaN. Also returns lines for the history. Raises InputError if there is no
+    time, or if there are too many names.
     """
     value_column, validity_column = column_by_kind["value"], column_by_kind.get("valid")
     text_columns = [column_by_kind[kind] for kind in ("name", "unit") if kind in column_by_kind]
@@ -566,7 +576,7 @@ def _pivot_long_table(
     if "timestring" in {label.name.casefold() for label in labels}:  # WinCC has exact times in a second column
         days = Label("Time_ms", "t", "microday since 1899-12-30")
         labels = [days if label.name.casefold() == "time_ms" else label for label in labels]
-    # values in counts, as such are not converted
+    # the values are read in counts, so that they are not converted
     request = Request({"u": f"#{value_column + 1} count"})
     choice = choose_columns(labels, request)
     assert choice.time is not None  # `choose_columns` raises InputError without a time
@@ -619,8 +629,8 @@ def check_size(n_rows: int, n_columns: int, file_size: int | None = None) -> Non
 def check_texts(count: int, width: int, name: str) -> None:
     """Raise InputError if a column has too many texts, or too long ones.
 
-    `count`: number of texts; `width`: length of the longest one [bytes]; `name`: the column in messages. The limits are
-    `_MAX_TEXTS` texts, `_MAX_TEXT_WIDTH` bytes for each, and `_MAX_TEXT_BYTES` for count times width.
+    `count`: number of texts; `width`: length of the longest text [bytes]; `name`: the column in messages. The limits
+    are `_MAX_TEXTS` for `count`, `_MAX_TEXT_WIDTH` for `width`, and `_MAX_TEXT_BYTES` for their product.
     """
     if count > _MAX_TEXTS or width > _MAX_TEXT_WIDTH or count * width > _MAX_TEXT_BYTES:
         raise InputError(
@@ -649,9 +659,9 @@ def _convert_numpy(value: Any) -> Any:
 
 
 def parse_description(source: str | bytes | Mapping[str, Any]) -> dict[str, Any]:
-    """Parse the description of a recording from `make_description`, given as a JSON text or as its values.
+    """Parse the description of a recording from `make_description`: a JSON text, or a mapping.
 
-    Raises InputError if it is damaged, or was written by a newer version.
+    Raises InputError if the description is damaged, or was written by a newer version.
     """
     try:
         parsed = source if isinstance(source, Mapping) else json.loads(source)

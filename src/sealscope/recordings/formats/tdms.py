@@ -34,8 +34,10 @@ def read_tdms(path: Path, request: Request) -> RecordingFields:
             for channel in group.channels():
                 properties, count = channel.properties, len(channel)
                 unit = next((str(properties[key]) for key in _UNITS if properties.get(key)), None)
-                values, clock = partial(channel.__getitem__, slice(None)), _waveform_clock(properties, count)
-                series.append(Series(group.name, Label.parse(channel.name, unit), count, values, clock))
+                read_values = partial(channel.__getitem__, slice(None))
+                clock = _waveform_clock(properties, count)
+                series.append(Series(group.name, Label.parse(channel.name, unit), count, read_values, clock))
+        # remarks on the file, and on each group
         remarks, *group_remarks = (
             collect_remarks(
                 (name, value) for name, value in member.properties.items() if isinstance(value, str | int | float)
@@ -49,7 +51,7 @@ def read_tdms(path: Path, request: Request) -> RecordingFields:
 def _waveform_clock(properties: Mapping[str, Any], count: int) -> Clock | None:
     """Build the sampling times (`Clock`) of a channel of `count` samples from its waveform properties.
 
-    None if these state no interval between samples.
+    None if the properties state no interval between samples.
     """
     step = properties.get("wf_increment")
     if not isinstance(step, float | int) or not step > 0:

@@ -1,7 +1,7 @@
 """Text logs: CSV files written by Sealscope, and logs of other programs.
 
-A log is read in blocks of complete lines. Blocks with numbers alone are read by pyarrow if it is installed, others
-row by row.
+A log is read in blocks of complete lines. Blocks that contain only numbers are read by pyarrow if it is installed,
+others row by row.
 """
 
 from __future__ import annotations
@@ -71,14 +71,17 @@ from sealscope.recordings.formats.timebase import (
     parse_stamps,
 )
 
-#: Bytes read at a time, factor for pyarrow, and bytes of the longest line.
-_CHUNK, _ARROW_FACTOR, _MAX_LINE = 2**19, 4, 2**23
+#: Bytes read at a time; for pyarrow `_ARROW_FACTOR` times as many.
+_CHUNK, _ARROW_FACTOR = 2**19, 4
+#: Longest line [bytes].
+_MAX_LINE = 2**23
 #: Smallest log [bytes] for which pyarrow is imported.
 _MIN_ARROW_SIZE = 2**20
 #: Characters that begin quoted cells and comments.
 _MARKS = (b'"', b"#", b"%", b"/", b"!")
-#: Longest description in the first line [bytes], and rows written at a time.
-_MAX_DESCRIPTION, _ROWS_PER_WRITE = 64 * 1024 * 1024, 8192
+#: Longest description in the first line [bytes].
+_MAX_DESCRIPTION = 64 * 1024 * 1024
+_ROWS_PER_WRITE = 8192
 #: Most lines of text among few samples (marks of events, a summary), and the longest such line.
 _MAX_TEXT_LINES, _MAX_TEXT_LINE = 8, 400
 _STAMP_RULE = "time must be a stamp such as 2024-05-31T12:00:00.002"
@@ -95,9 +98,12 @@ def read_text(path: Path, request: Request) -> RecordingFields:
 def read_text_parts(path: Path, request: Request, every: float) -> Iterator[RecordingFields]:
     """Yield a text log in parts of `every` [s], each as the fields of a recording, in bounded memory.
 
-    All parts have equally many rows, as many as `every` lasts at the sampling rate of the first block; the last may
-    have fewer. A log is a single part if it has a time column for each channel, if it begins with the last sample, or
-    if each row is one sample of a named channel (a long table).
+    All parts have the same number of rows: `every` times the sampling rate of the first block of rows. The last part
+    may have fewer. Three kinds of logs are a single part, as is any log for `every` = inf:
+
+    - logs with a time column for each channel;
+    - logs that begin with the last sample;
+    - long tables, in which each row is one sample of a named channel.
     """
     layout = read_layout(path)
     description = None if layout.description is None else parse_description(layout.description)
@@ -119,8 +125,8 @@ def read_text_parts(path: Path, request: Request, every: float) -> Iterator[Reco
     def make_part(blocks: list[_Block], state: TimeState, more_notes: Sequence[str] = ()) -> RecordingFields:
         """Convert the rows of some blocks to the fields of a recording.
 
-        `state`: state of the time column after the previous part, which is updated; `more_notes`: lines for the
-        history.
+        `state`: state of the time column after the previous part, which is updated; `more_notes`: further lines for
+        the history.
         """
         columns, notes = log.join_blocks(blocks)
         notes = [*layout.notes, *notes, *more_notes]
@@ -128,7 +134,8 @@ def read_text_parts(path: Path, request: Request, every: float) -> Iterator[Reco
             choice, columns, layout.kind, request, notes, remarks=layout.remarks, description=description, state=state
         )
 
-    blocks, rows_per_part, state = log.iter_blocks(), inf, TimeState()
+    blocks = log.iter_blocks()
+    rows_per_part, state = inf, TimeState()
     first = next(blocks, None)
     is_reversed = first is not None and choice.time is not None and is_falling(first.columns[choice.time])
     if first is not None and every < inf and not is_reversed:
@@ -140,20 +147,21 @@ def read_text_parts(path: Path, request: Request, every: float) -> Iterator[Reco
         if pending:
             yield make_part(pending, state)
         pending = part_blocks
+    # the last part notes the lines that were left out of the whole log
     yield make_part(pending, state, log.describe_text_lines())
 
 
 def _read_several_clocks(path: Path, layout: Layout, time_columns: Sequence[int], request: Request) -> RecordingFields:
-    """Read a log that has a time column for each channel, or one in which each row is a sample of a named channel.
+    """Read a log whose channels have sampling times of their own.
 
-    `time_columns`: numbers of the time columns, each of them before its channels; empty for a log of the second kind
-    (a long table).
+    `time_columns`: numbers of the time columns, each of which stands before its channels. If there are none, the log is
+    read as a long table, in which each row is one sample of a named channel.
     """
     cells_by_column: dict[int, NDArray[Any]] = {}
     columns = [column for column in range(len(layout.labels)) if column not in time_columns]
-    time_of_column = {
-        column: max(time for time in time_columns if time < column) for column in (columns if time_columns else ())
-    }
+    time_of_column: dict[int, int] = {}
+    if time_columns:
+        time_of_column = {column: max(time for time in time_columns if time < column) for column in columns}
 
     def prepare(kinds: Mapping[int, str], date: int | None) -> Sequence[str]:
         """Read the requested columns and their times, and return lines for the history.
@@ -169,10 +177,7 @@ def _read_several_clocks(path: Path, layout: Layout, time_columns: Sequence[int]
         return [*layout.notes, *notes, *log.describe_text_lines(), *notes_on_times]
 
     def make_series(column: int, clock: Clock | None = None) -> Series:
-        """Make the series of a column that `prepare` reads later.
-
-        Its length is not known before, and set to 0.
-        """
+        """Make the series of a column that `prepare` reads later; its count is 0, as the length is not known yet."""
         return Series("", layout.labels[column], 0, partial(cells_by_column.__getitem__, column), clock)
 
     start = scope_start(layout.remarks)
@@ -184,9 +189,9 @@ def _read_several_clocks(path: Path, layout: Layout, time_columns: Sequence[int]
 def _find_channel_times(labels: Sequence[Label]) -> list[int]:
     """Find the time columns of a log in which each channel, or group of channels, follows a time column of its own.
 
-    Returns their numbers; empty for other logs. The names of the time columns may differ only in a number at the end.
+    Returns the numbers of the time columns; empty for other logs. The names of the time columns may differ only in a
+    number at the end.
     """
-    # the time columns differ only in a number at the end of their names
     names = [_NUMBER_SUFFIX.sub("", label.name.casefold()) for label in labels]
     if names.count(names[0]) < 2 or not is_time(labels[0]):
         return []
@@ -197,23 +202,27 @@ def _find_channel_times(labels: Sequence[Label]) -> list[int]:
 
 
 def _split_blocks(blocks: Iterable[_Block], size: float) -> Iterator[list[_Block]]:
-    """Regroup blocks of rows of a log into lists with `size` rows each; the last list may have fewer rows."""
+    """Regroup blocks of rows of a log into lists with `size` rows each; the last list may have fewer rows.
+
+    With `size` = inf all rows are in one list.
+    """
     group: list[_Block] = []
     missing_rows = size
     for block in blocks:
-        rest = block
-        while len(rest) >= missing_rows:
-            yield [*group, rest[: int(missing_rows)]]
-            group, missing_rows, rest = [], size, rest[int(missing_rows) :]
-        if len(rest):
-            group.append(rest)
-            missing_rows -= len(rest)
+        remaining_block = block
+        while len(remaining_block) >= missing_rows:
+            yield [*group, remaining_block[: int(missing_rows)]]
+            remaining_block = remaining_block[int(missing_rows) :]
+            group, missing_rows = [], size
+        if len(remaining_block):
+            group.append(remaining_block)
+            missing_rows -= len(remaining_block)
     if group:
         yield group
 
 
 def read_layout(path: Path) -> Layout:
-    """Detect the layout of a text log from its beginning; raise InputError if the file is no text log."""
+    """Detect the layout of a text log from its beginning; raise InputError if the file is not a text log."""
     with path.open("rb") as file:
         head = file.read(SNIFF)
         encoding = detect_encoding(head)
@@ -253,21 +262,32 @@ class _Block:
 class _Log:
     """Reader of the rows of a text log, block by block.
 
-    - `kinds`: column to read -> kind of its values: "numbers"; "any", numbers with words as inf; "time"; or "texts".
-      `date`: column of the date that belongs to the time, or None.
+    A word is a text in place of a number or a time stamp.
+
+    - `place`: path of the log in messages.
     - `min_cells`: number of cells that a row needs.
     - `n_rows`, `n_repeated`, `n_text_lines`: numbers of rows, repeated heading lines and lines of text read until now.
+    - `first_text_line`: the first line of text with its place, for messages.
     - `has_stamps`: True if the time column contains date stamps, None before its first cell is read.
     - `has_date`: True if a date column completes these stamps.
-    - `day_first`: True if the day precedes the month in dates, None before the first date that leaves this open.
+    - `day_first`: True if the day precedes the month in dates, None until the first date such as 05/06/2024.
+    - `order_note`: line for the history if the dates leave the order of day and month open.
     - `n_words`: number of words by column.
     - `last_width`: number of cells in the last row.
-    - `uses_arrow`: True if pyarrow may read blocks; `null_values`: texts that it reads as missing.
+    - `uses_arrow`: True if pyarrow may read blocks; `null_values`: texts that pyarrow reads as missing.
     """
 
     def __init__(self, path: Path, layout: Layout, kinds: Mapping[int, str], date: int | None) -> None:
-        """Prepare to read a log, without reading rows, and decide if pyarrow can read its layout."""
-        self.path, self.layout, self.kinds, self.date, self.place = path, layout, kinds, date, str(path)
+        """Prepare to read the log at `path`, without reading rows, and decide if pyarrow can read its layout.
+
+        `layout`: as from `read_layout`; `date`: column of the date that belongs to the time, or None; `kinds`: column
+        to read -> kind of its values. The kinds are "numbers"; "any", i.e. numbers with inf in place of words; "time";
+        and "texts".
+        """
+        self.path, self.place = path, str(path)
+        self.layout = layout
+        self.kinds = kinds
+        self.date = date
         self.min_cells = max(kinds) + 1
         self.n_rows = self.n_repeated = self.n_text_lines = 0
         self.first_text_line = ""
@@ -276,17 +296,19 @@ class _Log:
         self.uses_arrow = (
             is_delimited and is_numeric and path.stat().st_size >= _MIN_ARROW_SIZE and find_spec("pyarrow") is not None
         )
+        self.null_values = ["", "NaN"]
         self.has_stamps: bool | None = None
+        self.has_date = False
         self.day_first: bool | None = None
         self.order_note = ""
-        self.has_date = False
         self.n_words = Counter[int]()
-        self.null_values, self.last_width = ["", "NaN"], 0
+        self.last_width = 0
 
     def iter_blocks(self) -> Iterator[_Block]:
         """Yield the rows of the log in blocks, in order.
 
-        A block is read by pyarrow if that is possible, else row by row.
+        A block is read by pyarrow if that is possible, else row by row. If the first block cannot be read by pyarrow,
+        later ones are not tried.
         """
         is_first = True
 
@@ -295,22 +317,24 @@ class _Log:
             return _CHUNK * (_ARROW_FACTOR if self.uses_arrow and not is_first else 1)
 
         with self.path.open("rb") as file:
-            for line, bytes_read, end, is_cut in _iter_line_blocks(file, self.layout.encoding, self.place, n_bytes):
-                block = self._read_by_arrow(line, bytes_read, end) if self.uses_arrow and not is_cut else None
-                if is_first and block is None:  # a later comment or word is no reason to give up pyarrow
+            line_blocks = _iter_line_blocks(file, self.layout.encoding, self.place, n_bytes)
+            for first_line, content, end, is_cut in line_blocks:
+                block = self._read_by_arrow(first_line, content, end) if self.uses_arrow and not is_cut else None
+                if is_first and block is None:  # later blocks may only have a comment or word that pyarrow cannot read
                     self.uses_arrow = False
                 is_first = False
                 if block is None:
-                    rows, lines = self._split_rows(line, bytes_read[:end], is_cut)
+                    rows, line_numbers = self._split_rows(first_line, content[:end], is_cut)
                     self._count_rows(len(rows))
-                    block = self._parse_rows(rows, lines, is_cut) if rows else None
+                    block = self._parse_rows(rows, line_numbers, is_cut) if rows else None
                 if block is not None:
                     yield block
 
     def _split_rows(self, first_line: int, block: bytes, is_cut: bool) -> tuple[list[list[str]], Sequence[int]]:
         """Split a block of bytes of the log into rows of cells; also return the line number of each row.
 
-        `first_line`: number of the block's first line; `is_cut`: the file ends within its last line.
+        Lines that are not samples are left out. `first_line`: number of the block's first line; `is_cut`: the file ends
+        within the block's last line, whose incomplete number is then missing.
         """
         lines = _decode_lines(block, self.layout)
         samples = self._select_samples(lines, max(0, self.layout.first_row + 1 - first_line))
@@ -321,26 +345,26 @@ class _Log:
         line_numbers = [first_line + i for i in samples]
         rows = self._split_lines([lines[i] for i in samples], line_numbers, is_cut)
         if is_cut and len(rows[-1]) < self.last_width and _PARTIAL_NUMBER.fullmatch(rows[-1][-1]):
-            # the last line is incomplete: a partial number and the cells after it are missing
+            # the last cell is a partial number: it and the cells that the file lacks are missing
             rows[-1] = [*rows[-1][:-1], *[""] * (self.min_cells - len(rows[-1]) + 1)]
         self.last_width = len(rows[-1])
         return self._remove_text_rows(rows, line_numbers)
 
     def _count_rows(self, n_rows: int) -> None:
-        """Add `n_rows` to the number of rows read; raise InputError if the columns then have too many values."""
+        """Add `n_rows` to the rows read until now; raise InputError if the columns then have too many values."""
         self.n_rows += n_rows
         check_size(self.n_rows, len(self.kinds))
 
     def _read_by_arrow(self, first_line: int, block: bytes, end: int) -> _Block | None:
-        """Read the rows of a block of bytes by pyarrow; None unless all of them are plain numbers that it can read.
+        """Read the rows of a block of bytes by pyarrow, and count them.
 
-        `first_line`: number of the block's first line; `end`: number of bytes up to the end of its last complete
-        line.
+        `first_line`: number of the block's first line; `end`: number of bytes up to the end of its last complete line.
+        None, and no rows counted, unless all cells to read are plain finite numbers or missing.
         """
         from pyarrow import ArrowInvalid, csv, float64, py_buffer
 
         layout, start = self.layout, 0
-        for _ in range(max(0, layout.first_row + 1 - first_line)):
+        for _ in range(max(0, layout.first_row + 1 - first_line)):  # skip the lines above the first row
             start = block.find(b"\n", start) + 1
         width = block.count(layout.delimiter.encode(), start, block.find(b"\n", start)) + 1
         if not self.min_cells <= width <= len(layout.labels):
@@ -351,7 +375,7 @@ class _Log:
             return None  # carriage returns inside a line
         names = [str(column) for column in self.kinds]
         table = None
-        for nulls in (self.null_values, ["NaN", *MISSING]):  # the short list is faster; if it fails, the long one stays
+        for nulls in (self.null_values, ["NaN", *MISSING]):  # the short list is faster; after it fails, the long stays
             with suppress(ArrowInvalid):
                 table = csv.read_csv(
                     py_buffer(block).slice(start, end - start),
@@ -378,7 +402,7 @@ class _Log:
     def _select_samples(self, lines: Sequence[str], first: int) -> list[int]:
         """List the indices of the lines that contain samples, from index `first` on.
 
-        Comments, blank lines and repeated headings are left out.
+        Comments, blank lines and repeated headings are left out; the latter are counted.
         """
         blank = " " if self.layout.delimiter == "\t" else None  # a line of tabs is a row of missing samples
         content = [
@@ -393,7 +417,8 @@ class _Log:
         """Split lines of the log into cells.
 
         `line_numbers`: number of each line in the file, for messages. Raises InputError for a quotation mark that is
-        not closed on its line. In the last line it may be open if `is_cut`, i.e. if the file ends within this line.
+        not closed on its line. If the file ends within the last line (`is_cut`), a quotation mark may be open there,
+        and its cell becomes empty.
         """
         delimiter = self.layout.delimiter
         if delimiter == " ":
@@ -418,123 +443,137 @@ class _Log:
     ) -> tuple[list[list[str]], Sequence[int]]:
         """Remove short rows of text, such as the mark of an event, and count them.
 
-        Returns the other rows and their line numbers. Raises InputError for other rows with too few or too many
-        cells.
+        Returns the remaining rows and their line numbers. A row of text has fewer cells than a sample needs, no value
+        and at most `_MAX_TEXT_LINE` characters. Raises InputError for any other row with too few or too many cells.
         """
-        layout, max_cells, complete = self.layout, len(self.layout.labels), []
+        layout, max_cells = self.layout, len(self.layout.labels)
         if min(map(len, rows)) >= self.min_cells and max(map(len, rows)) <= max_cells:
             return rows, line_numbers
+        complete_rows: list[int] = []
         for i, row in enumerate(rows):
             is_short = len(row) < self.min_cells
-            has_values = sum(map(len, row)) > _MAX_TEXT_LINE or (
-                is_short and any(is_value(cell, layout.decimal) for cell in row)
+            is_text = (
+                is_short
+                and sum(map(len, row)) <= _MAX_TEXT_LINE
+                and not any(is_value(cell, layout.decimal) for cell in row)
             )
-            if is_short and not has_values:
-                where = f"(line {line_numbers[i]}, {self.place})"
-                self.first_text_line = self.first_text_line or f"{layout.delimiter.join(row).strip()[:40]!r} {where}"
+            place = f"(line {line_numbers[i]}, {self.place})"
+            if is_text:
+                self.first_text_line = self.first_text_line or f"{layout.delimiter.join(row).strip()[:40]!r} {place}"
                 self.n_text_lines += 1
             elif is_short or any(cell.strip() for cell in row[max_cells:]):
-                raise InputError(
-                    f"a row must have {format_count(max_cells, 'cell')}, got {len(row)} "
-                    f"(line {line_numbers[i]}, {self.place})"
-                )
+                raise InputError(f"a row must have {format_count(max_cells, 'cell')}, got {len(row)} {place}")
             else:
-                complete.append(i)
-        return [rows[i] for i in complete], [line_numbers[i] for i in complete]
+                complete_rows.append(i)
+        return [rows[i] for i in complete_rows], [line_numbers[i] for i in complete_rows]
 
-    def _parse_rows(self, rows: Sequence[Sequence[str]], lines: Sequence[int], is_cut: bool) -> _Block:
+    def _parse_rows(self, rows: Sequence[Sequence[str]], line_numbers: Sequence[int], is_cut: bool) -> _Block:
         """Parse rows of cells to a block of values.
 
-        `lines`: number of each row's line in the file; `is_cut`: the last row is incomplete.
+        `line_numbers`: number of each row's line in the file; `is_cut`: the last row is incomplete. Words, i.e. texts
+        in place of numbers or time stamps, become NaN or NaT, and are counted in `n_words`. In a column of the kind
+        "any" words become inf instead, and are not counted.
         """
         block = _Block()
         for column, kind in self.kinds.items():
             cells = [row[column] for row in rows]
-            where, words = partial(self._format_place, lines=lines, column=column), list[int]()
+            format_place = partial(self._format_place, line_numbers=line_numbers, column=column)
+            values: NDArray[Any]
+            word_rows: list[int] = []
             if unit := self.layout.cell_units.get(column):
-                cells = strip_unit(cells, unit, is_cut, where)
+                cells = strip_unit(cells, unit, is_cut, format_place)
             if kind == "texts":
                 check_texts(self.n_rows, max(map(len, cells)), self.layout.labels[column].whole)
-                block.columns[column] = np.array(cells, dtype=object)
+                values = np.array(cells, dtype=object)
             elif kind == "time" and self._is_stamped(cells, rows):
                 cells = self._join_dates(rows, column)
-                block.columns[column], words = self._parse_dates(cells, where)
+                values, word_rows = self._parse_dates(cells, format_place)
             else:
-                block.columns[column], words = parse_numbers(cells, self.layout.decimal, where)
+                values, word_rows = parse_numbers(cells, self.layout.decimal, format_place)
                 if kind == "any":
-                    block.columns[column][words] = np.inf  # numbers in a log are finite
-                    continue
-            if words:
-                block.word_rows[column] = np.array(words)
-                self.n_words[column] += len(words)
-                block.first_words[column] = f"{cells[words[0]].strip()[:40]!r} {where(words[0])}"
+                    values[word_rows] = np.inf  # tells words from numbers, which are finite in a log
+                    word_rows = []
+            block.columns[column] = values
+            if word_rows:
+                block.word_rows[column] = np.array(word_rows)
+                self.n_words[column] += len(word_rows)
+                first_word = cells[word_rows[0]].strip()[:40]
+                block.first_words[column] = f"{first_word!r} {format_place(word_rows[0])}"
         return block
 
     def _is_stamped(self, cells: Sequence[str], rows: Sequence[Sequence[str]]) -> bool:
         """Return True if the time column contains date stamps, as its first cell in the log shows.
 
-        `cells`: cells of the time column in `rows`. Also finds out if a date column completes these stamps
-        (`has_date`).
+        `cells`: cells of the time column in `rows`. This first cell also decides `has_stamps` and `has_date`; the
+        latter is True if the stamps are times of day, and the cell in the date column is a date.
         """
         index = next((i for i, cell in enumerate(cells) if not is_missing(cell)), None)
         if self.has_stamps is None and index is not None:
             self.has_stamps = not is_number(cells[index], self.layout.decimal) and is_stamp(cells[index])
             row = rows[index]
             date_cell = row[self.date] if self.date is not None and self.date < len(row) else ""
-            is_time_of_day = ":" in cells[index][:3]
+            is_time_of_day = ":" in cells[index][:3]  # as in `12:00:00`
             self.has_date = self.has_stamps and is_time_of_day and is_stamp(date_cell) and ":" not in date_cell
         return bool(self.has_stamps)
 
     def _join_dates(self, rows: Sequence[Sequence[str]], column: int) -> list[str]:
-        """Return the cells of the time column `column`, each after the date in the date column if there is one."""
+        """Return the cells of the time column, each with the date before it if there is a date column.
+
+        `column`: number of the time column. A cell is empty if its date or its time is missing.
+        """
         if not self.has_date or self.date is None:
             return [row[column] for row in rows]
         days = [row[self.date].strip() if self.date < len(row) else "" for row in rows]
         times = [row[column].strip() for row in rows]
         return [f"{day} {time}" if day and time else "" for day, time in zip(days, times, strict=True)]
 
-    def _format_place(self, index: int, lines: Sequence[int], column: int) -> str:
+    def _format_place(self, index: int, line_numbers: Sequence[int], column: int) -> str:
         """Format the line, column and file of a cell for messages.
 
-        `index`: row of the cell in its block; `lines`: line numbers of the block's rows.
+        `index`: row of the cell in its block; `line_numbers`: line number of each of the block's rows.
         """
-        return f"(line {lines[index]}, column {self.layout.labels[column].whole}, {self.place})"
+        return f"(line {line_numbers[index]}, column {self.layout.labels[column].whole}, {self.place})"
 
-    def _parse_dates(self, cells: list[str], where: Callable[[int], str]) -> tuple[NDArray[np.datetime64], list[int]]:
-        """Parse cells to time stamps (n,), datetime64, NaT for missing ones and words.
+    def _parse_dates(
+        self, cells: list[str], format_place: Callable[[int], str]
+    ) -> tuple[NDArray[np.datetime64], list[int]]:
+        """Parse cells of the time column to time stamps (n,); also return the indices of the words.
 
-        Also returns the indices of the words. `where`: function from the index of a cell to its place. Raises
-        InputError for a cell with digits that is no stamp.
+        A word is a text without digits that is not a stamp. Words and missing cells become NaT. The first date such as
+        05/06/2024 sets `day_first`. `format_place`: function from the index of a cell to its place, for messages.
+        Raises InputError for a cell with digits that is not a stamp.
         """
         texts = ["" if cell.strip().lower() in MISSING else cell for cell in cells]
         if self.day_first is None and ambiguous_dates(texts):
-            self.day_first = self._is_day_first()
+            self.day_first = self._detect_day_first()
         with suppress(ValueError):
             return parse_stamps(texts, bool(self.day_first)), []
-        words = [
+        word_rows = [
             index
             for index, text in enumerate(texts)
-            if text.strip() and not is_stamp(text) and not any(sign.isdigit() for sign in text)
+            if text.strip() and not is_stamp(text) and not any(character.isdigit() for character in text)
         ]
-        for index in words:
+        for index in word_rows:
             texts[index] = ""
         try:
-            return parse_stamps(texts, bool(self.day_first)), words
+            return parse_stamps(texts, bool(self.day_first)), word_rows
         except ValueError as error:
-            bad = int(error.args[0])
-            raise InputError(f"{_STAMP_RULE}, got {cells[bad]!r} {where(bad)}") from None
+            bad_row = int(error.args[0])
+            raise InputError(f"{_STAMP_RULE}, got {cells[bad_row]!r} {format_place(bad_row)}") from None
 
-    def _is_day_first(self) -> bool:
-        """Decide if the day precedes the month in the dates of the log, such as 05/06/2024.
+    def _detect_day_first(self) -> bool:
+        """Detect if the day precedes the month in the dates of the log, such as 05/06/2024.
 
-        The log is read up to the first date that decides this.
+        The log is read up to the first date that decides this. Without such a date, the order is guessed
+        (`is_day_first`), and `order_note` says so.
         """
         log = _Log(self.path, self.layout, self.kinds, self.date)
         columns = [column for column, kind in self.kinds.items() if kind == "time"]
         dates: list[dict[str, None]] = [{} for _ in columns]
         with suppress(InputError), self.path.open("rb") as file:  # errors are raised when the row is read again
-            for line, block, end, is_cut in _iter_line_blocks(file, self.layout.encoding, self.place, lambda: _CHUNK):
-                rows, _ = log._split_rows(line, block[:end], is_cut)
+            line_blocks = _iter_line_blocks(file, self.layout.encoding, self.place, lambda: _CHUNK)
+            for first_line, content, end, is_cut in line_blocks:
+                rows, _ = log._split_rows(first_line, content[:end], is_cut)
                 for column, column_dates in zip(columns, dates, strict=True):
                     column_dates.update(ambiguous_dates(self._join_dates(rows, column)))
                 if any(explicit_order(date) is not None for date in dates):
@@ -547,9 +586,12 @@ class _Log:
     def join_blocks(self, blocks: list[_Block]) -> tuple[dict[int, NDArray[Any]], list[str]]:
         """Join blocks of the log to whole columns, column -> values (n,); also return lines for the history.
 
-        The columns are removed from the blocks to save memory. Raises InputError if too many cells are words.
+        Rows with a word in place of the time are left out. The columns are removed from the blocks to save memory.
+        Raises InputError if too many cells are words.
         """
-        labels, notes, columns = self.layout.labels, list[str](), dict[int, NDArray[Any]]()
+        labels = self.layout.labels
+        notes: list[str] = []
+        columns: dict[int, NDArray[Any]] = {}
         starts = [0, *accumulate(map(len, blocks))]
         last_column = [*self.kinds][-1]  # the time, if there is one
         word_rows = {
@@ -572,7 +614,7 @@ class _Log:
             if self.has_stamps and self.kinds[column] == "time":  # blocks before the first stamp were read as numbers
                 parts = [np.full(part.shape, "NaT", "M8[ns]") if part.dtype.kind == "f" else part for part in parts]
             cells = np.concatenate(parts)
-            # rows with a word in place of the time are those of a summary
+            # rows with a word in place of the time belong to a summary
             if word_rows[last_column] and self.kinds[last_column] == "time":
                 cells = np.delete(cells, word_rows[last_column])
             cells.setflags(write=False)  # so that the recording does not copy it
@@ -583,9 +625,9 @@ class _Log:
         return columns, notes
 
     def describe_text_lines(self) -> list[str]:
-        """Describe for the history the lines of text and the repeated headings that were left out of the log.
+        """Describe for the history how many lines of text and repeated headings were left out of the log.
 
-        The list is empty if there are none. Raises InputError if there are too many lines of text.
+        The list is empty if no line was left out. Raises InputError if there are too many lines of text.
         """
         if self.n_text_lines > max(MAX_WORD_FRACTION * self.n_rows, _MAX_TEXT_LINES):
             raise InputError(f"a sample must be a number, got {self.first_text_line}")
@@ -600,33 +642,34 @@ def _iter_line_blocks(
 ) -> Iterator[tuple[int, bytes, int, bool]]:
     """Yield a text file in blocks of lines: (number of the first line, bytes, end, is_cut).
 
-    The bytes before `end` are complete lines; those after it come again in the next block. `is_cut`: the file ends
-    within the block's last line. `place`: path of the file for messages; `n_bytes`: function that returns the number
-    of bytes to read next.
+    The bytes before `end` are complete lines; the bytes after it come again in the next block. Only the last block may
+    have an incomplete last line, without a line end: then `is_cut` is True, and `end` is the number of its bytes.
+    `place`: path of the file for messages; `n_bytes`: function that returns the number of bytes to read next. Raises
+    InputError for binary data, and for a line that is too long.
     """
     character_bytes = 2 if encoding.startswith("utf-16") else 1
     newline = "\n".encode(encoding if character_bytes == 2 else "ascii")
-    number = 1
+    first_line = 1
     while block := file.read(n_bytes()):
         while (end := _last_newline(block, newline)) < 0 and len(block) < _MAX_LINE and (more := file.read(n_bytes())):
             block += more
         if character_bytes == 1 and b"\0" in block:
-            line = number + block[: block.index(b"\0")].count(b"\n")
+            line = first_line + block[: block.index(b"\0")].count(b"\n")
             raise InputError(f"a text log must be text throughout, got binary data (line {line}, {place})")
         if end < 0 and len(block) >= _MAX_LINE:
             if b"\r" not in block or character_bytes == 2:
                 raise InputError(f"a text log must have lines, got {len(block)} bytes without")
             end = block.rfind(b"\r")
         if end < 0:
-            yield number, block, len(block), not block.endswith(b"\r")
+            yield first_line, block, len(block), not block.endswith(b"\r")
             return
         end += character_bytes
         file.seek(end - len(block), SEEK_CUR)  # reading again costs less than copying the block
-        yield number, block, end, False
+        yield first_line, block, end, False
         # numpy counts newlines faster than bytes does
         characters = np.frombuffer(block, f"<u{character_bytes}", end // character_bytes)
-        lines = int(np.count_nonzero(characters == int.from_bytes(newline, "little")))
-        number += lines or block.count(b"\r", 0, end)
+        n_lines = int(np.count_nonzero(characters == int.from_bytes(newline, "little")))
+        first_line += n_lines or block.count(b"\r", 0, end)
 
 
 def _last_newline(block: bytes, newline: bytes) -> int:
@@ -672,7 +715,7 @@ def write_text(
 def _arrow_values(cells: Any) -> Array:
     """Convert a pyarrow ChunkedArray of doubles to an array (n,), NaN for null.
 
-    Its own `to_numpy` would load pandas.
+    The array's method `to_numpy` would load pandas.
     """
     parts = []
     for chunk in cells.chunks:

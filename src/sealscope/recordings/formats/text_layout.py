@@ -86,7 +86,11 @@ class Layout:
 
 
 def detect_encoding(head: bytes) -> str | None:
-    """Detect the encoding of a text from the first bytes of its file; None if they are no text."""
+    """Detect the encoding of a text from the first bytes of its file; None if they are not text.
+
+    The encodings are tried in this order: the one that a byte order mark states; UTF-16; UTF-8; gb18030 and Shift-JIS,
+    if the text then has a known word; cp1252, if few bytes are control characters.
+    """
     for mark, name in (
         (codecs.BOM_UTF8, "utf-8-sig"),
         (codecs.BOM_UTF16_LE, "utf-16-le"),
@@ -122,8 +126,8 @@ def split_at_blanks(line: str) -> list[str]:
 def split_cells(line: str, delimiter: str) -> list[str]:
     """Split a line into cells at the `delimiter`; a blank stands for any number of blanks and tabs.
 
-    Unless the delimiter is a blank, a cell may stand in double quotation marks. They are removed, and a delimiter
-    between them does not split the cell.
+    Unless the delimiter is a blank, a cell may stand in double quotation marks, which are removed. A delimiter between
+    them does not split the cell.
     """
     if delimiter == " ":
         return split_at_blanks(line)
@@ -143,9 +147,10 @@ def _used_width(row: Sequence[str]) -> int:
 
 
 def _detect_dialect(body: Sequence[str]) -> tuple[str, str, int]:
-    """Detect delimiter, decimal separator and number of cells in a row from some lines of a log.
+    """Detect (delimiter, decimal separator, number of cells in a row) from some lines of a log.
 
-    Returns the three in this order. With them, the largest fraction of the cells are numbers or time stamps.
+    All pairs of `_DIALECTS` are tried. The best is the one with which the largest fraction of the present cells are
+    values, i.e. numbers or time stamps, in rows of one width. Lines without values have commas, points and one cell.
     """
     ranks: dict[tuple[str, str, int], tuple[float, float, bool, int]] = {}
     text = "\n".join(body)
@@ -157,7 +162,7 @@ def _detect_dialect(body: Sequence[str]) -> tuple[str, str, int]:
         n_values = Counter[int]()  # by width of the row
         for row, count in zip(rows, counts, strict=True):
             n_values[len(row)] += count
-        width = max(n_values, key=lambda w: (n_values[w], w), default=0)
+        width = max(n_values, key=lambda row_width: (n_values[row_width], row_width), default=0)
         if any(counts) and 2 * n_values[width] >= n_values.total():
             cells = [cell for row, count in zip(rows, counts, strict=True) if count for cell in row]
             n_present = sum(not is_missing(cell) for cell in cells)
@@ -171,12 +176,12 @@ def _split_heading(line: str, delimiter: str, width: int = 0) -> list[str]:
     """Split the heading line of a log into the names of columns.
 
     If the delimiter is a blank, a unit in brackets stays with its name. Names may then contain single blanks, if
-    wider spaces separate exactly `width` names.
+    wider spaces separate exactly `width` names, but single blanks do not.
     """
     if delimiter == " ":
-        words = _SPACED_LABEL.findall(line)
-        phrases = re.split(r"\s{2,}|\t", line.strip())  # names with a blank, separated by two
-        return phrases if len(phrases) == width != len(words) else words
+        names = _SPACED_LABEL.findall(line)
+        names_with_blanks = re.split(r"\s{2,}|\t", line.strip())
+        return names_with_blanks if len(names_with_blanks) == width != len(names) else names
     return [cell.strip() for cell in split_cells(line, delimiter)]
 
 
@@ -196,9 +201,10 @@ def _parse_heading(
 ) -> tuple[list[Label], int]:
     """Parse the heading of a log, which ends above the first line of samples.
 
-    `lines`: lines of the log; `first_row`: index of the first line of samples; `width`: number of cells in a row of
-    samples; `delimiter`, `decimal`: separators of cells and of decimals. Returns (labels of the columns, number of
-    heading lines); no labels if there is no heading.
+    The heading consists of rows of names and units, or else of names in a comment. `lines`: lines of the log;
+    `first_row`: index of the first line of samples; `width`: number of cells in a row of samples; `delimiter`,
+    `decimal`: separators of cells and of decimals. Returns (labels of the columns, number of heading lines); ([], 0)
+    if there is no heading.
     """
 
     def split_names(line: str) -> list[str] | None:
@@ -210,7 +216,8 @@ def _parse_heading(
         if cells and not cells[-1]:  # drop empty cells beyond the width
             cells = cells[: max(_used_width(cells), min(width, len(cells)))]
         fits_width = abs(len(cells) - width) <= 1 or (len(cells) >= width > 1)
-        return cells if fits_width and any(cells) and not all(is_value(c, decimal) for c in cells if c) else None
+        names = [cell for cell in cells if cell]
+        return cells if fits_width and names and not all(is_value(name, decimal) for name in names) else None
 
     # from the lowest line up
     lines_above = [line.strip("\r\n ") for line in lines[first_row - 1 :: -1] if line.strip()] if first_row else []
@@ -226,6 +233,7 @@ def _parse_heading(
         rows.append(row)
     if rows:
         labels, n_lines = _parse_keyed_rows(rows) or _parse_stacked_rows(rows)
+        # descriptions of the columns may be in a row of labels, or in a table above the heading
         label_lines = [
             line
             for line, row in zip(lines_above, rows, strict=False)
@@ -246,26 +254,30 @@ def _parse_keyed_rows(rows: Sequence[Sequence[str]]) -> tuple[list[Label], int] 
     are no such keys.
     """
     keys = [row[0].strip().rstrip(":").casefold() for row in rows]
-    heading = next((i for i, key in enumerate(keys) if key in WORDS["row"]["name"] and _used_width(rows[i]) > 1), None)
-    unit = next((i for i, key in enumerate(keys) if key in WORDS["row"]["unit"]), None)
-    if heading is None or unit is None:
+    name_row = next((i for i, key in enumerate(keys) if key in WORDS["row"]["name"] and _used_width(rows[i]) > 1), None)
+    unit_row = next((i for i, key in enumerate(keys) if key in WORDS["row"]["unit"]), None)
+    if name_row is None or unit_row is None:
         return None
-    # a row with one cell names the first column
-    names = [rows[0][0] if _used_width(rows[0]) == 1 else rows[heading][0], *rows[heading][1:]]
+    # the lowest row may be the name of the first column, on a line of its own
+    first_name = rows[0][0] if _used_width(rows[0]) == 1 else rows[name_row][0]
+    names = [first_name, *rows[name_row][1:]]
     # the first cell is the key of the row
-    units = chain([None], _parse_unit_row(rows[unit][1:]) or [], repeat(None))
-    return [Label.parse(name, unit_text) for name, unit_text in zip(names, units, strict=False)], max(heading, unit) + 1
+    units = chain([None], _parse_unit_row(rows[unit_row][1:]) or [], repeat(None))
+    labels = [Label.parse(name, unit) for name, unit in zip(names, units, strict=False)]
+    return labels, max(name_row, unit_row) + 1
 
 
 def _parse_stacked_rows(rows: Sequence[Sequence[str]]) -> tuple[list[Label], int]:
-    """Parse heading rows of names, and possibly of units, of groups of columns, and of rulers such as `----`.
+    """Parse heading rows without keys: a row of names, and possibly others.
 
-    `rows`: cells of the rows, from the lowest up. Returns (labels of the columns, number of rows). The name of a group
-    is put before the names of its columns.
+    `rows`: cells of the rows, from the lowest up. Rulers such as `----` may stand below the names, units below or above
+    them, and names of groups of columns on top; the name of a group is put before the names of its columns. Returns
+    (labels of the columns, number of rows).
     """
     n_skipped = next((i for i, row in enumerate(rows[:-1]) if not _is_ruler(row)), len(rows) - 1)
     row, *rows_above = rows[n_skipped:]
-    names, n_rows = list(row), n_skipped + 1
+    names = list(row)
+    n_rows = n_skipped + 1
     units = (_parse_graphtec_units(row) or _parse_unit_row(row)) if rows_above else None
     if units is not None:  # units below the names
         names, rows_above, n_rows = list(rows_above[0]), rows_above[1:], n_rows + 1
@@ -284,7 +296,7 @@ def _parse_stacked_rows(rows: Sequence[Sequence[str]]) -> tuple[list[Label], int
         and not any(Label.parse(text).name.casefold() in channel_names for text in names)
         and any(map(is_quantity, rows_above[0]))
     ):
-        # a group stands above its first name only
+        # the name of a group stands only above its first column
         groups = accumulate(chain(rows_above[0], repeat("")), lambda group, cell: cell.strip() or group, initial="")
         names = [f"{group} {text}".strip() for text, group in zip(names, islice(groups, 1, None), strict=False)]
         n_rows += 1
@@ -304,7 +316,7 @@ def _parse_graphtec_units(row: Sequence[str]) -> list[str | None] | None:
 
 
 def _is_ruler(row: Sequence[str]) -> bool:
-    """Return True if a row separates others: a ruler such as `----`, or one text, which is no unit, in all cells."""
+    """Return True if a row is a ruler such as `----`, or repeats one text in all cells that is not a unit."""
     cells = [cell.strip() for cell in row if cell.strip()]
     is_repeated = len(set(cells)) == 1 < len(cells) and _parse_unit_row(cells) is None
     return is_repeated or all(_RULER.fullmatch(cell) for cell in cells)
@@ -332,7 +344,8 @@ def detect_layout(head: bytes, encoding: str, place: str, *, is_complete: bool) 
         raise InputError("a recording must have samples, got an empty file")
     # rows for the detection: the second half, or the last 20 if these are more, as remarks and a heading come first
     rows = content[max(1, min(len(content) // 2, len(content) - 20)) :] or content
-    body, original_lines = rows[-_N_ROWS:], lines
+    body = rows[-_N_ROWS:]
+    original_lines = lines
     if prefixed := _has_prefixes(rows):
         body = [expand_prefixes(line) for line in body]
         lines = [_expand_sample_prefixes(line) for line in lines]
@@ -368,7 +381,7 @@ def detect_layout(head: bytes, encoding: str, place: str, *, is_complete: bool) 
 def _no_rows_error(line: str, delimiter: str | None) -> InputError:
     """Build the InputError for a text without rows of numbers.
 
-    `line`: its first line; `delimiter`: separator of cells, or None if it is not known.
+    `line`: first line of the text; `delimiter`: separator of cells, or None if it is not known.
     """
     kind = {"{": "JSON", "[": "JSON", "<": "XML or HTML"}.get(line.lstrip()[:1])
     if kind is not None:
@@ -387,13 +400,16 @@ def _find_first_row(lines: Sequence[str], body: Sequence[str], delimiter: str, d
     """Find the index of the first line with samples in over half of the numeric columns; None if there is none.
 
     `lines`: lines of the log; `body`: lines of samples that show which columns are numeric; `width`: number of cells in
-    a row; `delimiter`, `decimal`: separators of cells and of decimals.
+    a row; `delimiter`, `decimal`: separators of cells and of decimals. Missing cells count as samples, but a row needs
+    at least one number or time stamp.
     """
     rows = [row for row in (split_cells(line, delimiter) for line in body) if len(row) == width]
     is_value_cell = [[is_value(cell, decimal) for cell in row] for row in rows]
     max_values = max(map(sum, is_value_cell), default=0)
-    row_indices = [k for k, row in enumerate(is_value_cell) if 0 < max_values <= 2 * sum(row)]  # no preamble
-    rows, is_value_cell = [rows[k] for k in row_indices], [is_value_cell[k] for k in row_indices]
+    # rows with fewer than half as many values may belong to the lines above the samples
+    row_indices = [k for k, row in enumerate(is_value_cell) if 0 < max_values <= 2 * sum(row)]
+    rows = [rows[k] for k in row_indices]
+    is_value_cell = [is_value_cell[k] for k in row_indices]
     numeric_columns = [
         i
         for i in range(width)

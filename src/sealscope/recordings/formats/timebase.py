@@ -34,7 +34,9 @@ _DATES = (
 )
 _EITHER_DATE = re.compile(rf"\s*(?P<date>{_EITHER})")
 _LAST_MONTH = 12
-#: A number, which is no stamp unless it has eight digits.
+#: Hour of a wrong time on a 12-hour clock, such as 13 PM; numpy refuses it.
+_WRONG_HOUR = 99
+#: A number, which is a stamp only if it has eight digits.
 _BARE_NUMBER = re.compile(r"[+-]?\d*(?:[.,]\d*)?")
 _CLOCK = r"\d{1,2}:\d{2}(?::\d{2}(?:[.,:]\d{1,9})?|[.,]\d{1,9})?|\d{6}(?:[.,]\d{1,9})?"
 _STAMPS = [
@@ -57,14 +59,18 @@ _MIN_SHARED = 20
 _MAX_ROUNDING, _MIN_SLACK, _MAX_SLACK = 0.6, 1e-9, 1e-3
 #: The date used for a time of day without a date.
 _NO_DATE = "1970-01-01"
-#: A jump of one hour, to within _TOLERANCE median intervals, before 4 o'clock is a change of daylight saving time.
-_HOUR, _DAY, _TOLERANCE, _LATEST_CHANGE = 3600.0, 86400.0, 3.0, 4
-#: Range of days since 1899-12-30 in the years 1982 to 2078; largest intervals of fractions of a day and of days, as no
-#: logger samples every 2 or 12 us; MATLAB's datenum of 1899-12-30.
+_HOUR, _DAY = 3600.0, 86400.0  # [s]
+#: Largest deviation of a clock jump from its nominal size, in median intervals.
+_TOLERANCE = 3.0
+#: Daylight saving time changes before this hour of the day.
+_LATEST_CHANGE = 4
+#: Range of days since 1899-12-30 in the years 1982 to 2078.
 _EXCEL_RANGE = (30_000, 65_000)
+#: Largest intervals of numbers that count fractions of a day, and days: no logger samples every 2 or 12 us.
 _MAX_FRACTION_STEP, _MAX_DAY_STEP = 2e-6, 1.2e-5
+#: MATLAB's datenum of 1899-12-30.
 _DATENUM_OFFSET = 693_960
-#: From here on (2008 since 1904, 2074 since 1970) seconds are counted from 1904.
+#: Numbers from here on (the year 2074 if counted from 1970) are seconds since 1904 (then the year 2008).
 _SINCE_1904, _FROM_1904_TO_1970 = 3.28e9, 2_082_844_800.0
 #: Range of seconds since 1970, from March 1973 to the year 5138; smaller times count from the start of a recording.
 _MIN_EPOCH, _MAX_EPOCH = 1e8, 1e11
@@ -76,9 +82,9 @@ _Seconds = tuple[Array, dict[str, Any], list[str]]
 class TimeState:
     """State of a log's time column between two parts of the log, which are read one after the other.
 
-    `head`: first times of a column without a unit; `rate`: sampling rate [Hz]; `resolution`: step [s] of coarse times
-    that several samples share; `last_time`: last time as in the file; `last_seconds`: the same in seconds. Values are
-    None, or 0.0 for `last_seconds`, where they are not known.
+    `head`: numbers in the first part, if the column has no unit; `rate`: sampling rate [Hz]; `resolution`: step [s] of
+    coarse times that several samples share; `last_time`: last time as in the file; `last_seconds`: the same time in
+    seconds. Values that are not known are None, except `last_seconds`, which is then 0.0.
     """
 
     head: Array | None = None
@@ -117,7 +123,7 @@ def parse_stamps(cells: Sequence[str], day_first: bool | None = None) -> NDArray
     """Parse stamps (ISO, day.month.year, month/day/year) and times of day to datetime64[ns], NaT for empty cells.
 
     `day_first`: True if the day precedes the month in dates such as 05/06/2024 and 05-06-2024; by default decided
-    from these cells (`is_day_first`). Raises ValueError with the index of the first cell that is no stamp.
+    from these cells (`is_day_first`). Raises ValueError with the index of the first cell that is not a stamp.
     """
     if day_first is None:
         day_first = is_day_first([ambiguous_dates(cells)])
@@ -129,13 +135,14 @@ def parse_stamps(cells: Sequence[str], day_first: bool | None = None) -> NDArray
                 raise ValueError(index)
             iso_stamps.append("NaT")
             continue
-        hour, colon, rest = _format_clock(parts["clock"] or "00:00").partition(":")
-        if half := parts["half"]:  # 12 AM is midnight, 12 PM is noon; 99 is refused below, as 13 PM is no time
-            hour = str(int(hour) % 12 + (12 if half[0] in "pP" else 0)) if 1 <= int(hour) <= 12 else "99"
-        iso_stamps.append(f"{_iso_date(parts, day_first)}T{hour:0>2}{colon}{rest}")
+        hour, colon, minutes = _format_clock(parts["clock"] or "00:00").partition(":")
+        if half := parts["half"]:  # AM or PM; 12 AM is midnight, 12 PM is noon
+            afternoon = 12 if half[0] in "pP" else 0
+            hour = str(int(hour) % 12 + afternoon if 1 <= int(hour) <= 12 else _WRONG_HOUR)
+        iso_stamps.append(f"{_iso_date(parts, day_first)}T{hour:0>2}{colon}{minutes}")
     try:
         return np.array(iso_stamps, dtype="datetime64[ns]")
-    except ValueError:  # the 30th of February
+    except ValueError:  # such as the 30th of February
         raise ValueError(next(index for index, text in enumerate(iso_stamps) if not _is_datetime(text))) from None
 
 
@@ -151,8 +158,8 @@ def ambiguous_dates(cells: Iterable[str]) -> dict[str, None]:
 def explicit_order(dates: Iterable[str]) -> bool | None:
     """Decide from dates such as 05/06/2024 if the day precedes the month.
 
-    The first date of which exactly one of the two numbers is over 12 decides: True if it is the first number, as in
-    31/12/2024, else False. None if there is no such date.
+    The first date in which exactly one of the two numbers is over 12 decides. The result is True if that is the first
+    number, as in 31/12/2024, else False; None if there is no such date.
     """
     over_12 = ((first > _LAST_MONTH, second > _LAST_MONTH) for first, second, _ in map(_date_numbers, dates))
     return next((first for first, second in over_12 if first != second), None)
@@ -161,9 +168,13 @@ def explicit_order(dates: Iterable[str]) -> bool | None:
 def is_day_first(columns: Collection[Iterable[str]]) -> bool:
     """Decide if the day precedes the month in dates such as 05/06/2024.
 
-    `columns`: the `ambiguous_dates` of columns with the same format. Criteria in order: a number over 12
-    (`explicit_order`); the order in which no column goes back in time; the order with the shorter time span.
-    Otherwise the day comes first with hyphens, the month with slashes.
+    `columns`: the `ambiguous_dates` of columns with the same format. These criteria are applied in turn until one
+    decides:
+
+    - a number over 12 (`explicit_order`);
+    - with one of the two orders only, no column goes back in time;
+    - the dates span a shorter time with one order than with the other;
+    - the day comes first with hyphens, the month with slashes.
     """
     known_order = next((order for order in map(explicit_order, columns) if order is not None), None)
     if known_order is not None:
@@ -179,7 +190,7 @@ def is_day_first(columns: Collection[Iterable[str]]) -> bool:
 
 
 def _ordinal_day(text: str, day_first: bool) -> int:
-    """Compute the day number (`date.toordinal`) of a date such as 05/06/2024; 0 if that is no date.
+    """Compute the day number (`date.toordinal`) of a date such as 05/06/2024; 0 if there is no such day.
 
     `day_first`: True if the day precedes the month.
     """
@@ -208,7 +219,7 @@ def _is_datetime(text: str) -> bool:
 def counts_from_1970(clock: float) -> bool:
     """Test whether a clock reading [s] counts from 1970, rather than from the start of a machine.
 
-    It then lies between March 1973 and the year 5138.
+    It does if it then means a time between March 1973 and the year 5138.
     """
     return _MIN_EPOCH < clock < _MAX_EPOCH
 
@@ -227,7 +238,7 @@ def clock_text(clock: float) -> str:
 
 
 def parse_epoch(stamp: str) -> float | None:
-    """Parse an ISO date and time, as if in UTC, to seconds since 1970, to a millisecond; None if it is none."""
+    """Parse an ISO date and time, taken as UTC, to seconds since 1970, to a millisecond; None for any other text."""
     try:
         moment = np.datetime64(stamp, "ms")
     except ValueError:
@@ -262,9 +273,10 @@ def _iso_date(parts: Mapping[str, str | None], day_first: bool) -> str:
 def nominal_rate(t: Array) -> float:
     """Estimate the nominal sampling rate [Hz] of times `t` (n,) [s].
 
-    It is the decimal number with the fewest digits that agrees with the reciprocal of the mean interval, to within the
-    rounding of the times. If the times do not increase throughout, or deviate from an even spacing by 0.6 intervals or
-    more, the median interval takes the place of the mean. Raises InputError if no interval is positive.
+    The estimate is the decimal number with the fewest digits that agrees with the reciprocal of the mean interval, to
+    within the rounding of the times. If the times do not increase throughout, or deviate from an even spacing by 0.6
+    intervals or more, the median of the positive intervals is used instead of the mean. Raises InputError if no
+    interval is positive.
     """
     steps = np.diff(t)
     span = float(t[-1] - t[0])
@@ -294,8 +306,9 @@ def _convert_stamps(values: NDArray[np.datetime64], name: str, state: TimeState)
     """Convert date stamps (n,) of a time column to seconds from the first of them.
 
     Returns (times (n,) [s], provenance of the start, lines for the history). Times of day without a date continue from
-    part to part of a log, from the last time in `state`. Jumps back at midnight or at the full hour, and those of
-    daylight saving time, are removed. `name`: the column in messages. Raises InputError if no row has a stamp.
+    part to part of a log, from the last time in `state`; their jumps back at midnight or at the full hour are removed.
+    In stamps with a date, a single jump by an hour in the night, as of daylight saving time, is removed. `name`: the
+    column in messages. Raises InputError if no row has a stamp.
     """
     nanoseconds = values.astype("datetime64[ns]")
     known = ~np.isnat(nanoseconds)
@@ -305,23 +318,26 @@ def _convert_stamps(values: NDArray[np.datetime64], name: str, state: TimeState)
     continues = is_undated and state.last_time is not None
     if continues:  # prefix the last stamp of the previous part
         nanoseconds, known = np.append(state.last_time, nanoseconds), np.append(True, known)
-    start = nanoseconds[known][0]
+    stamps = nanoseconds[known]
+    start = stamps[0]
     t = (nanoseconds - start).astype(np.int64).astype(np.float64) / 1e9
     t[~known] = np.nan
-    first_hour = int((nanoseconds[known] - nanoseconds[known].astype("datetime64[D]")).min() / np.timedelta64(1, "h"))
+    earliest_hour = int((stamps - stamps.astype("datetime64[D]")).min() / np.timedelta64(1, "h"))  # of the day
     note_of_jump = {
         -_DAY: "has no date: begins again with the next day",
         -_HOUR: "has no date: begins again with the next hour",
     }
     if not is_undated:
         note = "steps by an hour: taken for daylight saving time, the hour left out"
-        note_of_jump = dict.fromkeys((-_HOUR, _HOUR), note) if first_hour < _LATEST_CHANGE else {}
+        note_of_jump = dict.fromkeys((-_HOUR, _HOUR), note) if earliest_hour < _LATEST_CHANGE else {}
     notes = []
     for step, note in note_of_jump.items():
         if (continuous := _remove_jumps(t, step, single=not is_undated)) is not None:
             t = continuous
             notes.append(f"column {name} {note}")
-    return t[1:] + state.last_seconds if continues else t, {} if is_undated else {"start": iso_moment(start)}, notes
+    if continues:  # without the prefixed stamp
+        t = t[1:] + state.last_seconds
+    return t, {} if is_undated else {"start": iso_moment(start)}, notes
 
 
 def _remove_jumps(t: Array, step: float, single: bool) -> Array | None:
@@ -379,8 +395,10 @@ def _convert_without_unit(values: Array, finite: Array, name: str, state: TimeSt
     numbers show if they are days or seconds, and since when. `name`: the column in messages; `state`: state of the
     column after the previous part of the log, which is updated. Raises InputError if the numbers count rows.
     """
-    first, is_first_part = float(finite[0]), state.head is None
-    state.head = head = finite if state.head is None else state.head
+    first = float(finite[0])
+    is_first_part = state.head is None
+    head = finite if state.head is None else state.head
+    state.head = head
     if (days := _detect_days(head)) is not None:
         origin, meaning = days
         note = f"column {name} read as {meaning}"
@@ -407,15 +425,17 @@ def _convert_without_unit(values: Array, finite: Array, name: str, state: TimeSt
 def _detect_days(values: Array) -> tuple[np.datetime64 | None, str] | None:
     """Find out if the numbers (n,) of a time column without a unit count days.
 
-    Returns (origin, meaning in words), or None if they do not. Numbers count days if the steps between them, taken as
-    seconds, would be shorter than those of any logger, and if the first is a date from 1982 to 2078 as spreadsheets or
-    MATLAB count days. They are fractions of a day if they lie between 0 and 1; the origin is then None.
+    Returns (origin, meaning in words), or None if the numbers do not count days. They count days if the steps between
+    them, taken as seconds, would be shorter than those of any logger, and if one of two conditions is met. Either the
+    first number, counted as spreadsheets or MATLAB count days, is a date from 1982 to 2078. Or all numbers lie between
+    0 and 1: they are fractions of a day, and the origin is None.
     """
     steps = np.diff(values)
     steps = steps[steps > 0]
     if not steps.size:
         return None
-    step, first, origin = float(np.median(steps)), float(values[0]), np.datetime64("1899-12-30", "us")
+    step, first = float(np.median(steps)), float(values[0])
+    origin = np.datetime64("1899-12-30", "us")
     if step <= _MAX_DAY_STEP:
         if _EXCEL_RANGE[0] <= first <= _EXCEL_RANGE[1]:
             return origin, "days since 1899-12-30, as spreadsheets count"
@@ -431,11 +451,14 @@ def time_base(
 ) -> tuple[Array, float, dict[str, Any], list[str]]:
     """Convert the values (n,) of a time column, numbers in `unit` or datetime64, to seconds and a sampling rate.
 
-    Returns the times (n,) [s], the rate [Hz], the provenance of the start, and lines for the history. Stamps and
-    epoch times become relative to their first sample; other times stay as they are. `name`: the column in messages;
-    `stated_rate` [Hz]: rate in the file, with which samples that share stamps are spaced; `state`: state after the
-    previous part of the log, which the values continue; it is updated. Raises InputError for a column that is empty,
-    counts rows, does not increase or has no unit of time.
+    Returns the times (n,) [s], the rate [Hz], the provenance of the start, and lines for the history. Stamps, and
+    numbers that count from a date, become relative to their first sample; other times stay as they are.
+
+    - `name`: the column in messages.
+    - `stated_rate` [Hz]: rate in the file, with which samples that share stamps are spaced.
+    - `state`: state after the previous part of the log, which the values continue; it is updated. None for a whole log.
+
+    Raises InputError for a column that is empty, counts rows, does not increase or has no unit of time.
     """
     state = TimeState() if state is None else state
     if values.dtype.kind == "M":
@@ -460,8 +483,9 @@ def time_base(
 def _space_shared_times(t: Array, state: TimeState) -> tuple[float, Array] | None:
     """Spread samples that share a time, because the times of the log have coarse steps, evenly over these steps.
 
-    `t` (n,): times [s]. Returns (step [s], new times (n,)), or None if no samples share times regularly. A part of a
-    log that is too short for estimating the step uses the step and the rate in `state`, unless it has a gap.
+    `t` (n,): times [s]. Returns (step [s], new times (n,)). None if a time is missing, if the times step back, or if
+    the steps do not have about equally many samples, two or more. A part of a log that is too short for estimating the
+    step uses the step and the rate in `state`, unless it has a gap.
     """
     steps = np.diff(t)
     changes = np.flatnonzero(steps)
@@ -471,9 +495,10 @@ def _space_shared_times(t: Array, state: TimeState) -> tuple[float, Array] | Non
         if 2 * changes.size > steps.size:
             return None
         resolution = float(steps[changes].min())
-        n_resolutions, n_samples = np.round(steps[changes][1:] / resolution), np.diff(changes)
-        samples_per_step = float(n_samples.sum() / n_resolutions.sum())
-        if samples_per_step < 2.0 or np.abs(n_samples / n_resolutions - samples_per_step).max() > 1.0:
+        n_steps = np.round(steps[changes][1:] / resolution)  # of the coarse clock, between changes of the time
+        n_samples = np.diff(changes)
+        samples_per_step = float(n_samples.sum() / n_steps.sum())
+        if samples_per_step < 2.0 or np.abs(n_samples / n_steps - samples_per_step).max() > 1.0:
             return None
         rate = _shortest_decimal(samples_per_step / resolution, 1.0 / float(n_samples.sum()))
     elif state.resolution is not None and state.rate is not None and steps.max(initial=0.0) < 1.5 * state.resolution:

@@ -14,19 +14,18 @@ _ROW = WORDS["row"]
 #: Names of columns in pairs: `X`, `p_A X` or `p_A.x`, and the same with `Y`.
 _PAIR_NAMES = {axis: re.compile(rf"(?P<name>.*?)[\s_.:-]{{0,3}}\b{axis}\d{{0,3}}", re.IGNORECASE) for axis in "xy"}
 _MAX_NAME = 80
-#: Rows that only a TwinCAT Scope export has; a unit with its quantity: `V (Voltage)`, `(None)`.
-_SCOPE_ROWS, _UNIT_WITH_QUANTITY = (
-    ("SampleTime[ms]", "Starttime of export"),
-    re.compile(r"([^()]{0,20})\([^()]{0,40}\)"),
-)
+#: First cells of rows that only a TwinCAT Scope export has.
+_SCOPE_ROWS = ("SampleTime[ms]", "Starttime of export")
+#: A unit with its quantity: `V (Voltage)`, `(None)`.
+_UNIT_WITH_QUANTITY = re.compile(r"([^()]{0,20})\([^()]{0,40}\)")
 
 
 def apply_descriptions(labels: Sequence[Label], rows: Sequence[Sequence[str]]) -> list[Label]:
     """Replace the names of columns by the descriptions that a user has entered for them in the logger.
 
-    They are in a table of channels above the heading, or in a row of labels, whose first cell is `label` or `labels`.
-    `rows`: cells of the lines above the heading, and of the heading's rows of labels. A description may state the unit
-    if the heading does not. The columns' own names are kept in `Label.called`.
+    Descriptions are in a table of channels above the heading, or in a row of labels, whose first cell is `label` or
+    `labels`. `rows`: cells of the lines above the heading, and of the heading's rows of labels. A description may state
+    the unit if the heading does not. The replaced names are kept in `Label.called`.
     """
     names: dict[str, str] = {}
     name_column: int | None = None
@@ -51,7 +50,7 @@ def _fold(text: str) -> str:
 
 
 def _column_key(label: Label) -> str:
-    """Return the last word of a column's name, without case, because the name of a group may precede it."""
+    """Return the last word of a column's name, in lower case; the name of a group may precede this word."""
     return _fold(label.name.rpartition(" ")[2] or label.name)
 
 
@@ -65,11 +64,11 @@ def _rename_label(label: Label, name: str) -> Label:
 
 
 def parse_scope_heading(lines: Sequence[str], delimiter: str) -> tuple[list[Label], int] | None:
-    """Parse the heading of a TwinCAT Scope export to (labels of the columns, number of its lines).
+    """Parse the heading of a TwinCAT Scope export to (labels of the columns, number of heading lines).
 
-    None for any other text. `lines`: the lines above the first sample. An export has a row for each property, such as
-    the names and the units. The name of the property stands above each time column, and the channel's value above the
-    channel. Times are in milliseconds since the start of the export.
+    None for any other text. `lines`: the lines above the first sample. The heading has a row for each property, such as
+    name and unit. In this row, the property is named above each time column, and has its value above each channel.
+    Times are in milliseconds since the start of the export.
     """
     rows = [[cell.strip() for cell in line.split(delimiter)] for line in lines]
     begin = max((index for index, row in enumerate(rows) if row[0] == "Name" and len(row) > 2), default=None)
@@ -88,9 +87,9 @@ def parse_scope_heading(lines: Sequence[str], delimiter: str) -> tuple[list[Labe
 def split_pairs(labels: Sequence[Label]) -> list[Label]:
     """Rename the columns of a table in which each channel has its own time column; other tables stay as they are.
 
-    Columns of times X and of values Y alternate, named as in `X [s], p_A [bar], X [s], p_B [bar]` or in `p_A X, p_A Y
-    [bar], p_B X, p_B Y [bar]`. The times become `t`, and the values get the channels' names. An X without a unit is
-    in seconds.
+    Columns of times X and of values Y alternate. They are named like `X [s], p_A [bar], X [s], p_B [bar]`, or like
+    `p_A X, p_A Y [bar], p_B X, p_B Y [bar]`. The times become `t`, in seconds if they have no unit; the values get the
+    channels' names.
     """
     times, values = labels[::2], labels[1::2]
     are_times = all(label.unit is None or same_dimension(label.unit, "s") for label in times)

@@ -36,7 +36,7 @@ class Formula(Generic[K]):
 
     @property
     def column(self) -> K | None:
-        """The column, if the formula is a single column without factor and constant; None for other formulas."""
+        """The only column, if the formula has no factor other than 1 and no constant; None for other formulas."""
         return next(iter(self.factors)) if self.constant == 0.0 and [*self.factors.values()] == [1.0] else None
 
     def plus(self, other: Formula[K], times: float = 1.0) -> Formula[K]:
@@ -52,7 +52,7 @@ class Formula(Generic[K]):
     def values(self, columns: Mapping[K, Array]) -> Array:
         """Compute the values (n,) of the formula, in its unit, from the samples (n,) of its columns.
 
-        A column without factor and constant is returned itself, not as a copy.
+        If the formula is a single column (`column`), its array itself is returned, not a copy.
         """
         if self.column is not None:
             return columns[self.column]
@@ -74,10 +74,7 @@ def parse_formula(text: str) -> Formula[str]:
         names: list[str] = []
 
         def replace_name(match: re.Match[str], names: list[str] = names) -> str:
-            """Append the name of a column to `names`, and return `columnN` to replace it in the text.
-
-            The name may be none that Python can parse.
-            """
+            """Append the name of a column to `names`, and return `columnN`, a name that Python can parse, instead."""
             names.append(match[1] or match[2])
             return _COLUMN.format(len(names) - 1)
 

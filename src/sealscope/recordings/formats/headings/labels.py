@@ -20,7 +20,7 @@ class Label:
     """Heading of a column of a table.
 
     `whole`: the heading as written; `name`: the heading without the unit; `unit`: the unit, or None; `called`: the
-    column's own name if `name` is a description that the user has entered for the channel, else "".
+    logger's name of the column if `name` is a description that the user has entered for the channel, else "".
     """
 
     whole: str
@@ -67,9 +67,9 @@ def split_square_brackets(text: str) -> tuple[str, str | None]:
 
 
 def _split_brackets_or_slash(text: str) -> tuple[str, str | None]:
-    """Split `name (unit)` or `name / unit` into name and unit, at the first possible place.
+    """Split `name (unit)` or `name / unit` into name and unit; return (text, None) for any other text.
 
-    Returns (text, None) for any other text.
+    Of several possible splits, that with the shortest name is used.
     """
     splits: list[tuple[int, int]] = []  # end of the name, beginning of the unit
     parts = text.split("/")
@@ -83,7 +83,7 @@ def _split_brackets_or_slash(text: str) -> tuple[str, str | None]:
         depth += {")": 1, "(": -1}.get(text[index], 0)
         n_opened += text[index] == "("
         if depth == 0:
-            if n_opened <= 2:  # `name (m/(s V))`; deeper brackets are no unit
+            if n_opened <= 2:  # `name (m/(s V))`; deeper brackets do not contain a unit
                 splits.append((len(text[:index].rstrip()), index))
             break
     end, begin = min(splits, default=(0, 0))

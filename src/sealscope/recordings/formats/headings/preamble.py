@@ -33,7 +33,8 @@ _QUANTITY = re.compile(r"(?P<number>[+-]?\d{1,12}(?:[.,]\d{1,12})?(?:[eE][+-]?\d
 def stated_rate(remarks: Mapping[str, str]) -> float | None:
     """Find the sampling rate [Hz] in the remarks of a file; None if it is not stated.
 
-    A remark may state the rate or the interval between samples.
+    A remark may state the rate or the interval between samples, with its unit after the number, in the name or not at
+    all. The first remark with a positive number counts.
     """
     for name, text in remarks.items():
         label = Label.parse(name)
@@ -83,7 +84,8 @@ def collect_remarks(pairs: Iterable[tuple[object, object]]) -> dict[str, str]:
 def clean_remarks(provenance: Mapping[str, object]) -> dict[str, str]:
     """Return the remarks on a recording, name -> text, made printable and shortened (`collect_remarks`).
 
-    They are the entries of the mapping `about` in its provenance, read from the header of the file; none without it.
+    The remarks were read from the header of the file, and are in the entry `about` of the `provenance`. The result is
+    empty without this entry.
     """
     remarks = provenance.get("about")
     return collect_remarks(remarks.items()) if isinstance(remarks, Mapping) else {}

@@ -25,9 +25,9 @@ _UNITS = {kind: {**CHANNEL_UNITS, "t": "s"}[channel] for kind, channel in _CHANN
 _FRACTION_UNITS = frozenset(("%", "percent", "pct", "Prozent", "prozent"))
 _PRESSURES = {"A": "p_A", "B": "p_B", "1": "p_1", "2": "p_2", "pump 1": "p_1", "pump 2": "p_2"}
 _TOKEN = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+|[^\W\d_a-zA-Z]+")
-#: The last capitalised word of a name: `Bar` of `MainPaBar`; two letters are no unit, as `MainPa` is pressure A.
+#: The last capitalised word of a name: `Bar` of `MainPaBar`; two letters are not a unit, as `MainPa` is pressure A.
 _LAST_WORD = re.compile(r"(?<=[a-z\d])[A-Z]+[a-z]*$")
-#: The number that tells equal names of columns apart, as in `X_Value.1`.
+#: The number at the end of repeated names of columns, as in `X_Value.1`.
 _COUNTED = re.compile(r"[. _]?\d{1,3}$")
 _MAX_NAME = 80
 
@@ -54,21 +54,21 @@ class _Guess(NamedTuple):
 def proposed_map(labels: Sequence[Label]) -> dict[str, str]:
     """Propose a map, channel (or ``t``) -> column, for the columns whose names reveal their meaning.
 
-    Columns that already have a channel's name, and channels that several columns may mean, are left out. A unit at
-    the end of a name (``PA_bar``) becomes the unit of the column. The map is empty if it would contain the time
-    alone.
+    Columns that already have a channel's name are left out, and so are channels for which several columns are equally
+    likely. A unit at the end of a name (``PA_bar``) becomes the unit of the column. The map is empty if it would
+    contain only the time.
     """
     channel_names = {label.name.casefold() for label in labels} & {name.casefold() for name in CHANNEL_UNITS}
     head = _find_head_side(labels)
     candidates: dict[str, list[tuple[Label, _Guess]]] = {}
     for label in labels:
         guess = None if label.name.casefold() in channel_names else _guess_meaning(label, head)
-        if guess is None or (_is_named_time(label) and guess.kind != "time"):  # X_Value is no position
+        if guess is None or (_is_named_time(label) and guess.kind != "time"):  # X_Value is a time, not a position
             continue
         if guess.channel is not None:
             candidates.setdefault(guess.channel, []).append((label, guess))
     if "p_A" not in candidates and "p_B" not in candidates and not {"p_a", "p_b"} & channel_names:
-        # without others, pressures 1 and 2 are those of the chambers
+        # without pressures A and B, pressures 1 and 2 are those of the chambers
         for channel, pump_port in (("p_A", "p_1"), ("p_B", "p_2")):
             if pump_port in candidates:
                 candidates[channel] = candidates.pop(pump_port)
@@ -88,7 +88,7 @@ def proposed_map(labels: Sequence[Label]) -> dict[str, str]:
         if len(columns) == 1 and channel.casefold() not in channel_names:
             label, guess = columns[0]
             result[channel] = label.whole + (f"[{guess.unit}]" if guess.unit not in (None, label.unit) else "")
-    return {} if set(result) <= {"t"} else result  # the time alone is no recording
+    return {} if set(result) <= {"t"} else result
 
 
 def format_map(channel_map: Mapping[str, str]) -> str:
@@ -108,7 +108,7 @@ def _is_named_time(label: Label) -> bool:
 
 
 def unit_of_time(label: Label) -> str | None:
-    """Find the unit of a time column in its heading or at the end of its name; None if it has none or is no time."""
+    """Find the unit of a time column, in its heading or name; None if it has no unit, or is not a time."""
     guess = _guess_meaning(label)
     return guess.unit if guess is not None and guess.kind == "time" else None
 
@@ -168,7 +168,7 @@ def is_temperature(label: Label) -> bool:
 def is_measured(label: Label) -> bool:
     """Return True if a column is a measured pressure, position, speed or flow, by its name or unit.
 
-    Demands, and values computed from others, are not measured.
+    Set points, and values computed from other columns, are not measured.
     """
     if len(label.name) > _MAX_NAME:
         return False
@@ -198,9 +198,11 @@ def _strip_accents(text: str) -> str:
 def _split_words(name: str) -> set[str]:
     """Split a name into its words, in lower case.
 
-    The result also contains the last part of a German compound (`weg` of `kolbenweg`); the two letters of a word `pa`
-    or `pb`, i.e. `p` and the side; and known words of languages without spaces, such as Chinese, that the name
-    contains.
+    The result also contains parts of words:
+
+    - the last part of a German compound, such as `weg` of `kolbenweg`;
+    - both letters of `pa` and `pb`, i.e. `p` and the side;
+    - known words of languages without spaces, such as Chinese.
     """
     words = {word for word in _UNSPACED if word in name}
     for token in (token.casefold() for token in _TOKEN.findall(_strip_accents(name))):
@@ -212,7 +214,7 @@ def _split_words(name: str) -> set[str]:
 def _find_head_side(labels: Sequence[Label]) -> str:
     """Find the chamber, "A" or "B", that columns called "head" mean; "" if that is not known.
 
-    It is A if other columns are called rod, and B if others are called cap.
+    The chamber is A if another column is called rod or the like, else B if another one is called cap or the like.
     """
     words = {word for label in labels if len(label.name) <= _MAX_NAME for word in _split_words(label.name)}
     if not words & _SIDE["head"]:
@@ -223,7 +225,8 @@ def _find_head_side(labels: Sequence[Label]) -> str:
 def _guess_meaning(label: Label, head: str = "") -> _Guess | None:
     """Guess the meaning of a column from its name and unit; None if it is not known.
 
-    `head`: the chamber, "A" or "B", that the word "head" means.
+    The unit is that of the heading, else that at the end of the name. `head`: the chamber, "A" or "B", that the word
+    "head" means, or "".
     """
     if len(label.name) > _MAX_NAME:
         return None
@@ -240,7 +243,7 @@ def _guess_meaning(label: Label, head: str = "") -> _Guess | None:
     if unit is not None and same_dimension(unit, "m^3/s"):
         kind = "leak" if words & _MEASURED["leak"] else "flow"
         return _Guess(kind, side, unit) if words & _MEASURED[kind] else None
-    # a command may be called wanted, a measured quantity not
+    # a command may be called `setpoint`, a measured quantity may not
     is_measured_quantity = any(words & _MEASURED[kind] for kind in ("pressure", "position", "speed", "angle"))
     if words & _KIND["other"] or (words & _KIND["wanted"] and is_measured_quantity):
         return None
@@ -264,17 +267,14 @@ def _is_command_unit(unit: str) -> bool:
 
 
 def is_current_or_fraction(unit: str) -> bool:
-    """Return True if a unit is one of current, as for the command of a valve, or a fraction of full scale.
-
-    A fraction is, for example, %.
-    """
+    """Return True if a unit is one of current or of a fraction of full scale, such as %; both occur for commands."""
     return unit in _FRACTION_UNITS or same_dimension(unit, "A")
 
 
 def _guess_at_valve(label: Label, kind: str) -> _Guess | None:
-    """Find out from its name if a column is the pressure before or behind a valve; None for other columns.
+    """Guess from its name and unit if a column is a pressure before or behind a valve; None for other columns.
 
-    `kind`: "before" or "behind". Returns the guessed meaning with the unit.
+    `kind`: "before" or "behind", the side to test. Returns the guessed meaning, in which no side is stated.
     """
     name, ending = split_unit(label.name)
     unit = ending if label.unit is None else label.unit
@@ -290,7 +290,9 @@ def suggest_map_entry(label: Label) -> str:
     The channel is `CHANNEL` if it is not known.
     """
     guess = _guess_meaning(label)
-    channel = None if guess is None else "q_pump" if guess.kind == "flow" else guess.channel
+    channel = None if guess is None else guess.channel
+    if guess is not None and guess.kind == "flow":  # of either side
+        channel = "q_pump"
     if channel is None:
         at_valve = {"p_1": "before", "p_2": "behind"}
         channel = next((name for name, kind in at_valve.items() if _guess_at_valve(label, kind)), None)
@@ -300,12 +302,13 @@ def suggest_map_entry(label: Label) -> str:
 def _find_side(words: set[str]) -> str:
     """Find the side of the machine that the words of a name mean; "" if it is not known.
 
-    The result is "A" or "B" for a chamber, "pump", "pump 1" or "pump 2" for a port of the pump, or "1" or "2".
+    The result is "A" or "B" for a chamber; "pump", "pump 1" or "pump 2" for a port of the pump; or "1" or "2" if only
+    this number is known.
     """
-    cap, rod = bool(words & _SIDE["A"]), bool(words & _SIDE["B"])
+    is_a, is_b = bool(words & _SIDE["A"]), bool(words & _SIDE["B"])
     number = next((digit for digit in ("1", "2") if digit in words), "")
-    if words & _SIDE["pump"] or (words & _SIDE["port"] and cap == rod):
+    if words & _SIDE["pump"] or (words & _SIDE["port"] and is_a == is_b):
         return f"pump {number}".strip()
-    if cap != rod:
-        return "A" if cap else "B"
-    return "" if cap else number  # both sides named: unknown
+    if is_a != is_b:
+        return "A" if is_a else "B"
+    return "" if is_a else number  # if both sides are named, the side is not known

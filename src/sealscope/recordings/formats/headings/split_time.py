@@ -27,8 +27,8 @@ def find_time_parts(labels: Sequence[Label], used: Container[int], only_subsecon
     """Find the columns that together form the time: part of the time, such as "hour" -> column.
 
     There must be one column each of hours, minutes and seconds; otherwise the result is empty. Columns of milli-,
-    micro- and nanoseconds are added, and year, month and day if all three exist. `used`: columns to ignore. With
-    `only_subsecond`, only parts of a second are searched for, which accompany a column of whole seconds.
+    micro- and nanoseconds are added, and year, month and day if all three exist. With `only_subsecond`, the result has
+    only milli-, micro- and nanoseconds, which accompany a time column of whole seconds. `used`: columns to ignore.
     """
     columns_of_part: dict[str, int] = {}
     for part, words in WORDS["part"].items():
@@ -51,16 +51,17 @@ def find_time_parts(labels: Sequence[Label], used: Container[int], only_subsecon
 def combine_time_parts(base: NDArray[Any], parts: Mapping[str, Array], unit: str | None) -> NDArray[Any] | None:
     """Combine several columns of a time, such as date, hours and minutes, to time stamps or seconds (n,).
 
-    `base` (n,): datetime64, or doubles in `unit`; if the parts have hours, only its dates are used. `parts`: part of
-    the time, such as "hour" -> values (n,). None if the parts do not belong to this time, such as fractional hours,
-    or milliseconds since the start beside stamps.
+    `base` (n,): the time column, datetime64 or doubles in `unit`; if there is a part "hour", only the dates of `base`
+    are used. `parts`: part of the time, such as "hour" -> values (n,). None if the values cannot be parts of this time,
+    such as fractional hours, or milliseconds since the start.
     """
-    second_parts = [part for part in _SUBSECOND if part in parts]
-    smallest_part = second_parts[-1] if second_parts else "second"
+    subsecond_parts = [part for part in _SUBSECOND if part in parts]
+    smallest_part = subsecond_parts[-1] if subsecond_parts else "second"
     for part, values in parts.items():
         known = values[np.isfinite(values)]
-        end = 1e3 if part in second_parts[1:] else _UPPER_LIMIT.get(part, np.inf)  # microseconds after milliseconds
-        if not known.size or known.min() < 0.0 or known.max() >= end:
+        # microseconds beside milliseconds are parts of a millisecond
+        limit = 1e3 if part in subsecond_parts[1:] else _UPPER_LIMIT.get(part, np.inf)
+        if not known.size or known.min() < 0.0 or known.max() >= limit:
             return None
         # only the smallest part may have a fraction
         if part != smallest_part and not np.array_equal(known, np.floor(known)):
@@ -80,10 +81,10 @@ def combine_time_parts(base: NDArray[Any], parts: Mapping[str, Array], unit: str
 
 
 def _restarts_each_second(base: NDArray[Any], offset: Array) -> bool:
-    """Return True if parts of a second grow within each second and fall at the next one, as they should.
+    """Return True if parts of a second grow within each second and fall at the next second, as they should.
 
     `base` (n,): whole seconds or stamps; `offset` (n,): the parts of a second. A tenth of the steps may differ. False
-    if fewer than half of the steps are within a second.
+    if fewer than half of the steps are within a second, because the parts then show no order.
     """
     steps = np.diff(base) / (np.timedelta64(1, "s") if base.dtype.kind == "M" else 1.0)
     is_same_second, is_next_second, change = steps == 0, steps == 1, np.diff(offset)

@@ -91,9 +91,9 @@ def _unpack(path: Path, kind: str, folder: Path, max_bytes: int) -> Path:
 
 @contextmanager
 def _open_member(path: Path, kind: str) -> Iterator[tuple[IO[bytes], str, int]]:
-    """Open the single file in an archive of the `kind`; yield (stream, name, size [bytes]).
+    """Open the single file in an archive; yield (stream, name, size [bytes]).
 
-    If the archive does not state name and size, they are "" and 0.
+    `kind`: kind of the archive, such as "zip". For kinds other than "zip" and "tar", name and size are "" and 0.
     """
     with ExitStack() as stack:
         if kind == "zip":

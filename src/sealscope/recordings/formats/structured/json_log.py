@@ -36,7 +36,7 @@ _decoder = json.JSONDecoder()
 
 
 def is_json(head: bytes) -> bool:
-    """Test whether `head` begins a JSON file, with an object or an array; a heading in brackets does not."""
+    """Test whether `head`, the first bytes of a file, begins a JSON object or array; a heading in brackets does not."""
     encoding = detect_encoding(head)
     text = "" if encoding is None else head.decode(encoding, errors="replace").lstrip("\ufeff \t\r\n\x1e")
     if not _BEGINS.match(text):
@@ -106,10 +106,10 @@ def _read_members(text: str, place: str) -> tuple[list[Any], bool]:
 def _iter_members(text: str) -> Iterator[Any]:
     """Yield the values that stand one after the other in a JSON text, such as one record on each line.
 
-    Between them may be white space, commas and record separators. An array of arrays or objects is not yielded as a
-    whole: its members are, one by one, so that those before a truncated one are still read. Arrays within these
-    members stay whole, and so does any other array, such as a row of numbers. Raises json.JSONDecodeError where the
-    text is damaged or truncated.
+    Between the values may be white space, commas and record separators. The members of an array of arrays or objects
+    are yielded one by one, so that the members before a truncated one are still read. All other arrays are yielded as
+    a whole: those within these members, and any other outer array, such as a row of numbers. Raises
+    json.JSONDecodeError where the text is damaged or truncated.
     """
     position, in_array = 0, False
     while (position := _SEPARATORS.match(text, position).end()) < len(text):  # type: ignore[union-attr]
@@ -130,10 +130,15 @@ def _is_cell(value: object) -> bool:
 def _iter_cells(group: str, name: str, value: Any, depth: int) -> Iterator[tuple[str, str, Any, str | None]]:
     """Yield the single values in an entry of a JSON record, as (group, name, cell, unit).
 
-    `group`, `name`: names of the records around the entry, and of the entry. `value`: a single value (text, number or
-    null); a record `{"value": ..., "unit": ...}`, which states the unit, else None; a vector, whose members are called
-    `name(1)`, `name(2)`, ...; or a record of further values, whose name then belongs to the group. `depth`: number of
-    records and vectors around it. Raises InputError for other values.
+    `group`, `name`: names of the records around the entry, and of the entry; `depth`: number of records and vectors
+    around the entry. Its `value` may be:
+
+    - a single value, i.e. a text, a number or null; the unit is then None;
+    - a record `{"value": ..., "unit": ...}`;
+    - a vector, whose members are called `name(1)`, `name(2)`, ...;
+    - a record of further values, whose name then belongs to the group.
+
+    Raises InputError for other values.
     """
     if isinstance(value, Mapping) and depth < _MAX_DEPTH:
         unit = value.get("unit")
@@ -193,14 +198,14 @@ def _parse_records(members: Sequence[Any], place: str) -> list[Series]:
     check_size(rows, len(columns))
 
     def read_values(key: tuple[str, str]) -> NDArray[Any]:
-        """Convert the cells of a column to an array (n,) with one for each row; `key`: its group and name."""
+        """Convert the cells of a column to an array (n,), one value per row; `key`: group and name of the column."""
         return _parse_array([columns[key].get(row) for row in range(rows)], key[1])
 
     return [Series(key[0], Label.parse(key[1], units.get(key)), rows, partial(read_values, key)) for key in columns]
 
 
 def _block_length(member: Mapping[str, Any]) -> int | None:
-    """Find the number of rows in a block of columns; None if the value is no such block.
+    """Find the number of rows in a block of columns; None if the value is not such a block.
 
     A block of columns is a mapping of arrays of equal length, one of which is the time.
     """
@@ -231,9 +236,9 @@ def _parse_array(cells: Sequence[Any], name: str) -> NDArray[Any]:
 def _convert_lists(value: Any, place: str, depth: int = 0) -> Any:
     """Convert the lists in a JSON document, at any depth, to arrays or mappings of columns.
 
-    A list of samples or of equally long rows becomes an array. A list of records becomes a mapping of columns by
-    name, and another list of mappings a mapping with the names `(1)`, `(2)`, ... `depth`: number of mappings around
-    the value; `place`: the file, for messages.
+    A list of samples or of equally long rows becomes an array, and a list of records a mapping from name to column. Any
+    other list of mappings becomes a mapping with the names `(1)`, `(2)`, ..., and any other list None. `depth`: number
+    of mappings around the value; `place`: the file, for messages.
     """
     if isinstance(value, Mapping) and depth < _MAX_TREE_DEPTH:
         return {key: _convert_lists(member, place, depth + 1) for key, member in value.items()}

@@ -29,7 +29,7 @@ class _Packet:
     """A block of samples in a LabVIEW measurement file, with a header of its own.
 
     `head`: rows of the header, name -> an entry for each channel; `names`: names of the columns; `rows`: samples of
-    each row, NaN where it is shorter than others.
+    each row, NaN where a row is shorter than others.
     """
 
     head: Mapping[str, list[str]]
@@ -102,8 +102,9 @@ def read_lvm(path: Path, request: Request) -> RecordingFields:
 def _iter_packets(lines: Iterator[tuple[int, str]], delimiter: str, decimal: str, place: str) -> Iterator[_Packet]:
     """Yield the packets of samples in a LabVIEW measurement file, from its numbered lines.
 
-    The rows of a packet are added after it was yielded. `delimiter`, `decimal`: separators of cells and of decimals;
-    `place`: the file, for messages. Raises InputError for a word in place of a number.
+    A packet is yielded when the names of its columns are read; its rows are added while the next packet is searched
+    for. `delimiter`, `decimal`: separators of cells and of decimals; `place`: the file, for messages. Raises InputError
+    for a word in place of a number.
     """
     head: dict[str, list[str]] = {}
     packet: _Packet | None = None
@@ -123,7 +124,8 @@ def _iter_packets(lines: Iterator[tuple[int, str]], delimiter: str, decimal: str
                 """Format the line, column and file of a cell for messages; `index`: its column."""
                 return f"(line {number}, column {names[index]}, {place})"
 
-            values, words = parse_numbers(cells[: len(names)] + [""] * (len(names) - len(cells)), decimal, format_place)
+            padded_cells = cells[: len(names)] + [""] * (len(names) - len(cells))
+            values, words = parse_numbers(padded_cells, decimal, format_place)
             if words:
                 raise InputError(f"a sample must be a number, got {cells[words[0]][:40]!r} {format_place(words[0])}")
             packet.rows.append(values)
@@ -140,8 +142,8 @@ def _iter_packets(lines: Iterator[tuple[int, str]], delimiter: str, decimal: str
 def _list_series(packets: Sequence[_Packet], x_columns: str) -> list[Series]:
     """Join the samples of each channel from all packets that have the same columns as the first one.
 
-    Returns a series for each channel. `x_columns`: "one" if there is one column of times for all channels, "multi" if
-    there is one before each channel, or "no" if the headers of the packets state start and step instead.
+    Returns a series for each channel. `x_columns`: "one" if all channels share a column of times, "multi" if a column
+    of times stands before each channel, or "no" if the headers of the packets state start and step instead.
     """
     first, names = packets[0], packets[0].names
     times = [column for column, name in enumerate(names) if name.casefold().startswith("x_value")]
@@ -151,7 +153,8 @@ def _list_series(packets: Sequence[_Packet], x_columns: str) -> list[Series]:
     check_size(sum(len(packet.rows) for packet in matching), len(names))
     day_first = is_day_first([ambiguous_dates(day for packet in matching for day in packet.head.get("date", []))])
     offsets = _packet_offsets(matching, day_first)
-    is_multi, series = x_columns == "multi", []
+    is_multi = x_columns == "multi"
+    series = []
     for index, column in enumerate(column for column in range(len(names)) if column not in times):
         times_before = [time for time in times if time < column]
         time_column = times_before[-1] if is_multi and times_before else times[0]
@@ -175,7 +178,8 @@ def _list_series(packets: Sequence[_Packet], x_columns: str) -> list[Series]:
 def _compute_times(packet: _Packet, index: int, count: int) -> Array:
     """Compute the times (count,) [s] of channel `index` from start and step in the header of its packet.
 
-    Start is `X0`, 0 if it is not stated, and step `Delta_X`. Raises InputError if the step is not positive.
+    The start is `X0`, or 0 if `X0` is not stated, and the step is `Delta_X`. Raises InputError if the step is not
+    positive.
     """
     step = packet.number("delta_x", index)
     if not step > 0:
@@ -186,9 +190,9 @@ def _compute_times(packet: _Packet, index: int, count: int) -> Array:
 def _packet_offsets(packets: Sequence[_Packet], day_first: bool) -> list[float]:
     """Compute the time [s] from the first packet of samples to each packet.
 
-    It is the difference of the date stamps in their headers. All are 0 if the start times `X0` increase from packet to
-    packet, so that the times continue, or if the date of a packet is not known. `day_first`: True if the day precedes
-    the month in dates.
+    The times are differences of the date stamps in the headers. All are 0 if the start times `X0` increase from packet
+    to packet, because the sampling times then continue, or if the date of a packet is not known. `day_first`: True if
+    the day precedes the month in dates.
     """
     moments = [packet.moment(0, day_first) for packet in packets]
     first_times = [packet.number("x0", 0) for packet in packets]

@@ -69,10 +69,10 @@ def _struct_fields(value: Any) -> Mapping[str, Any] | None:
 
 
 def _iter_struct(group: str, name: str, fields: Mapping[str, Any], clock: Clock | None, depth: int) -> Iterator[Series]:
-    """Yield the series of samples in a struct.
+    """Yield the series of samples in a struct: a time series, a signal, or a group of other values.
 
-    The struct is a time series, i.e. samples with their times; a signal with a unit; or a group of other values.
-    `fields`: the fields of the struct by name; other arguments as for `_iter_value`.
+    A time series has samples and their times. A signal has samples and a unit, or is that of a Simulink log. `fields`:
+    the fields of the struct by name; other arguments as for `_iter_value`.
     """
     by_name = {key.rstrip("_").casefold(): value for key, value in fields.items()}
     unit = _first_text(by_name, _UNIT_FIELDS)
@@ -93,7 +93,8 @@ def _iter_struct(group: str, name: str, fields: Mapping[str, Any], clock: Clock 
 def _iter_time_series(group: str, name: str, by_name: Mapping[str, Any], clock: Clock, depth: int) -> Iterator[Series]:
     """Yield the series of samples in a struct that also contains their times.
 
-    `by_name`: its fields by their names in lower case; `clock`: the times; other arguments as for `_iter_value`.
+    `by_name`: the fields of the struct by their names in lower case; `clock`: the times; other arguments as for
+    `_iter_value`.
     """
     data = by_name.get("data")
     if "signals" in by_name:
@@ -109,10 +110,10 @@ def _iter_time_series(group: str, name: str, by_name: Mapping[str, Any], clock: 
 
 
 def _iter_group(group: str, fields: Mapping[str, Any], clock: Clock | None, depth: int) -> Iterator[Series]:
-    """Yield the series of samples in each field of a struct, with names and units from its descriptive fields.
+    """Yield the series of samples in each field of a struct, with names and units from fields such as `units`.
 
-    Descriptive fields are, for example, `units` and `names`. `group`: names of the struct and of those around it,
-    with slashes between; other arguments as for `_iter_value`.
+    `group`: names of the struct and of the structs around it, with slashes between; other arguments as for
+    `_iter_value`.
     """
     units, column_names = _find_field_units(fields), _find_column_names(fields)
     for key, value in fields.items():
@@ -140,7 +141,7 @@ def _is_vector(value: Any) -> bool:
 def _first_text(by_name: Mapping[str, Any], names: tuple[str, ...]) -> str | None:
     """Return the text of the first of the fields `names` that is present; None if none is present.
 
-    The result is empty if the field is no text. `by_name`: fields by their names in lower case.
+    The result is empty if the field is not a text. `by_name`: fields by their names in lower case.
     """
     return next((_single_text(by_name[name]) for name in names if name in by_name), None)
 
@@ -169,9 +170,9 @@ def _find_column_names(fields: Mapping[str, Any]) -> list[str]:
 
 
 def _read_struct_times(by_name: Mapping[str, Any]) -> NDArray[np.float64] | None:
-    """Read the times (n,) [s] of a struct, given as numbers, or by start, increment and length; None if it has none.
+    """Read the times (n,) [s] of a struct, given as numbers, or by start, increment and length.
 
-    `by_name`: fields by their names in lower case.
+    `by_name`: fields by their names in lower case. None for a struct without times or without samples.
     """
     if "signals" not in by_name and "data" not in by_name:
         return None
