@@ -47,10 +47,10 @@ def order_ranks(n: int, order: float, confidence: float = 0.95) -> tuple[int, in
     """Compute the ranks (r, s) of the two sorted sample values that enclose a quantile of the distribution.
 
     The quantile lies between them with at least the probability `confidence`. `n` is the number of values, and `order`
-    the order of the quantile, such as 0.9. r is the largest rank with ``P(X
-    <= r - 1) <= alpha/2`` and s the smallest with ``P(X >= s) <= alpha/2``, where X is binomial (n, order) and alpha
-    = 1 - confidence. r = 0 and s = n + 1 mean that there is no bound. Raises InputError for an impossible order or
-    confidence. Source: Conover, Practical Nonparametric Statistics, 3rd ed. (1999), section 3.2.
+    the order of the quantile, such as 0.9. r is the largest rank with ``P(X <= r - 1) <= alpha/2`` and s the smallest
+    with ``P(X >= s) <= alpha/2``, where X is binomial (n, order) and alpha = 1 - confidence. r = 0 and s = n + 1 mean
+    that there is no bound. Raises InputError for an impossible order or confidence. Source: Conover, Practical
+    Nonparametric Statistics, 3rd ed. (1999), section 3.2.
     """
     from scipy.special import betainc
 
@@ -109,7 +109,8 @@ def _interval_coverage(
     All arrays are (n,), one value per record. A record whose `low` or `high` is nan has no interval and is not
     counted; None stands for no intervals at all. `confidence`: confidence of the proportion's own interval.
     """
-    low, high = _as_matching(low, truth.size, "lower limits"), _as_matching(high, truth.size, "upper limits")
+    low = _as_matching(low, truth.size, "lower limits")
+    high = _as_matching(high, truth.size, "upper limits")
     has_interval = ~(np.isnan(low) | np.isnan(high))
     covered = (low <= truth) & (truth <= high) & has_interval
     return proportion(int(np.count_nonzero(covered)), int(has_interval.sum()), confidence)

@@ -1,7 +1,7 @@
-"""Probability of detection (POD) as a function of the size of the leak.
+"""Estimate the probability of detection (POD) as a function of the size of the leak.
 
-It is given by proportions at each size, and by a logistic curve fitted to hits and misses. The curve yields a50, a90
-and a90/95 as in MIL-HDBK-1823A.
+Two estimates are computed: proportions at each size, and a logistic curve fitted to hits and misses. The curve yields
+a50, a90 and a90/95 as in MIL-HDBK-1823A.
 """
 
 from __future__ import annotations
@@ -178,7 +178,8 @@ class HitMiss:
         """
         from scipy.special import expit, ndtri
 
-        x, v = _log_sizes(size), self.covariance  # of intercept and slope
+        x = _log_sizes(size)
+        v = self.covariance  # of intercept and slope
         z = float(ndtri(0.5 + as_probability(confidence, "confidence") / 2.0))
         margin = z * np.sqrt(v[0, 0] + 2.0 * v[0, 1] * x + v[1, 1] * x * x)
         eta = self.intercept + self.slope * x
@@ -208,7 +209,8 @@ class HitMiss:
         as_probability(detection, "the probability of detection")
         if not 0.5 <= confidence < 1.0:
             raise InputError(f"confidence must be from 0.5 to 1, got {confidence}")
-        log_odds, allowed_drop = _log_odds(detection), 0.5 * float(ndtri(confidence)) ** 2
+        log_odds = _log_odds(detection)
+        allowed_drop = 0.5 * float(ndtri(confidence)) ** 2  # of the log-likelihood
         if not self.slope > 0.0 or self.log_likelihood - self.null <= allowed_drop:
             return math.inf
 
@@ -221,7 +223,8 @@ class HitMiss:
 
         # bracket the root with growing steps from the estimate upwards
         log_range = float(np.ptp(_log_sizes(self.size)))
-        lower, step = (log_odds - self.intercept) / self.slope, log_range / 8.0
+        lower = (log_odds - self.intercept) / self.slope
+        step = log_range / 8.0
         upper = lower + step
         while excess_drop(upper) < 0.0:
             lower, step = upper, 2.0 * step

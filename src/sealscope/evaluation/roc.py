@@ -73,9 +73,9 @@ def roc_curve(leak_free: npt.ArrayLike, leaky: npt.ArrayLike, confidence: float 
     """Compute the ROC curve of a score that is high for leaks, from the scores of leak-free and of leaky records.
 
     If scores of both groups are equal, the curve has a slanted step there. The confidence band contains the whole
-    true curve with the probability `confidence`. It is the envelope of the curve's points, each moved by +-d in false
-    alarms and by +-e in detections. Here d and e are the `kolmogorov_margin` of the leak-free and of the leaky
-    scores, both at the confidence sqrt(`confidence`). Raises InputError unless there are scores of both groups.
+    true curve with at least the probability `confidence`. The band is the envelope of the curve's points, each moved by
+    +-d in false alarms and by +-e in detections. Here d and e are the `kolmogorov_margin` of the leak-free and of the
+    leaky scores, both at the confidence sqrt(`confidence`). Raises InputError unless there are scores of both groups.
     Source: Campbell, Stat. Med. 13 (1994) 499-508, doi 10.1002/sim.4780130512.
     """
     a, b = _as_scores(leak_free, leaky)

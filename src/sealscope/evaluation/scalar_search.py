@@ -45,10 +45,12 @@ def find_root(function: Callable[[float], float], low: float, high: float) -> fl
             c, f_c, b, f_b = b, f_b, a, f_a
         a, f_a = x, f_x
         best = a if abs(f_a) < abs(f_b) else b
-        tolerance, width = _RELATIVE_TOLERANCE * abs(best) + _ABSOLUTE_TOLERANCE, abs(b - a)
+        tolerance = _RELATIVE_TOLERANCE * abs(best) + _ABSOLUTE_TOLERANCE
+        width = abs(b - a)
         if f_a == 0.0 or width <= 2.0 * tolerance:
             return best
-        fraction, margin = 0.5, min(0.5, tolerance / width)
+        fraction = 0.5
+        margin = min(0.5, tolerance / width)  # keeps the next point away from a and b by the tolerance
         xi, phi = (a - b) / (c - b), (f_a - f_b) / (f_c - f_b)  # Chandrupatla's notation
         if 1.0 - (1.0 - xi) ** 0.5 < phi < xi**0.5:  # inverse quadratic interpolation stays inside
             fraction = f_a / (f_b - f_a) * f_c / (f_b - f_c)

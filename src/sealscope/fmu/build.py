@@ -193,7 +193,8 @@ class MockUp(NamedTuple):
 
         `system`: name in `PLATFORMS`; `version`: version of FMI, 2 or 3. Raises InputError if the compiler fails.
         """
-        platform, compiler = PLATFORMS[system], find_compiler()
+        platform = PLATFORMS[system]
+        compiler = find_compiler()
         inputs = [folder / "unit.c", folder / f"fmi{version}.c"]
         for function, module in self.modules.items():
             object_file = folder / f"{function}-{system}.o"
@@ -259,7 +260,8 @@ def write_fmu(
     >>> [variable.name for variable in variables if variable.causality == "input"]  # doctest: +SKIP
     ['u', 'G', 'C', 'F', 'G_ext_A', 'G_ext_B']
     """
-    path, chosen_platforms = Path(path), _choose_platforms(path, fmi, platforms)
+    path = Path(path)
+    chosen_platforms = _choose_platforms(path, fmi, platforms)
     machine = _load_pump_controlled_rig(rig)
     if step is None:
         step, found_error = choose_step(machine, error)
@@ -336,7 +338,8 @@ def write_sensor_fmu(
     """
     from sealscope.fmu import sensor as sensor_unit
 
-    path, chosen_platforms = Path(path), _choose_platforms(path, fmi, platforms)
+    path = Path(path)
+    chosen_platforms = _choose_platforms(path, fmi, platforms)
     if sensor != "volume":
         raise InputError(f"sensor must be volume, got {sensor!r}")
     if not rate >= MIN_STRIDE / STRIDE:

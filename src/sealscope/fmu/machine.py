@@ -1,8 +1,8 @@
 """The code of a functional mock-up unit (FMU) of a rig: the equations of `simulate`, compiled to functions for C.
 
-The functions' arguments are pointers to arrays of doubles: `values`, the parameters, in the order of
-`variables.VALUES`; `inputs` in the order of `variables.INPUTS`; the state `y` in that of `physics.state.STATES`; and
-`results`, the outputs, in that of `variables.RESULTS`. The functions return 0, or a code of `FAILURES`.
+The functions' arguments are pointers to arrays of doubles. The arrays, and the tables that give their order, are:
+parameters `values`, `variables.VALUES`; `inputs`, `variables.INPUTS`; state `y`, `physics.state.STATES`; outputs
+`results`, `variables.RESULTS`. The functions return 0, or a code of `FAILURES`.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ class RigChoice(NamedTuple):
     """The equations and the solver that are compiled into the FMU of a rig; the rig's parameters remain variables.
 
     `laws`: for each entry of `physics.rig.CHOICES`, which equation the rig has, or if an optional equation is present;
-    `exponent`: 1 if the closed fraction of a throttle is that of its area, 2 if that of its diameter;
+    `exponent`: 1 if the closed fraction of a throttle is a fraction of its area, 2 if of its diameter;
     `literal_metering`: True if eqs. (4.9)-(4.12) of the thesis are taken as printed; `implicit`: True for the
     implicit-explicit method, False for Runge-Kutta; `euler`: True if the speed loop's integral is computed by eq. (4.2)
     of the thesis.
@@ -126,8 +126,8 @@ def _build_parameters_law(
 
     Its arguments are the values (n,), in the order of `variables.VALUES`, and two conductances [m^3/(s Pa)] of
     external leakage out of the chambers A and B, which are added to those of the rig. `laws`: the equations that the
-    rig has (`RigChoice`); `exponent`: 1 if the closed fraction of a throttle is that of its area, 2 if that of its
-    diameter; `literal_metering`: True if eqs. (4.9)-(4.12) of the thesis are taken as printed.
+    rig has (`RigChoice`); `exponent`: 1 if the closed fraction of a throttle is a fraction of its area, 2 if of
+    its diameter; `literal_metering`: True if eqs. (4.9)-(4.12) of the thesis are taken as printed.
     """
 
     @law

@@ -156,8 +156,8 @@ def _map_variables(path: Path, variables: Mapping[str, Any], names: Mapping[str,
     """Find the FMU's variable for each channel and input, and return its name by channel or input.
 
     `names`: variable by channel or input, for variables with another name than the channel; `variables`: all variables
-    of the FMU by name. Channels and inputs without a variable are left out of the result.
-    Raises InputError if `names` has an unknown channel or variable.
+    of the FMU by name. Channels and inputs without a variable are left out of the result. Raises InputError if `names`
+    has an unknown channel or variable.
     """
     valid_names = {*_INPUT_NAMES, *_MEASURED_NAMES}
     for channel, variable in names.items():

@@ -215,7 +215,8 @@ def build_functions(choice: SensorChoice) -> dict[str, Callable[..., Any]]:
     """
     from scipy.special import stdtrit
 
-    layout, interval = memory_layout(choice), 1.0 / choice.rate
+    layout = memory_layout(choice)
+    interval = 1.0 / choice.rate  # [s] between samples
     add_sample, memory = _build_sample_law(choice), record_view(layout)
     n_memory = layout.itemsize // 8  # doubles
     n_inputs, n_results, n_values = len(INPUTS), len(SENSOR_RESULTS), len(VALUES)
@@ -266,9 +267,10 @@ def build_functions(choice: SensorChoice) -> dict[str, Callable[..., Any]]:
 def _build_sample_law(choice: SensorChoice) -> Callable[..., Any]:
     """Build the compiled function that adds one sample of the measurements to a soft sensor's memory.
 
-    The measurements are those of the channels `INPUTS`. `choice`: settings of the sensor.
+    A sample has one measurement of each of the channels `INPUTS`. `choice`: settings of the sensor.
     """
-    (n_stride, block_strides, half), rate = _Lengths.from_rate(choice.rate), choice.rate
+    rate = choice.rate
+    n_stride, block_strides, half = _Lengths.from_rate(rate)
     n_support, n_block = SPAN * n_stride, n_stride * block_strides
     # phi = peak (1 - s^2)^4; the first value of `test_function` is at the middle of the first interval
     peak = float(test_function(rate)[0, 0]) / (1.0 - (1.0 / n_support - 1.0) ** 2) ** 4
@@ -331,10 +333,11 @@ def _add_pressure_difference(m: Any, k: int, n_block: int, rate: float) -> None:
 def _compute_increments(ring: Any, k: int, half: int, rate: float, displacement: float, out: Any) -> None:
     """Compute the increments of all terms of the volume balance over the interval from sample k to k + 1.
 
-    They are written to `out` (n,) in the order of `COLUMNS`. Those of the response and of the leak, for example, are
-    the volume that the pump displaces [m^3] and the time integral of p_A - p_B [Pa s]. `ring`: the last samples, where
-    sample k has the column k modulo its width; `half`: samples on either side of a central difference, by which the
-    direction of motion is found; `rate` [Hz]: sampling rate; `displacement` [m^3/rad]: that of the pump.
+    The increments are written to `out` (n,) in the order of `COLUMNS`. For example, the increment of the response is
+    the volume that the pump displaces [m^3], and the increment of the leak the time integral of p_A - p_B [Pa s].
+    `ring`: the last samples, where sample k has the column k modulo its width; `half`: samples on either side of a
+    central difference, by which the direction of motion is found; `rate` [Hz]: sampling rate; `displacement` [m^3/rad]:
+    displacement of the pump.
     """
     width = ring.shape[1]
     slot, next_slot = k % width, (k + 1) % width

@@ -57,7 +57,7 @@ class Details:
     def __getitem__(self, level: int) -> Array:
         """Return the detail d_j of the level j, (n,), including the samples at both ends that depend on padding.
 
-        Raises InputError if there is no such level; the first one is 1.
+        Raises InputError if `level` is not one of 1, the finest, to `levels`.
         """
         if not 1 <= level <= self.levels:
             raise InputError(f"level must be 1 to {self.levels}, got {level!r}")

@@ -23,7 +23,7 @@ def filter_rows(
     """Filter eight signals at once: ``out[to + i] = sum_k taps[tap + k] rows[first + stride i - dilation k]``.
 
     i runs from 0 to n - 1, and k from 0 to n_taps - 1. The indices count rows: the second axis of `rows`, `taps`
-    and `out` holds the eight signals. Eight outputs are computed at a time, the remaining ones one by one.
+    and `out` holds the eight signals. Eight outputs are computed at a time, the rest one by one.
     """
     i = 0
     while i + 8 <= n:

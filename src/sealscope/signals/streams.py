@@ -83,7 +83,8 @@ class DetailStream:
             raise InputError(f"channels must be a number or rows and columns of a table, got {channels}")
         self._shape_2d = require_positive_int(table[0], "channels"), require_positive_int(table[1], "channels")
         self.channels = self._shape_2d if isinstance(channels, tuple) else self._shape_2d[1]
-        self.levels, self.wavelet = require_levels(levels), wavelet
+        self.levels = require_levels(levels)
+        self.wavelet = wavelet
         self.threads = require_positive_int(threads, "threads")
         low, high = (np.repeat(taps[:, None], WIDTH, axis=1) for taps in decomposition_filters(wavelet))
         self.first, self.delay = (int(samples) for samples in reach(wavelet, self.levels)[-1])

@@ -27,8 +27,8 @@ class WindowedRms(NamedTuple):
     """RMS of sliding windows over a series.
 
     `rms` (..., w): RMS of each window, in the series' unit; `ends` (w,): number of the sample just after the window. A
-    window of `size` samples covers the samples ends - size .. ends - 1; its centre is at ``(ends - size /
-    2) / rate`` seconds.
+    window of `size` samples covers the samples ends - size .. ends - 1; its centre is at ``(ends - size / 2) / rate``
+    seconds.
     """
 
     ends: IntArray
@@ -68,8 +68,8 @@ def windowed_rms(
 class RmsStream:
     """RMS over sliding windows of live series; identical to `windowed_rms`, for blocks of any size.
 
-    For the output of a `DetailStream`, pass its `settling` as `skip` and its `first` as `first`: the windows are then
-    those of ``windowed_rms(details)``. A value that is not finite affects only the windows that contain it.
+    For the output of a `DetailStream`, pass its `settling` as `skip` and its `first` as `first`. The result then has
+    the same windows as ``windowed_rms(details)``. A value that is not finite affects only the windows that contain it.
 
     Parameters
     ----------
@@ -168,7 +168,8 @@ class RmsStream:
         """Make a stream that continues from a saved `state_dict`; raise InputError if the state is not valid."""
         size, step, rest, sums = (require_part(state, name, object) for name in ("size", "step", "rest", "sums"))
         stream = cls(size, step, skip=require_count(state, "skip"))
-        stream._next_end, stream._n_unused = require_count(state, "next_end"), require_count(state, "ahead")
+        stream._next_end = require_count(state, "next_end")
+        stream._n_unused = require_count(state, "ahead")
         if rest is None and sums is None:
             return stream
         leading_axes = np.shape(rest)[:-1]

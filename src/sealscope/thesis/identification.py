@@ -55,7 +55,8 @@ def noise_free_mean_squares(
     values = {**experiment_values(condition), **(values or {})}
     experiment = Experiment.of(rig=rig, command=condition.command, set=values, leak=leak, duration=duration, x_0=x_0)
     _, trajectory = run_with_sized_leaks(experiment)
-    factor, rate = oversampling(experiment), experiment.rate
+    factor = oversampling(experiment)  # outputs of the solver for each sample
+    rate = experiment.rate
     bounds = [round(SETTLING * rate), round((SETTLING + ANALYSED) * rate)]
     sampled = (decimate(trajectory[chamber], factor, round(duration * rate)) / PSI for chamber in CHAMBERS)
     return np.concatenate([mean_squares(details(pressure), bounds) for pressure in sampled])
@@ -109,7 +110,7 @@ class Hypothesis:
     """A possible difference between the real rig and the rig that was fitted to the tests of Appendix C.
 
     The fitted rig is symmetric: both chamber pressures ring alike, and a leak damps both. In Appendix C, however, the
-    RMS of the wavelet detail d3 of p_A falls with the leak while that of d4 of p_B rises. A test has a half without
+    RMS of the wavelet detail d3 of p_A falls with the leak while the RMS of d4 of p_B rises. A test has a half without
     and a half with the leak.
 
     - `overrides`, `factors`: values of parameters, and factors on parameters, in both halves
@@ -174,7 +175,8 @@ def parameters_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
 
     The columns are name, meaning, value in the thesis's rig, value in the fitted rig, and source.
     """
-    fitted, thesis_rows = load_rig(BENCH_RIG), {row.name: row for row in load_rig("thesis").table()}
+    fitted = load_rig(BENCH_RIG)
+    thesis_rows = {row.name: row for row in load_rig("thesis").table()}
     rows = [
         (row.name, row.meaning, thesis_rows[row.name].given, row.given, row.source)
         for row in fitted.table()

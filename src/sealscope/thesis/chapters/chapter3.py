@@ -50,7 +50,7 @@ class WaveletCentre(NamedTuple):
 
 
 class AmplitudeSpectrum(NamedTuple):
-    """Amplitudes and phases [degree] of the cosines of which a signal consists, by frequency [Hz]; each (n,)."""
+    """Amplitudes and phases [degree] of the cosines whose sum is a signal, by frequency [Hz]; each (n,)."""
 
     frequency: Array
     amplitude: Array
@@ -116,7 +116,7 @@ def continuous_transform(x: Array, rate: float, scales: Array) -> Array:
     """Compute the continuous wavelet transform of samples `x` (n,) at `rate` [Hz] for `scales` a [s].
 
     CWT(a, b) = integral of x(t) |a|^(-1/2) psi((t - b)/a) dt, eqs. (3.4), (3.6). The mean of x is subtracted, the
-    record is mirrored at its ends, and the integral is computed by Fourier transforms. The time b is that of the
+    record is mirrored at its ends, and the integral is computed by Fourier transforms. The time b is the
     wavelet's middle (the centre of its energy). Returns (scales, n), a column for b at each sample [unit of x times
     s^0.5].
     """
@@ -160,7 +160,7 @@ def two_tone_signal(t: Array) -> Array:
 
 
 def amplitude_spectrum(x: Array, rate: float) -> AmplitudeSpectrum:
-    """Compute the amplitudes and phases of the cosines of which `x` (n,), sampled at `rate` [Hz], consists.
+    """Compute the amplitudes and phases of the cosines whose sum is the signal `x` (n,), sampled at `rate` [Hz].
 
     They follow from the discrete Fourier transform of eq. (3.2).
     """
@@ -203,7 +203,8 @@ def two_tone_figure(context: Context, item: Item) -> tuple[Figure, ...]:
         numbers.append(Number(f"phase at {tone:g} Hz (cosine 0)", float(phase[k]), "deg"))
     elsewhere = np.delete(amplitude, list(tone_indices.values()))
     numbers.append(Number("largest amplitude elsewhere", float(elsewhere.max())))
-    beginning, lines = t < 0.2, amplitude > 1e-6  # smaller ones are rounding errors
+    beginning = t < 0.2  # [s]
+    lines = amplitude > 1e-6  # smaller amplitudes are rounding errors
     signal = FigureCurve(t[beginning], x[beginning], "x(t), eq. 3.3", "reference")
     spectrum = FigureCurve(frequency[lines], amplitude[lines], "2 |X[n]| / N, eq. 3.2", "reference", "stems")
     x_range = (0.0, 150.0)
@@ -296,7 +297,7 @@ def _width(t: Array, values: Array) -> float:
 def scalogram_figure(context: Context, item: Item) -> tuple[Figure, ...]:
     """Draw the wavelet transform of a simulated, ringing chamber pressure p_A without and with a leak.
 
-    The transform follows eqs. (3.4)-(3.6). It is drawn of p_A as recorded, and of p_A without the instruments' noise.
+    The transform follows eqs. (3.4)-(3.6), and is drawn for p_A as recorded and for p_A without the instruments' noise.
     """
     run = context.run(Experiment.of(command=_COMMAND, duration=20.0, leak=f"{_LEAK} from {_ONSET:g} s"))
     t = run.recorded.t

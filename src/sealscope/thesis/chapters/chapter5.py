@@ -129,7 +129,8 @@ class FigureView:
 
         If `t` is None, `y` is over the times of the recording.
         """
-        half, (start, stop) = self.test.half, self.span
+        half = self.test.half
+        start, stop = self.span
         before = replace(self, span=(start, min(stop, half)))._curve(y, "no leak", "no leak", t)
         return [before, self._curve(y, "leak", "leak", t, start=half)]
 
@@ -207,7 +208,7 @@ class FigureView:
     def _rms_changes(self, names: tuple[str, ...]) -> list[Number]:
         """Compute the RMS of the wavelet details `names` without and with the leak, and the change [%] of each.
 
-        The pressure is that of the figure's chamber, and each RMS is over one part of the test.
+        The details are those of the pressure in the figure's chamber. Each RMS is over one part of the test.
         """
         numbers = []
         for name, (before, after) in part_detail_rms(self.recording, self.test.parts)[self.chamber].items():
@@ -252,7 +253,8 @@ def leak_test_figure(context: Context, item: Item) -> tuple[Figure, ...]:
 
     `item.inputs` has the test, the view, such as "details", the chamber and the interval [s].
     """
-    test, span = TESTS[item.inputs["test"]], (item.inputs["from_s"], item.inputs["to_s"])
+    test = TESTS[item.inputs["test"]]
+    span = (item.inputs["from_s"], item.inputs["to_s"])
     view = FigureView(context.run(make_test_experiment(test)), test, span, item.inputs["chamber"])
     _, draw = _VIEWS[item.inputs["view"]]
     panels, numbers = draw(view)

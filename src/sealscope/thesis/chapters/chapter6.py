@@ -75,7 +75,7 @@ DUTY = f"position {1e3 * AMPLITUDE} mm sin({OMEGA!r}t)"
 def conductance(lpm: float, rig: Rig) -> float:
     """Compute the leakage conductance [m^3/(s Pa)] of a leak that passes `lpm` [L/min] under a load of 2 kN (`LOAD`).
 
-    It is flow / (LOAD / A_A), with the piston's area A_A.
+    The formula is flow / (LOAD / A_A), with the piston's area A_A.
     """
     return lpm * LITRE_PER_MINUTE / (LOAD / rig.cylinder.A_A)
 
@@ -352,7 +352,8 @@ def valve_table(context: Context, item: Item) -> tuple[ThesisTable | Figure, ...
         efficiencies = [100 * efficiency for efficiency in loop.efficiencies()]
         rows.append((source, name, lpm, error, loop.bandwidth(), loop.stiffness(), energy, pump_energy, *efficiencies))
     notes = format_note("valve", rig=RIG, other=VALVE_RIG, mm=1e3 * AMPLITUDE, f=1 / CYCLE, load=LOAD, damper=DAMPER)
-    table, title = item.table(rows, notes), "Energy and stiffness, pump and valve"
+    table = item.table(rows, notes)
+    title = "Energy and stiffness, pump and valve"
     return table, _figure_over_leak(table, title, _VALVE_ROLES, (_ENERGY, _STIFF), log_y=True)
 
 

@@ -71,8 +71,8 @@ def _format_count(fires: Fires | None) -> tuple[Cell, Cell, Cell, Cell]:
 def _count_heads(source: str, count: str) -> tuple[str, ...]:
     """Build the column heads of the four cells in which a table states a count.
 
-    They are the count, the rate [%], and both limits of its 95 % interval [%]. `source`: name of the data sheet, with
-    which each head begins; `count`: name of the first column.
+    The cells are the count, the rate [%], and both limits of its 95 % interval [%]. `source`: name of the data sheet,
+    with which each head begins; `count`: name of the first column.
     """
     return tuple(f"{source}: {part}" for part in (count, "rate [%]", "95 % low [%]", "95 % high [%]"))
 
@@ -96,9 +96,10 @@ THRESHOLDS = (
 def count_rules(measured: DataSheet | None, leak: DataSheet, no_leak: DataSheet, drift: DataSheet) -> list[_Row]:
     """Count in how many tests each rule of Table 5.1 fires (indicates a leak), as rows with the columns `RATES`.
 
-    The sheets are the measured one (None if not given), and the simulated ones with leak, without leak, and without
-    leak but with drifting parameters. A row has the count, the rate and its 95 % interval on each sheet, and the rate
-    with the leak minus that with drift alone. Two more rows are for a rule that always fires and one that never does.
+    `measured`: measured sheet, None if not given; `leak`, `no_leak`, `drift`: sheets simulated with leak, without leak,
+    and without leak but with drifting parameters. A row has the count, the rate and its 95 % interval on each sheet,
+    and the rate on `leak` minus the rate on `drift`. Two more rows are for a rule that always fires and a rule that
+    never fires.
     """
     rules: dict[str, tuple[str, Callable[[DataSheet], Fires]]] = {
         **{rule.name: (rule.printed, rule.fires) for rule in (*CLAIMED, *UNCLAIMED)},

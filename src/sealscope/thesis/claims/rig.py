@@ -37,7 +37,7 @@ _COMPARED_CLOSING = 75.0
 def claims(evidence: ClaimEvidence) -> tuple[Claim, ...]:
     """Judge the claims of the abstract and of chapters 1, 5 and 6 that the data sheet alone cannot decide.
 
-    They are 1.3.1, which cannot be tested, and a.3, 5.7.1 to 5.7.6, and 6.1.2 to 6.1.4.
+    These claims are 1.3.1, which cannot be tested, a.3, 5.7.1 to 5.7.6, and 6.1.2 to 6.1.4.
     """
     return (
         judge_claim("1.3.1", [None]),
@@ -151,8 +151,8 @@ def _throttle_claim(evidence: ClaimEvidence) -> Claim:
     for command in sorted({row.command for row in APPENDIX_C}):
         is_command = np.array([row.command == command for row in APPENDIX_C])
         max_closed = closed_pct[is_command].max()
-        masks = (is_command & (closed_pct == closed) for closed in (0.0, max_closed))
-        range_open, range_throttled = (ranges[:, mask].mean(axis=1) for mask in masks)
+        range_open = ranges[:, is_command & (closed_pct == 0.0)].mean(axis=1)  # of p_A and of p_B
+        range_throttled = ranges[:, is_command & (closed_pct == max_closed)].mean(axis=1)
         rise = range_throttled - range_open
         texts.append(f"{command} {1e3 * rise[0]:+.2f} and {1e3 * rise[1]:+.2f} kPa at {max_closed:g} %")
         is_raised += list(rise > _MIN_RELATIVE_RISE * range_open)
@@ -160,7 +160,8 @@ def _throttle_claim(evidence: ClaimEvidence) -> Claim:
             amplitude_V = float(command.split(maxsplit=1)[0])
             amplitude_rises.append((amplitude_V, float(np.mean(rise))))
     rises = [rise for _, rise in sorted(amplitude_rises)]
-    return judge_claim("6.1.3", [*is_raised, rises == sorted(rises)], rises="; ".join(texts))
+    grows_with_amplitude = rises == sorted(rises)
+    return judge_claim("6.1.3", [*is_raised, grows_with_amplitude], rises="; ".join(texts))
 
 
 def _agreement_claim(evidence: ClaimEvidence) -> Claim:

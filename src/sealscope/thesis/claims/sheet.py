@@ -132,8 +132,8 @@ def _rate_claim(rule: Rule, where: str) -> SheetClaim:
 def _test_opposite_moves(sheet: DataSheet) -> Iterator[Finding]:
     """Test claim 5.5.7: with the leak, the RMS of the wavelet details of p_A rise and those of p_B fall.
 
-    Each of d3, d4 and d3d4 of each chamber must do so in more than half of the tests. All other sentences of section
-    5.6 state the opposite (`DIRECTION`).
+    Each of d3, d4 and d3d4 of each chamber must move in this direction in more than half of the tests. All other
+    sentences of section 5.6 state the opposite (`DIRECTION`).
     """
     for chamber in CHAMBERS:
         for name in SENSITIVE:
@@ -205,7 +205,7 @@ def _test_identified_leaks(sheet: DataSheet) -> Iterator[Finding]:
     """Test claim a.1: in each chamber the best wavelet detail reveals the leak in at least 80 % of the tests.
 
     A detail reveals the leak if its RMS falls in p_A, or rises in p_B, by more than noise alone changes it in 95 % of
-    the tests (`d1_threshold`). The best of d3, d4 and d3d4 is the one that does so most often.
+    the tests (`d1_threshold`). The best of d3, d4 and d3d4 is the detail that reveals the leak most often.
     """
     for chamber in CHAMBERS:
         best = max(SENSITIVE, key=lambda name: int(_exceeds_noise(sheet, chamber, name).sum()))
@@ -256,7 +256,8 @@ def _trend_test(chamber: str) -> SheetTest:
         """
         for name in SENSITIVE:
             change = sheet.log_change(chamber, name)
-            raw, partial = float(np.corrcoef(change, leak)[0, 1]), partial_correlation(change, leak, conditions)
+            raw = float(np.corrcoef(change, leak)[0, 1])
+            partial = partial_correlation(change, leak, conditions)
             is_raw_significant = is_correlated(raw, _N_TESTS)
             is_partial_significant = is_correlated(partial, _N_TESTS, conditions.shape[1])
             parts = [raw * direction > 0 and is_raw_significant, partial * direction > 0 and is_partial_significant]
@@ -421,7 +422,8 @@ def _test_rows(
     noise alone exceeds in 5 % of the tests (`d1_threshold`). Returns a text, and True or False for each detail. If
     several rows can be the test of chapter 5, the text also counts how many of them change beyond the noise.
     """
-    row, limit = test.condition.number - 1, d1_threshold(sheet, chamber, either_side=statement == "change")
+    row = test.condition.number - 1
+    limit = d1_threshold(sheet, chamber, either_side=statement == "change")
     changes = {name: sheet.log_change(chamber, name) for name in names}
     falls = statement == "fall"
     exceeds = {name: (-change if falls else np.abs(change)) > limit for name, change in changes.items()}

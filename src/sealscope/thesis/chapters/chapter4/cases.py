@@ -211,7 +211,7 @@ def summarise_run(run: SimulatedRun) -> dict[str, float]:
 def piston_drift(run: SimulatedRun) -> float:
     """Compute the drift [m] of the piston: its mean position in the last whole period of the command minus the first.
 
-    It is nan if the run diverged.
+    Returns nan if the run diverged.
     """
     if run.diverged:
         return math.nan

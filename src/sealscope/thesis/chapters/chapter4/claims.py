@@ -62,14 +62,15 @@ def ringing(run: SimulatedRun, window: float = 0.05, after: float = 0.3) -> floa
     moving_mean = np.convolve(np.pad(p_A, n_window // 2, mode="edge"), np.full(n_window, 1.0 / n_window), mode="valid")
     ringing_part = p_A - moving_mean
     reversals = np.flatnonzero(np.diff(np.sign(omega)) != 0)
-    n_after, last = round(after * rate), p_A.size - n_window
+    n_after = round(after * rate)
+    last = p_A.size - n_window
     # without the first second, in which the run starts, and without the ends of the moving mean
     used = [k for k in reversals if run.t[k] > 1.0 and k + n_after < last]
     return float(np.median([np.ptp(ringing_part[k + n_window : k + n_after]) for k in used]))
 
 
 def _judge_cases_without_orifices(context: Context) -> Iterator[Claim]:
-    """Judge claims 4.2 and 4.4 to 4.6 on the cases without orifices, which are those of Table 4.2.
+    """Judge claims 4.2 and 4.4 to 4.6 on the cases without orifices, listed in Table 4.2.
 
     - 4.2: the motor's speed is a sine, with a residual below 5 % of the sine's rms.
     - 4.4, on measured displacements, cannot be tested.
@@ -91,20 +92,23 @@ def _judge_cases_without_orifices(context: Context) -> Iterator[Claim]:
     yield judge_claim("4.2", tests, fits="; ".join(fits))
     spans = "; ".join(f"{name}: {cases.steady_range(run, 'x') * 1e3:.1f} mm peak to peak" for name, run in runs.items())
     yield judge_claim("4.4", NOT_TESTED, spans=spans)
-    noise, rings = cases.visible_pressure(), {name: ringing(run) for name, run in runs.items()}
+    noise = cases.visible_pressure()
+    rings = {name: ringing(run) for name, run in runs.items()}
     text = ", ".join(f"{ring * 1e-3:.1f} kPa ({name})" for name, ring in rings.items())
     yield judge_claim("4.5", [ring < noise for ring in rings.values()], rings=text, noise=noise * 1e-3)
 
     def drift_mm(**overrides: float) -> float:
         """Compute the drift [mm] of the piston in a run of 60 s, with some of the rig's parameters replaced.
 
-        The drift is the mean position in the last whole period of the command minus that in the first.
+        The drift is the mean position in the last whole period of the command minus the mean in the first period.
         """
         run = context.run(cases.make_drift_experiment(DEFAULT_READING, None, "converged", **overrides))
         return 1e3 * cases.piston_drift(run)
 
     # F_pr and F_cfr: Coulomb force without pressure, and its increase with pressure; breakaway is a multiple of both
-    baseline, without_friction, without_integral = drift_mm(), drift_mm(F_pr=0.0, F_cfr=0.0), drift_mm(K_i=0.0)
+    baseline = drift_mm()
+    without_friction = drift_mm(F_pr=0.0, F_cfr=0.0)
+    without_integral = drift_mm(K_i=0.0)  # integral gain of the speed loop
     tests = [abs(baseline - without_friction) > DRIFT_FRACTION * abs(baseline)]
     yield judge_claim("4.6", tests, baseline=baseline, smooth=without_friction, unintegrated=without_integral)
 
@@ -150,7 +154,8 @@ def _judge_equations_and_tables(context: Context) -> Iterator[Claim]:
     cylinder with less resistance than back, on both sides.
     """
     rig = thesis_rig()
-    charge, run = rig.fluid.p_charge * 1e-6, context.run(make_experiment(COMMANDS[0], 25.0))
+    charge = rig.fluid.p_charge * 1e-6  # [MPa]
+    run = context.run(make_experiment(COMMANDS[0], 25.0))
     peaks = [float(steady_output(run, name).max()) * 1e-6 for name in PRESSURES]
     low, high = min(peaks), max(peaks)
     needed = charge + _PRINTED_PEAK_MPA - high  # charge pressure with which the peaks are as printed
