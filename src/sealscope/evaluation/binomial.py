@@ -64,16 +64,16 @@ def proportion(k: int, n: int, confidence: float = 0.95) -> Proportion:
     k, n = int(k), int(n)
     as_probability(confidence, "confidence")
     if n == 0 and k == 0:
-        return Proportion(0, math.nan, 0.0, 1.0, 0)
+        return Proportion(n=0, value=math.nan, low=0.0, high=1.0, count=0)
     low, high = clopper_pearson(k, n, confidence)
-    return Proportion(n, k / n, low, high, k)
+    return Proportion(n=n, value=k / n, low=low, high=high, count=k)
 
 
 def lower_bound(k: int, n: int, confidence: float = 0.95) -> float:
     """Compute the exact one-sided lower confidence bound of a probability from `k` successes in `n` trials.
 
     The bound is ``B(1 - confidence; k, n-k+1)`` with B the quantile of the beta distribution, and 0 for k = 0. For
-    example, 29 successes in 29 trials prove a probability of 90 % at 95 % confidence. Raises InputError for an
+    example, 29 successes in 29 trials prove a probability of at least 90 % at 95 % confidence. Raises InputError for an
     impossible count or confidence.
     """
     from scipy.special import betaincinv

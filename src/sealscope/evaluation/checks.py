@@ -13,8 +13,8 @@ Array = npt.NDArray[np.float64]
 def as_numbers(values: npt.ArrayLike, what: str) -> Array:
     """Convert `values` to an array (n,) of finite numbers.
 
-    Raises InputError if they are not numbers in one flat list, if there are none, or if one is not finite. `what`
-    names the values in the message.
+    Raises InputError if the values are not numbers in one flat list, if the list is empty, or if a value is not
+    finite. `what` names the values in the message.
     """
     try:
         array = np.asarray(values, dtype=np.float64)
@@ -46,7 +46,7 @@ def as_sizes(values: npt.ArrayLike, what: str = "leak sizes") -> Array:
 def as_flags(values: npt.ArrayLike, n: int, what: str) -> npt.NDArray[np.bool_]:
     """Convert `values`, True/False or 1/0, to an array (n,) of booleans.
 
-    Raises InputError for other values or if there are not `n` of them. `what` names the values in the message.
+    Raises InputError for other values, or if the number of values is not `n`. `what` names the values in the message.
     """
     array = as_numbers(np.asarray(values, dtype=np.float64), what)
     if array.size != n:

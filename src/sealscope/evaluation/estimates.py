@@ -44,20 +44,23 @@ class EstimateErrors:
 
 
 def order_ranks(n: int, order: float, confidence: float = 0.95) -> tuple[int, int]:
-    """Compute the ranks (r, s) of the sorted sample values between which a quantile lies with `confidence`.
+    """Compute the ranks (r, s) of the two sorted sample values that enclose a quantile of the distribution.
 
-    `n` is the number of values, and `order` the order of the quantile, such as 0.9. r is the largest rank with ``P(X
-    <= r - 1) <= alpha/2`` and s the smallest with ``P(X >= s) <= alpha/2``, where X is binomial (n, order) and alpha
-    = 1 - confidence. r = 0 and s = n + 1 mean that there is no bound. Raises InputError for an impossible order or
-    confidence. Source: Conover, Practical Nonparametric Statistics, 3rd ed. (1999), section 3.2.
+    The quantile lies between them with at least the probability `confidence`. `n` is the number of values, and `order`
+    the order of the quantile, such as 0.9. r is the largest rank with ``P(X <= r - 1) <= alpha/2`` and s the smallest
+    with ``P(X >= s) <= alpha/2``, where X is binomial (n, order) and alpha = 1 - confidence. r = 0 and s = n + 1 mean
+    that there is no bound. Raises InputError for an impossible order or confidence. Source: Conover, Practical
+    Nonparametric Statistics, 3rd ed. (1999), section 3.2.
     """
     from scipy.special import betainc
 
     as_probability(order, "the order of a quantile")
     tail = (1.0 - as_probability(confidence, "confidence")) / 2.0
     k = np.arange(1, n + 1)
-    p_at_least_k = betainc(k, n + 1 - k, order)  # falls with k
-    return int(np.count_nonzero(1.0 - p_at_least_k <= tail)), int(np.count_nonzero(p_at_least_k > tail)) + 1
+    p_at_least_k = betainc(k, n + 1 - k, order)  # P(X >= k), which falls with k, so that counts are ranks
+    r = int(np.count_nonzero(1.0 - p_at_least_k <= tail))
+    s = int(np.count_nonzero(p_at_least_k > tail)) + 1
+    return r, s
 
 
 def estimate_quantile(values: npt.ArrayLike, order: float, confidence: float = 0.95) -> IntervalEstimate:
@@ -73,7 +76,7 @@ def estimate_quantile(values: npt.ArrayLike, order: float, confidence: float = 0
         raise InputError("values for a quantile must be at least 1 and none of them nan")
     n = array.size
     r, s = order_ranks(n, order, confidence)
-    padded = np.concatenate([[-math.inf], array, [math.inf]])
+    padded = np.concatenate([[-math.inf], array, [math.inf]])  # rank k at index k; ranks 0 and n + 1 are infinite
     rank = min(n, max(1, math.ceil(n * order * (1.0 - 1e-12))))  # 1e-12: rounding of n * order
     return IntervalEstimate(n, float(padded[rank]), float(padded[r]), float(padded[s]))
 
@@ -104,9 +107,10 @@ def _interval_coverage(
     """Compute the proportion of stated intervals, from `low` to `high`, that contain the true value.
 
     All arrays are (n,), one value per record. A record whose `low` or `high` is nan has no interval and is not
-    counted; None stands for no intervals at all. `confidence` is that of the proportion's interval.
+    counted; None stands for no intervals at all. `confidence`: confidence of the proportion's own interval.
     """
-    low, high = _as_matching(low, truth.size, "lower limits"), _as_matching(high, truth.size, "upper limits")
+    low = _as_matching(low, truth.size, "lower limits")
+    high = _as_matching(high, truth.size, "upper limits")
     has_interval = ~(np.isnan(low) | np.isnan(high))
     covered = (low <= truth) & (truth <= high) & has_interval
     return proportion(int(np.count_nonzero(covered)), int(has_interval.sum()), confidence)
@@ -141,7 +145,8 @@ def estimate_errors(
     if not has_estimate.any():
         raise InputError(f"errors need at least one estimate, got none in {n_records} records")
     error = values[has_estimate] - true_values[has_estimate]
-    mean_square, absolute_error = estimate_mean(error**2, confidence), np.abs(error)
+    absolute_error = np.abs(error)
+    mean_square = estimate_mean(error**2, confidence)
     rmse, low_rmse, high_rmse = (math.sqrt(max(x, 0.0)) for x in (mean_square.value, mean_square.low, mean_square.high))
     return EstimateErrors(
         n=error.size,

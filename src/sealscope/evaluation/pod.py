@@ -1,7 +1,7 @@
-"""Probability of detection (POD) as a function of the size of the leak.
+"""Estimate the probability of detection (POD) as a function of the size of the leak.
 
-It is given by proportions at each size, and by a logistic curve fitted to hits and misses. The curve yields a50, a90
-and a90/95 as in MIL-HDBK-1823A.
+Two estimates are computed: proportions at each size, and a logistic curve fitted to hits and misses. The curve yields
+a50, a90 and a90/95 as in MIL-HDBK-1823A.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from sealscope.errors import InputError
 from sealscope.evaluation.binomial import Proportion, lower_bound, proportion
 from sealscope.evaluation.checks import Array, as_flags, as_probability, as_sizes
 
-#: A bound counts as infinite beyond this many times the range of the tested sizes' logarithms.
+#: The search for a bound ends, and the bound is infinite, if a step exceeds this many ranges of the sizes' logarithms.
 _MAX_SPANS = 1e4
 
 
@@ -54,8 +54,8 @@ def proven_size(rows: list[SizeDetection], detection: float = 0.9) -> float:
 
     `rows`: results for each size; `detection`: the probability of detection to be proven. A size is proven if the
     lower confidence bound of its proportion is at least `detection`. For example, 29 hits of 29 prove 90 % at 95 %
-    confidence: this is a90/95 without a model. The confidence applies to each size separately. Returns infinity if no
-    size is proven. Source: Clopper and Pearson (1934), doi 10.1093/biomet/26.4.404.
+    confidence: this is a90/95 without a model. The confidence applies to each size separately. Returns infinity if the
+    largest size is not proven. Source: Clopper and Pearson (1934), doi 10.1093/biomet/26.4.404.
     """
     as_probability(detection, "the probability of detection")
     proven = math.inf
@@ -123,8 +123,8 @@ def _fit_coefficients(design: Array, n: Array, k: Array, *, firth: bool) -> Arra
 def _is_separated(n: Array, k: Array) -> bool:
     """Return True if all leaks above one size are hits and all below it are misses, or the reverse.
 
-    At this size there may be both. The likelihood of the logistic curve then has no finite maximum. `n` and `k` (m,)
-    are trials and hits at rising sizes.
+    At the size itself there may be hits and misses. The likelihood of the logistic curve then has no finite maximum.
+    `n` and `k` (m,) are trials and hits at rising sizes.
     """
     hit_fraction = k / n
     n_mixed_sizes = np.count_nonzero((hit_fraction > 0.0) & (hit_fraction < 1.0))
@@ -173,12 +173,13 @@ class HitMiss:
     def detection_band(self, size: npt.ArrayLike, confidence: float = 0.95) -> tuple[Array, Array]:
         """Compute a two-sided confidence interval (low, high) of the probability of detection at each size.
 
-        `size` (k,): positive sizes; low and high are (k,). The interval is Wald's on log odds, and holds at each size
-        separately.
+        `size` (k,): positive sizes; low and high are (k,). The interval is Wald's for the log odds. Its confidence
+        applies to each size separately.
         """
         from scipy.special import expit, ndtri
 
-        x, v = _log_sizes(size), self.covariance  # of intercept and slope
+        x = _log_sizes(size)
+        v = self.covariance  # of intercept and slope
         z = float(ndtri(0.5 + as_probability(confidence, "confidence") / 2.0))
         margin = z * np.sqrt(v[0, 0] + 2.0 * v[0, 1] * x + v[1, 1] * x * x)
         eta = self.intercept + self.slope * x
@@ -197,10 +198,10 @@ class HitMiss:
         """Compute the one-sided upper confidence bound of the size detected with the probability `detection`.
 
         By default it is a90/95. The bound is the largest size whose profile log-likelihood is within ``z^2/2`` of the
-        maximum, with z the normal quantile of `confidence` (chi square with one degree of freedom). It is infinite if
-        all larger sizes are within it, too. Raises InputError unless `confidence` is from 0.5 to below 1. Source:
-        MIL-HDBK-1823A (2009), appendix G. Cheng and Iles, Technometrics 25 (1983) 77-86, doi
-        10.1080/00401706.1983.10487822, give simultaneous bounds, which are wider.
+        maximum, with z the normal quantile of `confidence` (chi square with one degree of freedom). The bound is
+        infinite if there is no such largest size, or if the detection does not rise with the size. Raises InputError
+        unless `confidence` is from 0.5 to below 1. Source: MIL-HDBK-1823A (2009), appendix G. Cheng and Iles,
+        Technometrics 25 (1983) 77-86, doi 10.1080/00401706.1983.10487822, give simultaneous bounds, which are wider.
         """
         from scipy.optimize import brentq
         from scipy.special import ndtri
@@ -208,7 +209,8 @@ class HitMiss:
         as_probability(detection, "the probability of detection")
         if not 0.5 <= confidence < 1.0:
             raise InputError(f"confidence must be from 0.5 to 1, got {confidence}")
-        log_odds, allowed_drop = _log_odds(detection), 0.5 * float(ndtri(confidence)) ** 2
+        log_odds = _log_odds(detection)
+        allowed_drop = 0.5 * float(ndtri(confidence)) ** 2  # of the log-likelihood
         if not self.slope > 0.0 or self.log_likelihood - self.null <= allowed_drop:
             return math.inf
 
@@ -221,7 +223,8 @@ class HitMiss:
 
         # bracket the root with growing steps from the estimate upwards
         log_range = float(np.ptp(_log_sizes(self.size)))
-        lower, step = (log_odds - self.intercept) / self.slope, log_range / 8.0
+        lower = (log_odds - self.intercept) / self.slope
+        step = log_range / 8.0
         upper = lower + step
         while excess_drop(upper) < 0.0:
             lower, step = upper, 2.0 * step
@@ -264,7 +267,7 @@ class HitMiss:
             value = _log_likelihood(design, self.tested, self.hits, eta, firth=self.estimator == "firth")
             return -value if math.isfinite(value) else 1e300
 
-        width = max(float(np.abs(x - log_size).max()), 1e-300)  # above 0 if `log_size` is that of all leaks
+        width = max(float(np.abs(x - log_size).max()), 1e-300)  # never 0, as the next line divides by it
         return -float(minimize_scalar(loss, bracket=(0.0, 1.0 / width), options={"xtol": 1e-9}).fun)
 
 
@@ -285,24 +288,25 @@ def fit_hit_miss(leaks: npt.ArrayLike, hits: npt.ArrayLike) -> HitMiss:
     likelihood. If hits and misses are separated by size, the likelihood has no finite maximum, and Firth's penalised
     likelihood is used instead (`HitMiss.estimator`), both for the curve and for the confidence bound of a size, such as
     a90/95 (`HitMiss.size_bound`). The curve goes to 0 for small leaks, as it does not include the false-alarm rate.
-    Raises InputError for a single size, only hits or only misses. Source:
-    MIL-HDBK-1823A (2009), appendix G; Firth, Biometrika 80 (1993) 27-38, doi 10.1093/biomet/80.1.27; Heinze and
-    Schemper, Stat. Med. 21 (2002) 2409-2419, doi 10.1002/sim.1047.
+    Raises InputError for a single size, only hits or only misses. Source: MIL-HDBK-1823A (2009), appendix G; Firth,
+    Biometrika 80 (1993) 27-38, doi 10.1093/biomet/80.1.27; Heinze and Schemper, Stat. Med. 21 (2002) 2409-2419, doi
+    10.1002/sim.1047.
     """
     x = np.log(as_sizes(leaks))
     is_hit = as_flags(hits, x.size, "hits")
     if is_hit.all() or not is_hit.any():
         raise InputError(f"a curve needs hits and misses, got {int(is_hit.sum())} hits of {is_hit.size}")
-    values, index = np.unique(x, return_inverse=True)
+    values, index = np.unique(x, return_inverse=True)  # logarithms of the tested sizes; index of each leak in them
     if values.size < 2:
         raise InputError(f"a curve needs leaks of at least 2 sizes, got {is_hit.size} of one size")
-    # leaks n and hits k of each size
-    n, k = (np.asarray(np.bincount(index, weights), dtype=np.float64) for weights in (None, is_hit.astype(np.float64)))
+    n = np.asarray(np.bincount(index), dtype=np.float64)  # leaks of each size
+    k = np.asarray(np.bincount(index, weights=is_hit.astype(np.float64)), dtype=np.float64)  # hits of each size
     firth = _is_separated(n, k)
     # centred and scaled for the fit, so that the unit of the size does not matter
     centre, half_range = float(values.mean()), float(np.ptp(values)) / 2.0
     design = np.column_stack([np.ones(values.size), (values - centre) / half_range])
     beta = _fit_coefficients(design, n, k, firth=firth)
+    # intercept and slope over ln(size), from those over the scaled logarithm
     unscale = np.array([[1.0, -centre / half_range], [0.0, 1.0 / half_range]])
     covariance = unscale @ np.linalg.inv(_information(design, n, design @ beta)) @ unscale.T
     intercept, slope = (float(b) for b in unscale @ beta)

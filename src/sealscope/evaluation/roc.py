@@ -38,8 +38,8 @@ class Roc:
 class Area:
     """Area under the ROC curve, with its standard error and its confidence interval from `low` to `high`.
 
-    `value` is P(leaky score > leak-free score) + P(equal)/2. `standard_error` is 0 if the scores are completely
-    separated. `method` is the method of the interval.
+    `value` is P(leaky score > leak-free score) + P(equal)/2. `standard_error` is DeLong's, and 0 if the scores are
+    completely separated or all equal. `method` is the method of the interval, "newcombe" in these two cases.
     """
 
     value: float
@@ -54,8 +54,8 @@ def _as_scores(leak_free: npt.ArrayLike, leaky: npt.ArrayLike) -> tuple[Array, A
     return as_numbers(leak_free, "leak-free scores"), as_numbers(leaky, "scores with a leak")
 
 
-def _count_exceeding(scores: Array, thresholds: Array) -> Array:
-    """Count for each threshold (k,) the scores (n,) that are equal or larger."""
+def _count_alarms(scores: Array, thresholds: Array) -> Array:
+    """Count for each of `thresholds` (k,) how many of `scores` (n,) reach or exceed it."""
     return np.asarray(scores.size - np.searchsorted(np.sort(scores), thresholds, side="left"), dtype=np.float64)
 
 
@@ -73,17 +73,18 @@ def roc_curve(leak_free: npt.ArrayLike, leaky: npt.ArrayLike, confidence: float 
     """Compute the ROC curve of a score that is high for leaks, from the scores of leak-free and of leaky records.
 
     If scores of both groups are equal, the curve has a slanted step there. The confidence band contains the whole
-    true curve with the probability `confidence`. It is the envelope of the curve's points, each moved by +-d in false
-    alarms and by +-e in detections. Here d and e are the `kolmogorov_margin` of the leak-free and of the leaky
-    scores, both at the confidence sqrt(`confidence`). Raises InputError unless there are scores of both groups.
+    true curve with at least the probability `confidence`. The band is the envelope of the curve's points, each moved by
+    +-d in false alarms and by +-e in detections. Here d and e are the `kolmogorov_margin` of the leak-free and of the
+    leaky scores, both at the confidence sqrt(`confidence`). Raises InputError unless there are scores of both groups.
     Source: Campbell, Stat. Med. 13 (1994) 499-508, doi 10.1002/sim.4780130512.
     """
     a, b = _as_scores(leak_free, leaky)
     as_probability(confidence, "confidence")
-    thresholds = np.concatenate([[np.inf], np.unique(np.concatenate([a, b]))[::-1]])
-    false_alarm, detection = _count_exceeding(a, thresholds) / a.size, _count_exceeding(b, thresholds) / b.size
+    falling_scores = np.unique(np.concatenate([a, b]))[::-1]
+    thresholds = np.concatenate([[np.inf], falling_scores])
+    false_alarm, detection = _count_alarms(a, thresholds) / a.size, _count_alarms(b, thresholds) / b.size
     d, e = (kolmogorov_margin(scores.size, math.sqrt(confidence)) for scores in (a, b))
-    # the empirical point at any threshold is within d of the true false-alarm probability
+    # first and last point of the curve whose false-alarm fraction is within d of the point's own
     first = np.searchsorted(false_alarm, false_alarm - d, side="left")
     last = np.searchsorted(false_alarm, false_alarm + d, side="right") - 1
     low, high = np.maximum(detection[first] - e, 0.0), np.minimum(detection[last] + e, 1.0)
@@ -97,27 +98,28 @@ def placements(leak_free: Array, leaky: Array) -> tuple[Array, Array]:
     for the leak-free scores (n,) and for the leaky scores (m,).
     """
     a, b = np.sort(leak_free), np.sort(leaky)
-    below = (np.searchsorted(a, leaky, "left") + np.searchsorted(a, leaky, "right")) / (2.0 * a.size)
-    above = 1.0 - (np.searchsorted(b, leak_free, "left") + np.searchsorted(b, leak_free, "right")) / (2.0 * b.size)
-    return np.asarray(above, dtype=np.float64), np.asarray(below, dtype=np.float64)
+    # "left" counts smaller scores, "right" smaller and equal ones: their mean counts equal scores half
+    a_below = (np.searchsorted(a, leaky, "left") + np.searchsorted(a, leaky, "right")) / (2.0 * a.size)
+    b_above = 1.0 - (np.searchsorted(b, leak_free, "left") + np.searchsorted(b, leak_free, "right")) / (2.0 * b.size)
+    return np.asarray(b_above, dtype=np.float64), np.asarray(a_below, dtype=np.float64)
 
 
-def _newcombe_interval(value: float, leak_free: int, leaky: int, z: float) -> tuple[float, float]:
+def _newcombe_interval(value: float, n: int, m: int, z: float) -> tuple[float, float]:
     """Compute Newcombe's confidence interval (low, high) of an area A = `value` under the ROC curve.
 
-    Its ends are the solutions t of ``|t - A| = z SE(t)``. `leak_free` and `leaky` are the numbers of scores, and `z`
-    is a normal quantile. SE is Hanley and McNeil's standard error with both numbers replaced by their mean. The
-    interval has a width even if A is 0 or 1. Source: Newcombe, Stat. Med. 25 (2006) 559-573, doi 10.1002/sim.2324,
-    method 5.
+    Its ends are the solutions t of ``|t - A| = z SE(t)``, with Hanley and McNeil's standard error ``SE(t)^2 = t (1 - t)
+    (1 + (N - 1) q)/(n m)``, where ``q = (1 - t)/(2 - t) + t/(1 + t)`` and N is the mean of n and m. `n`, `m`: numbers
+    of leak-free and of leaky scores; `z`: normal quantile. The interval has a width even if A is 0 or 1. Source:
+    Newcombe, Stat. Med. 25 (2006) 559-573, doi 10.1002/sim.2324, method 5.
     """
     from scipy.optimize import brentq
 
-    mean_number = (leak_free + leaky) / 2.0
+    mean_number = (n + m) / 2.0
 
     def excess(t: float) -> float:
         """Compute (t - A)^2 - (z SE(t))^2 for an area t, which is 0 at the ends of the interval."""
         q = (1.0 - t) / (2.0 - t) + t / (1.0 + t)
-        return (t - value) ** 2 - z * z * t * (1.0 - t) * (1.0 + (mean_number - 1.0) * q) / (leak_free * leaky)
+        return (t - value) ** 2 - z * z * t * (1.0 - t) * (1.0 + (mean_number - 1.0) * q) / (n * m)
 
     low = brentq(excess, 0.0, value * (1.0 - 1e-9)) if value > 0.0 else 0.0
     high = brentq(excess, value + (1.0 - value) * 1e-9, 1.0) if value < 1.0 else 1.0
@@ -129,7 +131,7 @@ def auc(leak_free: npt.ArrayLike, leaky: npt.ArrayLike, confidence: float = 0.95
 
     `leak_free` are scores a (n,) and `leaky` scores b (m,), which are high for leaks. The area is ``sum of (b > a) +
     (b = a)/2`` over all pairs, divided by n m. The interval is DeLong's normal approximation, cut off at 0 and 1. If
-    the scores are completely separated, DeLong's interval has no width, and Newcombe's is used instead (`method`).
+    the scores are completely separated or all equal, DeLong's interval has no width, and Newcombe's is used instead.
     Raises InputError for fewer than 2 records of either group. Source: DeLong, DeLong and Clarke-Pearson, Biometrics
     44 (1988) 837-845, doi 10.2307/2531595, eq. (5)-(8).
     """
@@ -137,14 +139,14 @@ def auc(leak_free: npt.ArrayLike, leaky: npt.ArrayLike, confidence: float = 0.95
 
     a, b = _as_scores(leak_free, leaky)
     z = float(ndtri(0.5 + as_probability(confidence, "confidence") / 2.0))
-    n = min(a.size, b.size)
-    if n < 2:
-        raise InputError(f"an interval of the area needs at least 2 records of each kind, got {n}")
+    smaller_size = min(a.size, b.size)
+    if smaller_size < 2:
+        raise InputError(f"an interval of the area needs at least 2 records of each kind, got {smaller_size}")
     leak_free_fractions, leaky_fractions = placements(a, b)
     value = float(leaky_fractions.mean())
     variances = (values.var(ddof=1) / values.size for values in (leak_free_fractions, leaky_fractions))
     standard_error = math.sqrt(sum(variances))
-    if standard_error < 1e-12:  # completely separated, up to rounding
+    if standard_error < 1e-12:  # 0 up to rounding
         return Area(value, standard_error, *_newcombe_interval(value, a.size, b.size, z), "newcombe")
     margin = z * standard_error
     return Area(value, standard_error, max(0.0, value - margin), min(1.0, value + margin), "delong")

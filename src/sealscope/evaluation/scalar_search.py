@@ -1,4 +1,4 @@
-"""Find roots and minima of functions of one number, for commands that must start fast.
+"""Find roots and minima of functions of one variable, for commands that must start fast.
 
 `scipy.optimize` finds the same, but its import loads 200 modules, which takes a fifth of the time of a diagnosis.
 Used wherever a probability is converted to a threshold or a bound.
@@ -13,26 +13,29 @@ from collections.abc import Callable
 
 import numpy as np
 
+#: The golden section, 0.618: each step of `find_minimum` shortens the interval to this fraction.
 _GOLDEN = 0.5 * (5.0**0.5 - 1.0)
-#: Relative and absolute tolerance of a root, and most evaluations of its function.
+#: Relative and absolute tolerance of a root, and largest number of steps to it.
 _RELATIVE_TOLERANCE, _ABSOLUTE_TOLERANCE = 4.0 * float(np.finfo(float).eps), float(np.finfo(float).tiny)
 _MAX_STEPS = 200
-#: Largest step of the secant method after which the next is below the last digit, and most steps of it.
+#: Relative step of the secant method after which the error is below the last digit, and largest number of steps.
 _LAST_STEP, _MAX_SECANTS = 1e-9, 12
 
 
 def find_root(function: Callable[[float], float], low: float, high: float) -> float:
     """Find a zero of a continuous function between `low` and `high` by Chandrupatla's method.
 
-    The search ends when the zero is enclosed to a relative width of 8 machine epsilons, or after 200 steps. Raises
-    ValueError if the function has the same sign at both ends, or is NaN there.
+    The search ends when a value is exactly 0, when the zero is enclosed to a relative width of 8 machine epsilons, or
+    after 200 steps. Raises ValueError if the function has the same sign at both ends, or is NaN there.
     """
-    a, b, f_a, f_b = high, low, function(high), function(low)  # a: the newest point; the root is between a and b
+    # a: newest point; b: the root is between a and b; c: point that was dropped last
+    a, b, f_a, f_b = high, low, function(high), function(low)
     if not f_a * f_b <= 0.0:
         raise ValueError(f"the function must change its sign between {low!r} and {high!r}")
     if f_a == 0.0 or f_b == 0.0:
         return high if f_a == 0.0 else low
-    best, fraction = a, 0.5
+    best = a
+    fraction = 0.5  # of the way from a to b; 0.5 is a bisection
     for _ in range(_MAX_STEPS):
         x = a + fraction * (b - a)
         f_x = function(x)
@@ -42,10 +45,12 @@ def find_root(function: Callable[[float], float], low: float, high: float) -> fl
             c, f_c, b, f_b = b, f_b, a, f_a
         a, f_a = x, f_x
         best = a if abs(f_a) < abs(f_b) else b
-        tolerance, width = _RELATIVE_TOLERANCE * abs(best) + _ABSOLUTE_TOLERANCE, abs(b - a)
+        tolerance = _RELATIVE_TOLERANCE * abs(best) + _ABSOLUTE_TOLERANCE
+        width = abs(b - a)
         if f_a == 0.0 or width <= 2.0 * tolerance:
             return best
-        fraction, margin = 0.5, min(0.5, tolerance / width)
+        fraction = 0.5
+        margin = min(0.5, tolerance / width)  # keeps the next point away from a and b by the tolerance
         xi, phi = (a - b) / (c - b), (f_a - f_b) / (f_c - f_b)  # Chandrupatla's notation
         if 1.0 - (1.0 - xi) ** 0.5 < phi < xi**0.5:  # inverse quadratic interpolation stays inside
             fraction = f_a / (f_b - f_a) * f_c / (f_b - f_c)
@@ -60,9 +65,9 @@ def find_near_root(
     """Find a zero of a smooth rising function near `start` by the secant method; None if it does not converge.
 
     `slope` is the approximate slope of the function at `start`. The iteration has converged at x if the next step is
-    at most 1e-9 max(1, |x|), so x should be of the order of one. If `start` is within a few per cent of the zero, this
-    takes a third of the evaluations of `find_root`. The result is also None if the iteration leaves the range from
-    `low` to `high`, or meets a slope that is not positive.
+    at most 1e-9 max(1, |x|), so x should be of the order of one. Returns None if this takes more than 12 steps, if the
+    iteration leaves the range from `low` to `high`, or if it meets a slope that is not positive. If `start` is within a
+    few per cent of the zero, the search takes a third of the evaluations of `find_root`.
     """
     x, f_x = start, function(start)
     for _ in range(_MAX_SECANTS):

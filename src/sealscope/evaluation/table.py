@@ -20,8 +20,8 @@ CANNOT_TELL = "cannot tell"
 def poisson_interval(count: int, confidence: float = 0.95) -> tuple[float, float]:
     """Compute the exact confidence interval (low, high) of a Poisson mean after `count` events.
 
-    With G the quantile of the gamma distribution of shape k and alpha = 1 - confidence, ``low = G(alpha/2; k)`` and
-    ``high = G(1 - alpha/2; k + 1)``, where k is the count; low is 0 if there was no event. Raises InputError for an
+    With k the count, G(p; s) the quantile of the gamma distribution of shape s, and alpha = 1 - confidence, ``low =
+    G(alpha/2; k)`` and ``high = G(1 - alpha/2; k + 1)``; low is 0 if there was no event. Raises InputError for an
     impossible count or confidence. Source: Garwood, Biometrika 28 (1936) 437-442, doi 10.1093/biomet/28.3-4.437.
     """
     from scipy.special import gammainccinv, gammaincinv
@@ -29,7 +29,9 @@ def poisson_interval(count: int, confidence: float = 0.95) -> tuple[float, float
     if count < 0 or count != int(count):
         raise InputError(f"a number of events must be whole and >= 0, got {count}")
     tail = (1.0 - as_probability(confidence, "confidence")) / 2.0
-    return 0.0 if count == 0 else float(gammaincinv(count, tail)), float(gammainccinv(count + 1, tail))
+    low = 0.0 if count == 0 else float(gammaincinv(count, tail))
+    high = float(gammainccinv(count + 1, tail))
+    return low, high
 
 
 def events_per_hour(count: int, hours: float, confidence: float = 0.95) -> IntervalEstimate:
@@ -72,8 +74,9 @@ def confusion_matrix(
     """Count the verdicts for each true fault, with Clopper-Pearson intervals of their fractions.
 
     `truth` and `verdicts` are the true fault and the verdict of each record. `faults` are the names of all faults,
-    including that for no fault, in the order of rows and columns; `confidence` is that of the intervals. Raises
-    InputError for a name that is not in `faults`, or if "cannot tell" is among the faults.
+    including the name for no fault, in the order of rows and columns; `confidence` is that of the intervals. Raises
+    InputError for a name that is not in `faults`, if "cannot tell" is among the faults, if there are no records, or if
+    `truth` and `verdicts` differ in length.
     """
     if len(truth) != len(verdicts) or not truth:
         raise InputError(f"verdicts must be as many as the true faults, got {len(verdicts)} for {len(truth)}")

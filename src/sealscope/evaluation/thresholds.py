@@ -15,7 +15,8 @@ import numpy.typing as npt
 from sealscope.errors import InputError
 from sealscope.evaluation.checks import as_numbers, as_probability
 
-#: `average`: the false-alarm probability is kept on average over sets of leak-free records; `bound`: with confidence.
+#: How a false-alarm probability is kept. `average`: on average over sets of leak-free records; `bound`: with a stated
+#: confidence in each set.
 Promise = Literal["average", "bound"]
 
 
@@ -67,17 +68,21 @@ def records_needed(false_alarm: float, confidence: float | None = None) -> int:
 
 
 def _threshold_rank(n: int, false_alarm: float, promise: Promise, confidence: float) -> int:
-    """Find the rank of the leak-free score to set as the threshold, counted from the highest of `n` scores.
+    """Find which of `n` leak-free scores is the lowest possible threshold; return its rank, 1 for the highest score.
 
-    It is the largest rank that keeps the probability `false_alarm`, on average or as a bound with `confidence`, as
-    for `quantile_threshold`. Returns 0 if there are too few scores.
+    With the score of rank r as the threshold, the true false-alarm probability is distributed as Beta(r, n + 1 - r).
+    The result is the largest r that keeps the `promise`, or 0 if no rank keeps it, as n is too small:
+
+    - "average": the mean r/(n + 1) of this distribution is at most `false_alarm`;
+    - "bound": the true probability is at most `false_alarm` with at least the probability `confidence`.
     """
     from scipy.special import betainc
 
     if promise == "average":
         return min(n, math.floor(false_alarm * (n + 1) * (1.0 + 1e-12)))  # 1e-12, here and below: rounding
     ranks = np.arange(1, n + 1)
-    return int(np.count_nonzero(betainc(ranks, n + 1 - ranks, false_alarm) >= confidence * (1.0 - 1e-12)))
+    p_kept = betainc(ranks, n + 1 - ranks, false_alarm)  # falls with the rank, so that the count is the largest rank
+    return int(np.count_nonzero(p_kept >= confidence * (1.0 - 1e-12)))
 
 
 def quantile_threshold(
@@ -85,10 +90,10 @@ def quantile_threshold(
 ) -> Threshold:
     """Compute the lowest threshold that keeps a false-alarm probability p, from scores of leak-free records.
 
-    `scores` (n,) are high for a leak, and `false_alarm` is p. With the promise "average", the threshold is the score
-    of the rank ``floor(p (n + 1))`` from the highest; the next leak-free record exceeds it with a probability of at
-    most p (split conformal). With "bound", it has the largest rank whose true false-alarm probability is at most p
-    with the probability `confidence` (tolerance limit). Both are exact for independent records of any continuous
+    `scores` (n,) are high for a leak, and `false_alarm` is p. With the promise "average", the threshold is the
+    ``floor(p (n + 1))``-th highest score; the next leak-free record exceeds it with a probability of at most p (split
+    conformal). With "bound", the threshold is the lowest score whose true false-alarm probability is at most p with
+    the probability `confidence` (tolerance limit). Both are exact for independent records of any continuous
     distribution. Raises InputError if there are too few records; the message states the number needed. Source: Wilks
     (1941), doi 10.1214/aoms/1177731788; Vovk, Proc. Mach. Learn. Res. 25 (2012) 475-490, proposition 2.
     """

@@ -34,9 +34,9 @@ Version = Literal[2, 3]
 #: Methods of a soft sensor: the volume balance, from both chamber pressures, the pump's angle and the piston's
 #: position.
 Sensor = Literal["volume"]
-#: Default rms error [Pa] of a pressure for which the step of an FMU is chosen, and the commands of the runs that
-#: choose it.
+#: Default limit [Pa] of the rms error of a pressure, to which the solver's step in an FMU is chosen.
 ERROR = 1.0
+#: Commands of the runs by which this step is chosen.
 STEP_COMMANDS = ("3 sin(4t)", "5 sin(2t)")
 #: Longest time [s] that the C compiler may take.
 _COMPILE_TIMEOUT = 300.0
@@ -50,7 +50,7 @@ class Platform(NamedTuple):
     """An operating system and processor on which an FMU can run.
 
     `triple`: its name for LLVM; `target`: its name for the C compiler; `folders`: by FMI version, its folder in the
-    archive; `suffix`: that of a shared library's file.
+    archive; `suffix`: file suffix of a shared library.
     """
 
     triple: str
@@ -65,7 +65,7 @@ PLATFORMS: Mapping[str, Platform] = convert_type(
 
 
 def this_platform() -> str:
-    """Return the name of the present system in `PLATFORMS`, such as "linux"; raise InputError if it has none."""
+    """Return the name of the present system in `PLATFORMS`, such as "linux"; raise InputError if it is not there."""
     import platform
 
     is_arm = platform.machine().lower() in ("arm64", "aarch64")
@@ -87,7 +87,7 @@ class Compiler(NamedTuple):
 
 
 def find_compiler() -> Compiler:
-    """Find a C compiler: that of the package ziglang, else the system's; raise InputError if there is none."""
+    """Find a C compiler, in the package ziglang or else in the system; raise InputError if there is none."""
     from importlib.util import find_spec
 
     if find_spec("ziglang") is not None:
@@ -111,8 +111,8 @@ def fmi_headers() -> Path:
 def choose_step(rig: Rig, error: float) -> tuple[float, float]:
     """Choose the solver's step with which the rms error of the pressures is at most `error` [Pa].
 
-    A run of 4 s from mid-stroke is simulated under each of `STEP_COMMANDS`; each run chooses its step by this limit.
-    Returns the shortest of the steps [s], and the largest of the errors [Pa] that the runs estimate.
+    A run of 4 s from mid-stroke is simulated under each of `STEP_COMMANDS`, and chooses its own step to keep this
+    limit. Returns the shortest of these steps [s], and the largest of the errors [Pa] that the runs estimate.
     """
     from sealscope.simulation.experiment import Experiment
     from sealscope.simulation.integrate import integrate_run
@@ -125,10 +125,10 @@ def choose_step(rig: Rig, error: float) -> tuple[float, float]:
 class MockUp(NamedTuple):
     """The code and data of a functional mock-up unit (FMU), to be compiled and archived.
 
-    `summary`: one line that describes it; `modules`: LLVM code by function; `variable_list`: its variables; `values`:
-    initial values of the parameters, in the order of the code; `n_inputs`, `n_results`, `n_states`: number of inputs,
-    outputs and states, of a soft sensor the doubles of its memory; `step` [s]: longest step of the solver, or sampling
-    interval of a soft sensor; `failures`: messages by the code that a function returns.
+    `summary`: one line that describes the FMU; `modules`: LLVM code by name of the function; `values`: initial values
+    of the parameters, in the order of the code; `n_states`: number of states, or of doubles in the memory of a soft
+    sensor; `step` [s]: longest step of the solver, or sampling interval of a soft sensor; `failures`: messages by the
+    code that a function returns.
     """
 
     summary: str
@@ -143,9 +143,9 @@ class MockUp(NamedTuple):
 
     @property
     def token(self) -> str:
-        """Hash of the FMU's description, code and variables (32 hex digits).
+        """Hash of the FMU's summary, variables and code (32 hex digits).
 
-        By this hash the FMU's compiled library recognises its XML description.
+        The FMU's compiled library recognises its XML description by this hash.
         """
         texts = [self.summary, str(self.variable_list), *self.modules.values()]
         return hashlib.sha256("".join(texts).encode()).hexdigest()[:32]
@@ -176,7 +176,8 @@ class MockUp(NamedTuple):
         """
         interface = files("sealscope.fmu") / "c"
         value_indices = {variable.reference - REFERENCES["value"] for variable in self.variable_list}
-        present = [int(k in value_indices) for k in range(len(self.values))]  # 1: a parameter is a variable of the unit
+        # 1 for a parameter that is a variable of the FMU, 0 for one that keeps its value
+        present = [int(k in value_indices) for k in range(len(self.values))]
         config = templates().get_template("config.h.j2").render(unit=self, references=REFERENCES, present=present)
         texts = {name: (interface / name).read_text("utf-8") for name in ("unit.c", "unit.h", f"fmi{version}.c")}
         texts |= {f"headers/{path.name}": path.read_text("utf-8") for path in fmi_headers().glob(f"fmi{version}*.h")}
@@ -192,11 +193,13 @@ class MockUp(NamedTuple):
 
         `system`: name in `PLATFORMS`; `version`: version of FMI, 2 or 3. Raises InputError if the compiler fails.
         """
-        platform, compiler = PLATFORMS[system], find_compiler()
+        platform = PLATFORMS[system]
+        compiler = find_compiler()
         inputs = [folder / "unit.c", folder / f"fmi{version}.c"]
         for function, module in self.modules.items():
-            inputs.append(folder / f"{function}-{system}.o")
-            inputs[-1].write_bytes(object_code(module, platform.triple))
+            object_file = folder / f"{function}-{system}.o"
+            object_file.write_bytes(object_code(module, platform.triple))
+            inputs.append(object_file)
         output = folder / f"{system}{platform.suffix}"
         target = ["-target", platform.target] if compiler.cross_compiles else []
         flags = ["-std=c11", "-O2", "-fPIC", "-shared", f"-I{folder}", f"-I{folder / 'headers'}", "-o", str(output)]
@@ -257,7 +260,8 @@ def write_fmu(
     >>> [variable.name for variable in variables if variable.causality == "input"]  # doctest: +SKIP
     ['u', 'G', 'C', 'F', 'G_ext_A', 'G_ext_B']
     """
-    path, chosen_platforms = Path(path), _choose_platforms(path, fmi, platforms)
+    path = Path(path)
+    chosen_platforms = _choose_platforms(path, fmi, platforms)
     machine = _load_pump_controlled_rig(rig)
     if step is None:
         step, found_error = choose_step(machine, error)
@@ -293,10 +297,12 @@ def write_sensor_fmu(
 ) -> tuple[Variable, ...]:
     """Write a functional mock-up unit (FMU) that estimates the leakage from measurements, a soft sensor.
 
-    Its inputs are measured pressures, angle and position. It estimates the leakage of pump and piston together in
-    blocks of 3 s. Its outputs are the mean leakage of the last blocks (at most 20) [m^3/s], its rise above the mean of
-    the first 20 blocks [m^3/s], each with a 95 % interval, and further numbers such as the conductance. The FMU
-    contains the compiled volume balance that also judges live recordings, and needs no Python.
+    From measured pressures, angle and position, it estimates the leakage of pump and piston together in blocks of 3 s.
+    The FMU contains the compiled volume balance that also judges live recordings, and needs no Python. Its outputs are
+
+    - the mean leakage of the last blocks, at most 20, with a 95 % interval [m^3/s];
+    - the rise of this mean above the mean of the first 20 blocks, with a 95 % interval [m^3/s];
+    - further numbers, such as the leakage conductance.
 
     Parameters
     ----------
@@ -332,7 +338,8 @@ def write_sensor_fmu(
     """
     from sealscope.fmu import sensor as sensor_unit
 
-    path, chosen_platforms = Path(path), _choose_platforms(path, fmi, platforms)
+    path = Path(path)
+    chosen_platforms = _choose_platforms(path, fmi, platforms)
     if sensor != "volume":
         raise InputError(f"sensor must be volume, got {sensor!r}")
     if not rate >= MIN_STRIDE / STRIDE:

@@ -47,11 +47,11 @@ def format_description(fmi: int, identifier: str, token: str, summary: str, vari
     """Format the text of modelDescription.xml, the description of an FMU.
 
     `fmi`: version of FMI, 2 or 3; `identifier`: prefix of the C functions; `token`: hash by which the FMU's library
-    recognises this description; `summary`: one line that describes the FMU.
+    recognises this description; `summary`: one line that describes the FMU; `variables`: all its variables.
     """
     by_name = {variable.name: variable for variable in variables}
     outputs = [variable for variable in variables if variable.causality == "output"]
-    units = sorted({"s", *(variable.unit for variable in variables)} - {"1"})  # s is the unit of the time
+    units = sorted({"s", *(variable.unit for variable in variables)} - {"1"})  # s: unit of time; 1: no unit
     return (
         templates()
         .get_template(f"fmi{fmi}.xml.j2")

@@ -1,8 +1,8 @@
 """The code of a functional mock-up unit (FMU) of a rig: the equations of `simulate`, compiled to functions for C.
 
-The functions' arguments are pointers to arrays of doubles: `values`, the parameters, in the order of
-`variables.VALUES`; `inputs` in the order of `variables.INPUTS`; the state `y` in that of `physics.state.STATES`; and
-`results`, the outputs, in that of `variables.RESULTS`. The functions return 0, or a code of `FAILURES`.
+The functions' arguments are pointers to arrays of doubles. The arrays, and the tables that give their order, are:
+parameters `values`, `variables.VALUES`; `inputs`, `variables.INPUTS`; state `y`, `physics.state.STATES`; outputs
+`results`, `variables.RESULTS`. The functions return 0, or a code of `FAILURES`.
 """
 
 from __future__ import annotations
@@ -52,8 +52,7 @@ FAILURES = MappingProxyType(
         BEYOND_DRIVE: "the drive cannot hold the load at standstill",
     }
 )
-_SIZES = {"values": len(VALUES), "inputs": len(INPUTS), "y": len(STATES), "results": len(RESULTS)}
-_N_VALUES, _N_INPUTS, _N_STATES, _N_RESULTS = _SIZES.values()
+_N_VALUES, _N_INPUTS, _N_STATES, _N_RESULTS = len(VALUES), len(INPUTS), len(STATES), len(RESULTS)
 _N_PARAMETERS, _N_OUTPUTS = len(PARAMETERS), len(OUTPUTS)
 _G_EXT_A, _G_EXT_B = VALUES.index("cylinder.G_ext_A"), VALUES.index("cylinder.G_ext_B")
 _U, _G, _C, _F, _ADDED_G_EXT_A, _ADDED_G_EXT_B = range(len(INPUTS))
@@ -93,8 +92,8 @@ def _at_imex_nodes(a: float, b: float, t: float, h: float) -> tuple[float, float
 class RigChoice(NamedTuple):
     """The equations and the solver that are compiled into the FMU of a rig; the rig's parameters remain variables.
 
-    `laws`: for each entry of `physics.rig.CHOICES`, which equation the rig has, or if an optional one is present;
-    `exponent`: 1 if the closed fraction of a throttle is that of its area, 2 if that of its diameter;
+    `laws`: for each entry of `physics.rig.CHOICES`, which equation the rig has, or if an optional equation is present;
+    `exponent`: 1 if the closed fraction of a throttle is a fraction of its area, 2 if of its diameter;
     `literal_metering`: True if eqs. (4.9)-(4.12) of the thesis are taken as printed; `implicit`: True for the
     implicit-explicit method, False for Runge-Kutta; `euler`: True if the speed loop's integral is computed by eq. (4.2)
     of the thesis.
@@ -112,9 +111,12 @@ class RigChoice(NamedTuple):
 
         The equations of load and external leakage are always included, because both are inputs of every FMU.
         """
-        laws = tuple(rig_numbers(rig)._replace(open_circuit=(True,), pushed=(True,)))[len(NUMBERS) :]
-        implicit, euler = choose_method(rig, "auto") == "imex", rig.motor.integrator == "euler"
-        return cls(laws, *throttle_readings(rig), implicit=implicit, euler=euler)
+        # open_circuit: external leakage; pushed: load; (True,): present
+        numbers = rig_numbers(rig)._replace(open_circuit=(True,), pushed=(True,))
+        laws = tuple(numbers)[len(NUMBERS) :]  # without the numbers before the choices of equations
+        exponent, literal_metering = throttle_readings(rig)
+        implicit = choose_method(rig, "auto") == "imex"
+        return cls(laws, exponent, literal_metering, implicit=implicit, euler=rig.motor.integrator == "euler")
 
 
 def _build_parameters_law(
@@ -124,8 +126,8 @@ def _build_parameters_law(
 
     Its arguments are the values (n,), in the order of `variables.VALUES`, and two conductances [m^3/(s Pa)] of
     external leakage out of the chambers A and B, which are added to those of the rig. `laws`: the equations that the
-    rig has (`RigChoice`); `exponent`: 1 if the closed fraction of a throttle is that of its area, 2 if that of its
-    diameter; `literal_metering`: True if eqs. (4.9)-(4.12) of the thesis are taken as printed.
+    rig has (`RigChoice`); `exponent`: 1 if the closed fraction of a throttle is a fraction of its area, 2 if of
+    its diameter; `literal_metering`: True if eqs. (4.9)-(4.12) of the thesis are taken as printed.
     """
 
     @law
@@ -147,10 +149,13 @@ def _build_parameters_law(
 def build_functions(choice: RigChoice) -> dict[str, Callable[..., Any]]:
     """Build the functions of an FMU for a rig, which `rig_code` compiles; return them by name.
 
-    ``start(values, inputs, x_0, y)`` sets the state `y` to standstill at the piston position x_0 [m] under the load
-    among the inputs. ``advance(values, inputs, slopes, y, span, steps)`` integrates `y` over `span` [s] in `steps`
-    equal steps, while the inputs change linearly by their `slopes` (per second). ``report(values, inputs, y, results)``
-    writes the outputs to `results`. All arguments but x_0, span and steps are pointers to arrays of doubles.
+    - ``start(values, inputs, x_0, y)`` sets the state `y` to standstill at the piston position x_0 [m] under the load
+      among the inputs.
+    - ``advance(values, inputs, slopes, y, span, steps)`` integrates `y` over `span` [s] in `steps` equal steps, while
+      the inputs change linearly by their `slopes` (per second).
+    - ``report(values, inputs, y, results)`` writes the outputs to `results`.
+
+    All arguments but x_0, span and steps are pointers to arrays of doubles.
     """
     laws, exponent, literal_metering, implicit, euler = choice
     throttled = bool(laws[CHOICES.index("throttled")])

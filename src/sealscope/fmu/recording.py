@@ -47,8 +47,8 @@ def record_fmu(
     """Run a functional mock-up unit under an experiment's command, and record it with the instruments of its rig.
 
     The unit replaces the machine: only the instruments of the experiment's rig are used. Channels without an
-    instrument (``q_comp``, ``q_pump``, ``T_oil``) are recorded as the unit outputs them. A unit is a program, and
-    runs with all rights of this one.
+    instrument (``q_comp``, ``q_pump``, ``T_oil``) are recorded as the unit outputs them. A unit is a program, which
+    runs with all rights of the calling program.
 
     Parameters
     ----------
@@ -95,15 +95,17 @@ def record_fmu(
         )
     rate = experiment.rate
     factor = oversampling_of(rate, MAX_COMMUNICATION_STEP)
-    n = round(experiment.duration * rate)
+    n = round(experiment.duration * rate)  # samples of the recording
+    # communication points, with those that the anti-alias filter needs after the last sample
     t = np.arange((n + FILTER_REACH) * factor + 1) / (rate * factor)
     input_table = _build_input_table(path, experiment, names, variables, t)
     rows = _run_unit(path, t, input_table, list(measured.values()), experiment.duration, progress)
     outputs = {}
     for name, variable in measured.items():
-        unit = variables[variable].unit or CHANNEL_UNITS[name]  # what has no unit is taken to be in SI units
+        unit = variables[variable].unit or CHANNEL_UNITS[name]  # no unit stated: SI units
         outputs[name] = to_si(rows[variable], unit, CHANNEL_UNITS[name], name=f"{variable} of {path.name}")
     volts = experiment.voltage_command.volts(t[: n * factor : factor])
+    # zeros stand for channels that the unit lacks, which are not recorded
     all_outputs = {name: outputs.get(name, np.zeros(t.size)) for name in _MEASURED_NAMES}
     recorded = record(experiment.rig, all_outputs, volts, factor, experiment.seed, experiment.readings())
     recorded_names = {"u", *measured} | ({"omega"} if "theta" in measured else set())
@@ -123,7 +125,7 @@ def record_fmu(
 def _check_experiment(experiment: Experiment) -> None:
     """Check that an FMU can run the experiment; raise InputError otherwise.
 
-    An FMU takes neither a target of the position, nor a fault or drift of the machine, nor a leak stated as a flow.
+    An FMU cannot take a target of the position, a fault or drift of the machine, or a leak stated as a flow.
     """
     if experiment.target is not None:
         raise InputError(f"a unit must have a command, not a target, got {experiment.command}")
@@ -151,10 +153,11 @@ def _read_description(path: Path) -> Any:
 
 
 def _map_variables(path: Path, variables: Mapping[str, Any], names: Mapping[str, str]) -> dict[str, str]:
-    """Find the variable of the FMU for each channel and input: the one given in `names`, else one of the same name.
+    """Find the FMU's variable for each channel and input, and return its name by channel or input.
 
-    `variables`: variables of the FMU by name. Channels and inputs without a variable are left out of the result.
-    Raises InputError if `names` has an unknown channel or variable.
+    `names`: variable by channel or input, for variables with another name than the channel; `variables`: all variables
+    of the FMU by name. Channels and inputs without a variable are left out of the result. Raises InputError if `names`
+    has an unknown channel or variable.
     """
     valid_names = {*_INPUT_NAMES, *_MEASURED_NAMES}
     for channel, variable in names.items():
@@ -174,9 +177,11 @@ def _build_input_table(
 
     FMPy keeps an input constant during a step, so each row has the value in the middle of the step, for second-order
     accuracy. `names`: variable of the FMU by channel or input; `variables`: description of each variable. Raises
-    InputError if the experiment needs an input that the FMU does not have, or a load over position or velocity.
+    InputError if the FMU lacks the command or another input that the experiment needs, or if the experiment has a load
+    over position or velocity.
     """
     half_step = 0.5 * (t[1] - t[0])
+    # in each step, the inputs are needed at one time only, its middle
     u, G, C = (values[:, 0] for values in RunInputs(experiment, experiment.leaks).at_nodes(t, np.array([half_step])))
     if experiment.load is not None and experiment.load.tables() is not None:
         raise InputError(f"a unit takes its load over time, got one over position or velocity ({experiment.load})")
@@ -202,9 +207,9 @@ def _run_unit(
 ) -> Any:
     """Run the FMU with a table of inputs, and return its outputs at the communication points `t` [s].
 
-    Returns a structured array with a field for each variable in `outputs`, and the time. `duration` [s]: length of
-    the recording, of which `progress` gets the completed fraction. Raises SimulationFailed if the FMU fails or ends
-    early.
+    Returns a structured array with the fields "time" and each variable in `outputs`. `duration` [s]: length of the
+    recording, of which `progress` gets the completed fraction. Raises SimulationFailed if the FMU fails, ends early, or
+    ends with an output that is not finite.
     """
     import fmpy
 
@@ -214,7 +219,8 @@ def _run_unit(
             progress("running the unit", min(1.0, time / duration))
         return True
 
-    communication_step, log = float(t[1] - t[0]), io.StringIO()
+    communication_step = float(t[1] - t[0])
+    log = io.StringIO()
     try:
         with redirect_stdout(log):  # FMPy prints what the unit logs
             rows = fmpy.simulate_fmu(

@@ -151,9 +151,9 @@ class SensorChoice(NamedTuple):
 class _Lengths(NamedTuple):
     """Numbers of samples and strides by which a soft sensor divides its measurements.
 
-    A stride is the time from one row of the volume balance to the next: `stride_samples` long, `block_strides` of them
-    in a block; the direction of motion is found from a central difference of the position over 2 `half_difference`
-    samples.
+    A stride is the time from one row of the volume balance to the next. `stride_samples`: samples in a stride;
+    `block_strides`: strides in a block; `half_difference`: samples on either side of the central difference of the
+    position by which the direction of motion is found.
     """
 
     stride_samples: int
@@ -162,10 +162,7 @@ class _Lengths(NamedTuple):
 
     @classmethod
     def from_rate(cls, rate: float) -> _Lengths:
-        """Compute a soft sensor's numbers of samples and strides for a sampling rate [Hz].
-
-        They are rounded to whole ones.
-        """
+        """Compute a soft sensor's numbers of samples and strides, rounded to whole ones, for a sampling rate [Hz]."""
         return cls(stride_samples(rate), round(BLOCK_SECONDS / STRIDE), max(1, round(HALF_DIFFERENCE * rate)))
 
 
@@ -174,21 +171,18 @@ def memory_layout(choice: SensorChoice) -> np.dtype[Any]:
 
     The memory is a record of doubles with the scalars `_SCALARS` and the following arrays.
 
-    Samples: `ring` has the last samples, a column each; `increments` the increment of each term of the volume balance
-    over the last sampling interval.
+    A row of the volume balance is the weighted integral of all terms over `SPAN` strides, where a stride is the time
+    from one row to the next. A block is open until its rows are weighted.
 
-    Rows of the volume balance: a row is the weighted integral of all terms over `SPAN` strides, where a stride is the
-    time from one row to the next. `unfinished` has the `SPAN` rows to which the present interval adds; `rows` the
-    finished rows of the open blocks, whose rows are not weighted yet; `ends` the index past the last row of each open
-    block; `gram` the Gram matrices of the blocks weighted last. `pressure_sums` has, for each of the last blocks, the
-    sum of abs(p_A - p_B) and the number of samples in it; `slow_sums` the sums over earlier blocks for the coefficients
-    that are not fitted to each block (`weigh_rows`).
-
-    Blocks before the first fit: `waiting_grams` has their Gram matrices, `waiting_sizes` their sizes
-    (`_BLOCK_ROWS`, `_BLOCK_PRESSURE`), `precisions` the precisions of their estimates.
-
-    Results: `history` has leak, pressure and other results of each of the last blocks (`_G` ... `_PRESSURE`); `model`
-    is a `Coefficients`; `workspace` is a `Workspace`.
+    - `ring`: last samples, a column each; `increments`: of each term of the balance over the last sampling interval
+    - `unfinished`: the `SPAN` rows to which the present interval adds; `rows`: finished rows of the open blocks
+    - `ends`: index past the last row of each open block; `gram`: Gram matrices of the blocks weighted last
+    - `pressure_sums`: sum of abs(p_A - p_B) and number of samples, for each of the last blocks
+    - `slow_sums`: sums over earlier blocks for the coefficients that are not fitted to each block (`weigh_rows`)
+    - `waiting_grams`, `waiting_sizes`: of the blocks that wait for the first fit, Gram matrices and sizes
+      (`_BLOCK_ROWS`, `_BLOCK_PRESSURE`); `precisions`: precisions of these blocks' estimates
+    - `history`: results of each of the last blocks (`_G` ... `_PRESSURE`)
+    - `workspace`: a `Workspace`; `model`: a `Coefficients`
     """
     lengths, n_slow = _Lengths.from_rate(choice.rate), len(choice.column_order) - choice.n_fast - 1
     max_rows = SUPPORT * lengths.block_strides
@@ -221,7 +215,8 @@ def build_functions(choice: SensorChoice) -> dict[str, Callable[..., Any]]:
     """
     from scipy.special import stdtrit
 
-    layout, interval = memory_layout(choice), 1.0 / choice.rate
+    layout = memory_layout(choice)
+    interval = 1.0 / choice.rate  # [s] between samples
     add_sample, memory = _build_sample_law(choice), record_view(layout)
     n_memory = layout.itemsize // 8  # doubles
     n_inputs, n_results, n_values = len(INPUTS), len(SENSOR_RESULTS), len(VALUES)
@@ -272,9 +267,10 @@ def build_functions(choice: SensorChoice) -> dict[str, Callable[..., Any]]:
 def _build_sample_law(choice: SensorChoice) -> Callable[..., Any]:
     """Build the compiled function that adds one sample of the measurements to a soft sensor's memory.
 
-    The measurements are those of the channels `INPUTS`. `choice`: settings of the sensor.
+    A sample has one measurement of each of the channels `INPUTS`. `choice`: settings of the sensor.
     """
-    (n_stride, block_strides, half), rate = _Lengths.from_rate(choice.rate), choice.rate
+    rate = choice.rate
+    n_stride, block_strides, half = _Lengths.from_rate(rate)
     n_support, n_block = SPAN * n_stride, n_stride * block_strides
     # phi = peak (1 - s^2)^4; the first value of `test_function` is at the middle of the first interval
     peak = float(test_function(rate)[0, 0]) / (1.0 - (1.0 / n_support - 1.0) ** 2) ** 4
@@ -337,10 +333,11 @@ def _add_pressure_difference(m: Any, k: int, n_block: int, rate: float) -> None:
 def _compute_increments(ring: Any, k: int, half: int, rate: float, displacement: float, out: Any) -> None:
     """Compute the increments of all terms of the volume balance over the interval from sample k to k + 1.
 
-    They are written to `out` (n,) in the order of `COLUMNS`. Those of the response and of the leak, for example, are
-    the volume that the pump displaces [m^3] and the time integral of p_A - p_B [Pa s]. `ring`: the last samples, where
-    sample k has the column k modulo its width; `half`: samples on either side of a central difference, by which the
-    direction of motion is found; `rate` [Hz]: sampling rate; `displacement` [m^3/rad]: that of the pump.
+    The increments are written to `out` (n,) in the order of `COLUMNS`. For example, the increment of the response is
+    the volume that the pump displaces [m^3], and the increment of the leak the time integral of p_A - p_B [Pa s].
+    `ring`: the last samples, where sample k has the column k modulo its width; `half`: samples on either side of a
+    central difference, by which the direction of motion is found; `rate` [Hz]: sampling rate; `displacement` [m^3/rad]:
+    displacement of the pump.
     """
     width = ring.shape[1]
     slot, next_slot = k % width, (k + 1) % width
@@ -371,8 +368,8 @@ def _compute_increments(ring: Any, k: int, half: int, rate: float, displacement:
 def _find_angle_sign(m: Any, n_rows: int) -> None:
     """Find the sign with which the pump's angle is recorded, and store it, 1 or -1, in `m.angle_sign`.
 
-    With the right sign the pump's flow rises with p_A - p_B: the sign is -1 if their covariance is negative. It is
-    computed from the first `n_rows` rows of the volume balance in the sensor's memory m.
+    With the right sign the pump's flow rises with p_A - p_B, so the sign is -1 if their covariance is negative. The
+    covariance is computed from the first `n_rows` rows of the volume balance in the sensor's memory m.
     """
     mean, covariance = 0.0, 0.0
     for r in range(n_rows):
@@ -386,10 +383,12 @@ def _find_angle_sign(m: Any, n_rows: int) -> None:
 def _append_conductance(m: Any, size_error: float, n_rows: float, pressure: float, is_learned: bool) -> None:
     """Estimate the leakage conductance of the block loaded in `m.model`, and append it to the history.
 
-    An estimate at standstill is left out if its precision, the inverse of its variance, is at most
-    `MIN_REST_PRECISION` times the usual one. `m`: the sensor's memory; `size_error`: relative standard error of the
-    leakage due to the machine's sizes; `n_rows`, `pressure` [Pa]: number of rows of the volume balance in the block,
-    and its mean abs(p_A - p_B); `is_learned`: True if the balance's other coefficients are updated with the block.
+    The precision of an estimate is the inverse of its variance. An estimate at standstill is left out if its precision
+    is at most `MIN_REST_PRECISION` times the usual precision, and any estimate if its precision is not positive. The
+    first `WINDOW` estimates are also added to the sums of the baseline. `m`: the sensor's memory; `size_error`:
+    relative standard error of the leakage due to the machine's sizes; `n_rows`, `pressure` [Pa]: number of rows of the
+    volume balance in the block, and its mean abs(p_A - p_B); `is_learned`: True if the balance's other coefficients are
+    updated with the block.
     """
     model = m.model
     motion = relative_motion(model.block[-1, -1], n_rows, model.numbers)  # [-1, -1]: sum of the squared response
@@ -412,9 +411,9 @@ def _append_conductance(m: Any, size_error: float, n_rows: float, pressure: floa
 def _fit_to_waiting(m: Any, size_error: float) -> None:
     """Fit the coefficients of the volume balance to the first `LEARNED` blocks, and append the leakage of each.
 
-    `m`: the sensor's memory, in which these blocks wait. The median of the precisions of their estimates becomes the
-    usual precision, to which later estimates are compared. `size_error`: relative standard error of the leakage due to
-    the machine's sizes (displacement, piston area).
+    `m`: the sensor's memory, in which these blocks wait; afterwards no block waits. The median of the precisions of
+    their estimates becomes the usual precision, to which later estimates are compared. `size_error`: relative standard
+    error of the leakage due to the machine's sizes (displacement, piston area).
     """
     model = m.model
     for k in range(LEARNED):
@@ -449,9 +448,9 @@ def _forget_standstill(m: Any) -> None:
 def _update_with_block(m: Any, size_error: float, b: int, n_rows: float, pressure: float) -> None:
     """Estimate the leakage of block b from its Gram matrix `m.gram[b]`, and append it to the history.
 
-    From the first block with motion on, the first `LEARNED` blocks are stored until the coefficients can be fitted to
-    all of them together. After `N_WAKING` successive blocks whose mean square motion is more than 1/`STANDSTILL` times
-    that of earlier blocks, all estimates are discarded, and this first fit is repeated.
+    Before the first fit, blocks are only stored, from the first block with motion on; the coefficients are fitted to
+    the first `LEARNED` blocks together. After `N_WAKING` successive blocks whose mean square motion is more than
+    1/`STANDSTILL` times that of earlier blocks, all estimates are discarded, and the first fit is repeated.
 
     `m`: the sensor's memory; `size_error`: relative standard error of the leakage due to the machine's sizes; `n_rows`,
     `pressure` [Pa]: number of rows of the volume balance in the block, and its mean abs(p_A - p_B).
@@ -479,9 +478,9 @@ def _update_with_block(m: Any, size_error: float, b: int, n_rows: float, pressur
 
 
 def _build_block_law(choice: SensorChoice) -> Callable[..., Any]:
-    """Build the compiled function that weights the rows of the volume balance in the newest blocks of a soft sensor.
+    """Build the compiled function that finishes a block of a soft sensor: `finish_block`.
 
-    The function also estimates the leakage of these blocks. `choice`: settings of the sensor.
+    The function weights the rows of the volume balance and estimates the leakage. `choice`: settings of the sensor.
     """
     column_order, n_fast, size_error = choice.column_order, choice.n_fast, choice.size_error
 
@@ -489,9 +488,9 @@ def _build_block_law(choice: SensorChoice) -> Callable[..., Any]:
     def finish_block(m: Any, rows: Any, ends: Any, block: int) -> None:
         """Weight the rows of the volume balance in all open blocks, and estimate the leakage of each block.
 
-        A block is open if it is not yet weighted. The first `SUPPORT` blocks are weighted together, later ones one
-        by one as they end. `m`: the sensor's memory; `rows`: rows of the open blocks; `ends`: index past the last
-        row of each, where that of the newest is set here; `block`: number of the newest block.
+        A block is open if it is not yet weighted. The first `SUPPORT` blocks are weighted together, later blocks one
+        by one as they end. `m`: the sensor's memory; `rows`: rows of the open blocks; `ends`: index past the last row
+        of each open block, set here for the newest block; `block`: number of the newest block.
         """
         n_rows, n_open, is_first = len(rows), len(ends), m.n_weighted == 0.0
         ends[n_open - 1] = n_rows
@@ -528,8 +527,7 @@ def _build_block_law(choice: SensorChoice) -> Callable[..., Any]:
 def _mean(history: Any, newest: int, n: int, column: int) -> float:
     """Compute the mean of one result of a soft sensor over n blocks, the last of which is block `newest`.
 
-    `history` (blocks, 5): results of the last blocks, block k in row k modulo their number; `column`: column of the
-    result.
+    `history` (WINDOW, 5): results of the last blocks, block k in row k modulo WINDOW; `column`: column of the result.
     """
     total = 0.0
     for k in range(n):
@@ -541,8 +539,8 @@ def _mean(history: Any, newest: int, n: int, column: int) -> float:
 def _variance_of_mean(history: Any, newest: int, n: int) -> float:
     """Compute the variance of the mean conductance of n blocks, the last of which is block `newest`.
 
-    It is the larger of two variances, divided by n: the sample variance of the blocks' estimates, and the mean of
-    the variances that the fit gives these estimates. `history` (blocks, 5): results of the last blocks.
+    It is the larger of two variances, divided by n: the sample variance of the blocks' estimates, and the mean of the
+    variances that the fit gives these estimates. `history` (WINDOW, 5): results of the last blocks, as in `_mean`.
     """
     mean, sample_variance = _mean(history, newest, n, _COMPARABLE_G), 0.0
     for k in range(n):
@@ -555,10 +553,11 @@ def _write_results(m: Any, size_error: float, quantiles: Any, out: Any) -> None:
     """Compute the outputs of the soft sensor by the formulas of the module's docstring, and write them to `out`.
 
     The leakage is the mean conductance of the last blocks (at most `WINDOW`), times their mean abs(p_A - p_B). The rise
-    is the difference of their mean from that of the first `WINDOW` blocks, times the same pressure. `m`: the
-    sensor's memory; `size_error`: relative standard error of the leakage due to the machine's sizes; `quantiles`:
-    Student's t for 1, 2, ... degrees of freedom; `out`: outputs in the order of `SENSOR_RESULTS`. The number of blocks
-    and the misfit are always written; the other outputs are 0 while there are too few blocks.
+    is the mean conductance of the last blocks after the baseline (at most `WINDOW`), minus that of the baseline (the
+    first `WINDOW` blocks), times the mean abs(p_A - p_B) of these last blocks. `m`: the sensor's memory; `size_error`:
+    relative standard error of the leakage due to the machine's sizes; `quantiles`: Student's t for 1, 2, ... degrees of
+    freedom; `out`: outputs in the order of `SENSOR_RESULTS`. The number of blocks and the misfit are always written;
+    the other outputs are 0 while there are too few blocks.
     """
     out[:] = 0.0
     history, n_estimated, newest = m.history, int(m.n_estimated), int(m.n_estimated) - 1

@@ -18,7 +18,8 @@ from sealscope.recordings.channels import CHANNEL_UNITS, LONG_NAMES
 #: other numbers are derived.
 VALUES = tuple(NAMES_OF_VALUES.values())
 _TABLES: dict[str, Any] = tomllib.loads((files("sealscope.fmu") / "variables.toml").read_text("utf-8"))
-#: Inputs, outputs and a soft sensor's outputs in the order of the code: (unit, description).
+#: (unit, description) of the inputs and the outputs of a rig's FMU, and of a soft sensor's outputs, in the order of the
+#: code.
 INPUTS: Mapping[str, tuple[str, str]] = _TABLES["inputs"]
 RESULTS: Mapping[str, tuple[str, str]] = {
     **{name: _TABLES["outputs"].get(name) or (CHANNEL_UNITS[name], LONG_NAMES[name]) for name in OUTPUTS},
@@ -52,16 +53,16 @@ class Variable(NamedTuple):
 def input_variables(rows: Mapping[str, tuple[str, str]]) -> Iterator[Variable]:
     """Yield the input variables of an FMU, with the initial value 0.
 
-    `rows`: unit and description of each, by name.
+    `rows`: (unit, description) by name of the variable.
     """
     for k, (name, (unit, description)) in enumerate(rows.items()):
         yield Variable(REFERENCES["input"] + k, name, "input", "continuous", unit, description, 0.0)
 
 
 def output_variables(rows: Mapping[str, tuple[str, str]]) -> Iterator[Variable]:
-    """Yield the output variables of an FMU; those of a servo valve are left out.
+    """Yield the output variables of an FMU, without the outputs of a servo valve.
 
-    `rows`: unit and description of each, by name.
+    `rows`: (unit, description) by name of the variable.
     """
     for k, (name, (unit, description)) in enumerate(rows.items()):
         if name not in _VALVE_OUTPUTS:
@@ -74,12 +75,12 @@ def rig_variable(rig: Rig, name: str, variability: Literal["tunable", "fixed"]) 
     Returns None if the rig lacks the part that the parameter describes. `variability`: "tunable" if the variable
     can be changed during a run, else "fixed".
     """
-    value, field = float(attrgetter(name)(rig)), dict(iter_fields(Rig))[name]
+    value = float(attrgetter(name)(rig))
+    field = dict(iter_fields(Rig))[name]
+    if value == absent_of(field):
+        return None
     reference, description = REFERENCES["value"] + VALUES.index(name), str(field.title or name)
-    is_absent = value == absent_of(field)
-    return (
-        None if is_absent else Variable(reference, name, "parameter", variability, unit_of(field), description, value)
-    )
+    return Variable(reference, name, "parameter", variability, unit_of(field), description, value)
 
 
 def variables(rig: Rig, step: float) -> Iterator[Variable]:

@@ -3,13 +3,13 @@
 The thesis's "db8 details" can be read in three ways, which differ in length, in the scale of the levels and in the RMS
 of white noise with standard deviation sigma:
 
-===============  ======================================================  ====================================
-transform        what d_j is                                             RMS of white noise
-===============  ======================================================  ====================================
-`stationary`     a trous transform, unit l2 norm per level (default)     sigma in every level
-`decimated`      Mallat's transform, each coefficient held 2^j samples   sigma in every level
-`reconstructed`  inverse transform of each d_j; they sum up to x         sigma 2^(-j/2): d_2/d_1 = 0.71
-===============  ======================================================  ====================================
+===============  =======================================================  ====================================
+transform        what d_j is                                              RMS of white noise
+===============  =======================================================  ====================================
+`stationary`     a trous transform, unit l2 norm per level (default)      sigma in every level
+`decimated`      Mallat's transform, each coefficient held 2^j samples    sigma in every level
+`reconstructed`  part of the signal from level j; all parts sum up to it  sigma 2^(-j/2): d_2/d_1 = 0.71
+===============  =======================================================  ====================================
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class Details:
     def __getitem__(self, level: int) -> Array:
         """Return the detail d_j of the level j, (n,), including the samples at both ends that depend on padding.
 
-        Raises InputError if there is no such level; the first one is 1.
+        Raises InputError if `level` is not one of 1, the finest, to `levels`.
         """
         if not 1 <= level <= self.levels:
             raise InputError(f"level must be 1 to {self.levels}, got {level!r}")
@@ -89,11 +89,12 @@ class Details:
 def edge_samples(wavelet: str = "db8", levels: int = 4, transform: Transform = "stationary") -> IntArray:
     """Count the samples at the beginning and at the end of each level that depend on padding, (levels, 2).
 
-    The detail of a sample in level j depends on before_j samples before and after_j after it (`reach`). These are the
-    counts for the stationary transform. At the beginning, the decimated one depends on padding up to sample ``2^j
-    ceil(2 before_j / 2^j) - before_j``, where the first coefficient without padding begins; at the end it depends on as
-    many samples as the stationary one. In the reconstructed one analysis and synthesis together reach ``(L - 1)(2^j -
-    1)`` to both sides, with L taps.
+    The detail d_j of a sample depends on before_j earlier and after_j later samples (`reach`). The two counts are:
+
+    - stationary: before_j and after_j;
+    - decimated: ``2^j ceil(2 before_j / 2^j) - before_j``, the sample at which the first coefficient without padding
+      begins, and after_j;
+    - reconstructed: both ``before_j + after_j = (L - 1)(2^j - 1)``, for analysis and synthesis with L taps together.
     """
     _check_choice(transform, Transform, "transform")
     stationary = reach(wavelet, levels)
@@ -133,10 +134,10 @@ def details(
     d_4 (5 in every decimated level, 0 in every reconstructed one). A causal system knows d_j of sample n only at
     sample ``n + (L/2)(2^j - 1)``, for db8 8, 24, 56 and 120 samples later.
 
-    Raises InputError for a signal that is not finite and one-dimensional or is shorter than `min_samples`, and for an
-    unknown wavelet, transform or edge. Source: "Understanding Effect and Diagnosis of Internal Leakage in Hydrostatic
-    Actuation Systems", chapter 5; Mallat, A Wavelet Tour of Signal Processing, 3rd ed. (2009), sections 5.2.2 and
-    7.3; PyWavelets `swt(norm=False)`, `wavedec`, `waverec`.
+    Raises InputError for a signal that is not finite and one-dimensional or is shorter than `min_samples`, for an
+    unknown wavelet, transform or edge, and for invalid levels. Source: "Understanding Effect and Diagnosis of Internal
+    Leakage in Hydrostatic Actuation Systems", chapter 5; Mallat, A Wavelet Tour of Signal Processing, 3rd ed. (2009),
+    sections 5.2.2 and 7.3; PyWavelets `swt(norm=False)`, `wavedec`, `waverec`.
     """
     _check_choice(edge, Edge, "edge")
     levels = require_levels(levels)
@@ -146,18 +147,16 @@ def details(
         raise InputError(
             f"signal must have at least {needed} samples for {levels} {transform} levels of {wavelet}, got {x.size}"
         )
-    compute = {"stationary": _atrous_details, "decimated": _mallat_details, "reconstructed": _inverse_details}[
-        transform
-    ]
-    values, approximation = compute(x, discrete_wavelet(wavelet), levels, edge)
+    methods = {"stationary": _atrous_details, "decimated": _mallat_details, "reconstructed": _inverse_details}
+    values, approximation = methods[transform](x, discrete_wavelet(wavelet), levels, edge)
     return Details(values, approximation, edge_samples(wavelet, levels, transform))
 
 
 def mean_squares(transformed: Details, bounds: ArrayLike) -> Array:
     """Compute the mean squares of d1, d2, d3, d4 and d3d4 in each of k segments of a signal, (k, 5).
 
-    `transformed`: the details of the signal; `bounds` (k + 1,): sample numbers at which the segments begin, and the
-    end.
+    `transformed`: details of the signal, with four levels; `bounds` (k + 1,): segment i has the samples bounds[i] to
+    bounds[i + 1] - 1.
     """
     return segment_means(np.square(transformed.quantities()), bounds).T
 
@@ -165,12 +164,13 @@ def mean_squares(transformed: Details, bounds: ArrayLike) -> Array:
 def segment_means(values: Array, bounds: ArrayLike) -> Array:
     """Compute the means (r, k) of the rows of `values` (r, n) over k segments.
 
-    `bounds` (k + 1,): sample numbers at which the segments begin, and the end.
+    `bounds` (k + 1,): segment i has the columns bounds[i] to bounds[i + 1] - 1.
     """
-    edges = np.asarray(bounds)
-    sums = np.add.reduceat(values, edges[:-1], axis=1)
-    sums[:, -1] = values[:, edges[-2] : edges[-1]].sum(axis=1)  # reduceat sums to the end of the row
-    return np.asarray(sums / np.diff(edges))
+    limits = np.asarray(bounds)
+    sums = np.add.reduceat(values, limits[:-1], axis=1)
+    # reduceat sums the last segment to the end of the row, not to its limit
+    sums[:, -1] = values[:, limits[-2] : limits[-1]].sum(axis=1)
+    return np.asarray(sums / np.diff(limits))
 
 
 def _check_choice(value: object, choices: Any, name: str) -> None:
@@ -193,7 +193,7 @@ def _atrous_details(x: Array, wavelet: Any, levels: int, edge: Edge) -> tuple[Ar
 
     before, after = (int(samples) for samples in reach(wavelet.name, levels)[-1])
     # swt is periodic: padding at least as long as the filters' reach keeps the wrapped samples away from the signal
-    after += -(x.size + before + after) % 2**levels  # swt needs a multiple of it
+    after += -(x.size + before + after) % 2**levels  # swt needs a multiple of 2^levels samples
     padded = pywt.pad(x, (before, after), edge)
     approximation, *deepest_first = pywt.swt(padded, wavelet, level=levels, trim_approx=True, norm=False)
     inside = slice(before, before + x.size)
@@ -209,11 +209,12 @@ def _mallat_details(x: Array, wavelet: Any, levels: int, edge: Edge) -> tuple[Ar
     import pywt
 
     approximation, *deepest_first = pywt.wavedec(x, wavelet, mode=edge, level=levels)
-    before = [0, *reach(wavelet.name, levels)[:, 0].tolist()]  # by level, from 0
+    # before[j]: number of earlier samples on which d_j depends; before[0] is not used
+    before = [0, *reach(wavelet.name, levels)[:, 0].tolist()]
 
     def hold_coefficients(coefficients: Array, level: int) -> Array:
         """Repeat each coefficient of a level 2^level times, and remove the samples of the padding; returns (n,)."""
-        # coefficient o is the stationary detail at sample 2^j o - before_j
+        # coefficient k of level j is the stationary detail at sample 2^j k - before_j
         return np.repeat(coefficients, 2**level)[before[level] : before[level] + x.size]
 
     values = [

@@ -14,7 +14,7 @@ from sealscope.errors import InputError
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-#: Most levels: one coefficient of db8 at level 12 depends on 61 000 samples.
+#: Largest number of levels: one coefficient of db8 at level 12 depends on 61 000 samples.
 MAX_LEVELS = 12
 
 
@@ -49,13 +49,14 @@ def require_levels(levels: int) -> int:
 
 
 def reach(wavelet: str = "db8", levels: int = 4) -> IntArray:
-    """Count for each level the samples before and after a sample that influence its detail, (levels, 2).
+    """Count the samples before and after a sample on which its detail depends, for each level, (levels, 2).
 
-    ``before_j = (L/2 - 1)(2^j - 1)`` and ``after_j = (L/2)(2^j - 1)`` with L taps, in the alignment of PyWavelets.
-    For db8: 7, 21, 49, 105 before and 8, 24, 56, 120 after.
+    Row j - 1 is for d_j, from the finest level j = 1 on: ``before_j = (L/2 - 1)(2^j - 1)`` and ``after_j = (L/2)(2^j -
+    1)`` with L taps, in the alignment of PyWavelets. For db8: 7, 21, 49, 105 before and 8, 24, 56, 120 after.
     """
     half_length = int(discrete_wavelet(wavelet).dec_len) // 2
-    total_dilation = 2 ** np.arange(1, require_levels(levels) + 1, dtype=np.int64) - 1  # of this level and those above
+    # 2^j - 1 = 1 + 2 + ... + 2^(j-1): d_j passes the filters of levels 1 to j, whose taps are 2^(level-1) samples apart
+    total_dilation = 2 ** np.arange(1, require_levels(levels) + 1, dtype=np.int64) - 1
     return np.stack([(half_length - 1) * total_dilation, half_length * total_dilation], axis=1)
 
 
@@ -67,7 +68,7 @@ def require_finite(values: ArrayLike, name: str = "signal", ndim: int | None = N
     """
     try:
         array = np.asarray(values)
-        if np.iscomplexobj(array) or array.dtype.kind in "SUMm":
+        if np.iscomplexobj(array) or array.dtype.kind in "SUMm":  # bytes, text, dates, time differences
             raise TypeError
         array = np.asarray(array, dtype=np.float64)
     except (TypeError, ValueError):
@@ -79,9 +80,9 @@ def require_finite(values: ArrayLike, name: str = "signal", ndim: int | None = N
     if not is_finite.all():
         first = tuple(int(i) for i in np.argwhere(~is_finite)[0])
         n_bad = int(array.size - np.count_nonzero(is_finite))
-        where = first[0] if array.ndim == 1 else first
+        sample = first[0] if array.ndim == 1 else first
         raise InputError(
-            f"{name} must be finite, got {array[first]} at sample {where} ({n_bad} of {array.size} samples)"
+            f"{name} must be finite, got {array[first]} at sample {sample} ({n_bad} of {array.size} samples)"
         )
     return array
 

@@ -23,7 +23,7 @@ def filter_rows(
     """Filter eight signals at once: ``out[to + i] = sum_k taps[tap + k] rows[first + stride i - dilation k]``.
 
     i runs from 0 to n - 1, and k from 0 to n_taps - 1. The indices count rows: the second axis of `rows`, `taps`
-    and `out` holds the eight signals. Eight outputs are computed at a time.
+    and `out` holds the eight signals. Eight outputs are computed at a time, the rest one by one.
     """
     i = 0
     while i + 8 <= n:
@@ -66,8 +66,8 @@ def split_levels(
     `low` and `high` (taps, WIDTH) are the low-pass and high-pass filters. `buffers` has a buffer of `capacity` rows for
     each level of the channel, stacked from row `start` on; the new samples begin at row `first` of the first buffer.
     High-pass filtering of a level's buffer gives its detail, and low-pass filtering fills the buffer of the next level.
-    Lower levels, whose filters are shorter, are delayed like the deepest one, so that all levels in a row of `details`
-    (levels, CHUNK, WIDTH) belong to one sample.
+    The finer levels, whose filters are shorter, get the delay of the deepest level, so that row i of all levels in
+    `details` (levels, CHUNK, WIDTH) belongs to one sample.
     """
     n_taps = low.shape[0]
     for level in range(levels):
@@ -83,8 +83,7 @@ def split_levels(
 def move_history(buffers: Array, start: int, levels: int, capacity: int, fill: int, history: int) -> None:
     """Move the last `history` of the `fill` used rows to the front of each buffer of one channel, to make room.
 
-    The channel has one buffer of `capacity` rows for each of `levels` levels. The buffers follow each other, and
-    the first one begins at row `start`.
+    The channel has one buffer of `capacity` rows for each of `levels` levels, one after the other from row `start` on.
     """
     for level in range(levels):
         row = start + level * capacity
@@ -106,18 +105,18 @@ def advance_details(
 ) -> int:
     """Compute the wavelet details of the next block of all signals.
 
-    Returns the number of rows that are then in use in the buffers. `block` (channels, actuators, n) are the samples,
-    and `out` (channels, actuators, levels, n) receives the details. Each group has eight actuators; `groups` are the
-    first and the last + 1 of the groups to filter. `buffers` (groups, channels, levels, capacity, WIDTH) have `fill`
-    rows in use, the last `history` of which are needed for later outputs. `low` and `high` (taps, WIDTH) are the
-    filters, and `details` (levels, CHUNK, WIDTH) is a work array.
+    `block` (channels, actuators, n): samples; `out` (channels, actuators, levels, n): receives the details. A group has
+    eight actuators, and `groups` is (first, last + 1) of the groups to filter. `buffers` (groups, channels, levels,
+    capacity, WIDTH) have `fill` rows in use, the last `history` of which are needed for later outputs. `low`, `high`
+    (taps, WIDTH): low-pass and high-pass filter; `details` (levels, CHUNK, WIDTH): work array. Returns the number of
+    rows that are in use in the buffers afterwards.
     """
     channels, actuators, n = block.shape
     levels, capacity = buffers.shape[2], buffers.shape[3]
     flat_details, flat_buffers = details.reshape(-1), buffers.reshape(-1)
     filled = fill
     for g in range(groups[0], groups[1]):
-        lanes = min(WIDTH, actuators - WIDTH * g)  # in use; the last group may have fewer than WIDTH
+        lanes = min(WIDTH, actuators - WIDTH * g)  # actuators of the group; the last group may have fewer
         for c in range(channels):
             start = (g * channels + c) * levels * capacity
             filled, n_done = fill, 0

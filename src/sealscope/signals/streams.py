@@ -30,7 +30,7 @@ class DetailStream:
     a sample only ``(L/2)(2^j - 1)`` samples later (db8: 8, 24, 56, 120). All levels are returned with the delay of
     the deepest one, so that a column has all levels of one sample: column i, counted from the beginning of the
     stream, is the detail of sample ``i - delay``. The first `settling` columns depend on the zeros before the
-    beginning. The next column is that of sample `first`.
+    beginning. The next column belongs to sample `first`.
 
     Parameters
     ----------
@@ -46,9 +46,12 @@ class DetailStream:
 
     Attributes
     ----------
-    delay, first, settling : int
-        Lag of the details behind the signal in samples (db8 to level 4: 120), the first sample whose details depend
-        only on the signal (105), and the number of columns to drop at the beginning, ``first + delay`` (225).
+    delay : int
+        Lag of the details behind the signal [samples], 120 for db8 to level 4.
+    first : int
+        Number of the first sample whose details depend only on the signal, 105 for db8 to level 4.
+    settling : int
+        Number of columns to drop at the beginning, ``first + delay``.
     samples : int
         Number of samples of each signal so far.
 
@@ -80,7 +83,8 @@ class DetailStream:
             raise InputError(f"channels must be a number or rows and columns of a table, got {channels}")
         self._shape_2d = require_positive_int(table[0], "channels"), require_positive_int(table[1], "channels")
         self.channels = self._shape_2d if isinstance(channels, tuple) else self._shape_2d[1]
-        self.levels, self.wavelet = require_levels(levels), wavelet
+        self.levels = require_levels(levels)
+        self.wavelet = wavelet
         self.threads = require_positive_int(threads, "threads")
         low, high = (np.repeat(taps[:, None], WIDTH, axis=1) for taps in decomposition_filters(wavelet))
         self.first, self.delay = (int(samples) for samples in reach(wavelet, self.levels)[-1])
@@ -89,11 +93,11 @@ class DetailStream:
         level_delays = len(low) // 2 * (2**self.levels - 2 * dilations)  # so that all levels lag like the deepest
         self._history = max(self.delay, int(np.max(level_delays + (len(low) - 1) * dilations)))
         groups = -(-self._shape_2d[1] // WIDTH)
-        # the kernels take taps (taps, WIDTH) of low- and high-pass, and the levels' buffers (groups, rows of the table,
-        # levels, history and CHUNK, WIDTH)
-        self.taps = low, high
+        self.taps = low, high  # each (taps, WIDTH), as the kernels take them
+        # (groups, rows of the table, levels, samples, WIDTH)
         self.buffers = aligned_zeros((groups, self._shape_2d[0], self.levels, self._history + CHUNK, WIDTH))
-        self._fill, self.samples = self._history, 0
+        self._fill = self._history  # number of used rows in the buffers
+        self.samples = 0
         n_parts = min(self.threads, groups)
         self._parts = list(pairwise(groups * i // n_parts for i in range(n_parts + 1)))
         self._workspaces = [aligned_zeros((self.levels, CHUNK, WIDTH)) for _ in self._parts]
@@ -105,7 +109,7 @@ class DetailStream:
         ----------
         block : array_like
             Samples (channels, n), or (n,) of a single signal; n may be 0. A missing sample (NaN) affects only its own
-            signal, and that for `settling` columns after it.
+            signal, in at most this and the next `settling` columns.
         out : ndarray, optional
             Array to write the result into: C-contiguous doubles in the shape of the result. If the block is of
             C-contiguous doubles, too, no other memory is allocated.
@@ -118,15 +122,15 @@ class DetailStream:
         Raises
         ------
         InputError
-            For a block or an `out` of a wrong shape.
+            For a block of a wrong shape, or an unsuitable `out`.
         """
         from sealscope.signals.kernels import advance_details
 
         shape = self.channels if isinstance(self.channels, tuple) else (self.channels,)
         is_single_signal = shape == (1,) and np.ndim(block) == 1
         if not is_single_signal and (np.ndim(block) == 0 or np.shape(block)[:-1] != shape):
-            sizes = "" if shape == (1,) else "".join(f"{size}, " for size in shape)
-            raise InputError(f"block must have shape ({sizes or 'n,'}{'n' if sizes else ''}), got {np.shape(block)}")
+            expected = "n," if shape == (1,) else "".join(f"{size}, " for size in shape) + "n"
+            raise InputError(f"block must have shape ({expected}), got {np.shape(block)}")
         n = np.shape(block)[-1]
         x = np.ascontiguousarray(block, dtype=np.float64).reshape(*self._shape_2d, n).view()
         x.setflags(write=False)  # so that the kernel is compiled for one type, read-only arrays
@@ -146,8 +150,8 @@ class DetailStream:
         def filter_part(part: tuple[int, int], work: Array) -> int:
             """Filter the block for a part of the groups of eight signals, in one thread.
 
-            `part` are the first and the last + 1 group, and `work` is the thread's work array. Returns the number
-            of rows that are then in use in the buffers.
+            `part`: (first, last + 1) of these groups; `work`: the thread's work array. Returns the number of rows that
+            are in use in the buffers afterwards, which is the same for all parts.
             """
             return advance_details(part, x, self.buffers, self._fill, self._history, *self.taps, work, target)
 
@@ -166,7 +170,7 @@ class DetailStream:
     def state_dict(self) -> dict[str, Any]:
         """Return the state of the stream as plain values and arrays, from which `from_state` continues.
 
-        `history` holds the last inputs of the filters.
+        `history` (rows of the table, levels, samples, columns of the table): last inputs of each level's filters.
         """
         history = np.moveaxis(self.buffers[:, :, :, self._fill - self._history : self._fill], 0, -2)
         return {
@@ -190,7 +194,7 @@ class DetailStream:
         history = require_numbers(state, "history", shape)
         stream.samples = require_count(state, "samples")
         groups, width = stream.buffers.shape[0], stream.buffers.shape[-1]
-        # the actuators, filled up to whole groups, divided into groups of lanes
+        # the signals (last axis), filled up with zeros to whole groups and divided into groups
         lanes = np.pad(history, [(0, 0)] * 3 + [(0, groups * width - shape[-1])]).reshape(*shape[:3], groups, width)
         stream.buffers[:, :, :, : stream._history] = np.moveaxis(lanes, -2, 0)
         return stream
@@ -202,5 +206,5 @@ def aligned_zeros(shape: tuple[int, ...]) -> Array:
     No row of 8 doubles is then divided between two cache lines.
     """
     values = np.zeros(math.prod(shape) + 8)  # 8 doubles of 8 bytes are one cache line
-    skip = -(values.ctypes.data // 8) % 8
+    skip = -(values.ctypes.data // 8) % 8  # doubles before the next cache line
     return values[skip : skip + math.prod(shape)].reshape(shape)

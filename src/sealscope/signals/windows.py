@@ -26,9 +26,9 @@ WINDOW_STEP = 500
 class WindowedRms(NamedTuple):
     """RMS of sliding windows over a series.
 
-    `rms` (..., w) are the values in the series' unit, and `ends` (w,) the number of the sample just after each
-    window. A window of `size` samples covers the samples ends - size .. ends - 1; its centre is at ``(ends - size /
-    2) / rate`` seconds.
+    `rms` (..., w): RMS of each window, in the series' unit; `ends` (w,): number of the sample just after the window. A
+    window of `size` samples covers the samples ends - size .. ends - 1; its centre is at ``(ends - size / 2) / rate``
+    seconds.
     """
 
     ends: IntArray
@@ -68,13 +68,13 @@ def windowed_rms(
 class RmsStream:
     """RMS over sliding windows of live series; identical to `windowed_rms`, for blocks of any size.
 
-    For the output of a `DetailStream`, pass its `settling` as `skip` and its `first` as `first`: the windows are then
-    those of ``windowed_rms(details)``. A value that is not finite affects only the windows that contain it.
+    For the output of a `DetailStream`, pass its `settling` as `skip` and its `first` as `first`. The result then has
+    the same windows as ``windowed_rms(details)``. A value that is not finite affects only the windows that contain it.
 
     Parameters
     ----------
     size, step : int
-        Number of samples in a window, and from the start of one window to that of the next.
+        Number of samples in a window, and from the start of one window to the start of the next.
     skip : int, default 0
         Number of values to omit at the beginning of the stream.
     first : int, default 0
@@ -101,13 +101,14 @@ class RmsStream:
         if isinstance(skip, bool) or not isinstance(skip, (int, np.integer)) or skip < 0:
             raise InputError(f"skip must be a whole number >= 0 samples, got {skip!r}")
         self._piece = math.gcd(self.size, self.step)
-        self._skip, self._next_end = int(skip), int(first) + self.size
+        self._skip = int(skip)
+        self._next_end = int(first) + self.size
         self._rest: Array | None = None  # samples of an incomplete piece, (..., fewer than piece)
         self._sums: Array | None = None  # sums of squares of the pieces of later windows, (..., pieces)
-        self._n_unused = 0  # number of pieces to skip, which are in no window (step > size)
+        self._n_unused = 0  # number of coming pieces that lie between two windows (if step > size), to be skipped
 
     def update(self, block: ArrayLike) -> WindowedRms:
-        """Add the next block of samples and return the RMS of the windows that it completes, possibly none.
+        """Add the next block of samples and return the RMS of the windows that it completes.
 
         Parameters
         ----------
@@ -117,12 +118,12 @@ class RmsStream:
         Returns
         -------
         WindowedRms
-            `ends` (w,), the number of the sample just after each window, and `rms` (..., w).
+            `ends` (w,), the number of the sample just after each window, and `rms` (..., w); w may be 0.
 
         Raises
         ------
         InputError
-            If the leading axes differ from those of the first block.
+            If the block is a single number, or its leading axes differ from those of the first block.
         """
         x = np.asarray(block, dtype=np.float64)
         if x.ndim == 0:
@@ -143,7 +144,7 @@ class RmsStream:
         sums = sums[..., n_skipped:]
         values = _rms_of_pieces(sums, self.size, self.step)
         n_windows = values.shape[-1]
-        n_finished = n_windows * (self.step // self._piece)  # pieces before the next window
+        n_finished = n_windows * (self.step // self._piece)  # pieces before the next window; some may be still to come
         self._n_unused += max(0, n_finished - sums.shape[-1])
         self._sums = sums[..., n_finished:].copy()
         ends = self._next_end + self.step * np.arange(n_windows, dtype=np.int64)
@@ -167,7 +168,8 @@ class RmsStream:
         """Make a stream that continues from a saved `state_dict`; raise InputError if the state is not valid."""
         size, step, rest, sums = (require_part(state, name, object) for name in ("size", "step", "rest", "sums"))
         stream = cls(size, step, skip=require_count(state, "skip"))
-        stream._next_end, stream._n_unused = require_count(state, "next_end"), require_count(state, "ahead")
+        stream._next_end = require_count(state, "next_end")
+        stream._n_unused = require_count(state, "ahead")
         if rest is None and sums is None:
             return stream
         leading_axes = np.shape(rest)[:-1]
@@ -181,7 +183,7 @@ class RmsStream:
 def _piece_sums(x: Array, piece: int) -> Array:
     """Compute the sums of squares of consecutive pieces of a series, (..., n // piece).
 
-    Each piece has `piece` samples of `x` (..., n); an incomplete last one is left out.
+    Each piece has `piece` samples of `x` (..., n); an incomplete last piece is left out.
     """
     n_pieces = x.shape[-1] // piece
     in_pieces = np.ascontiguousarray(x[..., : n_pieces * piece])
@@ -195,10 +197,10 @@ def _rms_of_pieces(sums: Array, size: int, step: int) -> Array:
     order. `size`: number of samples in a window; `step`: number of samples from one window to the next.
     """
     piece = math.gcd(size, step)
-    per_window, per_step = size // piece, step // piece  # pieces
-    n_windows = max(0, (sums.shape[-1] - per_window) // per_step + 1)
+    pieces_per_window, pieces_per_step = size // piece, step // piece
+    n_windows = max(0, (sums.shape[-1] - pieces_per_window) // pieces_per_step + 1)
     squares = np.zeros((*sums.shape[:-1], n_windows))
     if n_windows:
-        for i in range(per_window):
-            squares += sums[..., i : i + (n_windows - 1) * per_step + 1 : per_step]
+        for i in range(pieces_per_window):  # piece i of all windows
+            squares += sums[..., i : i + (n_windows - 1) * pieces_per_step + 1 : pieces_per_step]
     return np.asarray(np.sqrt(squares / size))

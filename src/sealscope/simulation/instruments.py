@@ -34,9 +34,10 @@ class Outputs(Protocol):
 def anti_alias_taps(factor: int, delay: float = 0.0) -> Array:
     """Compute the coefficients of the anti-alias filter, (2 FILTER_REACH factor + 1,).
 
-    The filter is a Kaiser-windowed sinc of unit gain. `factor`: the signal's rate over the recording's; `delay`: lag
-    of the filter as a fraction of the signal's sampling interval, 0 for zero phase. For `factor` 1 without a delay it
-    is a single coefficient of 1.
+    The filter is a Kaiser-windowed sinc of unit gain. The coefficients are not reversed when they are applied: the
+    first multiplies the earliest value, the middle one the value at the time of the output. `factor`: the signal's rate
+    over the recording's; `delay`: lag of the output behind the signal as a fraction of the signal's sampling interval,
+    0 for zero phase. For `factor` 1 without a delay there is a single coefficient, 1.
     """
     if factor == 1 and delay == 0.0:
         return np.ones(1)

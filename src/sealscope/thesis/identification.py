@@ -55,7 +55,8 @@ def noise_free_mean_squares(
     values = {**experiment_values(condition), **(values or {})}
     experiment = Experiment.of(rig=rig, command=condition.command, set=values, leak=leak, duration=duration, x_0=x_0)
     _, trajectory = run_with_sized_leaks(experiment)
-    factor, rate = oversampling(experiment), experiment.rate
+    factor = oversampling(experiment)  # outputs of the solver for each sample
+    rate = experiment.rate
     bounds = [round(SETTLING * rate), round((SETTLING + ANALYSED) * rate)]
     sampled = (decimate(trajectory[chamber], factor, round(duration * rate)) / PSI for chamber in CHAMBERS)
     return np.concatenate([mean_squares(details(pressure), bounds) for pressure in sampled])
@@ -93,13 +94,15 @@ def log_residuals(rig: Rig, sheet: DataSheet) -> Array:
     simulated at its own sampling rate. `sheet`: the measured data sheet.
     """
     group_squares = {}
-    for command, closed_pct in groups():  # the number and the level have no effect
-        condition = Condition(0, command, closed_pct, mean_leak_lpm=0.0, level="")
+    for command, closed_pct in groups():
+        # number and level have no effect on the simulation
+        condition = Condition(number=0, command=command, closed_pct=closed_pct, mean_leak_lpm=0.0, level="")
         group_squares[condition.group] = noise_free_mean_squares(rig, condition)
     squares = np.array([group_squares[condition.group] for condition in APPENDIX_C])
     simulated = [log_rms(squares[:, k], pressure_noise(rig, chamber)) for k, chamber in enumerate(CHAMBERS)]
-    measured = [[sheet.rms[chamber][name][:, 0] for name in QUANTITIES] for chamber in CHAMBERS]
-    return np.asarray(np.stack(simulated, axis=1) - np.log(np.moveaxis(np.array(measured), -1, 0)))
+    leak_free = [[sheet.rms[chamber][name][:, 0] for name in QUANTITIES] for chamber in CHAMBERS]
+    measured = np.moveaxis(np.array(leak_free), -1, 0)  # (tests, chambers, 5)
+    return np.asarray(np.stack(simulated, axis=1) - np.log(measured))
 
 
 @dataclass(frozen=True)
@@ -107,11 +110,15 @@ class Hypothesis:
     """A possible difference between the real rig and the rig that was fitted to the tests of Appendix C.
 
     The fitted rig is symmetric: both chamber pressures ring alike, and a leak damps both. In Appendix C, however, the
-    RMS of the wavelet detail d3 of p_A falls with the leak while that of d4 of p_B rises. A test has a half without
-    and a half with the leak. `overrides`: values of parameters in both halves; `factors`: factors on parameters in
-    both halves; `leaking_factors`: further factors in the half with the leak; `x_0`, `x_0_leaking` [m]: start of the
-    piston in the half without and in the half with the leak; `extra_closing_B`: closed fraction of throttle B minus
-    that of A; `gain_B`: gain of the pressure sensor B; `law`: law of the leak's flow, "laminar" or "orifice".
+    RMS of the wavelet detail d3 of p_A falls with the leak while the RMS of d4 of p_B rises. A test has a half without
+    and a half with the leak.
+
+    - `overrides`, `factors`: values of parameters, and factors on parameters, in both halves
+    - `leaking_factors`: further factors in the half with the leak
+    - `x_0`, `x_0_leaking` [m]: start of the piston in the half without and in the half with the leak
+    - `extra_closing_B`: closed fraction of throttle B minus that of A
+    - `gain_B`: gain of the pressure sensor B
+    - `law`: law of the leak's flow, "laminar" or "orifice"
     """
 
     name: str
@@ -125,7 +132,7 @@ class Hypothesis:
     law: Literal["laminar", "orifice"] = "laminar"
 
 
-#: The hypotheses on columns that the symmetric rig does not explain; the first is the rig itself.
+#: The hypotheses on what the symmetric rig does not explain; the first is the fitted rig itself, unchanged.
 HYPOTHESES = tuple(Hypothesis(name, **values) for name, values in load_texts("hypotheses.toml").items())
 
 
@@ -134,13 +141,13 @@ def predicted_sheet(
 ) -> DataSheet:
     """Simulate the tests of Appendix C on a rig that is changed according to a hypothesis; return the data sheet.
 
-    `conditions`: the inputs of the tests, each of which is simulated without and with its leak. The sheet has the RMS
-    of the wavelet details in psi, of their product d3d4 in psi^2.
+    `conditions`: inputs of the tests, each of which is simulated without and with its leak. The sheet has the RMS of
+    the wavelet details d1..d4 [psi] and of the product d3d4 [psi^2].
     """
     h = hypothesis
     healthy_rig = _scale_parameters(rig.with_overrides(h.overrides) if h.overrides else rig, h.factors)
     leaking_rig = _scale_parameters(healthy_rig, h.leaking_factors)
-    leak_free: dict[tuple[str, float], Array] = {}  # the mean squares of a condition, which several tests repeat
+    leak_free: dict[tuple[str, float], Array] = {}  # mean squares by operating condition, which several tests share
     rms = np.empty((len(conditions), 2, len(CHAMBERS), len(QUANTITIES)))
     for row, condition in enumerate(conditions):
         # less than 1, as a closed throttle would stop the flow
@@ -151,14 +158,15 @@ def predicted_sheet(
         leaking = noise_free_mean_squares(leaking_rig, condition, leak=leak, x_0=h.x_0_leaking, values=closed)
         for half, squares in enumerate((leak_free[condition.group], leaking)):
             for k, chamber in enumerate(CHAMBERS):
-                # mean squares scale with the gain squared, those of the product d3d4 with its fourth power
-                scaled = squares[k] * np.array([h.gain_B**2] * 4 + [h.gain_B**4]) if chamber == "p_B" else squares[k]
+                scaled = squares[k]
+                if chamber == "p_B":  # d1..d4 squared scale with the gain squared, d3d4 squared with its fourth power
+                    scaled = squares[k] * np.array([h.gain_B**2] * 4 + [h.gain_B**4])
                 rms[row, half, k] = np.exp(log_rms(scaled, pressure_noise(rig, chamber)))
     return DataSheet({c: {q: rms[:, :, k, j] for j, q in enumerate(QUANTITIES)} for k, c in enumerate(CHAMBERS)})
 
 
 def _scale_parameters(rig: Rig, factors: Mapping[str, float]) -> Rig:
-    """Multiply parameters of a rig by factors, given by the parameter's name; return the new rig."""
+    """Multiply parameters of a rig by `factors`, by name of the parameter; return the new rig."""
     return rig.with_overrides({name: float(rig[name]) * factor for name, factor in factors.items()}) if factors else rig
 
 
@@ -167,7 +175,8 @@ def parameters_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
 
     The columns are name, meaning, value in the thesis's rig, value in the fitted rig, and source.
     """
-    fitted, thesis_rows = load_rig(BENCH_RIG), {row.name: row for row in load_rig("thesis").table()}
+    fitted = load_rig(BENCH_RIG)
+    thesis_rows = {row.name: row for row in load_rig("thesis").table()}
     rows = [
         (row.name, row.meaning, thesis_rows[row.name].given, row.given, row.source)
         for row in fitted.table()
@@ -180,8 +189,9 @@ def parameters_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
 def fit_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Tabulate the ratio of simulated to measured leak-free RMS of each wavelet detail, for the fitted rig.
 
-    Returns two tables: geometric mean and geometric standard deviation over all tests of Appendix C, and geometric
-    means over the tests of each operating condition (command and closing of the throttles).
+    Returns two tables. The first has the geometric mean over all tests of Appendix C, "yes" if this is within 25 % of
+    1, and the geometric standard deviation. The second has the geometric means over the tests of each operating
+    condition (command and closing of the throttles).
     """
     assert context.sheet is not None
     residuals = log_residuals(load_rig(BENCH_RIG), context.sheet)
@@ -203,10 +213,13 @@ def fit_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
 def hypotheses_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Tabulate how well the fitted rig, changed as each hypothesis says, agrees with the measured data sheet.
 
-    For some wavelet details of each chamber the columns are: the geometric mean of simulated over measured leak-free
-    RMS; the geometric mean change of the simulated RMS with the leak [%]; and the number of tests in which this change
-    has the sign of the measured one. The first row is the measured sheet itself. A quick reproduction simulates only
-    the first two hypotheses.
+    The columns are, for some wavelet details of each chamber:
+
+    - the geometric mean of simulated over measured leak-free RMS;
+    - the geometric mean change of the simulated RMS with the leak [%];
+    - the number of tests in which simulated and measured change have the same sign.
+
+    The first row is the measured sheet itself. A quick reproduction simulates only the first two hypotheses.
     """
     assert context.sheet is not None
     sheet = context.sheet
@@ -221,7 +234,8 @@ def hypotheses_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
         return np.asarray(np.sign(sheet.rms[c][q][:, 1] - sheet.rms[c][q][:, 0]))
 
     measured = [float(100 * np.expm1(np.mean(sheet.log_change(c, q)))) for c, q in change_columns]
-    n = len(level_columns)  # the sheet agrees with itself in all of its tests
+    n = len(level_columns)
+    # the sheet agrees with itself: all ratios are 1, and all tests have the same sign
     rows: list[tuple[Cell, ...]] = [("the sheet", *[1.0] * n, *measured, *[sheet.tests] * n)]
     rig = load_rig(BENCH_RIG)
     for hypothesis in HYPOTHESES[:2] if context.quick else HYPOTHESES:

@@ -28,9 +28,10 @@ COLUMNS = tuple(product(CHAMBERS, QUANTITIES))
 UNITS = {name: "psi^2" if name == "d3d4" else "psi" for name in QUANTITIES}
 #: Name of the rig that was fitted to the leak-free columns of Appendix C.
 BENCH_RIG = "thesis-calibrated"
-#: File of each chamber, the environment variable that names their folder, and the reason why an item is left out.
+#: File of the measured data sheet for each chamber, and the environment variable that names the folder of both files.
 FILES = {"p_A": "appendix_c_pa.csv", "p_B": "appendix_c_pb.csv"}
 VARIABLE = "SEALSCOPE_SHEET"
+#: Reason for which an item is left out if the sheet is not given.
 MISSING = "needs the data sheet: give --sheet"
 _HALVES = ("no_leak", "leak")
 _POSITIVE_COLUMNS = ("mean_leak_lpm", "input_amplitude_v", "input_omega_rad_s")
@@ -39,7 +40,7 @@ _CLOSED_COLUMN, _LEVEL_COLUMN = "orifice_closed_pct", "leakage_level"
 
 @dataclass(frozen=True)
 class Condition:
-    """The inputs of one leakage test of Appendix C; `number` counts the tests from 1, in the order printed.
+    """The inputs of one leakage test of Appendix C; `number` counts the tests from 1, in the printed order.
 
     `command`: text for `parse_command`; `closed_pct`: closing of both throttles [%]; `mean_leak_lpm`: mean leak
     [L/min] after the bypass valve was opened; `level`: position of the bypass's needle valve, which does not
@@ -61,8 +62,8 @@ class Condition:
 def experiment_values(condition: Condition) -> dict[str, str | float]:
     """Return the rig parameters of a test `condition` by name, for `Rig.with_overrides` or `Experiment.of(set=...)`.
 
-    Both throttles are closed equally. If they are fully open, `line.orifices` is left as the rig has it: absent in
-    the thesis's model (section 4.2.1), present in a rig that includes the open valves.
+    Both throttles are closed equally. If they are fully open, `line.orifices` is not set, so that the rig's own value
+    holds: absent in the thesis's model (section 4.2.1), present in a rig that includes the open valves.
     """
     closed = condition.closed_pct / 100.0
     values: dict[str, str | float] = {"line.closed_A": closed, "line.closed_B": closed}
@@ -137,9 +138,9 @@ def find_sheet(folder: str | os.PathLike[str] | None = None) -> Path | None:
 def read_sheet(folder: Path) -> tuple[DataSheet, str]:
     """Read the measured data sheet in `folder`; return it with a SHA-256 digest of its two files.
 
-    Raises UnreadableFile if a file cannot be read. Raises InputError if a column or a row is missing, or if a value is
-    not a positive number (only the closing may be 0). It is also raised if command, closing, leak and level in row k
-    differ from test k in `APPENDIX_C`.
+    Raises UnreadableFile if a file cannot be read. Raises InputError if a column is missing, if there is not one row
+    for each test, if a value is not a positive number (only the closing may be 0), or if row k and test k in
+    `APPENDIX_C` differ in command, closing, leak or level.
     """
     rms: dict[str, dict[str, Array]] = {}
     digest = hashlib.sha256()
@@ -185,8 +186,8 @@ def _parse_number(row: dict[str, str], column: str, number: int, path: Path, *, 
 def _check_condition(row: dict[str, str], condition: Condition, path: Path) -> None:
     """Check that a row of the data sheet states the same test as `condition`; raise InputError otherwise.
 
-    Compared are the command, the closing of the throttles [%], the mean leak [L/min], and the leak's level, such as
-    "large". `path`: the file, for messages.
+    The command, the closing of the throttles [%], the mean leak [L/min], and the leak's level, such as "large", must be
+    equal. `path`: the file, for messages.
     """
     leak, amplitude, omega = (_parse_number(row, column, condition.number, path) for column in _POSITIVE_COLUMNS)
     closed = _parse_number(row, _CLOSED_COLUMN, condition.number, path, allow_zero=True)

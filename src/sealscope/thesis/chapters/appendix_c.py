@@ -23,7 +23,7 @@ def _percent_change(pairs: Array) -> Array:
 def _chamber_table(sheet: DataSheet, measured: DataSheet | None, chamber: str, item: Item) -> ThesisTable:
     """Tabulate the RMS of one chamber's wavelet details in all tests of Appendix C, in the form of the thesis.
 
-    A detail has six columns: RMS without the leak, RMS with it, and the change [%], simulated and then measured.
+    A detail has six columns: RMS without the leak, RMS with the leak, and the change [%], simulated and then measured.
     `sheet`: the simulated data sheet; `measured`: the measured one, None if not given, for which the cells are empty;
     `chamber`: "p_A" or "p_B"; `item`: entry of `items.toml` for which the table is made.
     """
@@ -49,11 +49,15 @@ def _chamber_table(sheet: DataSheet, measured: DataSheet | None, chamber: str, i
 def compare_sheets(sheet: DataSheet, measured: DataSheet | None) -> list[tuple[Cell, ...]]:
     """Compare the simulated data sheet with the measured one, in one row for each chamber and wavelet detail.
 
-    The first four columns are the chamber, the detail, and the mean change of the detail's RMS due to the leak [%],
-    in the simulation and in the measurement. The next two are the geometric mean and the geometric standard deviation
-    of the ratio of the simulated RMS to the measured RMS, without a leak. The last two are the number of tests in
-    which both RMS change in the same direction, and the correlation of their logarithmic changes. All columns but the
-    first three are None without a measured sheet.
+    All means are over the tests. The columns are:
+
+    - chamber and detail;
+    - geometric mean change of the RMS with the leak [%], i.e. 100 (exp(mean log change) - 1), simulated and measured;
+    - geometric mean and geometric standard deviation of the simulated over the measured RMS, both without the leak;
+    - number of tests in which the simulated and the measured RMS change in the same direction;
+    - correlation of the simulated and the measured logarithmic changes.
+
+    Without a measured sheet all columns but the first three are None.
     """
     rows: list[tuple[Cell, ...]] = []
     for chamber, name in COLUMNS:
@@ -62,10 +66,13 @@ def compare_sheets(sheet: DataSheet, measured: DataSheet | None) -> list[tuple[C
         if measured is not None:
             measured_change = measured.log_change(chamber, name)
             log_ratio = np.log(sheet.rms[chamber][name][:, 0] / measured.rms[chamber][name][:, 0])
-            same_sign = int(np.sum(np.sign(simulated_change) == np.sign(measured_change)))
-            correlation = np.corrcoef(simulated_change, measured_change)[0, 1]
-            numbers = 100 * np.expm1(measured_change.mean()), np.exp(log_ratio.mean()), np.exp(log_ratio.std(ddof=1))
-            comparison = (*map(float, numbers), same_sign, float(correlation))
+            comparison = (
+                float(100 * np.expm1(measured_change.mean())),
+                float(np.exp(log_ratio.mean())),
+                float(np.exp(log_ratio.std(ddof=1))),
+                int(np.sum(np.sign(simulated_change) == np.sign(measured_change))),
+                float(np.corrcoef(simulated_change, measured_change)[0, 1]),
+            )
         rows.append((chamber, name, float(100 * np.expm1(simulated_change.mean())), *comparison))
     return rows
 
@@ -85,9 +92,9 @@ def agreement_tables(context: Context, item: Item) -> tuple[ThesisTable, ...]:
 def difference_figure(context: Context, item: Item) -> tuple[Figure, ...]:
     """Draw the change of a wavelet detail's RMS with the leak, over the mean leak of each test.
 
-    The points are the measured change, the change simulated with the leak, and that simulated without any leak between
-    the two halves of a test. One panel shows the changes in the unit of the RMS, the other in %. `item.inputs` has the
-    chamber, the detail, and the direction in which a leak should change it ("down" or "up").
+    The points are the measured change, the change simulated with the leak, and the change between the two halves of a
+    test that is simulated without any leak. One panel shows the changes in the unit of the RMS, the other in %.
+    `item.inputs` has the chamber, the detail, and the direction in which a leak should change the RMS ("down" or "up").
     """
     chamber, name, direction = (item.inputs[key] for key in ("chamber", "detail", "way"))
     (table, sheet), leak = simulated_sheet(context, "leak"), mean_leaks()

@@ -30,7 +30,7 @@ from sealscope.units import PSI
 HALF, QUICK_HALF = 90.0, 40.0
 #: Beginning of each record that is left out [s]: the simulated rig starts at standstill, the thesis's was running.
 SETTLING = 5.0
-#: Kind of runs: what changes at half time; and the seed of the first test of each kind.
+#: Kind of runs, by what changes at half time, and a number for each kind to which the seeds of its tests are added.
 Runs = Literal["leak", "no-leak", "drift"]
 _SEEDS: Mapping[Runs, int] = {"leak": 0, "no-leak": 1000, "drift": 2000}
 #: RMS before and after half time, by chamber and quantity.
@@ -45,7 +45,8 @@ def draw_drifts(number: int, half: float, draw: int = 0) -> tuple[ParameterDrift
     test; `half`: time of the step, half the duration [s]; `draw`: 0, 1, .. for different draws of one test. The random
     numbers depend on `number` and `draw` only.
     """
-    rng, drifts = np.random.default_rng([_SEEDS["drift"], draw, number]), load_texts("cases.toml")["drifts"].values()
+    rng = np.random.default_rng([_SEEDS["drift"], draw, number])
+    drifts = load_texts("cases.toml")["drifts"].values()
     sizes = [rng.uniform(*drift["shares"]) for drift in drifts]
     changes = rng.choice([-1.0, 1.0], size=len(sizes)) * sizes
     return tuple(
@@ -112,7 +113,7 @@ def part_detail_rms(recording: Recording, parts: Sequence[tuple[float, float]]) 
     bounds = np.round(np.array(parts) * recording.rate).astype(int) + np.array([before, -after])
     result = {}
     for chamber in CHAMBERS:
-        # the even intervals between the bounds are the parts
+        # every second interval between the bounds is a part; the others lie between two parts
         squares = mean_squares(details(recording[chamber] / PSI), bounds.ravel())[::2]
         result[chamber] = {q: tuple(rms.tolist()) for q, rms in zip(QUANTITIES, np.sqrt(squares).T, strict=True)}
     return result
@@ -172,7 +173,8 @@ def runs_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     in a quick reproduction.
     """
     half, kind = QUICK_HALF if context.quick else HALF, item.inputs["runs"]
-    rows, proved = [], dict[tuple[str, float], bool | None]()  # condition -> whether its proved run is resolved
+    rows = []
+    proved: dict[tuple[str, float], bool | None] = {}  # operating condition -> True if halving the step changed little
     for condition, experiment in build_experiments(kind, half, context.quick):
         prove = kind == "leak" and not context.quick and condition.group not in proved
         run = simulate_run(experiment, prove)
@@ -183,7 +185,8 @@ def runs_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
         ranges = [pressure_range(run.outputs[chamber][is_before]) / 1e6 for chamber in CHAMBERS]
         rows.append(make_row(condition, _describe_change(experiment), run.mean_leak_lpm, ranges, rms))
     proof = "One test of each condition is proved by halving the step."
-    proof = "No run is proved (quick)." if context.quick else proof
+    if context.quick:
+        proof = "No run is proved (quick)."
     bounds = {}  # name of a drift -> text of the sizes from which it is drawn
     for name, drift in load_texts("cases.toml")["drifts"].items():
         low, high = drift["shares"]

@@ -24,9 +24,9 @@ TONES = ((100.0, 1.0), (30.0, 0.5))
 WAVELET = "db8"
 #: Command of the simulated pressures, and the largest mean leak of Appendix C with it.
 _COMMAND, _LEAK = "3 sin(4t)", "0.0163 L/min"
-#: Onset of the leak, end of the start-up, and length of the blocks of a running rms [s].
+#: Onset of the leak, end of the start-up, and length of the blocks in which an rms is computed [s].
 _ONSET, _SETTLED, _BLOCK = 10.0, 1.0, 0.05
-#: Number of factors after which the infinite product of the wavelet's spectrum has converged.
+#: Number of factors of the wavelet's spectrum after which the infinite product has converged.
 _N_FACTORS = 24
 
 
@@ -50,7 +50,7 @@ class WaveletCentre(NamedTuple):
 
 
 class AmplitudeSpectrum(NamedTuple):
-    """Amplitudes and phases [degree] of the cosines of which a signal consists, by frequency [Hz]; each (n,)."""
+    """Amplitudes and phases [degree] of the cosines whose sum is a signal, by frequency [Hz]; each (n,)."""
 
     frequency: Array
     amplitude: Array
@@ -116,11 +116,12 @@ def continuous_transform(x: Array, rate: float, scales: Array) -> Array:
     """Compute the continuous wavelet transform of samples `x` (n,) at `rate` [Hz] for `scales` a [s].
 
     CWT(a, b) = integral of x(t) |a|^(-1/2) psi((t - b)/a) dt, eqs. (3.4), (3.6). The mean of x is subtracted, the
-    record is mirrored at its ends, and the integral is computed by Fourier transforms. The time b is that of the
+    record is mirrored at its ends, and the integral is computed by Fourier transforms. The time b is the
     wavelet's middle (the centre of its energy). Returns (scales, n), a column for b at each sample [unit of x times
     s^0.5].
     """
-    wavelet_reach = int(np.ceil(16.0 * float(np.max(scales)) * rate))  # db8 is 15 long at scale 1
+    # db8 is 15 samples long at scale 1; 16 leaves a margin
+    wavelet_reach = int(np.ceil(16.0 * float(np.max(scales)) * rate))
     pad = min(x.size - 1, wavelet_reach)
     padded = np.pad(x - x.mean(), pad, mode="symmetric")
     omega = 2.0 * np.pi * np.fft.rfftfreq(padded.size, 1.0 / rate)
@@ -142,11 +143,13 @@ def inverse_gain(frequencies: Array, weight: float = 2.0) -> Array:
 
     where Psi is the spectrum of the wavelet db8 and w = 2 pi f; the integral is over six decades of scales around the
     frequencies. With weight 2 the gain is the same at all frequencies (the wavelet's admissibility constant), and
-    dividing by it recovers the signal. Eq. (3.5) is printed with weight 0, for which the gain falls as 1/w^2.
+    the signal is recovered by a division by this constant. Eq. (3.5) is printed with weight 0, for which the gain falls
+    as 1/w^2.
     """
     omega = 2.0 * np.pi * np.asarray(frequencies, dtype=np.float64)
     geometric_mean = float(np.exp(np.mean(np.log(omega))))
     a = np.geomspace(1e-3, 1e3, 12000) / geometric_mean
+    # da = a d(ln a)
     gains = [np.trapezoid(a ** (1.0 - weight) * np.abs(wavelet_spectrum(a * w)) ** 2 * a, np.log(a)) for w in omega]
     return np.array(gains)
 
@@ -157,7 +160,7 @@ def two_tone_signal(t: Array) -> Array:
 
 
 def amplitude_spectrum(x: Array, rate: float) -> AmplitudeSpectrum:
-    """Compute the amplitudes and phases of the cosines of which `x` (n,), sampled at `rate` [Hz], consists.
+    """Compute the amplitudes and phases of the cosines whose sum is the signal `x` (n,), sampled at `rate` [Hz].
 
     They follow from the discrete Fourier transform of eq. (3.2).
     """
@@ -200,7 +203,8 @@ def two_tone_figure(context: Context, item: Item) -> tuple[Figure, ...]:
         numbers.append(Number(f"phase at {tone:g} Hz (cosine 0)", float(phase[k]), "deg"))
     elsewhere = np.delete(amplitude, list(tone_indices.values()))
     numbers.append(Number("largest amplitude elsewhere", float(elsewhere.max())))
-    beginning, lines = t < 0.2, amplitude > 1e-6  # smaller ones are rounding errors
+    beginning = t < 0.2  # [s]
+    lines = amplitude > 1e-6  # smaller amplitudes are rounding errors
     signal = FigureCurve(t[beginning], x[beginning], "x(t), eq. 3.3", "reference")
     spectrum = FigureCurve(frequency[lines], amplitude[lines], "2 |X[n]| / N, eq. 3.2", "reference", "stems")
     x_range = (0.0, 150.0)
@@ -233,8 +237,8 @@ def wavelet_figure(context: Context, item: Item) -> tuple[Figure, ...]:
 def vanishing_moments(psi: Array, t: Array) -> int:
     """Count the vanishing moments of a wavelet `psi` (n,) over the time `t` (n,).
 
-    These are the integrals of t^k psi(t), k = 0, 1, ..., before the first one that is not 0, to within rounding; at
-    most 20 are counted.
+    The moments are the integrals of t^k psi(t), k = 0, 1, ... Those before the first moment that differs from 0, to
+    within rounding, are counted, at most 20.
     """
     k = 0
     centred = t - t.mean()  # smaller powers, the same number of vanishing moments
@@ -282,8 +286,7 @@ def transform_figure(context: Context, item: Item) -> tuple[Figure, ...]:
 def _width(t: Array, values: Array) -> float:
     """Compute the width [s] of the largest peak of a series `values` over `t` [s].
 
-    It is the standard deviation of the times around their mean, both weighted by `values` squared, within 0.1 s of the
-    maximum.
+    The width is the standard deviation of the times within 0.1 s of the maximum, weighted by `values` squared.
     """
     near_peak = np.abs(t - t[values.argmax()]) < 0.1
     weight = values[near_peak] ** 2 / np.sum(values[near_peak] ** 2)
@@ -294,7 +297,7 @@ def _width(t: Array, values: Array) -> float:
 def scalogram_figure(context: Context, item: Item) -> tuple[Figure, ...]:
     """Draw the wavelet transform of a simulated, ringing chamber pressure p_A without and with a leak.
 
-    The transform follows eqs. (3.4)-(3.6). It is drawn of p_A as recorded, and of p_A without the instruments' noise.
+    The transform follows eqs. (3.4)-(3.6), and is drawn for p_A as recorded and for p_A without the instruments' noise.
     """
     run = context.run(Experiment.of(command=_COMMAND, duration=20.0, leak=f"{_LEAK} from {_ONSET:g} s"))
     t = run.recorded.t
@@ -310,11 +313,11 @@ def scalogram_figure(context: Context, item: Item) -> tuple[Figure, ...]:
         title = f"({letter}) CWT(a, b), db8, {name}"
         panels.append(Panel("t [s]", "frequency [Hz]", title=title, marks=leak, image=image, log_y=True))
     parts: tuple[tuple[Role, np.ndarray], ...] = (("no leak", (t > _SETTLED) & (t < _ONSET)), ("leak", t >= _ONSET))
-    # of the last transform, without noise
+    # `transform` is now the last one, without noise
     part_rms = {role: np.sqrt(np.mean(transform[:, part] ** 2, axis=1)) * 1e3 for role, part in parts}
     curves = tuple(FigureCurve(frequencies, part_rms[role], role, role) for role, _ in parts)
     panels.append(Panel("frequency [Hz]", "rms of CWT [kPa s^0.5]", curves, "(d) rms of (c) over time", log_x=True))
-    above_30_hz = frequencies > 30.0  # lower peaks are of the motion
+    above_30_hz = frequencies > 30.0  # at lower frequencies the motion has peaks
     ring = int(np.flatnonzero(above_30_hz)[part_rms["no leak"][above_30_hz].argmax()])
     numbers = (
         Number("frequency of the ringing", float(frequencies[ring]), "Hz"),
@@ -344,7 +347,7 @@ def judge_claims(context: Context, item: Item) -> tuple[Claim, ...]:
 def _fourier_claims() -> Iterator[Claim]:
     """Judge claims 3.1 and 3.2 on the spectrum of the signal of eq. (3.3).
 
-    3.1: it has the amplitudes of the two tones and nothing else. 3.2: both tones are cosines, of phase 0.
+    3.1: the spectrum has the amplitudes of the two tones and is 0 elsewhere. 3.2: both tones are cosines, of phase 0.
     """
     t = np.arange(round(RATE)) / RATE
     frequency, amplitude, phase = amplitude_spectrum(two_tone_signal(t), RATE)
@@ -360,8 +363,8 @@ def _fourier_claims() -> Iterator[Claim]:
 def _wavelet_claims() -> Iterator[Claim]:
     """Judge claims 3.3 to 3.5 on the wavelet db8.
 
-    3.3: its mean is 0. 3.4: its energy is 1, and stays 1 if it is scaled by eq. (3.6). 3.5: the inverse transform as
-    printed in eq. (3.5) has the same gain at 30 and at 100 Hz, within 1 %.
+    3.3: the wavelet has the mean 0. 3.4: it has the energy 1, also when scaled by eq. (3.6). 3.5: the transform and its
+    inverse as printed in eq. (3.5) have the same gain at 30 and at 100 Hz, within 1 %.
     """
     _, psi, t = mother_wavelet()
     step = float(t[1] - t[0])
@@ -389,7 +392,7 @@ def _leak_claim(context: Context) -> Claim:
     experiments = (Experiment.of(command=_COMMAND, duration=40.0, leak=leak) for leak in (None, _LEAK))
     healthy, leaking = (context.run(experiment, prove=False) for experiment in experiments)
     is_settled = healthy.t > 10.0  # [s]
-    statistics = (np.mean, np.max, np.ptp)
+    statistics = (np.mean, np.max, np.ptp)  # mean, peak and range
     changes = {
         name: [float(f(leaking.outputs[name][is_settled]) - f(healthy.outputs[name][is_settled])) for f in statistics]
         for name in CHAMBERS

@@ -25,7 +25,7 @@ from sealscope.units import LITRE_PER_MINUTE, PSI
 
 Mask = NDArray[np.bool_]
 PanelsAndNumbers = tuple[list[Panel], list[Number]]
-_RPM = 2.0 * math.pi / 60.0
+_RPM = 2.0 * math.pi / 60.0  # [rad/s]
 _WINDOWED = ("d3", "d4", "d3d4")
 _PART_LABELS = ("without leak", "with leak")
 #: Nominal leak of each level [L/min], section 5.1.
@@ -56,7 +56,7 @@ class PrintedTest:
 
     @property
     def candidates(self) -> tuple[Condition, ...]:
-        """The tests of Appendix C with the command and leak level of this test of chapter 5; it is one of these."""
+        """The tests of Appendix C that this test can be: those with its command and leak level."""
         return tuple(row for row in APPENDIX_C if (row.command, row.level) == (self.command, self.level))
 
     @property
@@ -129,7 +129,8 @@ class FigureView:
 
         If `t` is None, `y` is over the times of the recording.
         """
-        half, (start, stop) = self.test.half, self.span
+        half = self.test.half
+        start, stop = self.span
         before = replace(self, span=(start, min(stop, half)))._curve(y, "no leak", "no leak", t)
         return [before, self._curve(y, "leak", "leak", t, start=half)]
 
@@ -144,8 +145,8 @@ class FigureView:
     def draw_inputs(self) -> PanelsAndNumbers:
         """Draw command, motor speed and displacement of the test as three panels.
 
-        Also returns, without and with the leak, the RMS of the speed [rpm] and the drift [mm/s] of the displacement,
-        that is its linear trend.
+        Also returns the RMS of the speed [rpm] and the drift (linear trend) [mm/s] of the displacement, each without
+        and with the leak.
         """
         recording = self.recording
         rpm, x = recording["omega"] / _RPM, recording["x"] * 1e3
@@ -207,7 +208,7 @@ class FigureView:
     def _rms_changes(self, names: tuple[str, ...]) -> list[Number]:
         """Compute the RMS of the wavelet details `names` without and with the leak, and the change [%] of each.
 
-        The pressure is that of the figure's chamber, and each RMS is over one part of the test.
+        The details are those of the pressure in the figure's chamber. Each RMS is over one part of the test.
         """
         numbers = []
         for name, (before, after) in part_detail_rms(self.recording, self.test.parts)[self.chamber].items():
@@ -230,8 +231,7 @@ _VIEWS: dict[str, tuple[str, Callable[[FigureView], PanelsAndNumbers]]] = {
 def iter_views() -> Iterator[tuple[str, str, dict[str, object]]]:
     """Yield (id, title, inputs) of Figs. 5.1 to 5.89, which show each test in several views.
 
-    The views are the input and motion, the leak and the pressures, the wavelet details, and their windowed RMS. A view
-    is drawn over the whole test or as a close-up of 20 s around the opening of the leak.
+    The views (`_VIEWS`) are drawn over the whole test or as a close-up of 20 s around the opening of the leak.
     """
     for test in TESTS.values():
         input_views = [("input", "", False), ("input", "", True)]  # (view, chamber, is_closeup)
@@ -253,7 +253,8 @@ def leak_test_figure(context: Context, item: Item) -> tuple[Figure, ...]:
 
     `item.inputs` has the test, the view, such as "details", the chamber and the interval [s].
     """
-    test, span = TESTS[item.inputs["test"]], (item.inputs["from_s"], item.inputs["to_s"])
+    test = TESTS[item.inputs["test"]]
+    span = (item.inputs["from_s"], item.inputs["to_s"])
     view = FigureView(context.run(make_test_experiment(test)), test, span, item.inputs["chamber"])
     _, draw = _VIEWS[item.inputs["view"]]
     panels, numbers = draw(view)
@@ -263,8 +264,8 @@ def leak_test_figure(context: Context, item: Item) -> tuple[Figure, ...]:
 def windowed_detail_rms(recording: Recording, chamber: str) -> tuple[Array, dict[str, Array]]:
     """Compute the RMS of a chamber pressure's wavelet details in windows of 1000 samples that begin every 500 samples.
 
-    Windows that reach samples near the record's ends, where the wavelet's filters reach beyond it, are left out.
-    Returns the centres of the windows [s], and the RMS of d1..d4 [psi] and d3d4 [psi^2] by the detail's name.
+    Windows near the record's ends are left out if they have samples whose details depend on padding. Returns the
+    centres of the windows [s], and the RMS of d1..d4 [psi] and d3d4 [psi^2] by the detail's name.
     """
     transformed = details(recording[chamber] / PSI)
     inside = transformed.inside()

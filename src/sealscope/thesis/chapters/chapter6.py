@@ -32,7 +32,7 @@ VALVE_RIG, VALVE_CONTROLLERS = "servo-valve", ("pi", "flatness")
 DAMPER = 20e3
 #: Parameters of the plant that differ from those the controllers assume: friction +20 %, bulk modulus -20 %.
 PLANT_MISMATCH: Mapping[str, float | str] = {"F_pr": 30.0, "F_cfr": 1.2e-6, "F_v": 360.0, "K_oil": 551e6}
-#: Load [N] at which leaks have their size, and their sizes [L/min].
+#: Load [N] under which a leak passes its stated flow, and the stated flows [L/min].
 LOAD, LEAKS = 2000.0, (0.0, 0.0042, 0.05, 0.5)
 #: Amplitude [m] and angular frequency [rad/s] of the duty; it needs less than 10 V with the largest leak.
 AMPLITUDE, OMEGA = 0.04, 0.5 * math.pi
@@ -45,11 +45,16 @@ BANDWIDTH_FREQUENCIES, BANDWIDTH_SPEED = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0),
 CONTROLLERS = ("pi", "flatness", "fault-tolerant", "fault-tolerant-flatness", "ideal")
 #: Controllers that are compared over the load.
 LOAD_CONTROLLERS = ("pi", "flatness", "fault-tolerant")
-#: Columns of the tables that figures show.
+#: Heads of the columns that figures show.
 _ERROR, _STIFF, _ENERGY = "rms error [mm]", "stiffness at 0.5 Hz [N/mm]", "electrical energy a cycle [J]"
-_ROLES: dict[tuple[str, ...], Role] = dict(
-    zip(((name,) for name in CONTROLLERS), ("simulated", "25 %", "leak", "75 %", "reference"), strict=True)
-)
+#: Line style of each curve by the first cells of its rows: the controller, or rig and controller.
+_ROLES: dict[tuple[str, ...], Role] = {
+    ("pi",): "simulated",
+    ("flatness",): "25 %",
+    ("fault-tolerant",): "leak",
+    ("fault-tolerant-flatness",): "75 %",
+    ("ideal",): "reference",
+}
 _VALVE_ROLES: dict[tuple[str, ...], Role] = {
     ("pump", "pi"): "simulated",
     ("pump", "flatness"): "25 %",
@@ -62,6 +67,7 @@ RESTORED_FRACTION = 0.1
 NEGLIGIBLE_DRIFT = 0.1
 #: Two machines or controllers count as different if a quantity differs by more than this factor.
 DISTINCT_RATIO = 1.5
+#: Period [s] of the duty, and its text as a position target.
 CYCLE = 2.0 * math.pi / OMEGA
 DUTY = f"position {1e3 * AMPLITUDE} mm sin({OMEGA!r}t)"
 
@@ -69,7 +75,7 @@ DUTY = f"position {1e3 * AMPLITUDE} mm sin({OMEGA!r}t)"
 def conductance(lpm: float, rig: Rig) -> float:
     """Compute the leakage conductance [m^3/(s Pa)] of a leak that passes `lpm` [L/min] under a load of 2 kN (`LOAD`).
 
-    It is flow / (LOAD / A_A), with the piston's area A_A.
+    The formula is flow / (LOAD / A_A), with the piston's area A_A.
     """
     return lpm * LITRE_PER_MINUTE / (LOAD / rig.cylinder.A_A)
 
@@ -88,7 +94,7 @@ def _amplitude_at(run: Trajectory, mask: NDArray[np.bool_], f: float) -> float:
 def supply_flow(run: Trajectory) -> Array:
     """Compute the flow [m^3/s] from the supply into a servo valve without overlap, over time.
 
-    It is the flow Q_A into chamber A if the spool connects the supply with A (spool position x_s > 0), else the flow
+    If the spool connects the supply with chamber A (spool position x_s > 0), this is the flow Q_A into A, else the flow
     -Q_B into chamber B.
     """
     return np.asarray(np.where(run["x_s"] > 0.0, run["Q_A"], -run["Q_B"]))
@@ -153,9 +159,9 @@ class ControlledRig:
     def bandwidth(self) -> float:
         """Compute the frequency [Hz] at which the tracking error of small sines first exceeds -3 dB of the target.
 
-        The error is |x/target - 1| of complex amplitudes, its limit 0.71. The target is a sum of sines of the tested
-        frequencies. The result is interpolated between the tested frequencies `BANDWIDTH_FREQUENCIES`. Returns the
-        lowest of these if the error exceeds the limit there already, and inf if it exceeds it at none of them.
+        The error is |x/target - 1| of complex amplitudes, and its limit 0.71. The target is a sum of sines of the
+        frequencies `BANDWIDTH_FREQUENCIES`, between which the result is interpolated. Returns the lowest of them if the
+        error exceeds the limit there already, and inf if the error is below the limit at all of them.
         """
         frequencies = BANDWIDTH_FREQUENCIES
         terms = [f"{1e3 * BANDWIDTH_SPEED / (2 * math.pi * f):.6f} mm sin({2 * math.pi * f!r}t)" for f in frequencies]
@@ -166,9 +172,11 @@ class ControlledRig:
         error = np.abs(sine_fit(run.t[is_settled], run["x"][is_settled], *omegas).amplitudes / target - 1.0)
         limit = math.sqrt(0.5)  # -3 dB
         exceeding = np.flatnonzero(error > limit)
-        if exceeding.size == 0 or exceeding[0] == 0:
-            return math.inf if exceeding.size == 0 else frequencies[0]
+        if exceeding.size == 0:
+            return math.inf
         k = int(exceeding[0])
+        if k == 0:
+            return frequencies[0]
         # interpolated on a logarithmic axis of frequency
         fraction = (limit - error[k - 1]) / (error[k] - error[k - 1])
         return float(frequencies[k - 1] * (frequencies[k] / frequencies[k - 1]) ** fraction)
@@ -176,9 +184,9 @@ class ControlledRig:
     def efficiencies(self) -> tuple[float, float]:
         """Compute the electrical and the hydraulic efficiency of a sine motion against a damper as the only load.
 
-        They are (work in the damper) / (electrical energy of the motor) and (work in the damper) / (hydraulic energy).
-        The latter is delivered by the pump at its ports or, in a valve-controlled rig, by a lossless supply at the
-        supply's pressure.
+        They are the work in the damper over the electrical energy of the motor, and over the hydraulic energy. The pump
+        delivers the hydraulic energy at its ports or, in a valve-controlled rig, a lossless supply at the supply's
+        pressure.
         """
         run, mask = replace(self, values=(("F_l", 0.0), ("d_load", DAMPER))).run_duty()
         flow = supply_flow(run) if _rig(self.rig).circuit.valve_controlled else run["Q_1"]
@@ -237,8 +245,8 @@ def _figure_over_leak(
 ) -> Figure:
     """Draw some columns of a table over the leak, one panel each.
 
-    `roles`: line style of each curve, by the cells with which the curve's rows begin; the next cell of these rows is
-    the leak [L/min]. `columns`: heads of the columns to draw.
+    `roles`: line style of each curve, by the first cells of the curve's rows; the next cell of these rows is the leak
+    [L/min]. `columns`: heads of the columns to draw. A leak of 0 is drawn at 0.001 L/min.
     """
     panels = []
     for head in columns:
@@ -257,7 +265,9 @@ def _figure_over_leak(
 def open_loop_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Tabulate the drift of the piston's mean position over the leak, in an open loop and with two controllers.
 
-    In the open loop a sine of the voltage moves the piston; the controllers are "pi" and "fault-tolerant".
+    In the open loop a sine of the voltage moves the piston; the controllers are "pi" and "fault-tolerant". The columns
+    are leak, amplitude of the motion in the open loop, its drift, this drift minus the drift without a leak, and the
+    drift with each controller.
     """
     rows: list[tuple[Cell, ...]] = []
     healthy_drift = 0.0
@@ -269,7 +279,8 @@ def open_loop_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
 
     for lpm in _leak_flows(context):
         open_loop = ControlledRig("", lpm).run(f"{OPEN_LOOP_U} sin({OMEGA!r}t + {0.5 * math.pi!r})", 3.0 * CYCLE)
-        healthy_drift = drift(open_loop, 1) if lpm == 0.0 else healthy_drift
+        if lpm == 0.0:  # the first of the leaks
+            healthy_drift = drift(open_loop, 1)
         is_settled = open_loop.t >= CYCLE
         amplitude_mm = 1e3 * _amplitude_at(open_loop, is_settled, 1 / CYCLE)
         closed = [drift(ControlledRig(name, lpm).run(DUTY, 4.0 * CYCLE), 2) for name in ("pi", "fault-tolerant")]
@@ -306,8 +317,8 @@ def load_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
 def external_leak_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Tabulate tracking and stiffness of each controller with a leak past the rod seal of either side.
 
-    The last column is the change [kPa] from the third to the fifth cycle of the cycle's mean of min(p_A, p_B), which
-    shows that the circuit loses oil. The leak's size is its flow at the mean pressure of its side without the leak.
+    The last column shows the loss of oil from the circuit: the change [kPa] of the mean of min(p_A, p_B) over a cycle,
+    from the third to the fifth cycle. The leak's stated flow is that at the mean pressure of its side without the leak.
     """
     healthy, mask = ControlledRig("pi", 0.0).run_duty()
     pressure = {side: float(np.mean(healthy[f"p_{side}"][mask])) for side in ("A", "B")}
@@ -341,7 +352,8 @@ def valve_table(context: Context, item: Item) -> tuple[ThesisTable | Figure, ...
         efficiencies = [100 * efficiency for efficiency in loop.efficiencies()]
         rows.append((source, name, lpm, error, loop.bandwidth(), loop.stiffness(), energy, pump_energy, *efficiencies))
     notes = format_note("valve", rig=RIG, other=VALVE_RIG, mm=1e3 * AMPLITUDE, f=1 / CYCLE, load=LOAD, damper=DAMPER)
-    table, title = item.table(rows, notes), "Energy and stiffness, pump and valve"
+    table = item.table(rows, notes)
+    title = "Energy and stiffness, pump and valve"
     return table, _figure_over_leak(table, title, _VALVE_ROLES, (_ENERGY, _STIFF), log_y=True)
 
 
@@ -351,8 +363,9 @@ def _column_by_leak(table: ThesisTable, names: tuple[str, ...], head: str) -> di
     Only rows whose first cells are `names`, such as a controller's name, are read; the leak is in the next column.
     Empty cells are read as 0.
     """
-    n, k = len(names), table.columns.index(head)
-    return {float(row[n] or 0.0): float(row[k] or 0.0) for row in table.rows if row[:n] == names}
+    leak_column, value_column = len(names), table.columns.index(head)
+    rows = [row for row in table.rows if row[:leak_column] == names]
+    return {float(row[leak_column] or 0.0): float(row[value_column] or 0.0) for row in rows}
 
 
 def judge_claims(context: Context, item: Item) -> tuple[Claim, ...]:
@@ -376,9 +389,9 @@ def _disturbance_claim(context: Context) -> Claim:
 def _tolerance_claim(context: Context) -> Claim:
     """Judge claim 6.2.2: a fault-tolerant controller restores tracking and stiffness with a leak.
 
-    With each leak, the tracking error may be at most 10 % larger, and the stiffness at most 10 % smaller, than those of
-    the PI controller without a leak. Without a leak it must have the tracking error of the PI controller, and
-    compensate nothing.
+    With each leak, the tracking error may be at most 10 % larger, and the stiffness at most 10 % smaller, than with the
+    PI controller and no leak. Without a leak the controller must have the tracking error of the PI controller, and
+    compensate no leakage.
     """
     table = first_table(context, "sec-6.2-controllers")
     error, tolerant_error = (_column_by_leak(table, (name,), _ERROR) for name in ("pi", "fault-tolerant"))
@@ -398,13 +411,15 @@ def _tolerance_claim(context: Context) -> Claim:
 def _load_claim(context: Context) -> Claim:
     """Judge claim 6.2.3: the largest tracking error over the loads, without a leak, differs between controllers.
 
-    The largest of three controllers must exceed the smallest by more than a factor of 1.5 (`DISTINCT_RATIO`).
+    The worst of three controllers must have more than 1.5 times the largest error of the best (`DISTINCT_RATIO`).
     """
-    table, error_ranges = first_table(context, "sec-6.2-load"), {}
+    table = first_table(context, "sec-6.2-load")
+    error_ranges = {}
     for name in LOAD_CONTROLLERS:
         errors = column(table, load_head(name, 0.0, _ERROR))
         error_ranges[name] = float(errors.min()), float(errors.max())
-    max_low, highs = max(low for low, _ in error_ranges.values()), [high for _, high in error_ranges.values()]
+    max_low = max(low for low, _ in error_ranges.values())
+    highs = [high for _, high in error_ranges.values()]
     text = "; ".join(f"{name} {low:.3f} to {high:.3f} mm" for name, (low, high) in error_ranges.items())
     tests = [max(highs) > DISTINCT_RATIO * min(highs)]
     all_below_one_percent = max(highs) < 0.01 * 1e3 * AMPLITUDE
@@ -423,5 +438,6 @@ def _valve_claim(context: Context) -> Claim:
         tests.append(max(pair) > DISTINCT_RATIO * min(pair))
     numbers = {(source, lpm): values for source, name, lpm, *values in table.rows if name == "pi"}
     max_leak = max(float(lpm or 0.0) for _, lpm in numbers)
-    pump, valve, *worn = (numbers[source, lpm] for lpm in (0.0, max_leak) for source in ("pump", "valve"))
+    pump, valve = numbers["pump", 0.0], numbers["valve", 0.0]
+    worn = [numbers["pump", max_leak], numbers["valve", max_leak]]
     return judge_claim("6.2.4", tests, pump=pump, valve=valve, largest=max_leak, worn=worn)

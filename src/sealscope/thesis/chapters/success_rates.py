@@ -29,9 +29,10 @@ _Row = tuple[Cell, ...]
 class Rule:
     """A rule of Table 5.1, by which the RMS of some wavelet details indicates a leak.
 
-    It fires in a test, i.e. indicates a leak, if from the first half to the second, in which the leak is open, the RMS
-    of all its details of p_A fall and those of p_B rise (`DIRECTION`). `details`: (chamber, detail) pairs; `printed`:
-    success rates [%] that the thesis prints, "" for a rule that it does not claim.
+    The rule fires in a test, i.e. indicates a leak, if the RMS of all its details of p_A fall and the RMS of all its
+    details of p_B rise (`DIRECTION`) from the first half of the test to the second, in which the leak is open.
+    `details`: (chamber, detail) pairs; `printed`: success rates [%] that the thesis prints, "" for a rule that the
+    thesis does not claim.
     """
 
     name: str
@@ -49,9 +50,9 @@ def _load_rules(name: str) -> tuple[Rule, ...]:
     return tuple(Rule(*row) for row in load_texts("cases.toml")[name])
 
 
-#: The six cells of Table 5.1 and the cumulative one; and the columns of Appendix C that the table leaves out.
+#: Rules of the six cells of Table 5.1, then of d3d4 in both chambers; and of the columns that the table leaves out.
 CLAIMED, UNCLAIMED = _load_rules("claimed"), _load_rules("unclaimed")
-#: The rules of Table 5.1 without the cumulative one: each has one detail.
+#: Rules of the six cells only, each with one detail.
 CLAIMED_CELLS = CLAIMED[:6]
 
 
@@ -70,13 +71,14 @@ def _format_count(fires: Fires | None) -> tuple[Cell, Cell, Cell, Cell]:
 def _count_heads(source: str, count: str) -> tuple[str, ...]:
     """Build the column heads of the four cells in which a table states a count.
 
-    They are the count, the rate [%], and both limits of its 95 % interval [%]. `source`: name of the data sheet, with
-    which each head begins; `count`: name of the first column.
+    The cells are the count, the rate [%], and both limits of its 95 % interval [%]. `source`: name of the data sheet,
+    with which each head begins; `count`: name of the first column.
     """
     return tuple(f"{source}: {part}" for part in (count, "rate [%]", "95 % low [%]", "95 % high [%]"))
 
 
 _SOURCES = ("sheet", "simulated leak", "simulated, no leak", "simulated, drift only")
+#: Heads of the three tables.
 RATES = (
     *("rule", "printed [%]", *(head for source in _SOURCES for head in _count_heads(source, "fires"))),
     "simulated leak less drift [points]",
@@ -94,9 +96,10 @@ THRESHOLDS = (
 def count_rules(measured: DataSheet | None, leak: DataSheet, no_leak: DataSheet, drift: DataSheet) -> list[_Row]:
     """Count in how many tests each rule of Table 5.1 fires (indicates a leak), as rows with the columns `RATES`.
 
-    The sheets are the measured one (None if not given), and the simulated ones with leak, without leak, and without
-    leak but with drifting parameters. A row has the count, the rate and its 95 % interval on each sheet, and the rate
-    with the leak minus that with drift alone. Two more rows are for a rule that always fires and one that never does.
+    `measured`: measured sheet, None if not given; `leak`, `no_leak`, `drift`: sheets simulated with leak, without leak,
+    and without leak but with drifting parameters. A row has the count, the rate and its 95 % interval on each sheet,
+    and the rate on `leak` minus the rate on `drift`. Two more rows are for a rule that always fires and a rule that
+    never fires.
     """
     rules: dict[str, tuple[str, Callable[[DataSheet], Fires]]] = {
         **{rule.name: (rule.printed, rule.fires) for rule in (*CLAIMED, *UNCLAIMED)},
@@ -115,10 +118,9 @@ def count_rules(measured: DataSheet | None, leak: DataSheet, no_leak: DataSheet,
 def column_tests(sheet: DataSheet) -> list[_Row]:
     """Test each column of a data sheet, a chamber's wavelet detail, for a change with the leak by a sign test.
 
-    Hypothesis of the two-sided test: in each test of the sheet the RMS falls or rises with probability 1/2. Returns
-    rows of chamber, detail, number of tests with a fall and with a rise, geometric mean of the change [%], p-value,
-    corrected p-value, and "yes" if the latter is below 0.05, else "no". Holm's correction covers all ten columns, since
-    Table 5.1 chose among them.
+    Hypothesis of the two-sided sign test: in each test of the sheet the RMS falls or rises with probability 1/2. Holm's
+    correction covers all ten columns, since Table 5.1 chose among them. Returns rows with the columns `TESTS`, without
+    the source.
     """
     rows = []
     for chamber, name in COLUMNS:
@@ -126,7 +128,7 @@ def column_tests(sheet: DataSheet) -> list[_Row]:
         down, up = int(np.sum(change < 0)), int(np.sum(change > 0))
         mean = float(100 * np.expm1(change.mean()))
         rows.append((chamber, name, down, up, mean, sign_test(down, down + up)))
-    corrected = holm([row[-1] for row in rows])
+    corrected = holm([p for *_, p in rows])
     return [(*row, p, "yes" if p < 0.05 else "no") for row, p in zip(rows, corrected, strict=True)]
 
 
@@ -134,9 +136,9 @@ def d1_threshold(sheet: DataSheet, chamber: str, either_side: bool = False) -> f
     """Compute the change of log RMS that noise alone exceeds in 5 % of the tests (`FALSE_ALARMS`).
 
     It is ``1.645 rms(log change of d1)`` over the tests of the sheet if changes of one sign count, and 1.960 times this
-    rms if changes of either sign do (`either_side`). d1 is the finest wavelet detail of the pressure `chamber`, "p_A"
-    or "p_B". It is noise and does not depend on the leak, so its changes between the halves of a test are as in a rig
-    without a leak. The other details scatter at least as much.
+    rms if changes of either sign count (`either_side`). d1 is the finest wavelet detail of the pressure `chamber`,
+    "p_A" or "p_B". d1 is noise and does not depend on the leak, so that its changes between the halves of a test are as
+    in a rig without a leak. The other details scatter at least as much.
     """
     change = sheet.log_change(chamber, "d1")
     return float((WITHIN_95 if either_side else UPPER_95) * np.sqrt(np.mean(change**2)))
@@ -176,11 +178,13 @@ def count_with_thresholds(measured: DataSheet | None, leak: DataSheet, drift: Da
 def success_rate_tables(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Build three tables on the success rates of Table 5.1, the fractions of tests in which a rule indicates the leak.
 
-    They are the rates counted again (`count_rules`), sign tests of all columns of Appendix C (`column_tests`), and the
-    rates of the same rules if a change must exceed a threshold (`count_with_thresholds`).
+    - The rates counted again (`count_rules`)
+    - Sign tests of all columns of Appendix C (`column_tests`)
+    - The rates of the rules on a single detail if a change must exceed a threshold (`count_with_thresholds`)
     """
     leak_runs, leak = simulated_sheet(context, "leak")
-    no_leak, drift = (simulated_sheet(context, runs)[1] for runs in ("no-leak", "drift"))
+    _, no_leak = simulated_sheet(context, "no-leak")
+    _, drift = simulated_sheet(context, "drift")
     measured, resolved = context.sheet, leak_runs.resolved
     sheets = dict(zip(_SOURCES, (measured, leak, no_leak, drift), strict=True))
     tests = [(name, *row) for name, sheet in sheets.items() if sheet is not None for row in column_tests(sheet)]

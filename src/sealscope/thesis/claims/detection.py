@@ -17,7 +17,8 @@ from sealscope.thesis.engine.products import Claim, ThesisTable, Verdict
 def detection_claims(context: Context, item: Item) -> tuple[Claim, ...]:
     """Judge the claims on leak detection in the thesis's abstract and chapters 1, 5 and 6, in the order of the thesis.
 
-    They are judged by data sheets, measured tests and simulations (`gather_evidence`).
+    The evidence is the measured and the simulated data sheets, and the simulated tests of chapter 5
+    (`gather_evidence`).
     """
     evidence = gather_evidence(context)
     claims = (*sheet.leak_level_claims(), *sheet.claims(evidence), *sheet.curve_claims(evidence), *rig.claims(evidence))
@@ -25,7 +26,7 @@ def detection_claims(context: Context, item: Item) -> tuple[Claim, ...]:
 
 
 def _claim_order(claim: Claim) -> tuple[int, ...]:
-    """Return the numbers in a claim's id as a key for sorting; claims of the abstract come first."""
+    """Compute the sorting key of a claim: the numbers in its id, such as (5, 4, 1), with 0 for "a", the abstract."""
     return tuple(int(number) for number in re.findall(r"[0-9]+", claim.id.replace("claim-a", "claim-0")))
 
 

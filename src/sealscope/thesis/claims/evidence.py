@@ -69,7 +69,7 @@ def gather_evidence(context: Context) -> ClaimEvidence:
     )
 
 
-#: A finding on a sheet: its text, and which parts of the claim are true.
+#: A finding on a sheet: its text, and True or False for each part of the claim on which it decides.
 Finding = tuple[str, Sequence[bool]]
 #: Tests a claim on a measured or simulated sheet.
 SheetTest = Callable[[DataSheet], Iterable[Finding]]
@@ -79,9 +79,8 @@ SheetTest = Callable[[DataSheet], Iterable[Finding]]
 class SheetClaim:
     """A claim that is tested on a data sheet, measured or simulated.
 
-    `test`: yields the findings on a sheet, each a text and a True or False for each part of the claim on which it
-    decides; `head`, `separator`: text before and between the texts of the findings; `values`: computes the values of
-    placeholders in the claim's other texts.
+    `test`: yields the findings on a sheet; `head`, `separator`: text before and between the texts of the findings;
+    `values`: computes the values of placeholders in the claim's other texts.
     """
 
     test: SheetTest
@@ -112,8 +111,8 @@ class SheetClaim:
 def format_rule_rate(sheet: DataSheet, rule: Rule) -> str:
     """Format the fraction of the tests of a data sheet in which a rule fires, such as "35/41 = 85.4 % (71 to 94 %)".
 
-    A rule of Table 5.1 fires in a test if the RMS of all its wavelet details of p_A fall and those of p_B rise from
-    the first to the second half (`Rule`). The limits in brackets are the 95 % interval.
+    A rule of Table 5.1 fires in a test if the RMS values indicate a leak (`Rule`). The limits in brackets are the 95 %
+    interval.
     """
     return format_rate(rule.fires(sheet))
 
@@ -131,7 +130,7 @@ def format_rate(tests: Sequence[bool] | np.ndarray) -> str:
 def log_change_to_percent(change: Array | float) -> float:
     """Convert a change c of a natural logarithm to the relative change 100 (exp(c) - 1) [%].
 
-    Of several changes the mean is converted.
+    For several changes c the result is the geometric mean change: their mean is converted.
     """
     return float(100.0 * np.expm1(np.mean(change)))
 
@@ -152,7 +151,7 @@ def moves_beyond_chance(sheet: DataSheet, chamber: str, name: str) -> bool:
     (`DIRECTION`). The p-value of the two-sided sign test, corrected by Holm for all columns of the sheet, must be below
     5 % (`holm_p_values`). `chamber`: "p_A" or "p_B"; `name`: the detail, such as "d3".
     """
-    change = sheet.log_change(chamber, name) * DIRECTION[chamber]
+    change = sheet.log_change(chamber, name) * DIRECTION[chamber]  # > 0: in the thesis's direction
     return bool(np.sum(change > 0) > np.sum(change < 0) and holm_p_values(sheet)[chamber, name] < 0.05)
 
 
@@ -228,8 +227,11 @@ def classify_without_baseline(sheet: DataSheet, leave_out: Literal["test", "cond
     detail_rms = [sheet.rms[chamber][f"d{level}"] for chamber in CHAMBERS for level in range(1, 5)]
     columns = np.column_stack([np.log(rms).T.ravel() for rms in detail_rms])  # all tests without, then with their leaks
     is_leaking = np.repeat([False, True], len(APPENDIX_C))
-    groups = [row.number if leave_out == "test" else f"{row.command} at {row.closed_pct:g} %" for row in APPENDIX_C] * 2
+    if leave_out == "test":
+        groups: list[object] = [row.number for row in APPENDIX_C]
+    else:
+        groups = [f"{row.command} at {row.closed_pct:g} %" for row in APPENDIX_C]
     regression = make_pipeline(StandardScaler(), LogisticRegression(C=1.0, tol=1e-9))
-    cross_validation: dict[str, Any] = {"groups": groups, "cv": LeaveOneGroupOut(), "method": "decision_function"}
+    cross_validation: dict[str, Any] = {"groups": groups * 2, "cv": LeaveOneGroupOut(), "method": "decision_function"}
     log_odds = cross_val_predict(regression, columns, is_leaking, **cross_validation)
     return float(np.mean((log_odds > 0) == is_leaking)), auc(log_odds[~is_leaking], log_odds[is_leaking]).value

@@ -20,9 +20,9 @@ from sealscope.thesis.sheet import APPENDIX_C, BENCH_RIG
 
 #: Changes [%] below which a quantity counts as unchanged, and above which a change counts as severe.
 _NEGLIGIBLE_CHANGE, _SEVERE_CHANGE = 1.0, 5.0
-#: A drift counts as lowered by the leak if it falls by this fraction more than in the same run without its leak.
+#: A drift counts as lowered by the leak if its fall exceeds the fall in the same run without the leak by this fraction.
 _MIN_EXTRA_FALL = 0.1
-#: Largest factor between two RMS that agree, and smallest number of tests, of 41, that agree in a sign.
+#: Two RMS agree within this factor; two sheets agree in a sign if they do so in at least this number of the 41 tests.
 _MAX_RMS_RATIO, _MIN_AGREEING_TESTS = 1.25, 39
 #: Operations per second that any small controller can make.
 _FEW_OPERATIONS = 1e7
@@ -37,7 +37,7 @@ _COMPARED_CLOSING = 75.0
 def claims(evidence: ClaimEvidence) -> tuple[Claim, ...]:
     """Judge the claims of the abstract and of chapters 1, 5 and 6 that the data sheet alone cannot decide.
 
-    They are 1.3.1, which cannot be tested, and a.3, 5.7.1 to 5.7.6, and 6.1.2 to 6.1.4.
+    These claims are 1.3.1, which cannot be tested, a.3, 5.7.1 to 5.7.6, and 6.1.2 to 6.1.4.
     """
     return (
         judge_claim("1.3.1", [None]),
@@ -52,14 +52,14 @@ def claims(evidence: ClaimEvidence) -> tuple[Claim, ...]:
 def _wavelet_claims() -> Iterator[Claim]:
     """Judge claims 5.7.5 and a.3 on db8: it separates bands better than lower orders, and its computation is cheap.
 
-    5.7.5: of db1, db2, db4 and db8, each high-pass filter must have a smaller fraction of its energy below its band
-    than the one before. a.3: the transform must need fewer than 1e7 operations per second.
+    5.7.5: in the order db1, db2, db4, db8, each high-pass filter must have a smaller fraction of its energy below its
+    band than the filter before. a.3: the transform must need fewer than 1e7 operations per second.
     """
     overlaps = {}  # order -> fraction of the high-pass filter's energy below its band
     for order in (1, 2, 4, 8):
         _, high_pass = decomposition_filters(f"db{order}")
         energy = np.abs(np.fft.rfft(high_pass, 4096)) ** 2  # padded for a fine spectrum
-        overlaps[order] = float(energy[: energy.size // 2].sum() / energy.sum())
+        overlaps[order] = float(energy[: energy.size // 2].sum() / energy.sum())  # the band is the upper half
     falls = [later < earlier for earlier, later in itertools.pairwise(overlaps.values())]
     text = ", ".join(f"db{order} {100 * fraction:.1f} %" for order, fraction in overlaps.items())
     yield judge_claim("5.7.5", falls, shares=text)
@@ -93,10 +93,11 @@ def _format_range(values: Iterable[float]) -> str:
 def _printed_test_claims(evidence: ClaimEvidence) -> Iterator[Claim]:
     """Judge the claims on the ten tests whose figures chapter 5 prints, by measures of the simulated tests.
 
-    5.7.1: the RMS of the motor's speed changes by less than 1 % with the leak. 5.7.2: the drift of the piston falls by
-    at least a tenth more than in the same time without the leak. 6.1.2: a leak changes velocity and pressure ranges by
-    more than 5 % in some test. 5.7.3: it changes both pressure ranges of test 5.3a by more than 5 %. 5.7.4: the onset
-    is found from d3 within 10 s.
+    - 5.7.1: the RMS of the motor's speed changes by less than 1 % with the leak in each test.
+    - 5.7.2: in test 5.2a the drift of the piston falls by at least a tenth more than in the same test without the leak.
+    - 6.1.2: a leak changes the velocity by more than 5 % in some test, and a pressure range likewise.
+    - 5.7.3: the leak of test 5.3a changes both pressure ranges by more than 5 %.
+    - 5.7.4: in all tests and both chambers the onset is found from d3 within 10 s.
     """
     tests = evidence.test_measures
     speed_changes = {name: abs(_percent_change(test.speed)) for name, test in tests.items()}
@@ -128,8 +129,8 @@ def _printed_test_claims(evidence: ClaimEvidence) -> Iterator[Claim]:
 def _d3_sign_claim(evidence: ClaimEvidence) -> Claim:
     """Judge claim 5.7.6: a fall of the RMS of the wavelet detail d3 of p_A indicates a leak.
 
-    In simulations without a leak it must fall in fewer than 5 % of the tests, with constant parameters as well as with
-    drifting ones.
+    In simulations without a leak the RMS must fall in fewer than 5 % of the tests, both with constant and with drifting
+    parameters.
     """
     d3_rule = CLAIMED[0]
     sheets = {"leak": evidence.leak_sheet, "no_leak": evidence.no_leak_sheet, "drift": evidence.drift_sheet}
@@ -141,8 +142,8 @@ def _d3_sign_claim(evidence: ClaimEvidence) -> Claim:
 def _throttle_claim(evidence: ClaimEvidence) -> Claim:
     """Judge claim 6.1.3: partly closed throttles raise the leak-free pressure ranges, more so at larger commands.
 
-    For each command, the range of each chamber pressure at the largest closing must exceed that with open throttles by
-    more than 1 %. At 75 % closed, the rise must grow with the amplitude of the command.
+    For each command, the range of each chamber pressure at the largest closing must exceed the range with open
+    throttles by more than 1 %. Among the commands whose largest closing is 75 %, the rise must grow with the amplitude.
     """
     ranges = np.stack([column(evidence.leak_table, f"{chamber} range [MPa]") for chamber in CHAMBERS])
     closed_pct = np.array([row.closed_pct for row in APPENDIX_C])
@@ -150,8 +151,8 @@ def _throttle_claim(evidence: ClaimEvidence) -> Claim:
     for command in sorted({row.command for row in APPENDIX_C}):
         is_command = np.array([row.command == command for row in APPENDIX_C])
         max_closed = closed_pct[is_command].max()
-        masks = (is_command & (closed_pct == closed) for closed in (0.0, max_closed))
-        range_open, range_throttled = (ranges[:, mask].mean(axis=1) for mask in masks)
+        range_open = ranges[:, is_command & (closed_pct == 0.0)].mean(axis=1)  # of p_A and of p_B
+        range_throttled = ranges[:, is_command & (closed_pct == max_closed)].mean(axis=1)
         rise = range_throttled - range_open
         texts.append(f"{command} {1e3 * rise[0]:+.2f} and {1e3 * rise[1]:+.2f} kPa at {max_closed:g} %")
         is_raised += list(rise > _MIN_RELATIVE_RISE * range_open)
@@ -159,7 +160,8 @@ def _throttle_claim(evidence: ClaimEvidence) -> Claim:
             amplitude_V = float(command.split(maxsplit=1)[0])
             amplitude_rises.append((amplitude_V, float(np.mean(rise))))
     rises = [rise for _, rise in sorted(amplitude_rises)]
-    return judge_claim("6.1.3", [*is_raised, rises == sorted(rises)], rises="; ".join(texts))
+    grows_with_amplitude = rises == sorted(rises)
+    return judge_claim("6.1.3", [*is_raised, grows_with_amplitude], rises="; ".join(texts))
 
 
 def _agreement_claim(evidence: ClaimEvidence) -> Claim:

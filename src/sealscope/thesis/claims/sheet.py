@@ -1,7 +1,7 @@
 """Judge the claims of the abstract, chapter 5 and the conclusions on leaks, details and success rates by the sheet.
 
-A function `_test_...` yields the findings on a data sheet: a text, and which parts of the claim are true. "Beyond the
-noise" means that a change is larger than noise alone causes in 95 % of the tests (`d1_threshold`).
+A function `_test_...` yields the findings on a data sheet: a text, and True or False for each part of the claim. A
+change is "beyond the noise" if it is larger than noise alone causes in 95 % of the tests (`d1_threshold`).
 """
 
 from __future__ import annotations
@@ -18,7 +18,15 @@ from sealscope.errors import MissingExtra
 from sealscope.evaluation.binomial import upper_tail
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.thesis.chapters.chapter5 import NOMINAL_LPM, TESTS, PrintedTest
-from sealscope.thesis.chapters.success_rates import CLAIMED, DIRECTION, UNCLAIMED, Rule, d1_threshold, drift_threshold
+from sealscope.thesis.chapters.success_rates import (
+    CLAIMED,
+    CLAIMED_CELLS,
+    DIRECTION,
+    UNCLAIMED,
+    Rule,
+    d1_threshold,
+    drift_threshold,
+)
 from sealscope.thesis.claims.evidence import (
     NO_SHEET,
     SENSITIVE,
@@ -51,7 +59,6 @@ _STATED_LPM = 0.0087
 _STATED_RATIOS = (0.5, 0.5, 1.0 / 16.0)
 #: Rules of Table 5.1: d3 of p_A, d3d4 of p_A, d3d4 of p_B, and d3d4 of both chambers.
 _A_D3, _, _A_D3D4, _, _, _B_D3D4, _BOTH_D3D4 = CLAIMED
-_CELLS = CLAIMED[:6]  # without the last, which has two details
 
 
 def _exceeds_noise(sheet: DataSheet, chamber: str, name: str) -> np.ndarray:
@@ -64,10 +71,9 @@ def _exceeds_noise(sheet: DataSheet, chamber: str, name: str) -> np.ndarray:
 
 
 def _format_controls(evidence: ClaimEvidence, rule: Rule) -> str:
-    """Format how often a rule of Table 5.1 fires in simulations without a leak, i.e. its false alarms.
+    """Format how often a rule of Table 5.1 fires, i.e. indicates a leak, in simulations without a leak (false alarms).
 
-    The two simulations have constant and drifting parameters. A rule fires in a test if the RMS of all its wavelet
-    details of p_A fall and those of p_B rise from the first to the second half (`Rule`).
+    One simulation has constant parameters, the other drifting parameters.
     """
     return (
         f"In simulation the rule fires in {format_rule_rate(evidence.no_leak_sheet, rule)} with no leak and in "
@@ -81,14 +87,16 @@ def _rate_claim(rule: Rule, where: str) -> SheetClaim:
     `where`: place of the claim in the thesis, such as "Fig. 5.90".
     """
     # without an effect each of the rule's details moves in its direction with probability 1/2
-    chance, printed = 0.5 ** len(rule.details), [int(rate) for rate in re.findall(r"\d+", rule.printed)]
+    chance = 0.5 ** len(rule.details)
+    printed = [int(rate) for rate in re.findall(r"\d+", rule.printed)]  # [%]
 
     def test_rate(sheet: DataSheet) -> Iterator[Finding]:
-        """Test that a rule's success rate is within one percentage point of a printed one, and higher than by chance.
+        """Test that a rule's success rate is within 1 percentage point of a printed rate, and higher than by chance.
 
         The success rate is the fraction of the tests in which the rule detects the leak. By chance, each of the rule's
-        k details moves as a leak would move it with probability 1/2, which gives a rate of 1/2^k. The one-sided
-        binomial p-value must be below 0.05/10, for ten columns. Yields one finding with two results.
+        k details moves as a leak would move it with probability 1/2, which gives a rate of 1/2^k. For a higher rate,
+        the one-sided binomial p-value must be below 0.05/10, as there are ten columns. Yields one finding with two
+        results.
         """
         fires = rule.fires(sheet)
         p = upper_tail(int(fires.sum()), fires.size, chance)
@@ -97,12 +105,13 @@ def _rate_claim(rule: Rule, where: str) -> SheetClaim:
         yield text, [as_printed, p < 0.05 / 10]  # Bonferroni's correction for ten columns
 
     def format_values(evidence: ClaimEvidence, sheet: DataSheet) -> dict[str, str]:
-        """Make the values that fill the braces of the claim's texts, by the names in the braces.
+        """Make the values that fill the placeholders of the claim's texts, by name.
 
-        The names are "where" (place of the claim in the thesis), "name" (details and chambers that the rule of Table
-        5.1 tests), "rates" (success rates that the thesis prints for it [%]), "product" (a remark on one printed rate,
-        "" for all other rules) and "controls" (how often the rule fires in simulations without a leak). `evidence`: has
-        the sheets of these simulations; `sheet`: data sheet of Appendix C, from which the rates are counted again.
+        - "where": place of the claim in the thesis
+        - "name": details and chambers that the rule of Table 5.1 tests
+        - "rates": success rates [%] that the thesis prints for the rule
+        - "product": a remark on the rate of d3d4 in both chambers, with rates counted on `sheet`; "" for other rules
+        - "controls": how often the rule fires in the simulations without a leak, which `evidence` has
         """
         rate_A, rate_B = (float(part.fires(sheet).mean()) for part in (_A_D3D4, _B_D3D4))
         product = (
@@ -123,8 +132,8 @@ def _rate_claim(rule: Rule, where: str) -> SheetClaim:
 def _test_opposite_moves(sheet: DataSheet) -> Iterator[Finding]:
     """Test claim 5.5.7: with the leak, the RMS of the wavelet details of p_A rise and those of p_B fall.
 
-    Each of d3, d4 and d3d4 of each chamber must do so in more than half of the tests. The rest of section 5.6 states
-    the opposite (`DIRECTION`).
+    Each of d3, d4 and d3d4 of each chamber must move in this direction in more than half of the tests. All other
+    sentences of section 5.6 state the opposite (`DIRECTION`).
     """
     for chamber in CHAMBERS:
         for name in SENSITIVE:
@@ -154,7 +163,8 @@ def _test_leak_levels(sheet: DataSheet) -> Iterator[Finding]:
 def _smallest_leak_test(rules: tuple[Rule, ...]) -> SheetTest:
     """Build the function that tests whether each of some rules of Table 5.1 detects the smallest leak.
 
-    That is the test of Appendix C with the smallest mean leak; a rule detects it if it fires (`Rule`).
+    The smallest leak is that of the test of Appendix C with the smallest mean leak. A rule detects a leak if the rule
+    fires (`Rule`).
     """
 
     def test_smallest(sheet: DataSheet) -> Iterator[Finding]:
@@ -183,8 +193,7 @@ def _test_abstract_rate(sheet: DataSheet) -> Iterator[Finding]:
 def _test_both_chambers(sheet: DataSheet) -> Iterator[Finding]:
     """Test claim 6.1.1: for leaks from 0.0048 L/min on, the RMS of d3d4 falls in p_A and rises in p_B.
 
-    The smallest leak for which this is the case must be 0.0048 L/min, and it must be the case in more than 80 % of
-    the tests.
+    The smallest leak with both changes must be 0.0048 L/min, and more than 80 % of all tests must have both changes.
     """
     fires, leak = _BOTH_D3D4.fires(sheet), mean_leaks()
     min_leak = float(leak[fires].min()) if fires.any() else math.nan
@@ -196,7 +205,7 @@ def _test_identified_leaks(sheet: DataSheet) -> Iterator[Finding]:
     """Test claim a.1: in each chamber the best wavelet detail reveals the leak in at least 80 % of the tests.
 
     A detail reveals the leak if its RMS falls in p_A, or rises in p_B, by more than noise alone changes it in 95 % of
-    the tests (`d1_threshold`). The best of d3, d4 and d3d4 is the one that does so most often.
+    the tests (`d1_threshold`). The best of d3, d4 and d3d4 is the detail that reveals the leak most often.
     """
     for chamber in CHAMBERS:
         best = max(SENSITIVE, key=lambda name: int(_exceeds_noise(sheet, chamber, name).sum()))
@@ -205,17 +214,18 @@ def _test_identified_leaks(sheet: DataSheet) -> Iterator[Finding]:
 
 
 def _baseline_texts(evidence: ClaimEvidence, sheet: DataSheet) -> dict[str, Any]:
-    """Format the success of detecting leaks without a baseline, for the texts of claim a.1.
+    """Format the success of detecting leaks without a healthy baseline, for the texts of claim a.1.
 
-    The texts are "tests" and "conditions": accuracy and area under the ROC of a cross-validated classifier, with single
-    tests and with whole operating conditions left out (`classify_without_baseline`). They say so if scikit-learn is not
-    installed. `evidence` is not used.
+    Both texts state the accuracy of a cross-validated classifier and its area under the ROC curve, with single tests
+    left out of the fit ("tests"), and with whole operating conditions left out ("conditions"). Without scikit-learn
+    they state that it is needed. `evidence` is not used.
     """
     texts = {}
     groups: tuple[Literal["test", "condition"], ...] = ("test", "condition")
     for name in groups:
         try:
-            texts[f"{name}s"] = "{:.2f} (AUC {:.3f})".format(*classify_without_baseline(sheet, name))
+            accuracy, area = classify_without_baseline(sheet, name)
+            texts[f"{name}s"] = f"{accuracy:.2f} (AUC {area:.3f})"
         except MissingExtra:
             texts[f"{name}s"] = "? (needs scikit-learn)"
     return texts
@@ -224,8 +234,8 @@ def _baseline_texts(evidence: ClaimEvidence, sheet: DataSheet) -> dict[str, Any]
 def _noise_limit_texts(evidence: ClaimEvidence, sheet: DataSheet) -> dict[str, Any]:
     """Format two results on the rule that the RMS of d3 of p_A falls, for the texts of claim 5.6.1.
 
-    They are "controls", how often the rule fires in simulations without a leak (false alarms), and "finds", the rate of
-    tests on the sheet in which the RMS falls by more than the noise (`d1_threshold`).
+    - "controls": how often the rule fires in simulations without a leak (false alarms)
+    - "finds": rate of the tests on the sheet in which the RMS falls beyond the noise (`d1_threshold`)
     """
     rate_beyond_noise = format_rate(_exceeds_noise(sheet, "p_A", "d3"))
     return {"controls": _format_controls(evidence, _A_D3), "finds": rate_beyond_noise}
@@ -246,7 +256,8 @@ def _trend_test(chamber: str) -> SheetTest:
         """
         for name in SENSITIVE:
             change = sheet.log_change(chamber, name)
-            raw, partial = float(np.corrcoef(change, leak)[0, 1]), partial_correlation(change, leak, conditions)
+            raw = float(np.corrcoef(change, leak)[0, 1])
+            partial = partial_correlation(change, leak, conditions)
             is_raw_significant = is_correlated(raw, _N_TESTS)
             is_partial_significant = is_correlated(partial, _N_TESTS, conditions.shape[1])
             parts = [raw * direction > 0 and is_raw_significant, partial * direction > 0 and is_partial_significant]
@@ -256,24 +267,31 @@ def _trend_test(chamber: str) -> SheetTest:
 
 
 def _prediction_values(evidence: ClaimEvidence, sheet: DataSheet) -> dict[str, Any]:
-    """Compute how well a linear regression predicts the mean leak of a test, for the texts of claims 5.5.3 and 5.5.4.
+    """Compute how well two linear regressions predict the mean leak of a test, for the texts of claims 5.5.3 and 5.5.4.
 
-    The values are the leave-one-out R^2 of the regression on the operating condition ("condition"), and on the log
-    changes of the RMS with the leak ("changes"). `evidence` is not used.
+    Returns the leave-one-out R^2 of each regression over the tests of Appendix C:
+
+    - "condition": on the operating condition alone, i.e. the command and the closing of the throttles
+    - "changes": on the logarithmic changes of the RMS of both chambers' details on `sheet` (`change_design`)
+
+    `evidence` is not used.
     """
-    columns = {"condition": condition_design(), "changes": change_design(sheet)}
-    return {name: leave_one_out_r2(design, mean_leaks()) for name, design in columns.items()}
+    return {
+        "condition": leave_one_out_r2(condition_design(), mean_leaks()),
+        "changes": leave_one_out_r2(change_design(sheet), mean_leaks()),
+    }
 
 
 def _test_sensitive_details(sheet: DataSheet) -> Iterator[Finding]:
-    """Test claim 5.5.1: the wavelet details of Table 5.1 change significantly, and those it leaves out do not.
+    """Test claim 5.5.1: the wavelet details in Table 5.1 change significantly, and the details left out do not.
 
-    The table has d3, d4 and d3d4 of both chambers, which must move as stated (`moves_beyond_chance`). It leaves out d1
-    and d2, for which the sign test, corrected by Holm for ten columns, must give a p-value of at least 0.05.
+    The table has d3, d4 and d3d4 of both chambers, which must move as the thesis states (`moves_beyond_chance`). It
+    leaves out d1 and d2, for which the sign test, corrected by Holm for ten columns, must give a p-value of at least
+    0.05.
     """
     p = holm_p_values(sheet)
-    for rule in (*_CELLS, *UNCLAIMED):
-        ((chamber, name),) = rule.details
+    for rule in (*CLAIMED_CELLS, *UNCLAIMED):
+        ((chamber, name),) = rule.details  # one detail
         column_p = p[chamber, name]
         as_claimed = moves_beyond_chance(sheet, chamber, name) if rule in CLAIMED else column_p >= 0.05
         change = log_change_to_percent(sheet.log_change(chamber, name))
@@ -340,7 +358,7 @@ _CLAIMS: dict[str, SheetClaim] = {
     "5.5.7": SheetClaim(_test_opposite_moves, f"tests as the sentence says, of {_N_TESTS}: ", ", "),
     "5.6.1": SheetClaim(_test_rates_over_80, values=_noise_limit_texts),
     "5.6.2": SheetClaim(_test_leak_levels, "d3 of P_A falls beyond noise: "),
-    "5.6.3": SheetClaim(_smallest_leak_test(_CELLS), _SMALLEST),
+    "5.6.3": SheetClaim(_smallest_leak_test(CLAIMED_CELLS), _SMALLEST),
     "6.1.1": SheetClaim(_test_both_chambers, "smallest test that passes d3d4 on both chambers: "),
     "5.5.1": SheetClaim(
         _test_sensitive_details, values=lambda evidence, sheet: {"d2": format_rule_rate(sheet, UNCLAIMED[1])}
@@ -399,12 +417,13 @@ def _test_rows(
 ) -> tuple[str, list[bool]]:
     """Test that the RMS of wavelet details change by more than the noise in one row of the data sheet.
 
-    The row is the one for which `test`, a test of chapter 5, is taken. `names`: the details; `statement`: "fall" if
-    only falls count, "change" for changes of either sign. The limit is the change that noise alone exceeds in 5 % of
-    the tests (`d1_threshold`). Returns a text, and True or False for each detail. If several rows can be the printed
-    test, the text also counts those with a change beyond the noise.
+    The row is that of `test.condition`, the test of Appendix C for which the test of chapter 5 is taken. `names`: the
+    details; `statement`: "fall" if only falls count, "change" for changes of either sign. The limit is the change that
+    noise alone exceeds in 5 % of the tests (`d1_threshold`). Returns a text, and True or False for each detail. If
+    several rows can be the test of chapter 5, the text also counts how many of them change beyond the noise.
     """
-    row, limit = test.condition.number - 1, d1_threshold(sheet, chamber, either_side=statement == "change")
+    row = test.condition.number - 1
+    limit = d1_threshold(sheet, chamber, either_side=statement == "change")
     changes = {name: sheet.log_change(chamber, name) for name in names}
     falls = statement == "fall"
     exceeds = {name: (-change if falls else np.abs(change)) > limit for name, change in changes.items()}
@@ -424,8 +443,8 @@ def _test_rows(
 def curve_claims(evidence: ClaimEvidence) -> Iterator[Claim]:
     """Judge the claims of chapter 5 that a leak lowers, or changes, the RMS of wavelet details of a chamber's pressure.
 
-    Each claim names a test, some details, and whether they fall or only change. The RMS of each detail must do so by
-    more than the noise in the measured data sheet (`_test_rows`); without this sheet the claim cannot be tested. For
+    Each claim names a test, some details, and whether their RMS fall or only change. In the measured data sheet the RMS
+    of each detail must do so by more than the noise (`_test_rows`); without this sheet the claim cannot be tested. For
     comparison, the texts state the simulated changes, and the changes that drifting parameters alone exceed in 5 % of
     the simulated tests.
     """
@@ -441,7 +460,7 @@ def curve_claims(evidence: ClaimEvidence) -> Iterator[Claim]:
         exceeding = [name for name, exceeds_noise in zip(names, is_beyond, strict=False) if exceeds_noise]
         by_relation = {"beyond": exceeding, "within": [name for name in names if name not in exceeding]}
         relations = [f"{_join_words(details)} {relation}" for relation, details in by_relation.items() if details]
-        # numbers of the figures: details, close-up, RMS of p_A, then of p_B; two figures before them show the leak
+        # order of a test's figures: input figures, two of the leak, three of p_A (details, close-up, RMS), three of p_B
         first = test.first_figure + test.n_input_figures + 2 + (0 if chamber == "p_A" else 3)
         yield judge_claim(
             f"5.2.{number}",

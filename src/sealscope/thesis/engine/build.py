@@ -30,11 +30,12 @@ from sealscope.thesis.sheet import MISSING, DataSheet, find_sheet, read_sheet
 
 #: Writes an item's products into a folder and returns the files, relative to the folder.
 Publish = Callable[[Item, Products, Path], tuple[str, ...]]
-#: Called with the number of finished items, the number of all items, and the ids of those in work.
+#: Called with the number of finished items, the number of all items to make, and the ids of the items in work.
 Progress = Callable[[int, int, Sequence[str]], None]
 State = Literal["made", "kept", "left out", "failed", "not made"]
 #: Libraries whose versions results and drawings depend on.
 _LIBRARIES = ("numpy", "scipy", "numba", "PyWavelets", "matplotlib")
+#: Name of the results folder in messages.
 _WHAT = "a reproduction"
 
 
@@ -42,9 +43,10 @@ _WHAT = "a reproduction"
 class ItemStatus:
     """The state of an item, that is of a figure, table or claim, in the folder of a reproduction.
 
-    `state`: "made" by this call, "kept" from an earlier one, "left out" or "failed" (for the `reason` given), or "not
-    made" (not selected, or stored by another version); `products`: without the curves of figures; `files`: paths
-    relative to the folder.
+    - `state`: "made" by this call, "kept" from an earlier call, "left out" or "failed" (for the stated `reason`), or
+      "not made" (not selected, or stored from other inputs)
+    - `products`: tables, claims, and figures without their panels
+    - `files`: paths relative to the folder
     """
 
     item: Item
@@ -101,7 +103,8 @@ def reproduce(
     if jobs is not None and jobs < 1:
         raise InputError(f"jobs must be >= 1, got {jobs}")
     all_items = load_items() if items is None else items
-    selected, root = add_needed_items(all_items, select_items(all_items, patterns)), Path(folder)
+    selected = add_needed_items(all_items, select_items(all_items, patterns))
+    root = Path(folder)
     sheet_folder = find_sheet(sheet)
     data, sheet_key = (None, "") if sheet_folder is None else read_sheet(sheet_folder)
     keys = _item_keys(all_items, sheet_key, quick, publish is not None)
@@ -164,7 +167,8 @@ def _item_keys(items: Sequence[Item], sheet_key: str, quick: bool, is_published:
     `sheet_key`: digest of the data sheet; `is_published`: True if files are written. The digest of an item includes the
     digests of the items it needs.
     """
-    by_id, sources = {item.id: item for item in items}, sources_key()
+    by_id = {item.id: item for item in items}
+    sources = sources_key()
 
     @cache
     def item_key(name: str) -> str:
@@ -181,7 +185,7 @@ def _parse_row(keys: Mapping[str, str], tree: Any) -> ItemRow | None:
     """Build the stored result of an item from JSON values; return None if it was made from other inputs.
 
     `keys`: present digest of each item's inputs, by id, with which the stored digest is compared; `tree`: the values.
-    Raises ValueError if they are no stored result.
+    Raises ValueError if they are not a stored result.
     """
     if not isinstance(tree, dict):
         raise ValueError("no row")
@@ -191,8 +195,8 @@ def _parse_row(keys: Mapping[str, str], tree: Any) -> ItemRow | None:
 def _item_status(item: Item, sheet: DataSheet | None, row: ItemRow | None, folder: Path) -> ItemStatus:
     """Determine the status of an item before anything is made: "kept", "left out" or "not made".
 
-    An item is left out if it needs the data sheet and `sheet` is None. It is kept if its stored result `row` is no
-    error and all its files still exist in `folder`; `row` is None if no result is stored.
+    An item is left out if it needs the data sheet and `sheet` is None. It is kept if its stored result `row` is not an
+    error and all its files still exist in `folder`; `row` is None if no result from the present inputs is stored.
     """
     if item.needs_sheet and sheet is None:
         return ItemStatus(item, "left out", MISSING)
@@ -202,9 +206,9 @@ def _item_status(item: Item, sheet: DataSheet | None, row: ItemRow | None, folde
 
 
 def _iter_rows(results: Generator[tuple[_Job, ItemRow | None], None, None]) -> Generator[ItemRow, None, None]:
-    """Yield the stored result (row) of each item from pairs of a job and its result.
+    """Yield the row to store for each item, from pairs (job, row).
 
-    A job whose process died has the result None, for which a row that states this error is yielded.
+    The row is None if the process of the job died; a row that states this error is then yielded instead.
     """
     with closing(results):
         for (item, key, _), row in results:
@@ -228,7 +232,7 @@ def _make_item(
         products = tuple(map(_thin_product, item.make(context, item)))
         files = () if publish is None else publish(item, products, folder)
         row = ItemRow(item.id, key, tuple(map(drop_curves, products)), files)
-        dumps(row.as_dict())  # a row that cannot be stored fails here, alone
+        dumps(row.as_dict())  # if a row cannot be stored, only its own item fails
     except Exception as error:
         return ItemRow(item.id, key, error=error_text(error) or type(error).__name__, trace=traceback.format_exc())
     return row

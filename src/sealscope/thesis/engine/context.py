@@ -50,8 +50,8 @@ class SimulatedRun:
 def simulate_run(experiment: Experiment, prove: bool) -> SimulatedRun:
     """Simulate an experiment, and return a failed run as a result instead of raising an error.
 
-    A run that its step does not resolve does not count as failed. `prove`: True to repeat the run with half the
-    solver's step and compare both.
+    A run that changes too much when the solver's step is halved does not count as failed (`resolved` is False).
+    `prove`: True to make this test, for which the run is repeated with half the step.
     """
     try:
         simulated = simulate_experiment(replace(experiment, allow_unresolved=True), prove=prove)
@@ -94,9 +94,9 @@ class Context:
         return run
 
     def product(self, name: str) -> Products:
-        """Return the products of the needed item `name`; () if that item was left out.
+        """Return the products of the needed item `name`; () if the needed item was left out.
 
-        Raises InputError if that item failed, or if the item to be made does not name it among its needs.
+        Raises InputError if the needed item failed, or if the item to be made does not name it in its `needs`.
         """
         if name not in self.needs:
             raise InputError(f"{self.name} must name {name} among its needs to ask for its products")
@@ -106,9 +106,9 @@ class Context:
 
 
 def first_table(context: Context, item: str) -> ThesisTable:
-    """Return the first table among the products of the item with the id `item`, which the item to be made needs.
+    """Return the first table among the products of a needed item with the id `item`.
 
-    Raises InputError if that item failed or made no table.
+    Raises InputError if the needed item failed or made no table.
     """
     table = next((product for product in context.product(item) if isinstance(product, ThesisTable)), None)
     if table is None:

@@ -93,8 +93,8 @@ def load_items() -> tuple[Item, ...]:
 def _iter_row_items(name: str, chapter: int, row: Mapping[str, Any]) -> Iterator[Item]:
     """Yield the items (figures, tables, claims) that a row of `items.toml` describes.
 
-    It is one item, whose id is `name`, the key of the row. If the row has an entry `each`, this names a function that
-    lists (id, title, inputs) of several items.
+    A row describes one item, whose id is `name`, the key of the row. If the row has an entry `each`, it describes
+    several items instead: the entry names a function that yields (id, title, inputs) of each.
     """
     row_inputs: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in row.items()}
     row_fields: dict[str, Any] = {key: row_inputs.pop(key) for key in row if key in _FIELDS}

@@ -69,7 +69,7 @@ class Panel:
 
 @dataclass(frozen=True)
 class Number:
-    """One number, or a short text, that a figure reports in addition to its curves; `unit`: "" for none."""
+    """One number, or a short text, that a figure reports in addition to its curves; `unit`: "" for no unit."""
 
     name: str
     value: float | str
@@ -119,8 +119,8 @@ Verdict = Literal["holds", "holds in part", "does not hold", "cannot be tested"]
 class Claim:
     """One testable sentence of the thesis, in our words, and the verdict on it.
 
-    `where`: place in the thesis; `claim`: the sentence; `sheet`, `simulation`: texts of the findings on the data sheet
-    of Appendix C and in simulation; `why`: reason for the verdict.
+    `where`: place in the thesis; `claim`: the sentence; `sheet`: text of the findings on the data sheet of Appendix C;
+    `simulation`: text of the findings in simulation; `why`: reason for the verdict.
     """
 
     id: str
@@ -135,8 +135,9 @@ class Claim:
 def claim_verdict(tests: Iterable[bool | None]) -> Verdict:
     """Judge a claim by the results of tests of its parts.
 
-    It `holds` if all tests pass, `does not hold` if none does, and `holds in part` otherwise. A result of None is a
-    test that cannot be made; it is ignored. Without any other result the claim `cannot be tested`.
+    The claim `holds` if all tests pass, `does not hold` if no test passes, and `holds in part` otherwise. A result of
+    None stands for a test that cannot be made, and is ignored. If there are no other results, the claim `cannot be
+    tested`.
     """
     results = {bool(test) for test in tests if test is not None}
     if len(results) == 1:
@@ -147,8 +148,8 @@ def claim_verdict(tests: Iterable[bool | None]) -> Verdict:
 def thin_curve(x: Array, y: Array, max_points: int = 4000) -> tuple[Array, Array]:
     """Thin a curve (x, y) to about `max_points` points that preserve its peaks.
 
-    They are the minimum and the maximum of each block of successive points. A curve with at most `max_points` points
-    is returned unchanged.
+    They are the minimum and the maximum of each block of successive points; points after the last whole block are left
+    out. A curve with at most `max_points` points is returned unchanged.
     """
     if x.size <= max_points:
         return x, y

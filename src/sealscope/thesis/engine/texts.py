@@ -28,14 +28,13 @@ def format_note(name: str, **values: Any) -> str:
 def judge_claim(id: str, tests: Iterable[bool | None], kind: str = "", /, **values: Any) -> Claim:
     """Judge the claim `id` by the tests of its parts (`claim_verdict`), and fill `values` into its texts.
 
-    `tests`: results, None for a test that cannot be made; the claim holds if all others pass. The texts are in
-    `claims.toml` under `id`, or under `kind` for claims that share texts; `values` replace their placeholders. Values
-    named `sheet` (finding by the thesis's data sheet), `simulation` (finding by simulation) and `why` (reason of the
-    verdict) replace the whole text of that name.
+    `tests`: results, None for a test that cannot be made. The texts are in `claims.toml` under `id`, or under `kind`
+    for claims that share texts. `values` replace their placeholders, except three that replace a whole text: `sheet`
+    (finding on the thesis's data sheet), `simulation` (finding by simulation) and `why` (reason for the verdict).
     """
     claims = load_texts("claims.toml")
     templates = dict(claims[kind or id])
-    # a claim without a text on the sheet has the one of its chapter, by the prefix of its id
+    # a claim without a text on the sheet gets the text of its chapter, by the prefix of its id
     templates.setdefault("sheet", next(text for prefix, text in claims["sheet"].items() if id.startswith(prefix)))
     replaced = {name: values[name] for name in ("sheet", "simulation", "why") if name in values}
     texts = {name: template.format(**values) for name, template in templates.items() if name not in replaced}

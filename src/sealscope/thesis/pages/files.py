@@ -60,10 +60,10 @@ def publish(item: Item, products: Sequence[Product | Claim], folder: Path) -> tu
 
 
 def figure_rows(figure: Figure) -> Iterable[Sequence[object]]:
-    """Yield the heads of the columns, then the rows, of a table of all points that a figure shows.
+    """Yield a table of all points that a figure shows: the heads of its columns, then its rows.
 
-    The columns are x and y of each curve, and x, y and value of each image. Columns of different length are filled with
-    empty texts.
+    The columns are x and y of each curve, and x, y and value of each image. Shorter columns are filled with empty
+    texts.
     """
     heads: list[str] = []
     columns: list[list[str]] = []

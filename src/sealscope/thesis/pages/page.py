@@ -23,6 +23,7 @@ CHAPTERS = {
     5: "Chapter 5 and Appendix C: leaks, details and their RMS",
     6: "Chapter 6: what follows",
 }
+#: Tone (class of the style sheet) of each verdict.
 _TONES = {"holds": "ok", "holds in part": "open", "does not hold": "leak", "cannot be tested": "none"}
 #: A table with more rows is collapsed.
 _MAX_OPEN_ROWS = 45
@@ -105,7 +106,7 @@ def _page_product(
 ) -> PageProduct:
     """Build the page's entry of a figure or table from its files in `folder`.
 
-    `claims`: all claims by id, from which those that the product supports or refutes are taken.
+    `claims`: all claims by id; the entry gets those that the product supports or refutes.
     """
     picture = _encode_picture(folder, product.id) if isinstance(product, Figure) else ""
     product_claims = [claims[name] for name in product.claims if name in claims]
@@ -128,7 +129,10 @@ def _encode_picture(folder: Path, name: str) -> str:
 
 
 def format_cell(value: Any) -> str:
-    """Format a table's value for the page: numbers with five significant digits, None and nan as a dash."""
+    """Format a table's value for the page: numbers with five significant digits, None and nan as a dash.
+
+    Numbers of 1e5 and more have four digits.
+    """
     if value is None or (isinstance(value, float) and math.isnan(value)):
         return "–"
     if isinstance(value, float):

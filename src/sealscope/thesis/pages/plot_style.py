@@ -11,7 +11,7 @@ from sealscope.thesis.engine.products import Role
 
 
 class Style(NamedTuple):
-    """Line style of the curves with one role, i.e. one meaning: colour, dashes, width [pt], and marker.
+    """Line style of all curves with the same role, i.e. meaning: colour, dashes, width [pt], and marker.
 
     `dashes`: lengths of dashes and gaps in turn, () for a solid line; `filled`: True for a filled marker.
     """
@@ -50,18 +50,22 @@ def caption(figure_id: str, title: str) -> str:
 def typeset(label: str) -> str:
     """Convert the symbols in a label, such as p_A, d3, omega and m^3/s, to matplotlib's mathematical notation."""
     text = label.replace("$", r"\$")
+    # wavelet details
     text = re.sub(r"\bd3d4\b", r"$d_3 d_4$", text)
     text = re.sub(r"\bd([1-9])\b", r"$d_\1$", text)
+    # symbols with a subscript, then Greek letters without
     text = re.sub(
         r"(?<![\w$])(omega|theta|[A-Za-z])_([A-Za-z0-9]{1,4})(?![\w$])",
         lambda m: f"${_GREEK.get(m[1], m[1])}_{{\\mathrm{{{m[2]}}}}}$",
         text,
     )
     text = re.sub(r"(?<![\w$\\])(omega|theta)(?![\w$])", lambda m: f"${_GREEK[m[1]]}$", text)
+    # areas and volumes such as cm3, whole exponents, then decimal exponents
     text = re.sub(r"\b([cm]?m)([23])\b", lambda m: m[1] + m[2].translate(_RAISED), text)
     text = re.sub(r"\^(-?\d+)(?![\d.])", lambda m: m[1].translate(_RAISED), text)
     return re.sub(r"\^(-?\d+\.\d+)", r"$^{\1}$", text)
 
 
 _GREEK = {"omega": r"\omega", "theta": r"\theta"}
+#: Superscript of each digit.
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.legend import Legend
 
 UNRESOLVED = "not resolved: halving the step moves it"
-#: Limit of an SVG with curves as paths [bytes]; in a larger one long curves are rasterised.
+#: Largest SVG with all curves as paths [bytes]; in a larger SVG long curves are rasterised.
 MAX_SVG_BYTES = 380_000
 DPI = 200
 #: Width of a figure, and heights of its parts [inch].
@@ -32,7 +32,8 @@ _LINE_HEIGHT, _CAPTION_MARGIN = 0.16, 0.14
 _ROW_HEIGHTS = {1: 3.4, 2: 2.35, 3: 1.85, 4: 1.6}
 #: Characters of a caption's line.
 _CAPTION_CHARACTERS = 122
-#: Width of a label's line and margin in a legend, and of all labels that fit above a figure or its panel [characters].
+#: Width of a label's line and margin in a legend, and width of all labels that fit above a figure or a panel
+#: [characters].
 _LABEL_MARGIN, _MAX_SHARED_CHARACTERS, _MAX_LEGEND_CHARACTERS = 6, 100, 92
 #: Points to which a line is thinned.
 _MAX_POINTS = 2400
@@ -120,8 +121,8 @@ def choose_grid(n_panels: int) -> tuple[int, int]:
 def _draw_figure(figure: Figure) -> MplFigure:
     """Lay out and draw a figure with matplotlib.
 
-    From the top: a warning if a run changed when the solver's step was halved, the legend if all panels share it, the
-    panels, and the caption.
+    From top to bottom it has: a warning if a run is not resolved by the solver's step, the legend if all panels share
+    it, the panels, and the caption.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure as MplFigure
@@ -234,8 +235,8 @@ def drawn_points(curve: FigureCurve, x_range: _Range | None) -> tuple[np.ndarray
 def _draw_curve(ax: Axes, curve: FigureCurve, n_before: int, x_range: _Range | None, *, is_only: bool) -> None:
     """Draw a curve into `ax` in the line style of its role.
 
-    `n_before`: number of earlier curves with this role in the panel, which chooses other dashes; `is_only`: True for
-    the panel's only curve, which is drawn in colour even if its role is a reference.
+    `n_before`: number of earlier curves with this role in the panel, by which other dashes are chosen; `is_only`: True
+    for the only curve of a panel, which is drawn in the style "other" if its role is "reference".
     """
     style = STYLES["other" if is_only and curve.role == "reference" else curve.role]
     x, y = drawn_points(curve, x_range)
@@ -261,7 +262,7 @@ def _draw_curve(ax: Axes, curve: FigureCurve, n_before: int, x_range: _Range | N
 def _has_shared_legend(panels: Sequence[Panel]) -> bool:
     """Return True if one legend serves all panels of a figure.
 
-    It does if there are several panels, all with the same two or more curves, and if the labels fit on one line.
+    This is so if there are several panels, all with the same two or more curves, and if the labels fit on one line.
     """
     keys = {tuple((curve.label, curve.role, curve.kind) for curve in panel.curves) for panel in panels}
     labels = [curve.label for curve in panels[0].curves] if panels else []
@@ -272,7 +273,7 @@ def _has_shared_legend(panels: Sequence[Panel]) -> bool:
 def _add_legend(ax: Axes, panel: Panel) -> None:
     """Add the legend of a panel, above the axes if it fits on one line, else on their right.
 
-    A panel with a single curve needs none if it has no title or if its y axis names the curve.
+    A panel with a single curve gets no legend if it has no title or if its y axis names the curve.
     """
     labels = [curve.label for curve in panel.curves if curve.label]
     if not labels or (len(panel.curves) == 1 and (not panel.title or labels[0] in panel.y_label)):

@@ -23,9 +23,9 @@ from sealscope.thesis.engine.context import Context, SimulatedRun
 
 Solver = Literal["converged", "as_published"]
 SOLVERS: tuple[Solver, ...] = ("converged", "as_published")
-#: Labels of the solvers in tables ...
+#: Labels of the solvers in tables.
 SOLVER_TEXT: dict[Solver, str] = {"converged": "converged", "as_published": "RK4 1e-4 s"}
-#: ... and in the legends of figures, in the order of drawing.
+#: Labels of the solvers in the legends of figures, in the order of drawing.
 LABELS: dict[Solver, str] = {"as_published": "RK4, 1e-4 s", "converged": "converged"}
 #: The runs of one case by solver.
 Runs = dict[Solver, SimulatedRun]
@@ -35,8 +35,8 @@ THESIS_STEP = 1e-4
 DURATION = 6.5
 STEADY = (math.pi, 2.0 * math.pi)
 WINDOW = "from pi to 2 pi s of a run from standstill"
-#: One sample per three steps of 1e-4 s: if a solution alternates from step to step, an odd number samples both of its
-#: values, while every 2nd, 4th or 20th step would hide the oscillation.
+#: Sampling rate [Hz]: one sample per three steps of 1e-4 s. Samples an odd number of steps apart show a solution that
+#: alternates from step to step; samples an even number of steps apart would hide the oscillation.
 SAMPLE_RATE = 1.0 / (3.0 * THESIS_STEP)
 #: Pressure difference [Pa] below which a throttle is laminar. Eqs. (4.9)-(4.12) have no such limit, and their infinite
 #: slope at zero cannot be integrated; 1 Pa is far below every drop.
@@ -88,7 +88,7 @@ class Reading:
         sampling: tuple[tuple[str, str | float], ...] = (("daq.sample_rate", SAMPLE_RATE),)
         if closed_pct is None:
             return sampling
-        # open throttles are the same under all readings; one key of parameters lets the runs be shared
+        # open throttles are the same under all readings: with the same parameters, their runs are shared
         reading = replace(self, metering="meter-out", closed_means="area") if closed_pct == 0 else self
         return (
             *sampling,
@@ -211,12 +211,12 @@ def summarise_run(run: SimulatedRun) -> dict[str, float]:
 def piston_drift(run: SimulatedRun) -> float:
     """Compute the drift [m] of the piston: its mean position in the last whole period of the command minus the first.
 
-    It is nan if the run diverged.
+    Returns nan if the run diverged.
     """
     if run.diverged:
         return math.nan
     t, x = run.t, run.outputs["x"]
-    last_period = int((t[-1] + t[1] - t[0]) // PERIOD) - 1
+    last_period = int((t[-1] + t[1] - t[0]) // PERIOD) - 1  # number of the last whole period, from 0
     means = [float(x[(t >= k * PERIOD) & (t < (k + 1) * PERIOD)].mean()) for k in (0, last_period)]
     return means[1] - means[0]
 

@@ -43,10 +43,10 @@ from sealscope.thesis.sines import sine_fit
 DRIFT_FRACTION = 0.01
 #: Peaks of the pressures in the thesis's figures [MPa].
 _PRINTED_PEAK_MPA = 0.4
-#: Largest residual of the speed from a sine, and largest difference of the two flows, as fractions of their rms.
+#: Largest residual of the speed from a sine, and largest difference of the two flows, as fractions of the rms.
 _MAX_RESIDUAL, _MAX_FLOW_DIFFERENCE = 0.05, 0.05
 _T = TypeVar("_T")
-#: Numbers (`cases.summarise_run`) of several commands or closings.
+#: Summaries of runs (`cases.summarise_run`) with several commands or closings.
 Rows = list[dict[str, float]]
 
 
@@ -62,18 +62,20 @@ def ringing(run: SimulatedRun, window: float = 0.05, after: float = 0.3) -> floa
     moving_mean = np.convolve(np.pad(p_A, n_window // 2, mode="edge"), np.full(n_window, 1.0 / n_window), mode="valid")
     ringing_part = p_A - moving_mean
     reversals = np.flatnonzero(np.diff(np.sign(omega)) != 0)
-    n_after, last = round(after * rate), p_A.size - n_window
+    n_after = round(after * rate)
+    last = p_A.size - n_window
     # without the first second, in which the run starts, and without the ends of the moving mean
     used = [k for k in reversals if run.t[k] > 1.0 and k + n_after < last]
     return float(np.median([np.ptp(ringing_part[k + n_window : k + n_after]) for k in used]))
 
 
 def _judge_cases_without_orifices(context: Context) -> Iterator[Claim]:
-    """Judge claims 4.2 and 4.4 to 4.6 on the cases without orifices, which are those of Table 4.2.
+    """Judge claims 4.2 and 4.4 to 4.6 on the cases without orifices, listed in Table 4.2.
 
-    4.2: the motor's speed is a sine, with a residual of at most 5 % of its rms. 4.4: on measured displacements, which
-    cannot be tested. 4.5: without noise the pressure p_A does not ring visibly after a reversal. 4.6: without Coulomb
-    friction the drift of the piston changes by more than 1 %.
+    - 4.2: the motor's speed is a sine, with a residual below 5 % of the sine's rms.
+    - 4.4, on measured displacements, cannot be tested.
+    - 4.5: without noise the pressure p_A does not ring visibly after a reversal.
+    - 4.6: without Coulomb friction the drift of the piston changes by more than 1 %.
     """
     runs = {command: context.run(make_experiment(command, None)) for command in COMMANDS}
     fits, tests = [], []
@@ -90,20 +92,23 @@ def _judge_cases_without_orifices(context: Context) -> Iterator[Claim]:
     yield judge_claim("4.2", tests, fits="; ".join(fits))
     spans = "; ".join(f"{name}: {cases.steady_range(run, 'x') * 1e3:.1f} mm peak to peak" for name, run in runs.items())
     yield judge_claim("4.4", NOT_TESTED, spans=spans)
-    noise, rings = cases.visible_pressure(), {name: ringing(run) for name, run in runs.items()}
+    noise = cases.visible_pressure()
+    rings = {name: ringing(run) for name, run in runs.items()}
     text = ", ".join(f"{ring * 1e-3:.1f} kPa ({name})" for name, ring in rings.items())
     yield judge_claim("4.5", [ring < noise for ring in rings.values()], rings=text, noise=noise * 1e-3)
 
     def drift_mm(**overrides: float) -> float:
         """Compute the drift [mm] of the piston in a run of 60 s, with some of the rig's parameters replaced.
 
-        The drift is the mean position in the last whole period of the command minus that in the first.
+        The drift is the mean position in the last whole period of the command minus the mean in the first period.
         """
         run = context.run(cases.make_drift_experiment(DEFAULT_READING, None, "converged", **overrides))
         return 1e3 * cases.piston_drift(run)
 
     # F_pr and F_cfr: Coulomb force without pressure, and its increase with pressure; breakaway is a multiple of both
-    baseline, without_friction, without_integral = drift_mm(), drift_mm(F_pr=0.0, F_cfr=0.0), drift_mm(K_i=0.0)
+    baseline = drift_mm()
+    without_friction = drift_mm(F_pr=0.0, F_cfr=0.0)
+    without_integral = drift_mm(K_i=0.0)  # integral gain of the speed loop
     tests = [abs(baseline - without_friction) > DRIFT_FRACTION * abs(baseline)]
     yield judge_claim("4.6", tests, baseline=baseline, smooth=without_friction, unintegrated=without_integral)
 
@@ -111,8 +116,8 @@ def _judge_cases_without_orifices(context: Context) -> Iterator[Claim]:
 def _judge_step_and_gains(context: Context) -> Iterator[Claim]:
     """Judge claims 4.1 and 4.3 on the solver's step and on the gains of the speed loop.
 
-    They hold if halving the thesis's step of 1e-4 s changes a run by no more than the tolerance: in each case of Tables
-    4.2 and 4.3 (4.1), and in two runs with the gains of the thesis's drive (4.3).
+    A test passes if halving the thesis's step of 1e-4 s changes a run by no more than the tolerance. The runs are all
+    cases of Tables 4.2 and 4.3 for claim 4.1, and two runs with the gains of the thesis's drive for claim 4.3.
     """
     runs = {case: context.run(make_experiment(*case, solver="as_published")) for case in cases.CASES.values()}
 
@@ -149,7 +154,8 @@ def _judge_equations_and_tables(context: Context) -> Iterator[Claim]:
     cylinder with less resistance than back, on both sides.
     """
     rig = thesis_rig()
-    charge, run = rig.fluid.p_charge * 1e-6, context.run(make_experiment(COMMANDS[0], 25.0))
+    charge = rig.fluid.p_charge * 1e-6  # [MPa]
+    run = context.run(make_experiment(COMMANDS[0], 25.0))
     peaks = [float(steady_output(run, name).max()) * 1e-6 for name in PRESSURES]
     low, high = min(peaks), max(peaks)
     needed = charge + _PRINTED_PEAK_MPA - high  # charge pressure with which the peaks are as printed
@@ -217,9 +223,9 @@ def _format_range(values: Iterable[float], unit: str = "kPa", factor: float = 1e
 
 
 def _range_text(head: str, values: Callable[[Rows], Iterable[float]]) -> Callable[[list[Rows]], str]:
-    """Build a function that formats the smallest and largest of some numbers [kPa] over all runs that it is given.
+    """Build a function that formats the smallest and the largest of some numbers [kPa] over several runs.
 
-    The function takes, for each interpretation of the throttles' equations, the list of its runs' summaries
+    The function's argument has, for each interpretation of the throttles' equations, the list of its runs' summaries
     (`summarise_run`). `values`: computes the numbers [Pa] from one such list; `head`: text before the numbers.
     """
     return lambda rows_of_readings: f"{head} {_format_range(v for rows in rows_of_readings for v in values(rows))}"
@@ -243,7 +249,7 @@ def _run_cases(context: Context, *commands_and_closings: tuple[str, float]) -> d
     """
 
     def summarise(command: str, closed: float, reading: Reading, solver: Solver) -> dict[str, float]:
-        """Simulate one case under one interpretation, orifices closed by `closed` [%], and summarise its run."""
+        """Simulate one case under one interpretation of the equations, and summarise its run."""
         return cases.summarise_run(context.run(make_experiment(command, closed, reading, solver)))
 
     return {
@@ -255,9 +261,11 @@ def _run_cases(context: Context, *commands_and_closings: tuple[str, float]) -> d
 def _judge_opening(context: Context) -> Iterator[Claim]:
     """Judge claims 4.8 to 4.12 on the change from open orifices to orifices that are 25 % closed.
 
-    4.8: no pressure's peak or range changes visibly. 4.9: the flows Q_A and Q_B differ by less than 5 %. 4.10: the peak
-    of each pressure changes visibly. 4.11: the mean of p_1 is visibly below that of p_A. 4.12: the mean of p_2 is
-    visibly above that of p_B. Visible is more than a transducer's noise (`visible_pressure`).
+    - 4.8: no pressure's peak or range changes visibly, i.e. by more than a transducer's noise (`visible_pressure`).
+    - 4.9: the flows Q_A and Q_B differ by less than 5 %.
+    - 4.10: the peak of each pressure changes visibly.
+    - 4.11: the mean of p_1 is visibly below the mean of p_A.
+    - 4.12: the mean of p_2 is visibly above the mean of p_B.
     """
     min_visible = cases.visible_pressure()
     opening = _run_cases(context, (COMMANDS[0], 0.0), (COMMANDS[0], 25.0))
@@ -289,9 +297,12 @@ def _judge_opening(context: Context) -> Iterator[Claim]:
 def _judge_larger_closings(context: Context) -> Iterator[Claim]:
     """Judge claims 4.14 to 4.16 and 4.21 on larger commands and closings of the orifices.
 
-    4.14: the pressures' ranges (maximum minus minimum) grow with the amplitude of the command. 4.15: tighter orifices
-    raise the chamber pressures' peaks (maxima). 4.16: they raise the ranges of all four pressures. 4.21: the drop at
-    the orifices is large. Each change or drop must exceed a transducer's noise (`visible_pressure`).
+    - 4.14: the pressures' ranges (maximum minus minimum) grow with the amplitude of the command.
+    - 4.15: tighter orifices raise the chamber pressures' peaks (maxima).
+    - 4.16: tighter orifices raise the ranges of all four pressures.
+    - 4.21: the largest drop at the orifices is visible.
+
+    Each change or drop must exceed a transducer's noise (`visible_pressure`).
     """
     min_visible = cases.visible_pressure()
     by_command = _run_cases(context, *((command, 50.0) for command in COMMANDS))
@@ -391,7 +402,7 @@ def _judge_drift(context: Context) -> Iterator[Claim]:
     yield _judge_runs(19, drifts, grows, drift_formatter(head))
 
 
-#: Numbers of a row of the table of readings, and the factors to the table's units.
+#: Keys of a run's summary that the table of readings shows, and the factor from SI units to the table's units.
 _TABLE_FACTORS: dict[str, float] = {
     **{f"range of {name}": 1e-6 for name in PRESSURES},
     "least pressure": 1e-6,

@@ -52,10 +52,11 @@ FIGURE_UNITS: dict[str, FigureUnit] = {
 }
 #: Gauge pressure [MPa] of a vacuum.
 _VACUUM = -1e-6 * P_ATM
-#: Two curves coincide if their rms difference is below this fraction of their range; one is then drawn as a number of
-#: marks.
+#: Two curves coincide if their rms difference is below this fraction of their range; one of them is then drawn as this
+#: number of marks.
 _COINCIDENCE_FRACTION, _N_MARKS = 0.005, 80
 _CLOSING_ROLES: dict[float, Role] = {25.0: "25 %", 50.0: "50 %", 75.0: "75 %"}
+#: Line volumes V_1 = V_2 [cm^3] that are compared, and those of a quick reproduction.
 _VOLUMES, _QUICK_VOLUMES = (10.0, 20.0, 44.0, 100.0, 234.0, 500.0), (10.0, 44.0, 234.0)
 
 
@@ -78,7 +79,7 @@ def _run_case(context: Context, item: Item) -> tuple[Runs, str]:
 def _run_notes(runs: Runs, reading: Reading | None) -> str:
     """Format the notes on a figure of a case: variant of the equations, and runs that failed or need a smaller step.
 
-    They also name runs in which a pressure falls below vacuum. `reading`: one way to understand the thesis's
+    The notes also name runs in which a pressure falls below vacuum. `reading`: one way to understand the thesis's
     inconsistent equations (`Reading`); None for a case without orifices.
     """
     notes = [format_note("measured-curve")]
@@ -128,8 +129,8 @@ def _solver_curves(runs: Runs, name: str) -> tuple[FigureCurve, ...]:
 def _rms_difference(runs: Runs, name: str) -> float:
     """Compute the rms difference of an output between the runs with the thesis's solver and with a converged one.
 
-    It is in the figures' unit (`FIGURE_UNITS`), and computed from pi to 2 pi seconds of the runs; nan if one of them
-    diverged.
+    The difference is in the figures' unit (`FIGURE_UNITS`), and taken from pi to 2 pi seconds of the runs. It is nan if
+    a run diverged.
     """
     difference = steady_output(runs["as_published"], name) - steady_output(runs["converged"], name)
     return float(np.sqrt(np.mean(difference**2)) * FIGURE_UNITS[name].scale)
@@ -139,7 +140,7 @@ def case_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Tabulate minimum, maximum and standard deviation of each quantity in a case of Table 4.2 or 4.3.
 
     The case is simulated with the thesis's solver (RK4, 1e-4 s) and with a converged one. The last column is the rms
-    difference of both. All numbers are from pi to 2 pi seconds of the runs.
+    difference between both runs. All numbers are from pi to 2 pi seconds of the runs.
     """
     runs, notes = _run_case(context, item)
     rows: list[tuple[Cell, ...]] = []

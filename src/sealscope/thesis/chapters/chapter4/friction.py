@@ -56,9 +56,9 @@ def friction_at_threshold(F_C: float) -> dict[str, tuple[float, float]]:
 def falling_friction_limit(F_C: float) -> float:
     """Compute the velocity [m/s] up to which the friction falls with speed, for the Coulomb force `F_C` [N].
 
-    It solves F_v = F_C (K_brk - 1) C_c exp(-C_c v), where viscous friction rises as fast as Stribeck friction falls,
-    and is 0 if the friction never falls. The parameters are those of the thesis's rig: F_v [N s/m] viscous coefficient,
-    K_brk breakaway force over Coulomb force, C_c [s/m] decay of the Stribeck effect.
+    At this velocity v, viscous friction rises as fast as Stribeck friction falls: F_v = F_C (K_brk - 1) C_c exp(-C_c
+    v). The result is 0 if the friction never falls. The parameters are those of the thesis's rig: F_v [N s/m] viscous
+    coefficient, K_brk breakaway force over Coulomb force, C_c [s/m] decay of the Stribeck effect.
     """
     f = thesis_rig().friction
     return max(0.0, math.log(F_C * (f.K_brk - 1.0) * f.C_c / f.F_v) / f.C_c)
@@ -94,7 +94,7 @@ def stribeck_figure(context: Context, item: Item) -> tuple[Figure, ...]:
     """
     rig = thesis_rig()
     f = rig.friction
-    charged = f.F_pr + f.F_cfr * 2.0 * rig.fluid.p_charge
+    charged = f.F_pr + f.F_cfr * 2.0 * rig.fluid.p_charge  # Coulomb force with both chambers at charge pressure
     v = np.linspace(-0.2, 0.2, 1601)
     v_slow = np.linspace(-2.0 * f.v_th, 2.0 * f.v_th, 1601)
     v_above = np.linspace(f.v_th, 0.2, 800)
