@@ -72,6 +72,16 @@ from ..refusals import refusal
             {"x": "Kolbenweg [mm]", "t": "t [s]", "u": "Stellsignal [V]"},
         ),
         (
+            "Zeit [s];Kolbenseitendruck [bar];Stangenraumdruck [bar];Kolbenweg [mm];Pumpendrehzahl [1/min]",
+            {
+                "t": "Zeit [s]",
+                "p_A": "Kolbenseitendruck [bar]",
+                "p_B": "Stangenraumdruck [bar]",
+                "x": "Kolbenweg [mm]",
+                "omega": "Pumpendrehzahl [1/min][rpm]",
+            },
+        ),
+        (
             "time_s;p_A_bar;p_B_bar;x_mm;p_pump_bar;p_tank_bar;spool_pct;flow_A_lpm",
             {
                 "t": "time_s[s]",

@@ -200,14 +200,17 @@ def _split_words(name: str) -> set[str]:
 
     The result also contains parts of words:
 
-    - the last part of a German compound, such as `weg` of `kolbenweg`;
+    - both parts of a German compound, such as `kolbenseite` and `druck` of `kolbenseitendruck`, where the last part is
+      a known ending, and the letter that links them is dropped;
     - both letters of `pa` and `pb`, i.e. `p` and the side;
     - known words of languages without spaces, such as Chinese.
     """
     words = {word for word in _UNSPACED if word in name}
     for token in (token.casefold() for token in _TOKEN.findall(_strip_accents(name))):
         words |= {token, "p", token[1:]} if token in ("pa", "pb") else {token}
-        words |= {ending for ending in WORDS["endings"] if token.endswith(ending)}
+        for ending in (ending for ending in WORDS["endings"] if token.endswith(ending)):
+            first = token.removesuffix(ending)
+            words |= {ending, first, first.removesuffix("n"), first.removesuffix("s")} - {""}
     return words
 
 
