@@ -18,15 +18,15 @@ if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
 _log = logging.getLogger(__name__)
-#: Data of a user's own detector (`decision/events.toml`).
+#: Kind of data (`Observable.data`) of a user's own detector, as in `decision/events.toml`.
 PLUG_IN = "plug-in"
 
 
 class Detector(Protocol):
     """A detector, which estimates quantities over a recording and tests them for changes, without a verdict.
 
-    Its recordings are uniformly sampled, and no sample of the chamber pressures and the command is missing: missing
-    ones are bridged and marked in `Recording.bridged`. Any other channel may be absent or contain NaN.
+    The recordings that a detector receives are uniformly sampled. Missing samples of the chamber pressures and the
+    command are interpolated and marked in `Recording.bridged`. Any other channel may be absent or contain NaN.
 
     A method `learn(recording)` may return the detector's summary of a healthy recording as plain values, or None. A
     detector with this method also receives stored summaries (`healthy.SummarisedRecording`) as baselines, and reads
@@ -42,20 +42,20 @@ class Detector(Protocol):
     def observe(self, recording: Recording, baseline: Sequence[Any] = ()) -> Observed:
         """Estimate the detector's quantities in a `usable` recording, test each for a change, and report both.
 
-        `baseline` holds leak-free recordings of the same machine with any load cycle, none of them twice. If it is
-        empty, only changes within the recording are tested.
+        `baseline` holds different leak-free recordings of the same machine, with any load cycle. If it is empty, only
+        changes within the recording are tested.
         """
         ...
 
 
-#: Makes a detector for what it may assume of the machine.
+#: Creates a detector for a rig, from which the detector takes its assumptions on the machine.
 Factory = Callable[["Rig"], Detector]
 
 
 def unusable_reason(detector: Detector, recording: Recording) -> str | None:
     """Return a line of text with the reason why a detector cannot use a recording; None if it can use it.
 
-    Raises TypeError if the detector gives anything else than a text or None.
+    Raises TypeError if the detector's method `usable` returns anything other than a text or None.
     """
     reason: Any = detector.usable(recording)
     if reason is None:
@@ -68,7 +68,7 @@ def unusable_reason(detector: Detector, recording: Recording) -> str | None:
 def make_observable(
     name: str, chance: float, *, size: float = 0.0, onset: tuple[float, float, float] | None = None
 ) -> Observable:
-    """Make the observable of a user's own detector from its p-value; it counts as a change that a piston leak causes.
+    """Make the observable of a user's own detector from its p-value; the change counts as an effect of a piston leak.
 
     Parameters
     ----------
@@ -90,8 +90,9 @@ def make_observable(
 def validate_report(report: Any, name: str) -> Observed:
     """Return a detector's report, with `name` as its provider; raise an error if the report is not valid.
 
-    A single observable counts as a report. Raises TypeError for wrong types, ValueError for a chance outside 0 to 1
-    or a reason of several lines, and ArithmeticError for a score that is not finite.
+    A single observable counts as a report. Raises TypeError for wrong types, and ArithmeticError for a score that is
+    not finite. Raises ValueError for a chance outside 0 to 1, or if `Observed.lack`, the reason why nothing could be
+    observed, has several lines.
     """
     if isinstance(report, Observable):
         report = Observed(name, (report,))
@@ -127,5 +128,5 @@ def log_failure(name: str, distribution: str | None, error: Exception) -> str:
 
 @cache
 def _log_once(line: str) -> None:
-    """Log a line with the traceback of the exception being handled, once per process for each text of the line."""
+    """Log a line with the traceback of the present exception; the cache suppresses further calls with this line."""
     _log.exception("%s", line)

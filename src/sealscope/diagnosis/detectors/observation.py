@@ -1,6 +1,6 @@
-"""Run detectors on recordings, and collect how unusual the changes within healthy recordings look.
+"""Run detectors on recordings, and collect the surprisals of the changes that they find in healthy recordings.
 
-The measure is the surprisal, -log(chance), with the chance that the detector's own law gives for such a change.
+The surprisal of a change is -log(chance), where chance is the p-value that the detector states for the change.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from sealscope.recordings.channels import flow_source
 from sealscope.recordings.motion import describe_hold
 from sealscope.recordings.recording import Recording, compute_once
 
-#: Key of a recording's cache for the surprisals of its observables.
+#: Key of the surprisals of a recording's observables in its cache (`compute_once`).
 SURPRISALS = "surprisals"
-#: Prefix of the keys of a balance under the hypothesis that the pump is cut off at rest (`regimes`).
+#: Prefix of the keys of surprisals of the volume balance if valves cut the pump off at rest.
 SHUT = "shut, "
 #: Minimum number of healthy recordings to compare each with all others.
 MIN_COMPARED = 3
@@ -66,9 +66,9 @@ def _thread_pools(n_modules: int) -> Any:
 def observe_rivals(recording: Recording, baseline: Sequence[Healthy], distrust: str | None = None) -> Observed:
     """Test a recording for changes of duty, noise, mains hum and mean pressures, which may be mistaken for a leak.
 
-    The duty is how the machine is moved and loaded. The changes are tested within the recording and, if `baseline` is
-    not empty, against its healthy recordings. `distrust` is the reason why the pressures cannot be judged, in which
-    case the report is empty; None if they can.
+    The duty is how the machine is moved and loaded. The changes are tested within the recording and against the healthy
+    recordings of `baseline`. `distrust` is the reason why the pressures cannot be judged, None if they can. If it is
+    given, nothing is tested, and the report only states the reason.
     """
     if distrust:
         return Observed(SIGNALS, lack=distrust)
@@ -92,17 +92,20 @@ def run_detector(
             if detector.name != name:
                 raise ValueError(f"its name must be that of its entry point, {name!r}, got {detector.name!r}")
             return _observe(detector, recording, baseline, distrust)
-    except Exception as error:
-        lack = log_failure(name, getattr(factory, "distribution", None), error)
+    except Exception as error:  # a plug-in may raise anything
+        distribution = getattr(factory, "distribution", None)
+        lack = log_failure(name, distribution, error)
         return Observed(name, lack=lack, has_failed=True)
 
 
 def _observe(detector: Detector, recording: Recording, baseline: Sequence[Healthy], distrust: str | None) -> Observed:
-    """Run a detector with those baseline recordings that it can use.
+    """Run a detector with the baseline recordings that it can use.
 
-    `distrust`: reason why the pressures cannot be judged, None if they can. If the detector cannot use the recording,
-    or none of the given baselines, the report is empty and states the reason. Without a baseline, the report is also
-    empty if a pressure does not move for some time; the volume balance, which needs no motion, is exempt from this.
+    The report is empty and states the reason in these cases:
+
+    - the pressures cannot be judged; `distrust` is then the reason, otherwise None,
+    - the detector cannot use the recording, or baseline recordings are given and it cannot use any of them,
+    - without a baseline, if a pressure does not move for some time; the volume balance needs no motion and is exempt.
     """
     lack = unusable_reason(detector, recording) or distrust
     if lack is None and not baseline and detector.name not in _AT_REST:
@@ -125,21 +128,22 @@ def _unusable_baseline(detector: Detector, healthy: Healthy) -> str | None:
 
 
 def healthy_surprisals(recording: Recording, rig: Rig) -> Mapping[str, float]:
-    """Compute the surprisal, -log(chance), of each change that the detectors see within a healthy recording.
+    """Compute the surprisal, -log(chance), of each change that the detectors test within a healthy recording.
 
     Returns surprisals by the key of the change (`null.null_key`). Results of the volume balance under the hypothesis
-    that the pump is cut off at rest have keys with the prefix `SHUT`.
+    that the pump is cut off at rest have keys with the prefix `SHUT`. The result is computed only once for a recording.
     """
     return compute_once(recording, (SURPRISALS, rig), lambda samples: _compute_surprisals(samples, rig))
 
 
 def _compute_surprisals(recording: Recording, rig: Rig) -> Mapping[str, float]:
-    """Compute the surprisals -log(chance) of all changes within a healthy recording, by the key of the change.
+    """Compute the surprisals for `healthy_surprisals`.
 
     The signals and the volume balance are tested. The pressure response is tested, too, if there is no balance, or if
     the recording has no channel of the flow, so that valves or a control loop may hold the load.
     """
-    surprisals, balance = _max_surprisals(observe_signals(recording)), VolumeBalance(rig)
+    surprisals = _max_surprisals(observe_signals(recording))
+    balance = VolumeBalance(rig)
     reports: Mapping[bool, Observed] = {}  # by whether the pump is cut off at rest
     if unusable_reason(balance, recording) is None:
         try:
@@ -159,7 +163,7 @@ def _max_surprisals(report: Observed) -> dict[str, float]:
     """Collect the largest surprisal of each observable that is tested for a change within the recording.
 
     A surprisal is -log of the p-value that the detector states. Returns surprisals by key (`null.null_key`). The test
-    for a step of the leak has a key of its own.
+    for a step of the leak is included, with the key `case.step_key`.
     """
     surprisals: dict[str, float] = {}
     for observable in report.observables:
@@ -172,13 +176,13 @@ def _max_surprisals(report: Observed) -> dict[str, float]:
 
 
 def healthy_null(baseline: Sequence[Healthy], rig: Rig, *, shut: bool = False) -> HealthyNull:
-    """Collect how improbable each test result is in the healthy recordings, as surprisals -log(chance).
+    """Collect the surprisals -log(chance) of all tests in healthy recordings, as the null distributions of the tests.
 
-    `chance` is the p-value that a detector states for a test result (observable). The result holds a list of surprisals
-    for each test of all detectors, as its null distribution. A test for a change within a recording has one value from
-    each healthy recording. The tests that compare recordings share one list for each kind of data (`Observable.data`):
-    each healthy recording is compared with all others, and its largest surprisal counts. With `shut`, surprisals of the
-    volume balance are those under the hypothesis that valves cut the pump off at rest.
+    `chance` is the p-value that a detector states for a test result (observable). A test for a change within a
+    recording has one value from each healthy recording. The tests that compare recordings share one list of values for
+    each kind of data (`Observable.data`): each healthy recording is compared with all others, and its largest surprisal
+    counts. With `shut`, surprisals of the volume balance are those under the hypothesis that valves cut the pump off at
+    rest.
     """
     surprisals_by_key = defaultdict[str, list[float]](list)
     for healthy in baseline:
@@ -186,8 +190,8 @@ def healthy_null(baseline: Sequence[Healthy], rig: Rig, *, shut: bool = False) -
             healthy.statistics if isinstance(healthy, SummarisedRecording) else healthy_surprisals(healthy, rig)
         )
         if shut:
-            shut_surprisals = {key.removeprefix(SHUT): u for key, u in surprisals.items() if key.startswith(SHUT)}
-            surprisals = {**surprisals, **shut_surprisals}
+            shut_keys = [key for key in surprisals if key.startswith(SHUT)]
+            surprisals = {**surprisals, **{key.removeprefix(SHUT): surprisals[key] for key in shut_keys}}
         for key, surprisal in surprisals.items():
             surprisals_by_key[key].append(float(surprisal))
     for observables in compare_healthy(baseline):
@@ -198,10 +202,11 @@ def healthy_null(baseline: Sequence[Healthy], rig: Rig, *, shut: bool = False) -
 
 
 def compare_healthy(baseline: Sequence[Healthy]) -> Iterator[Sequence[Observable]]:
-    """Compare the ringing of each healthy recording with that of all others; yield the tests (observables) of each.
+    """Compare the ringing of each healthy recording with the ringing of all others; yield each recording's observables.
 
-    The ringing is an oscillation of the pressures, measured by the RMS of their wavelet details. Nothing is yielded for
-    fewer than three recordings of the same chambers and sampling rate.
+    The ringing is an oscillation of the pressures, measured by the RMS of their wavelet details. Only recordings with
+    the same chambers and sampling rate as the first usable recording are compared. If there are fewer than
+    `MIN_COMPARED` of them, nothing is yielded.
     """
     detector = RmsChange()
     usable_entries = [entry for entry in baseline if _unusable_baseline(detector, entry) is None]
@@ -211,5 +216,8 @@ def compare_healthy(baseline: Sequence[Healthy]) -> Iterator[Sequence[Observable
         for summary in summaries
         if summary["chambers"] == summaries[0]["chambers"] and summary["rate"] == summaries[0]["rate"]
     ]
-    for k, summary in enumerate(comparable if len(comparable) >= MIN_COMPARED else ()):
-        yield compare_summaries(summary, comparable[:k] + comparable[k + 1 :], summary["chambers"])[0]
+    if len(comparable) < MIN_COMPARED:
+        return
+    for k, summary in enumerate(comparable):
+        observables, _ = compare_summaries(summary, comparable[:k] + comparable[k + 1 :], summary["chambers"])
+        yield observables

@@ -1,6 +1,6 @@
-"""Find detectors by name: the built-in ones, and those that other installed packages register as entry points.
+"""Find detectors by name: the built-in detectors, and those that other installed packages register as entry points.
 
-A package names a class, or any function that makes a detector for a Rig, in its `pyproject.toml`:
+A package registers a class, or a function that creates a detector for a Rig, in its `pyproject.toml`:
 
     [project.entry-points."sealscope.detectors"]
     "pressure means" = "my_package:PressureMeans"
@@ -26,14 +26,15 @@ from sealscope.diagnosis.verdict.evidence import PRESSURE_RESPONSE, RMS_CHANGE, 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
+#: Group of the entry points.
 GROUP = "sealscope.detectors"
-#: Names that mean something else wherever detectors are named.
+#: Names that no detector may have, as they mean something else in lists of detectors.
 _RESERVED = ("diagnose", "always fire", "never fire")
 
 
 @dataclass(frozen=True)
 class PlugIn:
-    """Factory of a detector from another installed package; calling it with a rig makes the detector.
+    """Factory of a detector from another installed package; calling it with a rig creates the detector.
 
     `name` is the detector's name, `distribution` the name of the package, and `make` the function or class that the
     package registers.
@@ -44,7 +45,7 @@ class PlugIn:
     make: Factory
 
     def __call__(self, rig: Rig) -> Detector:
-        """Make the plug-in's detector for a rig."""
+        """Create the plug-in's detector for a rig."""
         return self.make(rig)
 
     @property
@@ -61,12 +62,13 @@ class PlugIn:
 
 
 def _make_detector(module: str, name: str, rig: Rig) -> Detector:
-    """Make a built-in detector for a rig, from the class `name` in a module of `sealscope.diagnosis`."""
-    detector: Detector = getattr(import_module(f"sealscope.diagnosis.{module}"), name)(rig)
+    """Create a built-in detector for a rig, from the class `name` in a module of `sealscope.diagnosis`."""
+    detector_class = getattr(import_module(f"sealscope.diagnosis.{module}"), name)
+    detector: Detector = detector_class(rig)
     return detector
 
 
-#: The built-in detectors by name, loaded when first made; one contract test runs them all.
+#: Factories of the built-in detectors by name; a module is imported when its detector is first created.
 DETECTORS: dict[str, Factory] = {
     VOLUME_BALANCE: partial(_make_detector, "inference.volumes.detector", "VolumeBalance"),
     PRESSURE_RESPONSE: partial(_make_detector, "inference.pressures.detector", "PressureResponse"),
@@ -83,8 +85,8 @@ def detectors() -> Mapping[str, Factory]:
 def plug_ins(built_in_names: frozenset[str]) -> Mapping[str, PlugIn]:
     """Find the detectors of other installed packages, in the order of their names; the result is cached.
 
-    A detector is left out with one logged line if it cannot be loaded, or if its name is not valid, is reserved, or
-    belongs to a built-in detector or to another package.
+    A detector is left out, and the reason is logged, if it cannot be loaded, or if its name is not valid, is reserved,
+    or belongs to a built-in detector or to a detector found before.
     """
     plug_in_of: dict[str, PlugIn] = {}
     for point in sorted(entry_points(group=GROUP), key=lambda point: (point.name, point.value)):

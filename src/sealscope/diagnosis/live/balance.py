@@ -49,8 +49,8 @@ _PRIORS = LIVE.block
 #: Approximate duration of a block [s], and blocks before the first estimate.
 BLOCK_SECONDS: float = _PRIORS.seconds
 LEARNED: int = _PRIORS.learned
-#: A block at standstill counts if its precision is over this fraction of the usual one. After `N_WAKING` blocks that
-#: move far more than usual, the machine is taken to have stood still before.
+#: A block at standstill counts if its precision is over this fraction of the usual precision. After `N_WAKING`
+#: successive blocks that move far more than usual, the machine is taken to have stood still before.
 MIN_REST_PRECISION: float = _PRIORS.tells
 N_WAKING: int = _PRIORS.wakes
 
@@ -92,10 +92,7 @@ class BlockConductance(NamedTuple):
 
     @property
     def duty(self) -> tuple[float, float]:
-        """Logarithms of the mean |p_A - p_B| [Pa] and of the mean flow that moves the piston [m^3/s].
-
-        They are finite even if these are 0.
-        """
+        """Logarithms of mean |p_A - p_B| [Pa] and mean flow that moves the piston [m^3/s]; finite even for 0."""
         return math.log(max(self.pressure, TINY)), math.log(max(self.pump_flow, TINY))
 
 
@@ -121,15 +118,11 @@ class NotJudged(NamedTuple):
 
     @classmethod
     def with_count(cls, end: float, status: str, restarts: bool = False) -> NotJudged:
-        """Build the result of a block without an estimate, with a counter for the blocks of the same reason.
-
-        `end`: end of the block [s]; `status`: the reason in words, such as "at standstill"; `restarts`: True if later
-        blocks cannot be compared with earlier ones. The counter is called "blocks: " and the reason.
-        """
+        """Build the result of a block without an estimate, with the counter "blocks: " and the reason `status`."""
         return cls(end, status, f"blocks: {status}", restarts)
 
 
-#: The conductances that a block completes, or the reason for none.
+#: Conductances that became known with a block (those of all first blocks arrive together), or why there are none.
 BlockResult = Sequence[BlockConductance] | NotJudged
 
 
@@ -167,12 +160,16 @@ class LiveBalance:
     """Estimate the leakage conductance of a running machine block by block, from the balance of volumes.
 
     `rig` states displacement and circuit, and `names` are the channels of the samples. Raises InputError if these
-    channels allow no balance. The estimates do not depend on how the samples are divided into calls.
+    channels allow no balance. The estimates do not depend on how the samples are divided into calls. The attributes of
+    the class are explained at `pressures.PressureEstimator`, which has the same interface.
     """
 
-    method, data, states_level = "volumes", VOLUMES, True
+    method = "volumes"
+    data = VOLUMES
+    states_level = True
     min_internal_fraction = orifice_factor = 1.0  # the leak is surely internal, whatever its law
-    block_seconds, has_begun = BLOCK_SECONDS, True
+    block_seconds = BLOCK_SECONDS
+    has_begun = True
 
     def __init__(self, rig: Rig, names: Sequence[str], litres: bool | None = None) -> None:
         """Set up the volume balance for a rig and the channels `names`, with no samples yet.
@@ -183,8 +180,8 @@ class LiveBalance:
         if not self._balances:
             needed = format_ways(rig.circuit.watched_by)
             raise InputError(f"a live balance must have {needed}, got {', '.join(names) or 'nothing'}")
-        # of the pump's angle and speed the one that is recorded, behind a valve neither
-        needed_names = {"x", "p_A", "p_B", next((name for name in ("theta", "omega") if name in names), "x")}
+        pump_names = [name for name in ("theta", "omega") if name in names]  # none behind a servo valve
+        needed_names = {"x", "p_A", "p_B", *pump_names[:1]}
         needed_names |= {name for balance in self._balances for term in balance.terms for name in term.needs}
         self.names = tuple(name for name in names if name in needed_names)
         self.size_error = size_error(rig)
@@ -203,7 +200,7 @@ class LiveBalance:
         self._precision = 0.0  # of a usual block's conductance; 0 before the coefficients are learned
         self._moving = 0  # number of successive blocks that move far more than the usual ones
         self._stored: Blocks | None = None  # the last blocks, packed
-        self._waiting = 0  # number of these that the coefficients are to be learned from
+        self._waiting = 0  # number of stored blocks that await the first fit of the coefficients
         self._signals = SignalWindow()
         self._closed_samples: list[tuple[float, Mapping[str, Array], float]] = []  # begin, channels, rate of each block
         self._stream: BlockStream | None = None
@@ -217,18 +214,19 @@ class LiveBalance:
     def take(self, run: SampleRun) -> Iterator[BlockResult]:
         """Process the next samples, and yield the result of each block of the volume balance that they complete.
 
-        A result is the conductances of a block, or the reason for none. The next block is processed only when its
-        result is asked for. The first `LEARNED` blocks are estimated together. After a gap the coefficients of the
-        balance are kept, and samples before the gap that do not fill a block are dropped.
+        A result is the conductances of a block, or the reason why there are none. The next block is processed only when
+        its result is asked for. The first `LEARNED` blocks are estimated together. After a gap, or a change of the
+        sampling rate, the coefficients of the balance are kept, and earlier samples that do not fill a block are
+        dropped.
         """
         stream = self._stream
         if stream is None or not run.follows:
-            if stream is not None:
+            if stream is not None:  # complete the blocks before the gap
                 yield from self._take_blocks(stream.push({}, last=True))
             if stream is None or run.rate != self._rate:
                 self._rate = run.rate
                 new_stream = self._make_stream()
-                if stream is not None:  # offsets, signs and weights of the rows stay, samples at the other rate do not
+                if stream is not None:  # keep offsets, signs and weights of the rows, drop samples at the old rate
                     new_stream.load_state({**stream.state(), "samples": {}, "first": 0, "done": 0})
                 self._stream = stream = new_stream
             stream.restart(float(run.t[0]))
@@ -243,7 +241,7 @@ class LiveBalance:
         return BlockStream(self._balances, self._rate, BLOCK_SECONDS, on_samples=store_samples)
 
     def _take_blocks(self, blocks: Blocks | None) -> Iterator[BlockResult]:
-        """Process completed blocks of samples, and yield the conductances of each block or the reason for none."""
+        """Process completed blocks of samples, and yield for each its conductances or why there are none."""
         closed_samples, self._closed_samples = self._closed_samples, []
         for block, samples in zip([] if blocks is None else _split(blocks), closed_samples, strict=True):
             self._signals.take(*samples)
@@ -252,34 +250,41 @@ class LiveBalance:
     def _take_block(self, block: Blocks) -> BlockResult:
         """Estimate the leakage conductance in a block, or store the block until the coefficients can be fitted.
 
-        The first `LEARNED` blocks are stored, and the last of them gives the conductances of all. The result is a
-        NotJudged until then, for a block with missing values or at standstill, and if several blocks have moved far
-        more than the usual ones: the coefficients are then learned anew.
+        The first `LEARNED` blocks are stored; the last of them completes the conductances of all. The result is a
+        NotJudged
+
+        - before that,
+        - for a block with missing values or at standstill,
+        - after `N_WAKING` successive blocks that move far more than usual; the coefficients are then learned anew.
         """
-        end = self._sample_times(block)[1]
+        _, end = self._sample_times(block)
         if not block.rows[0]:
             return NotJudged.with_count(end, "missing values")
         packed = block.pack()
         self._stored = packed if self._stored is None else Blocks.join([self._stored, packed])[-WINDOW:]
         if self._precision > 0.0:
+            # if this block moves and the usual ones stood still, its relative motion is above 1/STANDSTILL
             self._moving = self._moving + 1 if self._relative_motion(block) > 1.0 / STANDSTILL else 0
             if self._moving >= N_WAKING:
                 self.relearn()
                 return NotJudged(end, "learning", "blocks: moves as never before", restarts=True)
             estimate = self._estimate_block(block)
             return estimate if isinstance(estimate, NotJudged) else [estimate]
-        if not block.gram[0, 0, -1, -1] > 0.0 and not self._waiting:
+        has_moved = _volume_square(block) > 0.0
+        if not has_moved and not self._waiting:
             return NotJudged.with_count(end, "at standstill")
         self._waiting += 1
         if self._waiting < LEARNED:
             return NotJudged(end, "learning")
-        blocks, self._waiting = self._stored[-self._waiting :].unpack(self._n_columns), 0
-        return self._estimate_first_blocks(blocks) or NotJudged(end, "at standstill")
+        first_blocks = self._stored[-self._waiting :].unpack(self._n_columns)
+        self._waiting = 0
+        return self._estimate_first_blocks(first_blocks) or NotJudged(end, "at standstill")
 
     def _estimate_first_blocks(self, blocks: Blocks) -> list[BlockConductance]:
         """Fit the coefficients of the volume balance to the first blocks, and return the leakage conductance in each.
 
-        Blocks at standstill are left out. The median precision of these conductances becomes the usual one.
+        The median precision of the conductances becomes the usual precision. Blocks at standstill are left out of the
+        result.
         """
         for e, (model, column_order) in enumerate(zip(self._models, self._column_orders, strict=True)):
             _fit_to_blocks(model, np.ascontiguousarray(blocks.gram[:, e]), column_order, blocks.rows)
@@ -290,10 +295,7 @@ class LiveBalance:
 
     @property
     def _half_stride(self) -> float:
-        """Half the time [s] between the test functions of two successive rows (equations) of the volume balance.
-
-        The samples of a block reach beyond its first and last equation by this much.
-        """
+        """Time [s] by which a block's samples extend beyond its first and last equation: half the equations' step."""
         return 0.5 * stride_samples(self._rate) / self._rate
 
     def _sample_times(self, block: Blocks) -> tuple[float, float]:
@@ -301,12 +303,8 @@ class LiveBalance:
         return float(block.start[0]) - self._half_stride, float(block.end[0]) + self._half_stride
 
     def _relative_motion(self, block: Blocks) -> float:
-        """Compute the motion of the machine in a block, relative to earlier blocks.
-
-        It is the mean square of the left side of the volume balance, i.e. of the measured volume, in the block, divided
-        by the weighted mean over earlier blocks.
-        """
-        return relative_motion(float(block.gram[0, 0, -1, -1]), float(block.rows[0]), self._models[0].numbers)
+        """Compute the mean square of the measured volume in a block, divided by that in earlier blocks."""
+        return relative_motion(_volume_square(block), float(block.rows[0]), self._models[0].numbers)
 
     def _solve_block(self, block: Blocks, is_learned: bool = True) -> tuple[float, ...]:
         """Estimate the leak in a block from all volume balances of the machine together.
@@ -316,9 +314,10 @@ class LiveBalance:
         coefficients. Returns (w, w g, w s, w^2 V), each summed over the balances. With `is_learned`, the block also
         updates the other coefficients.
         """
-        rows, equation_parts = float(block.rows[0]), zip(self._models, block.gram[0], self._column_orders, strict=True)
+        rows = float(block.rows[0])
         results = [
-            _estimate_leak(model, gram, column_order, rows, is_learned) for model, gram, column_order in equation_parts
+            _estimate_leak(model, gram, column_order, rows, is_learned)
+            for model, gram, column_order in zip(self._models, block.gram[0], self._column_orders, strict=True)
         ]
         return tuple(sum(values) for values in zip(*results, strict=True))
 
@@ -331,7 +330,8 @@ class LiveBalance:
         begin, end = self._sample_times(block)
         at_standstill = self._relative_motion(block) < STANDSTILL
         precision, weighted_total, weighted_shift, weighted_variance = self._solve_block(block, is_learned)
-        if not precision > (MIN_REST_PRECISION * self._precision if at_standstill else 0.0):
+        min_precision = MIN_REST_PRECISION * self._precision if at_standstill else 0.0
+        if not precision > min_precision:
             return NotJudged.with_count(end, "at standstill")
         total = weighted_total / precision
         offset = math.hypot(math.sqrt(weighted_variance) / precision, self.size_error * total)
@@ -342,7 +342,7 @@ class LiveBalance:
     def relearn(self, since: float = math.inf) -> None:
         """Drop all learned coefficients of the volume balance, for example after a repair.
 
-        They are then learned anew from the blocks that begin at `since` [s] or later, including stored ones.
+        They are then learned anew from the blocks, stored or future, that begin at `since` [s] or later.
         """
         for model in self._models:
             for values in model:
@@ -365,7 +365,7 @@ class LiveBalance:
         if len(blocks) < MIN_BLOCKS:
             return ()
         centred = remove_pressure_offset(blocks, self._roles)
-        volumes = volume_observables(centred, blocks, self._balances, self._roles, {})
+        volumes = volume_observables(centred, blocks, self._balances, self._roles, oil_loss={})
         return (*volumes, *self._signals.observables(since - BLOCK_SECONDS))
 
     def state(self) -> dict[str, Any]:
@@ -402,29 +402,30 @@ _MODEL, _BLOCK = ("sums", "values", "leak_products", "numbers"), tuple(Blocks.__
 
 
 def _split(blocks: Blocks) -> list[Blocks]:
-    """Split several blocks of samples into a list of single ones."""
+    """Split several blocks of samples into a list of single blocks."""
     return [blocks[k : k + 1] for k in range(len(blocks))]
 
 
-def size_error(rig: Rig) -> float:
-    """Return the relative standard error of all flows that is due to the uncertain size of the machine.
+def _volume_square(block: Blocks) -> float:
+    """Return the sum of squares of the measured volume, the left side of the first volume balance, in a block."""
+    return float(block.gram[0, 0, -1, -1])
 
-    The size is the one that scales the flows: the pump's displacement, or the piston area behind a servo valve.
-    """
+
+def size_error(rig: Rig) -> float:
+    """Return the relative standard error of all flows due to displacement or, behind a servo valve, piston area."""
     return float(getattr(INFERENCE.size, rig.circuit.flow_size))
 
 
 def live_equations(rig: Rig, names: Sequence[str], with_tested_terms: bool = False) -> list[Equation]:
     """Build the volume balances of a running machine that the channels `names` allow.
 
-    Balances whose flow is computed from the command are left out, and so is the pump's leakage, which cannot be told
-    from the piston's. `with_tested_terms` includes terms that are zero in a healthy machine and are only tested for a
-    change.
+    Balances whose flow is computed from the command are left out. So is the term of the pump's leakage, which cannot be
+    distinguished from the piston's. `with_tested_terms` includes terms that are zero in a healthy machine and are only
+    tested for a change.
     """
-    return [
-        balance._replace(
-            terms=tuple(term for term in balance.terms if (term.nuisance or with_tested_terms) and term.name != PUMP)
-        )
-        for balance in equations(rig, frozenset(names))
-        if not balance.by_command
-    ]
+    balances = []
+    for balance in equations(rig, frozenset(names)):
+        terms = (term for term in balance.terms if (term.nuisance or with_tested_terms) and term.name != PUMP)
+        if not balance.by_command:
+            balances.append(balance._replace(terms=tuple(terms)))
+    return balances

@@ -7,9 +7,9 @@ column eliminated from both. Then the nuisances c, and the leak's coefficient g_
     c = C^-1 m,    g_k = (n_k - b_k' c) / N_k,    Var g_k = s^2 / N_k,
 
 where N_k, n_k and b_k are the products of the leak's column with itself, the left side and the nuisances over the
-rows of block k, and s^2 is the long-run variance of a row. A leak does not enter c, so that a step of g_k is a step
-of the leak. No function allocates memory, as a simulation unit for other programs (`fmu.sensor`) runs the same
-functions in C.
+rows (equations) of block k, and s^2 is the long-run variance of a row. A leak does not enter c, so that a step of g_k
+is a step of the leak. No function allocates memory, as a simulation unit for other programs (`fmu.sensor`) runs the
+same functions in C.
 """
 
 from __future__ import annotations
@@ -27,13 +27,12 @@ from sealscope.diagnosis.priors.live import LIVE
 #: Standard deviations beyond which a residual is a glitch or a step; fraction of the usual motion at a standstill.
 JUMP: float = LIVE.coefficients.jump
 STANDSTILL: float = LIVE.block.standstill
-#: Factors per block by which the weight of earlier blocks and the shift of the series decay.
-_MEMORY, _SHIFT_DECAY = (math.exp(-1.0 / blocks) for blocks in (LIVE.coefficients.memory, LIVE.coefficients.returns))
+#: Factor per block by which the weight of earlier blocks decays, and the same for the shift of the series.
+_MEMORY: float = math.exp(-1.0 / LIVE.coefficients.memory)
+_SHIFT_DECAY: float = math.exp(-1.0 / LIVE.coefficients.returns)
 TINY = float(np.finfo(float).tiny)
 
-#: Entries of `Coefficients.numbers`: number of rows in the sums, sum of squares of their left sides, variance of a
-#: row, sum of squares of the leak's column, shift of the series from the level, and residual variance of the last block
-#: over the usual one.
+#: Indices of `Coefficients.numbers`, which explains them.
 ROWS, MOTION, NOISE, ENERGY, SHIFT, MISFIT = range(6)
 
 
@@ -51,9 +50,14 @@ class Coefficients(NamedTuple):
     leak_products : ndarray, shape (n,)
         Products of the leak's column with the nuisances' columns.
     numbers : ndarray, shape (6,)
-        At the indices `ROWS` to `MISFIT`: number of equations in the sums, sum of squares of their left sides,
-        variance of an equation, sum of squares of the leak's column, shift of the series of estimates, and residual
-        variance of the last block over the usual one.
+        By index:
+
+        - `ROWS`: number of equations in the sums,
+        - `MOTION`: sum of squares of their left sides,
+        - `NOISE`: variance of an equation's residual,
+        - `ENERGY`: sum of squares of the leak's column,
+        - `SHIFT`: shift that is subtracted from the estimates of the leak, so that their series remains continuous,
+        - `MISFIT`: residual variance of the last block over the usual variance.
     block : ndarray, shape (n + 2, n + 2)
         Work array: the products of one block.
     matrix : ndarray, shape (n, n + 3)
@@ -91,13 +95,14 @@ def add_block(model: Any, rows: float, weight: float, has_stepped: bool) -> None
     """Add the products in `model.block` to the sums over earlier blocks, which lose weight exponentially.
 
     `model` is a `Coefficients`, `rows` the number of equations in the block, and `weight` the weight of the block, 0 to
-    1. The leak's coefficient is assumed to take a random step before each block, with the variance that a block's
-    estimate of it has or, if `has_stepped`, with an infinite one. The earlier value of the leak is therefore
-    eliminated. With the sums S, their column S_l of the leak and its diagonal element S_ll, and the block's products B,
+    1. The leak's coefficient is assumed to take a random step before each block. Its variance is that of the block's
+    estimate of the leak or, if `has_stepped`, infinite. The earlier value of the leak is therefore eliminated. With the
+    sums S, their column S_l of the leak and its diagonal element S_ll, and the block's products B,
 
         S <- exp(-1/memory) (S - S_l S_l' / (S_ll + B_ll)) + weight B,
 
-    where `memory` is a number of blocks (`priors.toml`). If `has_stepped`, B_ll is left out.
+    where `memory` is a number of blocks (`priors.toml`). If `has_stepped`, B_ll is left out. The other sums in `model`
+    are updated with the same memory.
     """
     sums, block, size, leak = model.sums, model.block, len(model.block), len(model.block) - 2
     leak_column = model.matrix[0]  # a copy in free memory, as the sums change below
@@ -106,7 +111,7 @@ def add_block(model: Any, rows: float, weight: float, has_stepped: bool) -> None
     information = leak_column[leak] + (0.0 if has_stepped else max(block[leak, leak], TINY))
     for i in range(size):
         for j in range(size):
-            # what the sums lose where the leak before the random step is eliminated
+            # information that is lost as the leak before the random step is eliminated
             loss = leak_column[i] * (leak_column[j] / information) if information > 0.0 else 0.0
             sums[i, j] = _MEMORY * (sums[i, j] - loss) + weight * block[i, j]
     for i in range(leak):
@@ -120,10 +125,10 @@ def add_block(model: Any, rows: float, weight: float, has_stepped: bool) -> None
 def _solve(model: Any) -> None:
     """Solve the normal equations C x = r of a volume balance in place, for three right-hand sides r.
 
-    The unknowns are the n coefficients other than the leak's. `model` is a `Coefficients`, whose `matrix[:, n:]` (n, 3)
-    holds the right-hand sides, which the solutions replace. C (n, n) and the first right-hand side are computed here
-    from the sums, with the leak's column eliminated: these products of the columns of the unknowns with each other and
-    with the left side of the balance give the least-squares estimate.
+    The unknowns x are the n coefficients other than the leak's. `model` is a `Coefficients`, whose `matrix[:, n:]`
+    (n, 3) holds the right-hand sides; the solutions replace them. C (n, n) and the first right-hand side are computed
+    here from the sums, with the leak's column eliminated. They are the products of the unknowns' columns with each
+    other and with the left side of the balance, so that the first solution is the least-squares estimate.
     """
     sums, leak = model.sums, len(model.matrix)
     n, left_side = leak, leak + 1  # indices of the leak's column and of the equation's left side
@@ -137,10 +142,11 @@ def _solve(model: Any) -> None:
 
 @large_law
 def _sum_residual_squares(sums: Any, solution: Any) -> float:
-    """Compute a volume balance's residual sum of squares with given nuisance and best leak coefficients.
+    """Compute a volume balance's residual sum of squares for given coefficients other than the leak's.
 
-    `sums` (n + 2, n + 2) are the products of the columns of n nuisances (coefficients other than the leak's), leak
-    and left side. Column 0 of `solution` (n, k) holds the nuisance coefficients.
+    The leak's coefficient is the one that minimises this sum. `sums` (n + 2, n + 2) are the products of the columns of
+    n nuisances (coefficients other than the leak's), leak and left side. Column 0 of `solution` (n, k) holds the
+    nuisances.
     """
     n, square, leak_moment = len(solution), 0.0, 0.0
     for i in range(n + 2):
@@ -160,8 +166,8 @@ def _sum_residual_squares(sums: Any, solution: Any) -> float:
 def fit_coefficients(model: Any) -> None:
     """Compute a volume balance's coefficients other than the leak's, and the variance of its equations.
 
-    They are the least-squares estimate from the sums over blocks in `model`, a `Coefficients`, with the residual sum of
-    squares divided by the number of equations. Both are stored in `model`.
+    The coefficients are the least-squares estimate from the sums over blocks in `model`, a `Coefficients`. The variance
+    is the residual sum of squares over the number of equations. Both are stored in `model`.
     """
     n = len(model.matrix)
     solution = model.matrix[:, n:]
@@ -180,9 +186,9 @@ def _learn_block(model: Any, rows: float, g: float) -> float:
 
     `model` is a `Coefficients`, `rows` the number of equations in the block, and `g` the leak's coefficient in it. The
     usual noise is the variance of an equation's residual, averaged over earlier blocks with fading memory. The weight
-    is 1, or `JUMP`^2 times the usual noise over the block's residual variance if that is less. If g differs from the
-    earlier estimate by more than `JUMP` standard deviations, the leak has stepped and earlier blocks do not constrain
-    it any more.
+    is 1 or, if less, `JUMP`^2 times the usual noise over the block's residual variance; this ratio of the variances
+    is stored as `MISFIT`. If g differs from the earlier estimate by more than `JUMP` standard deviations, the leak has
+    stepped and earlier blocks do not constrain it any more.
     """
     sums, numbers, n = model.sums, model.numbers, len(model.matrix)
     variance = max(_sum_residual_squares(model.block, model.matrix[:, n:]), 0.0) / rows
@@ -192,7 +198,7 @@ def _learn_block(model: Any, rows: float, g: float) -> float:
     for i in range(n):
         moment -= sums[n, i] * model.matrix[i, n]
     energy = max(model.block[n, n], TINY)
-    # of the block's estimate, as much for the leak's random step, and of the earlier estimate, moment / information
+    # the earlier estimate is moment / information; the 2 is for the block's estimate and, equally, the random step
     step_variance = OVERLAP * numbers[NOISE] * (2.0 / (energy * weight) + 1.0 / information)
     add_block(model, rows, weight, (g - moment / information) ** 2 > JUMP**2 * step_variance)
     numbers[NOISE] += (1.0 - _MEMORY) * (variance * weight - numbers[NOISE])
@@ -209,10 +215,10 @@ def estimate_leak(model: Any, rows: float, is_learned: bool) -> tuple[float, flo
     g, w s, w^2 V).
     """
     block, n, numbers = model.block, len(model.matrix), model.numbers
-    # columns: c; C^-1 b_k, for the variance due to c; C^-1 (b_k - its usual value)
+    # columns after `_solve`: c; C^-1 b_k, for the variance due to c; C^-1 (b_k - its usual value)
     solution = model.matrix[:, n:]
-    # `energy` is N_k of the module's docstring; below, `usual_slope` is the regression of a nuisance's column on the
-    # leak's column over the last blocks
+    # `energy` is N_k of the module's docstring; `usual_slope`, below, is the slope of the regression of a nuisance's
+    # column on the leak's column over the last blocks
     energy, usual_energy = max(block[n, n], TINY), max(numbers[ENERGY], TINY)
     for i in range(n):
         solution[i, 1] = block[i, n]
@@ -230,7 +236,7 @@ def estimate_leak(model: Any, rows: float, is_learned: bool) -> tuple[float, flo
     g, weight = moment / energy, 1.0
     if is_learned:
         weight = _learn_block(model, rows, g)
-    # an error of the nuisances adds to the noise where the block's products with them differ from the usual ones
+    # an error of the nuisances adds to the noise only if the block's products b_k differ from their usual values
     precision = energy / (OVERLAP * numbers[NOISE] * (1.0 / weight + max(unusual, 0.0) / energy))
     systematic_variance = max(systematic, 0.0) * OVERLAP * numbers[NOISE] * (precision / energy) ** 2
     return precision, precision * g, precision * numbers[SHIFT], systematic_variance
@@ -241,7 +247,8 @@ def relative_motion(square: float, rows: float, numbers: Any) -> float:
     """Compute the mean square of the measured volume in a block, divided by that in earlier blocks.
 
     `square` is the sum of squares over the block's `rows` equations. `numbers` (`Coefficients.numbers`) holds the same
-    sum and number of equations over earlier blocks. Returns inf if only this block moved, and 1 if none moved.
+    sum and number of equations over earlier blocks. Returns infinity if only this block moved, and 1 if neither this
+    nor an earlier block moved.
     """
     usual_square = numbers[MOTION] * rows
     return square * numbers[ROWS] / usual_square if usual_square > 0.0 else (math.inf if square > 0.0 else 1.0)

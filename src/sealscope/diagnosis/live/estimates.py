@@ -30,7 +30,8 @@ GROUP: int = LIVE.watch.group
 class BlockEstimate:
     """Leakage of a running machine in one block.
 
-    Flows and their 95 % intervals are None if unknown. The intervals allow for warmer oil.
+    Flows and their 95 % intervals are None if unknown. After an alarm, the interval of the increase allows for colder
+    and warmer oil.
 
     Attributes
     ----------
@@ -131,11 +132,11 @@ class HealthyLevel:
     Attributes
     ----------
     level, low, high, deviation : float
-        Mean, minimum, maximum and standard deviation over recordings or groups [m^3/(s Pa)].
+        Mean, minimum, maximum and standard deviation over recordings or groups of blocks [m^3/(s Pa)].
     known_s : float
         Time until which the machine is known to be healthy [s]; for recordings the start of the last one.
     count : int
-        Number of recordings or groups.
+        Number of recordings or groups of blocks.
     """
 
     level: float
@@ -175,11 +176,14 @@ def find_level_rise(
 ) -> LiveRise | None:
     """Test whether a mean conductance exceeds that of the healthy machine, and estimate by how much.
 
-    `g` and `deviation` are the conductance and its standard error [m^3/(s Pa)], and `onset` is the onset to state in
-    the result. Two tests must both be significant at the false-alarm `probability`. The first compares g with the
-    lowest healthy mean, increased for the warmest oil. The second compares g with the average of the healthy means,
-    given their scatter (Student's t with Welch's degrees of freedom). The result is None if a test is not
-    significant, or if there are fewer than two healthy means.
+    `g` and `deviation` are the mean conductance and its standard error [m^3/(s Pa)], and `onset` is the onset to state
+    in the result. The healthy means are of single recordings or groups of blocks (`HealthyLevel`). Two tests must both
+    be significant at the false-alarm `probability`:
+
+    - g against the lowest healthy mean, increased for the warmest oil (normal distribution),
+    - g against the average of the healthy means, given their scatter (Student's t with Welch's degrees of freedom).
+
+    The result is None if a test is not significant, or if there are fewer than two healthy means.
     """
     from scipy.special import ndtr, ndtri
 
@@ -193,7 +197,7 @@ def find_level_rise(
     chance = max(float(ndtr((max_healthy - g) / deviation)), rise.chance)
     if chance >= probability:
         return None
-    # the healthy conductance now may be anywhere from the least healthy mean to the largest
+    # the present healthy conductance may be anywhere from the lowest healthy mean to `max_healthy`
     healthy_sd = max(healthy.level - healthy.low, max_healthy - healthy.level, 0.0) / WITHIN_95
     size = g - max(healthy.level, 0.0)
     score = -float(ndtri(max(chance, 1e-300)))  # finite for a chance of 0
@@ -204,10 +208,11 @@ def level_before_leak(leak: WatchedLeak, t: float) -> HealthyLevel:
     """Return the conductance before a leak began, and the range that it would have at time `t` [s] without the leak.
 
     The range, `low` to `high` of the result, allows for colder and warmer oil. It reaches from 1/r to r times the
-    conductance before, where r = warmest^(h / shift), h is the time since the onset [h] but at most `shift`, and
-    `warmest` and `shift` are in the table `oil` of `priors.toml`.
+    conductance before the leak. Here r = warmest^(h / shift), and h is the time since the onset [h] but at most
+    `shift`; `warmest` and `shift` are in the table `oil` of `priors.toml`.
     """
-    oil, hours, before = INFERENCE.oil, max(0.0, t - leak.onset_s) / 3600.0, leak.conductance_before
+    oil, before = INFERENCE.oil, leak.conductance_before
+    hours = max(0.0, t - leak.onset_s) / 3600.0
     max_ratio = float(oil.warmest ** min(1.0, hours / oil.shift))
     low, high = before / max_ratio, max(before, 0.0) * max_ratio
     return HealthyLevel(before, low, high, deviation=leak.rise_sd, known_s=leak.onset_s, count=1)
@@ -216,8 +221,8 @@ def level_before_leak(leak: WatchedLeak, t: float) -> HealthyLevel:
 def mean_flow(flows: Array, errors: Array) -> Flow:
     """Average the flows of n blocks (n,) [L/min]; return the mean and its standard error [L/min].
 
-    The squared standard error is sum(errors^2)/n^2 + s^2/n, with the standard `errors` (n,) of the flows and the
-    standard deviation s of the flows between blocks, 0 for a single block.
+    The squared standard error is sum(errors^2)/n^2 + s^2/n. Here `errors` (n,) are the standard errors of the flows,
+    and s is the standard deviation of the flows between blocks, 0 for a single block.
     """
     count = len(flows)
     scatter = float(flows.std(ddof=1)) / math.sqrt(count) if count > 1 else 0.0
@@ -231,7 +236,8 @@ def is_known_duty(duty: Duty, low: Duty, high: Duty) -> bool:
     range. The margin towards low pressures is larger, because a leak lowers the pressure difference.
     """
     margin = LIVE.watch.margin
-    min_duty = (low[0] - LIVE.watch.damped, low[1] - margin)
+    min_pressure, min_flow = low
+    min_duty = (min_pressure - LIVE.watch.damped, min_flow - margin)
     return all(lower <= value <= upper + margin for value, lower, upper in zip(duty, min_duty, high, strict=True))
 
 
@@ -244,7 +250,7 @@ class BaselineLearning:
     blocks : int
         Number of blocks.
     total : float
-        Sum of their conductances [m^3/(s Pa)].
+        Sum of the blocks' conductances [m^3/(s Pa)].
     flow : float
         Sum over the blocks of the factor from a conductance to a flow [L/min per m^3/(s Pa)], at the mean pressure
         difference of each block.
@@ -255,7 +261,7 @@ class BaselineLearning:
     count : int
         Number of complete groups.
     mean, squares : float
-        Mean of the group means, and sum of their squared deviations from it.
+        Mean of the group means, and sum of the squared deviations of the group means from this mean.
     low, high : float or None
         Smallest and largest group mean.
     """
@@ -275,22 +281,26 @@ class BaselineLearning:
     def add(self, g: float, flow: float, duty: Duty) -> None:
         """Add a block to the sums from which the baseline is computed.
 
-        `g` is its conductance [m^3/(s Pa)], `flow` the factor from a conductance to a flow at the block's mean pressure
-        [L/min per m^3/(s Pa)], and `duty` the logarithms of mean pressure difference and pump flow.
+        `g` is the block's conductance [m^3/(s Pa)], `flow` the factor from a conductance to a flow at its mean pressure
+        difference [L/min per m^3/(s Pa)], and `duty` the logarithms of mean pressure difference and pump flow.
         """
         self.blocks += 1
         self.total += g
         self.flow += flow
-        low, high = self.duty_low or duty, self.duty_high or duty
-        self.duty_low = min(low[0], duty[0]), min(low[1], duty[1])
-        self.duty_high = max(high[0], duty[0]), max(high[1], duty[1])
+        pressure, pump_flow = duty
+        min_pressure, min_flow = self.duty_low or duty
+        max_pressure, max_flow = self.duty_high or duty
+        self.duty_low = min(min_pressure, pressure), min(min_flow, pump_flow)
+        self.duty_high = max(max_pressure, pressure), max(max_flow, pump_flow)
         self.group.append(g)
         if len(self.group) == GROUP:
-            mean, self.group = sum(self.group) / GROUP, []
+            mean = sum(self.group) / GROUP
+            self.group = []
             self.low = mean if self.low is None else min(self.low, mean)
             self.high = mean if self.high is None else max(self.high, mean)
             # Welford's recursion of mean and sum of squared deviations
-            self.count, difference = self.count + 1, mean - self.mean
+            self.count += 1
+            difference = mean - self.mean
             self.mean += difference / self.count
             self.squares += difference * (mean - self.mean)
 
@@ -305,6 +315,7 @@ class BaselineLearning:
         level = self.total / self.blocks
         lpm = level * self.flow / self.blocks if states_lpm else None
         deviation = math.sqrt(self.squares / (self.count - 1)) if self.count > 1 else 0.0
-        period = {"version": version, "hours": hours, "lpm": lpm, "known_s": end}
-        duty = {"duty_low": self.duty_low, "duty_high": self.duty_high}
-        return WatchBaseline(level, self.low, self.high, deviation, count=self.count, **period, **duty)  # type: ignore[arg-type]
+        healthy = HealthyLevel(level, self.low, self.high, deviation, known_s=end, count=self.count)
+        return WatchBaseline(
+            **vars(healthy), version=version, hours=hours, lpm=lpm, duty_low=self.duty_low, duty_high=self.duty_high
+        )

@@ -18,9 +18,11 @@ from sealscope.diagnosis.priors.decision import DECISION
 from sealscope.diagnosis.priors.live import LIVE
 from sealscope.diagnosis.verdict.evidence import Cause
 
-#: Probabilities from which a leak, and its kind, explain a rise; largest chance of a change that shows in the blocks.
-_MIN_PROBABILITY, _MAX_CHANCE = DECISION.explanation, LIVE.explanation.rare
-#: Cause of leaks to the outside, which raise the total of pump and piston in part.
+#: Probabilities from which a leak (`leak`) and its cause (`named`) explain a rise.
+_MIN_PROBABILITY = DECISION.explanation
+#: Largest p-value of a change that the blocks show clearly enough.
+_MAX_CHANCE: float = LIVE.explanation.rare
+#: Cause of leaks to the outside. A part of their flow appears in the estimated leakage of pump and piston.
 OUTSIDE: Cause = "external leak"
 #: Events for which a watched machine raises an alarm.
 ALARMING = (*LEAK_EVENTS, *(event.name for event in load_events() if event.cause == OUTSIDE))
@@ -45,34 +47,37 @@ UNKNOWN = RiseExplanation(is_leak=False)
 def explain_rise(observables: Sequence[Observable], data: str, onset: Interval, is_settled: bool) -> RiseExplanation:
     """Find the cause of an increase of the leakage among the changes observed in the blocks around it.
 
-    `observables` are the results of tests for changes. `data` is the kind of data (`Observable.data`) that the leakage
-    is estimated from; changes in these data that began outside the interval `onset` [s] are ignored. `is_settled` is
-    True if enough blocks have followed to distinguish a leak to the outside from a sensor fault; before, only a leak
-    past piston or pump counts as a leak. The result is `UNKNOWN` if these data show no sufficiently rare change, or
-    none that the most probable events would cause.
+    `observables` are the results of tests for changes, and `onset` is the interval in which the increase began [s].
+    `data` is the kind of data (`Observable.data`) from which the leakage is estimated, "volumes" or "response".
+    Changes of this kind that began outside the interval are ignored. `is_settled` is True if enough blocks have
+    followed to distinguish a leak to the outside from a sensor fault; before, only a leak past piston or pump counts as
+    a leak.
+
+    The result is a leak if leaks are more probable than all other events together, else the most probable other events.
+    It is `UNKNOWN` if no change of this kind is sufficiently rare, or if none of the rare changes can be an effect of
+    the leak.
     """
-    names = ALARMING if is_settled else LEAK_EVENTS
-    events = [event for event in load_events() if event.name in names]
+    leak_names = ALARMING if is_settled else LEAK_EVENTS
+    leak_events = [event for event in load_events() if event.name in leak_names]
     at_onset = [observable for observable in observables if observable.data != data or _coincides(observable, onset)]
     rare_changes = [
         observable for observable in at_onset if observable.data == data and observable.chance < _MAX_CHANCE
     ]
     explanations = [explanation for explanation in explain(at_onset) if data in explanation.data]
-    if probability_of(explanations, *names) > _MIN_PROBABILITY.leak:
-        if not any(event.affects(observable) for event in events for observable in rare_changes):
+    if probability_of(explanations, *leak_names) > _MIN_PROBABILITY.leak:
+        if not any(event.affects(change) for event in leak_events for change in rare_changes):
             return UNKNOWN
         is_outside = probability_of(explanations, causes=[OUTSIDE]) > _MIN_PROBABILITY.named
         return RiseExplanation(is_leak=True, is_outside=is_outside)
-    best = next((explanation for explanation in explanations if not explanation.has(*ALARMING)), None)
-    if best is None or not rare_changes:
+    without_leak = [explanation for explanation in explanations if not explanation.has(*ALARMING)]
+    if not without_leak or not rare_changes:
         return UNKNOWN
-    return RiseExplanation(is_leak=False, other_events=" and ".join(event.description for event in best.events))
+    most_probable, *_ = without_leak  # sorted by probability
+    other_events = " and ".join(event.description for event in most_probable.events)
+    return RiseExplanation(is_leak=False, other_events=other_events)
 
 
 def _coincides(observable: Observable, onset: Interval) -> bool:
-    """Return True if a change may have begun in the interval `onset` [s], by the 95 % interval of the change's onset.
-
-    False if the onset of the change is unknown.
-    """
+    """Test whether the 95 % interval of a change's onset is known and overlaps the interval `onset` [s]."""
     change = observable.onset
     return change is not None and change.low <= onset.high and change.high >= onset.low

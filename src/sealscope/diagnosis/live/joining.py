@@ -33,25 +33,22 @@ def ways_to_watch(rig: Rig) -> tuple[tuple[str, ...], ...]:
     """Return the sets of channels from which an actuator can be watched, the best set first.
 
     The volume balance reads the position. The pressure response needs no position, but works only for a cylinder with
-    equal areas that the pump feeds.
+    equal areas that is fed directly by the pump.
     """
     has_response = rig.circuit.pump_feeds_chambers and not rig.cylinder.single_rod
     return (*rig.circuit.watched_by, ("p_A", "p_B", "u")) if has_response else rig.circuit.watched_by
 
 
 def format_ways(ways: Sequence[Sequence[str]]) -> str:
-    """Format sets of channels as words for a message, such as "p_A, p_B and u".
-
-    `ways` are the sets of channels from which an actuator can be watched (`ways_to_watch`).
-    """
+    """Format sets of channels (`ways_to_watch`) as words for a message, such as "p_A, p_B and u"."""
     return ", or ".join(f"{', '.join(way[:-1])} and {way[-1]}" for way in ways)
 
 
 def are_successive(steps: Any, rate: float) -> Any:
     """Test whether each sample directly follows the sample before it; False for a gap and for a copy.
 
-    `steps` are the times between neighbours [s], a number or an array, and `rate` is the sampling rate [Hz]. A sample
-    follows directly if this time is 0.5 to 1.5 sampling intervals (`samples.follows` in `priors.toml`).
+    `steps` are the times between neighbouring samples [s], a number or an array, and `rate` is the sampling rate [Hz].
+    A sample follows directly if this time is 0.5 to 1.5 sampling intervals (`samples.follows` in `priors.toml`).
     """
     return (steps * rate > _MIN_STEP) & (steps * rate < _MAX_STEP)
 
@@ -83,12 +80,13 @@ class SampleJoiner:
     ways : tuple of tuple of str
         Sets of channels from which the actuator can be watched (`ways_to_watch`).
     late_s : float
-        Samples up to this much older than the newest one [s] are late or repeated, and are dropped. Older ones show
-        that the clock was set back.
+        Greatest age of a late or repeated sample, relative to the newest sample [s]; such samples are dropped. An older
+        sample shows that the clock was set back.
     is_final : bool
         True if the set of channels must not be replaced any more.
     names : tuple of str
-        Set of channels in use. A better set replaces it if a position is recorded later.
+        Set of channels in use, empty before the first samples. A set with the position replaces it if a position is
+        recorded later.
     rate : float
         Sampling rate [Hz].
     newest : float
@@ -113,15 +111,16 @@ class SampleJoiner:
         self.counters[reason] = self.counters.get(reason, 0) + number
 
     def restart(self, reason: str) -> None:
-        """Accept any time for the next sample, because the recorder or its clock was restarted.
-
-        The restart is counted under `reason`.
-        """
+        """Accept any time for the next sample, as after a restart of the recorder; add 1 to the counter `reason`."""
         self.count(reason)
         self.newest = -math.inf
 
     def runs(self, samples: Recording) -> Iterator[SampleRun]:
-        """Divide samples into runs without a gap; drop and count those that are late or cannot be used."""
+        """Divide samples into runs without a gap.
+
+        Samples that are late or cannot be used are dropped. They are counted, and so are gaps and changes of the
+        sampling rate or of the set of channels.
+        """
         names = self._choose_names(samples)
         if lack := _find_lack(samples, names):
             self.count(lack if names else f"samples without {format_ways(self.ways)}", len(samples))
@@ -145,8 +144,8 @@ class SampleJoiner:
     def _choose_names(self, samples: Recording) -> tuple[str, ...]:
         """Choose the set of channels to use: the first of `ways` whose channels are all in the samples.
 
-        A set in use is kept. Only if the samples contain the piston's position x for the first time, and `is_final` is
-        False, it is replaced. The result is empty if no set is complete.
+        A set in use is replaced only if the samples contain the piston's position x for the first time, and `is_final`
+        is False. The result is empty if no set was in use and the samples contain none of the sets completely.
         """
         recorded = next((way for way in self.ways if samples.channels.keys() >= {*way}), ())
         has_new_position = "x" in recorded and "x" not in self.names and not self.is_final
@@ -156,9 +155,10 @@ class SampleJoiner:
         """Yield the index range (first, last + 1) of each run of times `t` (n,) [s] without a gap.
 
         Only times later than the newest sample are used. Times that are missing, late or repeated are counted. The
-        caller must update `newest` after each run.
+        clock was set back if a time is more than `late_s` before the newest sample; this is counted, too. The caller
+        must update `newest` after each run.
         """
-        with np.errstate(all="ignore"):  # NaN and infinity follow nothing
+        with np.errstate(all="ignore"):  # comparisons with NaN are False, which leads to the search below
             is_one_run = t.size > 1 and t[0] > self.newest and bool(are_successive(np.diff(t), self.rate).all())
         if is_one_run:  # the usual case needs no search
             yield 0, t.size
@@ -180,14 +180,11 @@ class SampleJoiner:
                 indices = indices[n_samples:]
 
     def state(self) -> dict[str, Any]:
-        """Return the channels in use, the time of the newest sample and the counters as plain values for JSON.
-
-        `load_state` restores them.
-        """
+        """Return channels, newest time, counters and flags as plain values for JSON, which `load_state` restores."""
         return save_attributes(self, _SAVED)
 
     def load_state(self, state: Any) -> None:
-        """Restore channels, newest time and counters saved by `state`; raise InputError if they do not fit."""
+        """Restore the values saved by `state`; raise InputError if the channels are not one of the sets `ways`."""
         restore_attributes(self, _SAVED, state, {"names": tuple[str, ...], "counters": dict[str, int]})
         if self.names not in ((), *self.ways):
             raise InputError(f"saved state's names must be {format_ways(self.ways)}, got {', '.join(self.names)}")
@@ -197,9 +194,9 @@ _SAVED = ("is_final", "names", "rate", "newest", "changed", "counters")
 
 
 def _find_lack(samples: Recording, names: Sequence[str]) -> str:
-    """Describe a reason why the samples do not suffice to watch an actuator; "" if they do.
+    """Describe why the samples do not suffice to watch an actuator; "" if they do.
 
-    `names` are the channels that are needed.
+    `names` are the channels that are needed; if they are empty, the samples do not suffice.
     """
     for name in names:
         if name not in samples:

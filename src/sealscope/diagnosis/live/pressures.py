@@ -36,16 +36,20 @@ if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
 _PRIORS = LIVE.response
-#: Blocks until the simulated states have settled, at first and after a short gap; longest such gap [s].
-_SETTLING, _RESUMING, _PAUSE = _PRIORS.settling, _PRIORS.resuming, LIVE.watch.pause
-#: Lowest sampling rate that is judged [Hz]; channels that are read.
-_MIN_RATE, _READ = PRESSURE.blocks.slowest, ("p_A", "p_B", "u")
+#: Numbers of blocks until the simulated states have settled: at the start, and after a gap of at most `_PAUSE` [s].
+_SETTLING, _RESUMING = _PRIORS.settling, _PRIORS.resuming
+_PAUSE: float = LIVE.watch.pause
+#: Channels that are read, and the lowest sampling rate that is judged [Hz].
+_READ = ("p_A", "p_B", "u")
+_MIN_RATE: float = PRESSURE.blocks.slowest
 #: Rows of the stored samples that are pressures; row 0 is the time.
 _PRESSURES = (1, 2)
-#: Blocks that a rise is explained by.
+#: Number of last blocks in which the cause of a rise is looked for.
 _WINDOW: int = LIVE.explanation.window
+#: Size of a block's Gram matrix: the residual, and its derivative by each parameter.
+_N_SUMS = 1 + len(PARAMETERS)
 #: Columns of a stored block: its end [s] and number of samples, then parameters, Gram matrix and scores of its fit.
-_END, _SAMPLES, _N_SUMS = 0, 1, 1 + len(PARAMETERS)
+_END, _SAMPLES = 0, 1
 _THETA = slice(2, 2 + len(PARAMETERS))
 _GRAM = slice(_THETA.stop, _THETA.stop + _N_SUMS**2)
 _SCORES = slice(_GRAM.stop, None)
@@ -61,6 +65,8 @@ class PressureEstimator:
 
     Attributes
     ----------
+    method, data : str
+        Name of the way of watching, and kind of data (`Observable.data`) from which the conductance is estimated.
     states_level : bool
         False, as the level of the conductance is not stated.
     size_error : float
@@ -72,9 +78,12 @@ class PressureEstimator:
         Smallest fraction of an estimated leak that is inside the actuator.
     """
 
-    method, data, states_level = "pressures", RESPONSE, False
+    method = "pressures"
+    data = RESPONSE
+    states_level = False
     cause: Cause = "internal or external leak"
-    size_error, orifice_factor = conductance_scale_error(), PRESSURE.conductance.orifice
+    size_error = conductance_scale_error()
+    orifice_factor: float = PRESSURE.conductance.orifice
     min_internal_fraction: float = LIVE.watch.inside
     block_seconds: float = _PRIORS.seconds
     states_flow = staticmethod(states_flow)
@@ -88,11 +97,12 @@ class PressureEstimator:
         self.litres = states_flow(rig) if litres is None else litres
         self._samples = np.empty((1 + len(_READ), 0))  # times and channels since the last whole block
         self._follower: Follower | None = None
-        self._held = np.full(len(_PRESSURES), math.nan)  # values that stuck pressure readings repeat, nan for none
-        self._end = math.nan  # of the last block that was followed [s]
-        self._settling = _SETTLING  # number of blocks until the simulated states have forgotten where they began
+        self._held = np.full(len(_PRESSURES), math.nan)  # values that stuck pressure readings repeat, nan if not stuck
+        self._end = math.nan  # end of the last block to which the model was fitted [s]
+        self._settling = _SETTLING  # number of next blocks in which the simulated states still depend on their start
         self._misfits = 0  # number of successive blocks that the model does not describe
-        self._rows, self._signals = np.empty((0, 0)), SignalWindow()  # sums of the last blocks, one in a row
+        self._rows = np.empty((0, 0))  # sums of the last blocks, one block in a row
+        self._signals = SignalWindow()
 
     @property
     def has_begun(self) -> bool:
@@ -102,33 +112,37 @@ class PressureEstimator:
     def take(self, run: SampleRun) -> Iterator[BlockResult]:
         """Process the next samples, and yield the result of each block that they complete.
 
-        A result is the conductance of a block, or the reason for none. The next block is processed only when its
-        result is asked for.
+        A result is the conductance of a block, or the reason why there is none. The next block is processed only when
+        its result is asked for. Before the first block, the model is fitted to `response.begins` (`priors.toml`)
+        seconds of samples. If these cannot be used, the reason is yielded, and the fit is tried again when half as many
+        more have arrived. Samples before a gap that do not fill a block are dropped.
         """
         if not run.follows:
-            self._held[:], self._samples = math.nan, self._samples[:, :0]
+            self._held[:] = math.nan
+            self._samples = self._samples[:, :0]
         samples = np.hstack([self._samples, [run.t, *(run.channels[name] for name in _READ)]])
         n_first, n_block = (round(seconds * run.rate) for seconds in (_PRIORS.begins, self.block_seconds))
         is_slow = run.rate < _MIN_RATE  # blocks are refused without a fit
         while self._follower is None and not is_slow and samples.shape[1] >= n_first:
-            beginning = _recording(samples[:, :n_first], run.rate)
+            beginning = _make_recording(samples[:, :n_first], run.rate)
             if reason := find_unmet_requirement(beginning, self._rig) or describe_hold(beginning):
-                samples = samples[:, n_first // 2 :]  # try again half a beginning later
+                samples = samples[:, n_first // 2 :]  # try again with the second half and the samples after it
                 yield NotJudged(float(run.t[-1]), "", f"half minutes before the first block: {reason}")
             else:
                 self._follower = Follower.fit_start(beginning, self._rig)
         while (self._follower is not None or is_slow) and samples.shape[1] >= n_block:
             if not self._remove_holds(samples, n_block, run.rate):
                 break
-            block, samples = _recording(samples[:, :n_block], run.rate), samples[:, n_block:]
+            block = _make_recording(samples[:, :n_block], run.rate)
+            samples = samples[:, n_block:]
             yield self._estimate_block(block)
         self._samples = samples.copy()
 
     def _remove_holds(self, samples: Array, n_block: int, rate: float) -> bool:
         """Set stuck pressure readings in the first `n_block` columns of `samples` to nan.
 
-        `samples` (4, n) holds times and channels, and `rate` is the sampling rate [Hz]. Returns True, or False
-        without a change if only later samples can tell that a reading is stuck.
+        `samples` (4, n) holds times and channels, and `rate` is the sampling rate [Hz]. Returns False, and changes
+        nothing, if only later samples can show whether a reading is stuck; otherwise True.
         """
         holds = [find_holds(samples[row], rate, held) for row, held in zip(_PRESSURES, self._held, strict=True)]
         if min(hold.pending for hold in holds) < n_block:
@@ -139,10 +153,14 @@ class PressureEstimator:
         return True
 
     def _estimate_block(self, block: Recording) -> BlockResult:
-        """Estimate the leakage conductance in a block of samples, or return the reason for none.
+        """Estimate the leakage conductance in a block of samples, or return the reason why there is none.
 
-        There is none at too low a sampling rate, with missing values, while the fit settles, if the model does not
-        describe the block, or if the standard error is above the prior standard deviation of the conductance.
+        Reasons are:
+
+        - the sampling rate is too low, or values are missing,
+        - the fit has not settled after its start or a gap,
+        - the model does not describe the block,
+        - the standard error of the conductance is above the standard deviation of its prior.
         """
         begin, end = float(block.t[0]), float(block.t[-1]) + 1.0 / block.rate
         if self._follower is None or block.rate < _MIN_RATE:
@@ -151,7 +169,8 @@ class PressureEstimator:
             return NotJudged.with_count(end, "missing values")
         follower, restarts = self._resume(self._follower, begin - self._end, block.rate)
         self._follower, self._end = follower, end
-        is_settling, self._settling = self._settling > 0, max(self._settling - 1, 0)
+        is_settling = self._settling > 0
+        self._settling = max(self._settling - 1, 0)
         if not self._follow(follower, block, is_settling):
             return self._reject(follower, end, is_settling, restarts)
         self._misfits = 0
@@ -171,12 +190,12 @@ class PressureEstimator:
 
         The fit is lost after `response.lost` (`priors.toml`) such blocks in succession, or at once if a parameter is
         not finite. The uncertainty of its parameters is then widened, it must settle anew, and the report states that
-        later blocks cannot be compared with earlier ones.
+        later blocks cannot be compared with earlier ones. Otherwise the report is "settling" if the fit had not settled
+        before this block (`is_settling`). If it had, the report is "not described by the model", and the fit must
+        settle for the next `_RESUMING` blocks.
 
-        Otherwise the report states `restarts`, which `_resume` returned for this block. If `is_settling`, i.e. the fit
-        had not yet settled after a start or a gap, the reason is "settling". If not, the reason is "not described by
-        the model", and the next `_RESUMING` blocks are left to settle. `follower`: the fit; `end`: end of the block
-        [s].
+        `follower`: the fit; `end`: end of the block [s]; `restarts`: True if this block cannot be compared with earlier
+        ones (`_resume`), which the report then states.
         """
         self._misfits += 1
         if self._misfits >= _PRIORS.lost or not np.isfinite(follower.theta).all():
@@ -189,15 +208,17 @@ class PressureEstimator:
     def _resume(self, follower: Follower, gap: float, rate: float) -> tuple[Follower, bool]:
         """Prepare the fit of the pressures for a block that follows the last one after a `gap` [s].
 
-        After a change of the sampling rate a new fit starts from the present parameters. Returns the fit to use, and
-        True if this and later blocks cannot be compared with earlier ones.
+        After a gap the uncertainty of the parameters is widened, and the fit must settle anew. After a change of the
+        sampling rate a new fit starts from the present parameters. Returns the fit to use, and True if this and later
+        blocks cannot be compared with earlier ones.
         """
         has_other_rate = follower.machine.rate != rate
         if has_other_rate:
             follower = follower.at_rate(self._rig, rate)
         elif abs(gap) < 0.5 / rate:
             return follower, False
-        is_short = -1.0 / rate <= gap <= _PAUSE  # gap is nan before the first block
+        # a short gap is at least minus one sample, for a rounded clock; before the first block `gap` is nan, i.e. long
+        is_short = -1.0 / rate <= gap <= _PAUSE
         follower.interrupt(max(gap, 0.0) if is_short else math.inf)
         self._settling = max(self._settling, _RESUMING if is_short else _SETTLING)
         return follower, has_other_rate or not is_short
@@ -205,8 +226,8 @@ class PressureEstimator:
     def _follow(self, follower: Follower, block: Recording, is_settling: bool) -> bool:
         """Fit the model of the pressures to a block; return True if the model describes the block.
 
-        The fit's sums over the block are stored. The block also updates the usual variance of the residuals. The
-        update is faster while the model is settling or does not describe the block.
+        The fit's sums over the block and its signals are stored. The block also updates the usual variance of the
+        residuals, faster if the fit is settling (`is_settling`) or the model does not describe the block.
         """
         sums = follower.update(block)
         self._signals.take(float(block.t[0]), {name: block[name] for name in _READ}, block.rate)
@@ -216,7 +237,7 @@ class PressureEstimator:
         is_described = bool(np.isfinite(follower.theta).all()) and follower.excess < _PRIORS.described
         variance = float(sums.gram[0, 0]) / max(sums.samples, 1.0)
         if math.isfinite(variance):
-            # a fading geometric mean, which one block changes by a factor of 10 at most
+            # a geometric mean with fading memory, in which a block counts with 0.1 to 10 times the earlier mean
             ratio = float(np.clip(max(variance, 1.0) / follower.variance, 0.1, 10.0))
             n_blocks = _PRIORS.usual if is_described and not is_settling else _RESUMING
             follower.variance *= ratio ** (1.0 / n_blocks)
@@ -235,7 +256,7 @@ class PressureEstimator:
         if len(rows) < MIN_BLOCKS or self._follower is None:
             return ()
         blocks = [
-            Block(row[_THETA], row[_GRAM].reshape(2 * (_N_SUMS,)), row[_SAMPLES], row[_SCORES].reshape(-1, _N_SUMS))
+            Block(row[_THETA], row[_GRAM].reshape(_N_SUMS, _N_SUMS), row[_SAMPLES], row[_SCORES].reshape(-1, _N_SUMS))
             for row in rows
         ]
         try:
@@ -247,10 +268,7 @@ class PressureEstimator:
         return (*response, *self._signals.observables(since))
 
     def relearn(self, since: float = math.inf) -> None:
-        """Forget the learned parameters of the machine, after a repair or an exchange.
-
-        `since` has no effect; both estimators are called in the same way, and `LiveBalance` needs it.
-        """
+        """Make the learned parameters uncertain again, e.g. after a repair; `since` is for `LiveBalance` only."""
         if self._follower is not None:
             self._follower.interrupt(math.inf)
 
@@ -283,7 +301,7 @@ _SAVED = ("litres", "_samples", "_held", "_end", "_settling", "_misfits", "_rows
 _FOLLOWER_ATTRIBUTES = ("theta", "covariance", "states", "variance", "last")
 
 
-def _recording(rows: Array, rate: float) -> Recording:
-    """Build a recording from stored samples (4, n), whose rows are time [s], p_A, p_B and u."""
+def _make_recording(rows: Array, rate: float) -> Recording:
+    """Make a recording from stored samples (4, n), whose rows are time [s], p_A, p_B and u."""
     t, *channels = rows
     return Recording(t, dict(zip(_READ, channels, strict=True)), {name: CHANNEL_UNITS[name] for name in _READ}, rate)

@@ -12,8 +12,10 @@ from sealscope.diagnosis.inference.observable import Flow, Observed, Remark
 from sealscope.diagnosis.inference.onset import Interval
 from sealscope.diagnosis.verdict.evidence import Cause, Evidence
 
-#: Name of the watch as a provider, and of its tests: for a step within the stream, and over a healthy level.
-WATCH, STEP, LEVEL = "watch", "step", "level"
+#: Name of the watch as a detector (`Evidence.detector`).
+WATCH = "watch"
+#: Names of its tests: for a step within the stream, and for a level above that of the healthy machine.
+STEP, LEVEL = "step", "level"
 _UNDATED = Interval(math.nan, math.nan, math.nan)
 
 
@@ -44,8 +46,8 @@ class LiveRise(NamedTuple):
     def log_chance(self) -> float:
         """Logarithm of the probability that a healthy machine reaches this score of the test or a higher one.
 
-        For a step it is an upper bound by Ville's inequality, -score/2. For a level, whose score is a normal quantile,
-        it is log Phi(-score).
+        For a step this is an upper bound by Ville's inequality, -score/2. For a level, whose score is a normal
+        quantile, it is log Phi(-score) with the normal distribution function Phi.
         """
         from scipy.special import log_ndtr
 
@@ -53,7 +55,7 @@ class LiveRise(NamedTuple):
 
     @property
     def chance(self) -> float:
-        """Largest probability with which a healthy machine reaches this score of the test."""
+        """Probability that a healthy machine reaches this score or a higher one; for a step an upper bound."""
         return math.exp(self.log_chance)
 
     def threshold(self, chance: float) -> float:
@@ -70,10 +72,7 @@ class LiveRise(NamedTuple):
         return self.interval
 
     def detectable_step(self, chance: float) -> float:
-        """Return infinity, as the smallest step that the test can detect is not known.
-
-        It depends on the random walk of the conductance.
-        """
+        """Return infinity: the smallest step that the test can detect depends on the conductance's random walk."""
         return math.inf
 
 
@@ -81,8 +80,8 @@ class LiveRise(NamedTuple):
 class LiveLeak:
     """The leakage of a watched machine, in the form that `decision.decide` judges.
 
-    The protocol `observable.LeakMeasure` explains the fields. `test` is the increase that a test has detected, or a
-    step too small for an alarm. `flow_per_conductance` is the mean of abs(p_A - p_B) [Pa].
+    The protocol `observable.LeakMeasure` explains the fields. In addition, `test` is the increase that a test has
+    detected, or a step too small for an alarm. `flow_per_conductance` is the mean of abs(p_A - p_B) [Pa].
     """
 
     test: LiveRise
@@ -101,18 +100,12 @@ class LiveLeak:
 
     @property
     def step(self) -> LiveRise | None:
-        """Test for a step (sudden lasting change) within the stream.
-
-        None if the increase was found by comparison with the healthy machine's mean instead.
-        """
+        """Test for a step (sudden lasting change) within the stream; None if another test found the increase."""
         return self.test if self.test.test == STEP else None
 
     @property
     def rise(self) -> LiveRise | None:
-        """Test of the conductance against that of the healthy machine.
-
-        It is None if the increase was found by the test for a step.
-        """
+        """Test of the conductance against that of the healthy machine; None if another test found the increase."""
         return self.test if self.test.test == LEVEL else None
 
     @property
@@ -141,8 +134,9 @@ class LiveLeak:
 def decide_on_stream(leak: LiveLeak | None, false_alarm_probability: float, lack: str = "") -> Evidence:
     """Decide from the estimated leakage of a watched machine if it leaks.
 
-    `leak`: the estimate; if there is none yet, `lack` is the reason in one line. Other explanations of an increase
-    are not considered here. They are weighed only once, when the test raises an alarm (module `explanation`).
+    `leak` is the estimate; if it is None, `lack` is the reason why there is no estimate yet, in one line. Other
+    explanations of an increase are not considered here. They are weighed only once, before the test raises an alarm
+    (module `explanation`).
     """
     report = Observed(WATCH, lack=lack, leak=leak)
     return decide(report, (), HealthyNull(), false_alarm_probability, weigh_rivals=False)

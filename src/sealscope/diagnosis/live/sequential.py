@@ -1,16 +1,18 @@
 """Detect a step of a coefficient in a stream: an e-detector over all onsets, with a random walk of any size.
 
-Each block gives an estimate g_k of the coefficient with a variance V_k. In a healthy machine the level of g follows a
-random walk. Given the earlier blocks, the innovations e_k of its Kalman filter have the variance kappa S_k with kappa
-unknown, and so follow Student's t. A step of size delta at block j adds f_k delta to e_k, where f is the filter's
-response to a step, which may begin within block j (`PARTS`). With a = sum f e / S, b = sum f^2 / S, T = sum e^2 / S
-and n innovations, and with delta ~ N(0, v kappa) and kappa integrated, the likelihood ratio is
+Each block k gives an estimate g_k of the coefficient with a variance V_k. In a healthy machine the level of g follows
+a random walk, whose increment in a block has the variance q. The Kalman filter for this walk predicts g_k from the
+earlier blocks. Its prediction errors (innovations) e_k have the variance kappa S_k with an unknown scale kappa, and so
+follow Student's t. A step of size delta that begins in block j adds f_k delta to e_k, where f is the filter's response
+to a unit step; the step may begin within block j (`PARTS`). Let a = sum f e / S, b = sum f^2 / S and T = sum e^2 / S,
+where T is over n innovations, including those before block j with fading memory. With the prior delta ~ N(0, v kappa)
+and kappa integrated out, the likelihood ratio of the step to no step is
 
     R_j = (1 + v b)^(-1/2) (1 - a^2 / ((b + 1/v) T))^(-n/2).
 
-It is counted only where a > 0, which makes it smaller. The walk's size q is one of `WALKS`. What was known of q
-before block j is its prior pi_j, in which each size keeps some probability, as the walk may change. Numerator and
-denominator are both averaged over it:
+R_j is set to 0 unless a > 0, as only rises count. q is one of `WALKS`. Its prior pi_j is the probability of each q
+given the blocks before j; a small part is shared equally by all q, as the walk may change. With the likelihood
+p_q(e_j..e_k) of the innovations without a step, numerator and denominator are both averaged over q:
 
     M_k = sum_j  sum_q pi_j(q) p_q(e_j..e_k) mean_v R_j  /  sum_q pi_j(q) p_q(e_j..e_k).
 
@@ -37,26 +39,32 @@ from sealscope.recordings.recording import Array
 from sealscope.storage.plain_state import restore_attributes, save_attributes
 
 _PRIORS = LIVE.step
-#: q of the module: variances of the walk in a block, over that of the first block's estimate (q, 1).
+#: q of the module's docstring: variances of the walk in a block, over that of the first block's estimate; shape (q, 1).
 WALKS = np.array(_PRIORS.walks)[:, None]
-#: v of the module: variances of the step's size; fractions of its first block in which the leak is open.
+#: v of the module's docstring: prior variances of the step's size, in the same unit.
 SIZES = np.array(_PRIORS.sizes)
+#: Fractions of the step's first block in which the leak is open.
 PARTS = np.array(_PRIORS.parts)
-#: Standard deviations beyond which an innovation is a step, not the walk; weight of earlier innovations per block.
-JUMP, MEMORY = LIVE.coefficients.jump, _PRIORS.memory
+#: Standard deviations beyond which an innovation is a step, not the walk.
+JUMP: float = LIVE.coefficients.jump
+#: Factor per block by which the weight of earlier innovations decays.
+MEMORY: float = _PRIORS.memory
 #: All onsets of the last `RECENT` blocks are stored, then `RECENT / 4` of each doubling of age, up to `HORIZON` blocks.
 RECENT, HORIZON = _PRIORS.recent, _PRIORS.horizon
-#: Largest number of a block, in the unit of the first block, whose square fits into a float.
+#: Largest estimate, in the unit of the first block, whose square fits into a float.
 _MAX_NUMBER = 1e60
-#: Smallest square of an innovation over its variance: repeated samples have none, and log 0 is not a number.
+#: Lower limit of an innovation's square over its variance; repeated samples give 0, whose logarithm is not finite.
 _MIN_SQUARE = 1e-12
-#: Innovations after which the walks' probabilities are updated, and onsets begin.
+#: Number of innovations from which on onsets are possible, and the probabilities of the walks are updated.
 _N_WARM = 4
-#: Blocks between two selections of the onsets.
+#: Number of blocks from one thinning of the onsets to the next.
 _SELECT_EVERY = 8
-#: Rows of the sums over innovations, for each walk and onset: 1 - f of the next block, a, b, T, and log pi of the onset
-#: with the likelihood of what came before it.
-_REST, _A, _B, _T, _LOG_PRIOR = range(5)
+#: Rows of the sums over innovations, for each walk and onset: part of a unit step that the filter has followed (1 - f
+#: of the next block), a, b, T, and log pi_j minus the log likelihood of the blocks before the onset (`_add_onsets`).
+_FOLLOWED, _A, _B, _T, _LOG_PRIOR = range(5)
+_N_ROWS = _LOG_PRIOR + 1
+#: Columns of the onsets: n of the innovations in T, number of the block, time, and begin of the block [s].
+_N, _BLOCK, _TIME, _BLOCK_BEGIN = range(4)
 _SAVED = tuple(f"_{name}" for name in ("level", "level_variance", "squares", "log_weights", "log_variances", "sums",
                                        "onsets", "unit", "count", "blocks", "end"))  # fmt: skip
 
@@ -64,15 +72,21 @@ _SAVED = tuple(f"_{name}" for name in ("level", "level_variance", "squares", "lo
 class StepDetector:
     """Detect an increase of one coefficient from its estimates block by block, in bounded memory.
 
-    In a healthy machine the coefficient follows a random walk, whose size q is unknown. For each of several sizes a
-    Kalman filter predicts the next estimate. The detector sums the evidence of a step for each size q and each
+    In a healthy machine the coefficient follows a random walk, whose variance q in a block is unknown. For each of
+    several q a Kalman filter predicts the next estimate. The detector sums the evidence of a step for each q and each
     possible onset j. The module's docstring gives the formulas, whose symbols are used here.
 
-    `_level` and `_level_variance` are the state of each filter. `_squares` and `_count` are T and n of the
-    innovations, with fading memory, `_log_weights` the log probability of q, and `_log_variances` the sum of log S.
-    `_sums` (5, q, j) has the rows `_REST` to `_LOG_PRIOR`. `_onsets` (j, 4) holds for each onset the number of
-    innovations since, the number of its block, its time and the begin of its block [s]. `_unit` is the standard
-    deviation of the first block, the unit in which estimates are stored.
+    Attributes, of which arrays have a row for each q:
+
+    - `_level`, `_level_variance`: state of each filter,
+    - `_squares`, `_count`: T and n of all innovations, with fading memory,
+    - `_log_weights`: log probability of each q,
+    - `_log_variances`: sum of log S over all innovations,
+    - `_sums` (5, q, j): rows `_FOLLOWED` to `_LOG_PRIOR` for each onset j,
+    - `_onsets` (j, 4): columns `_N` to `_BLOCK_BEGIN` for each onset,
+    - `_unit`: standard deviation of the first block, the unit in which estimates are stored,
+    - `_blocks`: number of blocks,
+    - `_end`: end of the last block [s], minus infinity after `forget`.
     """
 
     def __init__(self) -> None:
@@ -87,10 +101,10 @@ class StepDetector:
         Rises that may have begun in these blocks are not detected any more.
         """
         self._end = -np.inf
-        self._sums, self._onsets = np.zeros((5, len(WALKS), 0)), np.zeros((0, 4))
+        self._sums, self._onsets = np.zeros((_N_ROWS, len(WALKS), 0)), np.zeros((0, 4))
 
     def is_representable(self, g: float, deviation: float) -> bool:
-        """Test whether the squares of an estimate `g` and of its standard `deviation` can be stored as floats."""
+        """Test whether an estimate `g` and its standard `deviation` > 0 can be squared without overflow."""
         unit = self._unit or deviation
         return unit > 0.0 and abs(g) < _MAX_NUMBER * unit and unit / _MAX_NUMBER < deviation < _MAX_NUMBER * unit
 
@@ -98,46 +112,50 @@ class StepDetector:
         """Update the evidence of a step by the estimate `g` of the coefficient in the next block.
 
         `begin` and `end` [s] are the limits of the block, and `deviation` is the standard error of `g`. Let e be the
-        innovation, i.e. g minus its prediction by the Kalman filter for a random walk, S its variance, and f the effect
-        of a unit step on it. Then for each size of the walk and each possible onset, a += f e / S, b += f^2 / S and T
-        += e^2 / S. The first block after `forget` only sets the level of the filter.
+        innovation, i.e. g minus its prediction by the Kalman filter for a random walk. Let S be the variance of e, and
+        f the effect of a unit step on e. Then the sums for each walk and each possible onset are updated by
+
+            a += f e / S,    b += f^2 / S,    T += e^2 / S.
+
+        The first block after `forget` only sets the level of the filters.
         """
         self._unit = self._unit or deviation
         g, variance = g / self._unit, (deviation / self._unit) ** 2
         self._blocks += 1
-        elapsed_blocks, self._end = (begin - self._end) / (end - begin) + 1.0, end
+        elapsed_blocks = (begin - self._end) / (end - begin) + 1.0  # from the end of the last block to that of this one
+        self._end = end
         if not np.isfinite(elapsed_blocks):  # the first block after `forget`
             self._level[:], self._level_variance[:] = g, variance
             return
         level_variance = self._level_variance + WALKS * max(elapsed_blocks, 1.0)
         innovation, innovation_variance = g - self._level, level_variance + variance
         gain = level_variance / innovation_variance
-        new_parts = PARTS if self._count >= _N_WARM else PARTS[:0]
-        if len(new_parts):
+        may_begin = self._count >= _N_WARM
+        if may_begin:
             self._add_onsets(begin, end)
-        # f: the whole step less what the filter has followed of it
-        response = 1.0 - self._sums[_REST]
-        response[:, len(self._onsets) - len(new_parts) :] = new_parts
-        self._sums[_REST] += gain * response
+        response = 1.0 - self._sums[_FOLLOWED]  # f
+        if may_begin:  # of a step in this block, the mean over the block
+            response[:, -len(PARTS) :] = PARTS
+        self._sums[_FOLLOWED] += gain * response
         self._sums[_A] += response / innovation_variance * innovation
         self._sums[_B] += response / innovation_variance * response
         self._sums[_T] += innovation**2 / innovation_variance
-        self._onsets[:, 0] += 1.0
+        self._onsets[:, _N] += 1.0
         self._update_walks(innovation_variance, innovation**2 / innovation_variance)
         self._level = self._level + gain * innovation
         self._level_variance = gain * variance
 
     def _update_walks(self, variance: Array, square: Array) -> None:
-        """Update the scale of the noise and the probability of each size of the random walk after a block.
+        """Update the scale of the noise and the probability of each random walk after a block.
 
-        For each of the sizes, q in number, a Kalman filter has given the innovation e of the block (measured minus
-        predicted estimate) and its variance S. `variance` (q, 1) is S, and `square` (q, 1) is e^2 / S.
+        For each walk in `WALKS` a Kalman filter has given the innovation e of the block (measured minus predicted
+        estimate) and its variance S. `variance` (q, 1) is S, and `square` (q, 1) is e^2 / S.
         """
         square = np.maximum(square, _MIN_SQUARE)
         if self._count >= _N_WARM:
-            # clipped, as a jump is a step and says nothing of noise and walk
+            # clipped, as a large innovation is a step, which must not count as noise or walk
             square = np.minimum(square, JUMP**2 * self._squares / self._count)
-            # log density of Student's t, the probabilities flattened by the memory
+            # Bayes' rule with the log density of Student's t; the earlier probabilities fade
             log_weights = MEMORY * self._log_weights - 0.5 * np.log(variance * self._squares)
             log_weights -= 0.5 * (self._count + 1.0) * np.log1p(square / self._squares)
             self._log_weights = log_weights - np.logaddexp.reduce(log_weights, axis=0)
@@ -146,13 +164,16 @@ class StepDetector:
         self._log_variances = self._log_variances + np.log(variance)
 
     def _add_onsets(self, begin: float, end: float) -> None:
-        """Add possible onsets of a step in the block from `begin` to `end` [s]; thin out old ones.
+        """Add possible onsets of a step in the block from `begin` to `end` [s].
 
-        There is one for each of `PARTS`, the fractions of the block in which the leak is open.
+        There is one onset for each of `PARTS`, the fractions of the block in which the leak is open. Every
+        `_SELECT_EVERY` blocks, old onsets are thinned out.
         """
-        sums = np.zeros((5, len(WALKS), len(PARTS)))
+        # with a small probability the walk changes, after which all walks are equally likely
         log_prior = np.logaddexp(np.log1p(-_PRIORS.changes) + self._log_weights, np.log(_PRIORS.changes / len(WALKS)))
-        # pi_j(q) p_q(e_j..e_k) = exp(sums[_LOG_PRIOR]) T_k^(-n/2) prod S^(-1/2), up to a factor equal for all q
+        # the likelihood of all innovations up to a block is T^(-n/2) times the product of their S^(-1/2); divided here
+        # by its value at the onset, it becomes the likelihood since the onset (`_log_likelihoods`)
+        sums = np.zeros((_N_ROWS, len(WALKS), len(PARTS)))
         sums[_T] = self._squares
         sums[_LOG_PRIOR] = log_prior + 0.5 * (self._count * np.log(self._squares) + self._log_variances)
         onsets = np.array([[self._count, self._blocks, end - part * (end - begin), begin] for part in PARTS])
@@ -165,16 +186,17 @@ class StepDetector:
     def log_e(self, min_log_e: float = -np.inf) -> float:
         """Compute the logarithm of the evidence M that the coefficient has risen.
 
-        M is the sum over all possible onsets of the likelihood ratio of a step to no step, averaged over the size of
-        the random walk, the prior variance of the step and the part of the first block. In a healthy machine the mean
-        number of blocks until M exceeds A is at least A. The result is minus infinity if no rise can have begun yet,
-        or if a quick upper bound of log M is at most `min_log_e`.
+        M is the sum over all possible onsets of the likelihood ratio of a step to no step. It is averaged over the
+        random walks, the prior variances of the step and the fractions of its first block (`PARTS`). In a healthy
+        machine the mean number of blocks until M exceeds A is at least A. The result is minus infinity if no rise can
+        have begun yet, or if a quick upper bound of log M is at most `min_log_e`.
         """
         if not len(self._onsets):
             return -np.inf
         a, b, T = self._sums[_A : _T + 1]
-        explained = np.minimum(np.maximum(a, 0.0) ** 2 / (b * T), 1.0 - 1e-15)  # fraction of T, by the best size
-        max_log_ratio = -0.5 * float(np.min(self._onsets[:, 0] * np.log1p(-explained)))
+        # fraction of T that a step of the best size explains, less than 1 so that its logarithm is finite
+        explained = np.minimum(np.maximum(a, 0.0) ** 2 / (b * T), 1.0 - 1e-15)
+        max_log_ratio = -0.5 * float(np.min(self._onsets[:, _N] * np.log1p(-explained)))
         if max_log_ratio + np.log(len(self._onsets) / len(PARTS)) <= min_log_e:
             return -np.inf
         return float(np.logaddexp.reduce(self._log_terms().ravel()))
@@ -184,28 +206,29 @@ class StepDetector:
 
         The prior of the walk at the onset is included. A constant equal for all q is left out.
         """
-        n, log_T = self._onsets[:, 0], np.log(self._sums[_T])
+        n, log_T = self._onsets[:, _N], np.log(self._sums[_T])
         return np.asarray(self._sums[_LOG_PRIOR] - 0.5 * (n * log_T + self._log_variances))
 
     def _step_log_ratios(self) -> Array:
-        """Compute the log likelihood ratios (v, q, j) of a step of the coefficient against none.
+        """Compute the log likelihood ratios (v, q, j) of a rise of the coefficient to no step.
 
         v is the prior variance of the step's size (`SIZES`), q the variance of the random walk in a block (`WALKS`),
-        and j the onset. With the sums a, b and T over the n innovations since the onset, which `take` updates,
+        and j the onset. With n and the sums a, b and T of the module's docstring, which `take` updates,
 
             R = (1 + v b)^(-1/2) (1 - max(a, 0)^2 / ((b + 1/v) T))^(-n/2).
         """
         a, b, T = self._sums[_A : _T + 1]
         v = SIZES[:, None, None]
         explained = np.maximum(a, 0.0) ** 2 / ((b + 1.0 / v) * T)
-        return np.asarray(-0.5 * (np.log1p(v * b) + self._onsets[:, 0] * np.log1p(-explained)))
+        return np.asarray(-0.5 * (np.log1p(v * b) + self._onsets[:, _N] * np.log1p(-explained)))
 
     def _log_terms(self) -> Array:
         """Compute the logarithms (v, q, j) of the terms whose sum is the evidence that the coefficient has risen.
 
         A term is the likelihood ratio of a step to no step, for a prior variance v of the step (`SIZES`), a variance q
-        of the random walk (`WALKS`) and an onset j, times the posterior probability of q without a step, over the
-        numbers of v and of `PARTS`. It is 0, and its logarithm -inf, for a step down.
+        of the random walk (`WALKS`) and an onset j. It is multiplied by the posterior probability of q without a step,
+        and divided by the numbers of `SIZES` and `PARTS`, which are equally likely. For a step down the term is 0, and
+        its logarithm -inf.
         """
         likelihoods = self._log_likelihoods()
         total = np.logaddexp.reduce(likelihoods, axis=0) + np.log(len(SIZES) * len(PARTS))
@@ -220,21 +243,24 @@ class StepDetector:
         """
         terms = self._log_terms()
         log_e = float(np.logaddexp.reduce(terms.ravel()))
-        weights = np.exp(terms - log_e)
+        weights = np.exp(terms - log_e)  # posterior probabilities
         a, b, T = self._sums[_A : _T + 1]
+        # Student's t posterior of the size, for each v, q and j
         precision = b + 1.0 / SIZES[:, None, None]
-        sizes, freedom = a / precision, np.maximum(self._onsets[:, 0] - 2.0, 1.0)
+        sizes = a / precision
+        freedom = np.maximum(self._onsets[:, _N] - 2.0, 1.0)
         variances = np.maximum(T - a * sizes, 0.0) / freedom / precision
         size = float((weights * sizes).sum())
         deviation = float(np.sqrt((weights * (variances + (sizes - size) ** 2)).sum()))
-        probabilities = weights.sum(axis=(0, 1))  # of the onsets
-        onsets, begins = self._onsets[:, 2:].T
-        order = np.argsort(onsets, kind="stable")
-        low_index, high_index = np.searchsorted(np.cumsum(probabilities[order]), [0.025, 0.975])
-        latest = onsets[order[min(high_index, len(order) - 1)]]
-        resolution = float((onsets - begins)[-len(PARTS)]) / len(PARTS)  # about a part of a block
-        mean = float(probabilities @ onsets)
-        interval = Interval(mean, float(onsets[order[low_index]]) - resolution, float(latest) + resolution)
+        onset_probabilities = weights.sum(axis=(0, 1))
+        times, block_begins = self._onsets[:, _TIME], self._onsets[:, _BLOCK_BEGIN]
+        mean_time = float(onset_probabilities @ times)
+        order = np.argsort(times, kind="stable")
+        low_index, high_index = np.searchsorted(np.cumsum(onset_probabilities[order]), [0.025, 0.975])
+        earliest, latest = times[order[low_index]], times[order[min(high_index, len(order) - 1)]]
+        # a fifth of the last block, about the distance between the onsets in it
+        resolution = float((times - block_begins)[-len(PARTS)]) / len(PARTS)
+        interval = Interval(mean_time, float(earliest) - resolution, float(latest) + resolution)
         return LiveRise(STEP, 2.0 * log_e, interval, self._unit * size, self._unit * deviation)
 
     def bound(self, probability: float = BOUND_PROBABILITY) -> float:
@@ -246,10 +272,13 @@ class StepDetector:
         if not len(self._onsets):
             return np.inf
         a, b, T = self._sums[_A : _T + 1]
-        sizes, log_likelihoods = a / b, self._log_likelihoods()
-        deviations = np.sqrt(np.maximum(T - a * sizes, np.finfo(float).tiny) / self._onsets[:, 0] / b)
-        log_weights = log_likelihoods - np.logaddexp.reduce(log_likelihoods, axis=0)
-        log_weights = log_weights + np.logaddexp.reduce(self._step_log_ratios(), axis=0)
+        # least-squares size of a step at each onset and for each walk, and its standard error
+        sizes = a / b
+        residual_squares = np.maximum(T - a * sizes, np.finfo(float).tiny)
+        deviations = np.sqrt(residual_squares / self._onsets[:, _N] / b)
+        log_likelihoods = self._log_likelihoods()
+        log_walk_probabilities = log_likelihoods - np.logaddexp.reduce(log_likelihoods, axis=0)
+        log_weights = log_walk_probabilities + np.logaddexp.reduce(self._step_log_ratios(), axis=0)
         weights = np.exp(log_weights - log_weights.max())
         return self._unit * bound_steps(weights.ravel(), sizes.ravel(), deviations.ravel(), probability)
 
@@ -257,11 +286,11 @@ class StepDetector:
     def noise(self) -> float:
         """Variance of the estimates' prediction errors (innovations) over the variance that the Kalman filter predicts.
 
-        The filter is the one whose random walk has a variance per block of a tenth of the first estimate's variance.
-        The ratio is averaged over the blocks, with fading memory, and over `stated` more ones (`priors.toml`) with the
-        ratio 1.
+        The ratio is averaged over the blocks, with fading memory, and over `step.stated` (`priors.toml`) additional
+        blocks with the ratio 1. The filter is for a random walk whose variance in a block is a tenth of the first
+        estimate's variance.
         """
-        walk = 3  # index in `WALKS`
+        walk = 3  # index of this walk, 0.1, in `WALKS`
         return float((self._squares[walk, 0] + _PRIORS.stated) / (self._count + _PRIORS.stated))
 
     def state(self) -> dict[str, Any]:
@@ -269,10 +298,7 @@ class StepDetector:
         return save_attributes(self, _SAVED)
 
     def load_state(self, state: Any) -> None:
-        """Restore the evidence saved by `state`, so that later results are identical to the last bit.
-
-        Raises InputError if it does not fit.
-        """
+        """Restore the evidence that `state` returned; raise InputError if its parts do not fit together."""
         restore_attributes(self, _SAVED, state)
         if self._sums.shape[2] != len(self._onsets):
             raise InputError(f"saved state's onsets must be {len(self._onsets)}, got {self._sums.shape[2]}")
@@ -282,11 +308,11 @@ def _select_onsets(block: int, onsets: Array) -> NDArray[np.bool_]:
     """Flag the possible onsets of a step to keep, (j,): all of the last `RECENT` blocks, and fewer of older blocks.
 
     Older onsets are kept only at the start of a block, on a grid of blocks that becomes coarser with age, up to the
-    age `HORIZON`. `block` is the number of the present block. `onsets` (j, 4) holds for each onset the number of
-    innovations since, the number of its block, its time and the begin of its block [s].
+    age `HORIZON`. `block` is the number of the present block. `onsets` (j, 4) has the columns `_N` to `_BLOCK_BEGIN`.
     """
-    _, onset_block, onset, block_start = onsets.T
+    _, onset_block, time, block_begin = onsets.T
     age = block - onset_block
     n_doublings = np.ceil(np.log2(np.maximum(age / RECENT, 1.0)))
     spacing = 2.0 * 2.0**n_doublings  # blocks; RECENT/4 onsets in each doubling of age
-    return np.asarray((age < RECENT) | ((onset_block % spacing == 0) & (age < HORIZON) & (onset <= block_start)))
+    is_on_grid = (onset_block % spacing == 0) & (time <= block_begin)
+    return np.asarray((age < RECENT) | (is_on_grid & (age < HORIZON)))

@@ -39,8 +39,9 @@ from sealscope.diagnosis.priors.live import LIVE
 from sealscope.recordings.recording import Array
 from sealscope.storage.plain_state import restore_attributes, save_attributes
 
-#: Blocks in the window, and fewest that are tested for a step.
+#: Number of blocks in the window.
 WINDOW: int = LIVE.explanation.window
+#: Smallest number of blocks that are tested for a step.
 MIN_BLOCKS: int = CHANGES.levels.blocks[-1]
 #: Features of a block.
 DUTY = ("command", "motion")
@@ -56,7 +57,7 @@ FEATURES = (
 _BEGIN, _END, _SAMPLES, _SPEED, _MOVING = range(5)
 _FEATURES = slice(_MOVING + 1, _MOVING + 1 + len(FEATURES))
 _GRAM = slice(_FEATURES.stop, None)
-#: Numbers of blocks that are averaged for a level, the first that suffices.
+#: Numbers of blocks in a group whose mean pressures are tested; the smallest possible number is used.
 _GROUP_SIZES = (1, 2, 4)
 
 
@@ -67,8 +68,8 @@ class SignalWindow:
     """
 
     def __init__(self) -> None:
-        self._rows = np.empty((0, 0))
-        self._means = np.empty(0)  # of p_A and p_B in the first block [Pa]: levels are relative to them
+        self._rows = np.empty((0, 0))  # features of the last blocks, one block in a row
+        self._means = np.empty(0)  # mean p_A and p_B in the first block [Pa], to which pressure levels are relative
 
     @np.errstate(all="ignore")
     def take(self, begin: float, channels: Mapping[str, Array], rate: float) -> None:
@@ -85,8 +86,8 @@ class SignalWindow:
         max_speed = max(speed, float(self._rows[:, _SPEED].max(initial=0.0)) if self._rows.size else 0.0)
         fraction_moving = 1.0 if motion is None else float(time_in_motion(motion[None, :, 0], max_speed)[0])
         columns = pressure_level_rows(channels, rate, self._means, max_speed)
-        blocks = {name: values[None] for name, values in channels.items()}
-        values = {**dict(log_amplitudes(blocks)), **dict(sensor_features(blocks, rate))}
+        single_block = {name: values[None] for name, values in channels.items()}  # arrays (1, n) of one block
+        values = {**dict(log_amplitudes(single_block)), **dict(sensor_features(single_block, rate))}
         features = [float(values[name][0]) if name in values else np.nan for name in FEATURES]
         n_samples, gram = len(channels["p_A"]), columns.T @ columns
         row = np.array([begin, begin + n_samples / rate, n_samples, speed, fraction_moving, *features, *gram.ravel()])
@@ -102,7 +103,9 @@ class SignalWindow:
         rows = self._rows[self._rows[:, _BEGIN] >= since] if self._rows.size else self._rows
         if len(rows) < MIN_BLOCKS:
             return ()
-        time, is_moving = rows[:, [_BEGIN, _END]].mean(axis=1), is_in_motion(rows[:, _MOVING])
+        time = rows[:, [_BEGIN, _END]].mean(axis=1)
+        # duty and sensors are tested in the blocks in motion only
+        is_moving = is_in_motion(rows[:, _MOVING])
         moving_time, columns = time[is_moving], zip(FEATURES, rows[is_moving, _FEATURES].T, strict=True)
         features = {name: values for name, values in columns if np.isfinite(values).any()}
         duty = {name: features.pop(name) for name in DUTY if name in features}
@@ -114,14 +117,13 @@ class SignalWindow:
         )
 
     def _test_levels(self, rows: Array, time: Array) -> tuple[LevelChange, ...]:
-        """Test the mean pressures in either direction of motion for steps.
+        """Test the mean pressures in each direction of motion for steps.
 
         `rows` are the stored features of n blocks, and `time` (n,) the centres of the blocks [s]. The blocks are
-        averaged in the smallest groups in which the machine moves both ways. The result is empty if there are too few
-        groups.
+        averaged in groups of equal size, the smallest of `_GROUP_SIZES` with which the machine moves both ways in every
+        group. The result is empty if there is no such size, or if there are fewer than `MIN_BLOCKS` groups.
         """
-        # a row ends with a Gram matrix, flattened
-        n_columns = round((rows.shape[1] - _GRAM.start) ** 0.5)
+        n_columns = round((rows.shape[1] - _GRAM.start) ** 0.5)  # a row ends with a flattened square Gram matrix
         for size in _GROUP_SIZES:
             n_groups = len(rows) // size
             if n_groups < MIN_BLOCKS:
@@ -138,8 +140,5 @@ class SignalWindow:
         return save_attributes(self, ("_rows", "_means"))
 
     def load_state(self, state: Any) -> None:
-        """Restore the features saved by `state`, so that later results are identical to the last bit.
-
-        Raises InputError if they do not fit.
-        """
+        """Restore the features that `state` returned; raise InputError if they are not valid."""
         restore_attributes(self, ("_rows", "_means"), state)

@@ -47,22 +47,22 @@ from sealscope.units import LITRE_PER_MINUTE
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-#: Format of the saved state.
+#: Version of the format of the saved state.
 STATE_VERSION = 16
 _PRIORS, _EXPLANATION = LIVE.watch, LIVE.explanation
 #: Number of blocks in the mean that is stated as the leak after an alarm.
 _N_RECENT = _PRIORS.recent
-#: Numbers of a block that are saved.
+#: Type of a stored block, with the fields of `BlockConductance`.
 _BLOCK = np.dtype([(name, float) for name in BlockConductance._fields])
 #: Blocks with larger numbers are refused, as their products would overflow.
 _MAX_NUMBER = 1e100
-#: Each way of watching estimates a conductance for each block.
+#: Estimates a conductance for each block; there is one class for each way of watching.
 Estimator = LiveBalance | PressureEstimator
 _ESTIMATORS: dict[str, type[Estimator]] = {kind.method: kind for kind in (LiveBalance, PressureEstimator)}
 
 
 class Watch:
-    """Watch one running actuator for leaks; made by the function `watch`, with a state that can be saved.
+    """Watch one running actuator for leaks; created by the function `watch`, with a state that can be saved.
 
     If the position is recorded, the leakage is estimated from the balance of volumes, otherwise from the response of
     the pressures to the command.
@@ -120,20 +120,20 @@ class Watch:
         self.leak: WatchedLeak | None = None
         self.blocks, self.baseline_version = 0, 1
         self._learning, self._detector = BaselineLearning(), StepDetector()
-        self._compared = np.empty(0, _BLOCK)  # the last blocks that the next one is compared with, at most `RECENT`
+        self._compared = np.empty(0, _BLOCK)  # the last blocks with which the next is compared, at most `RECENT`
         self._grouped = 0  # number of these that await the test of their mean
         self._is_known = True  # whether the last block was under the baseline's duty
-        self._since = math.nan  # begin of the first block that others are compared with [s]
+        self._since = math.nan  # begin of the first block since the tests restarted [s]
 
     def _false_alarm_probability(self, test: str, seconds: float) -> float:
         """Compute the false-alarm probability of a single test that is made once in `seconds`.
 
-        It is the fraction of the stated rate of false alarms that belongs to the `test` (`STEP` or `LEVEL`; fractions
-        in `priors.toml`), times `seconds`. Raises InputError unless it is 1e-12 to 0.05.
+        Each `test`, `STEP` or `LEVEL`, has a fraction of the stated rate of false alarms (`priors.toml`). The
+        probability is this part of the rate times `seconds`. Raises InputError unless it is 1e-12 to 0.05.
         """
         rate: float = self.false_alarms_per_1000_h
         fraction_of_alarms = getattr(_PRIORS, test)
-        rate_per_probability: float = 1000.0 / fraction_of_alarms * 3600.0 / seconds
+        rate_per_probability: float = 1000.0 / fraction_of_alarms * 3600.0 / seconds  # false alarms in 1000 h
         min_rate, max_rate = 1e-12 * rate_per_probability, 0.05 * rate_per_probability  # supported probabilities
         if not min_rate <= rate <= max_rate:
             raise InputError(f"false_alarms_per_1000_h must be {min_rate:.2g} to {max_rate:.3g}, got {rate:g}")
@@ -146,11 +146,7 @@ class Watch:
 
     @property
     def learned_with(self) -> tuple[Rig, Mapping[str, bool], float]:
-        """Settings with which the baseline is learned.
-
-        They are the rig, a mapping, and the learning time [h]. The mapping tells for each way of watching, "volumes"
-        and "pressures", if the rig states the sizes that are needed for L/min.
-        """
+        """Settings with which the baseline is learned: rig, `litres` of the constructor, and learning time [h]."""
         return self._rig, self._litres, self.learn_hours
 
     @property
@@ -173,14 +169,17 @@ class Watch:
 
     @property
     def why_no_litres(self) -> str:
-        """Reason in words why leaks are not stated in L/min; "" if they are."""
+        """Reason why leaks are not stated in L/min, in words; "" if they are, or if no samples have arrived."""
         if self._estimator is None or self._estimator.litres:
             return ""
         return "L/min is not stated: areas and displacement of the machine are not, which its file states"
 
     @property
     def evidence(self) -> Evidence:
-        """Present verdict, with the detected leak or with a 95 % upper bound of an undetected one."""
+        """Present verdict, with the detected leak or with a 95 % upper bound of an undetected leak.
+
+        The verdict is "cannot tell" until there are enough blocks for a bound.
+        """
         leak = self.leak
         if leak is not None:
             return decide_on_stream(self._measure(self._estimator or self._make_estimator(), leak), leak.allowed)
@@ -194,8 +193,8 @@ class Watch:
     def _measure(self, estimator: Estimator, leak: WatchedLeak | None) -> LiveLeak:
         """Convert the detected `leak` to a LiveLeak, from which the verdict is decided (`decide_on_stream`).
 
-        If `leak` is None, the result has a score below the threshold and the 95 % upper bound of an undetected leak.
-        `estimator` states the uncertainty of flows.
+        If `leak` is None, the result has the present score of the test for a step, limited to below the threshold, and
+        the 95 % upper bound of an undetected leak. `estimator` states the uncertainty of flows.
         """
         make_measure = partial(
             LiveLeak,
@@ -204,8 +203,9 @@ class Watch:
             size_deviation=estimator.size_error,
         )
         if leak is not None:
+            # a detected leak needs neither a bound nor the pump's flow
             return make_measure(leak.estimate, leak.cause, leak.pressure, bound_flow=math.inf, pump_flow=(0.0, 0.0))
-        # a rise that nothing explains yet scores less than an alarm
+        # a rise above the threshold that nothing explains yet must not be a leak
         max_score = -2.0 * math.log(self._false_alarm_probability(STEP, self.block_seconds)) * (1.0 - 1e-6)
         test = LiveRise(STEP, min(max(2.0 * self._detector.log_e(), 0.0), max_score))
         pressure, pump_flow = (float(self._compared[name].mean()) for name in ("pressure", "pump_flow"))
@@ -234,8 +234,8 @@ class Watch:
     def each(self, samples: Recording, *, follows: bool = True) -> Iterator[tuple[BlockEstimate, WatchedLeak | None]]:
         """Process samples like `update`; yield the estimate of each block and the leak detected by then.
 
-        If no leak has been detected, the second item is None. Samples are processed only as the iterator advances,
-        and so it must be iterated to the end.
+        If no leak has been detected, the second item is None. Samples are processed only as the iterator advances; to
+        process all of them, iterate to the end.
         """
         if not follows:
             self._samples.restart("pauses between samples")
@@ -244,7 +244,7 @@ class Watch:
                 self._estimator = self._make_estimator()
             results = self._estimator.take(run)
             while True:
-                with np.errstate(all="ignore"):  # a block whose sums overflow says nothing
+                with np.errstate(all="ignore"):  # sums of impossible readings may overflow
                     result = next(results, None)
                 if result is None:
                     break
@@ -255,7 +255,7 @@ class Watch:
             self._samples.is_final = self._estimator.has_begun
 
     def _make_estimator(self) -> Estimator:
-        """Make the object that estimates the conductance from the channels in use."""
+        """Create the estimator of the conductance for the channels in use."""
         litres = self._litres.get(self.method, False)
         if self.method == PressureEstimator.method:
             return PressureEstimator(self._rig, litres)
@@ -280,7 +280,7 @@ class Watch:
     def dismiss(self) -> None:
         """Withdraw the leak alarm and restart the tests with the next block; keep the learned baseline.
 
-        The level from healthy recordings (`healthy`), which may have caused the alarm, is not used any more.
+        The level from healthy recordings (`healthy`), which may have caused the alarm, is dropped.
         """
         self.leak = self.healthy = None
         self._forget()
@@ -293,8 +293,9 @@ class Watch:
     def judge(self, result: BlockResult) -> BlockEstimate:
         """Test the conductances of a block for a leak, and return the estimate of the block.
 
-        `result` is the conductances, or the reason for none, which the returned estimate then states. The blocks of the
-        first fit arrive together in one result, and count as one block; the last of them is estimated.
+        `result` contains the conductances. If it is the reason why there are none, the returned estimate states this
+        reason. The blocks of the first fit arrive together in one result and count as one block; the estimate is of the
+        last of them.
         """
         self.blocks += 1
         if isinstance(result, NotJudged):
@@ -309,13 +310,14 @@ class Watch:
         return estimate
 
     def _judge_block(self, estimator: Estimator, block: BlockConductance) -> BlockEstimate:
-        """Test the conductance of a block against those of all earlier blocks, and estimate the leak in this block.
+        """Test the conductance of a block against those of earlier blocks, and estimate the leak in this block.
 
-        The block is added to the baseline, the healthy state, while that is being learned.
+        The block is added to the baseline, the healthy state, while the baseline is being learned and no leak has been
+        detected. A block with another duty than the baseline has no flows.
         """
         row = np.array([block], _BLOCK)
-        is_finite = all(abs(number) < _MAX_NUMBER for number in block)
-        if not (is_finite and self._detector.is_representable(block.g, block.sd)):
+        is_small = all(abs(number) < _MAX_NUMBER for number in block)  # False for NaN, too
+        if not (is_small and self._detector.is_representable(block.g, block.sd)):
             self._samples.count("blocks: beyond floating point")
             return BlockEstimate(self.blocks, block.end, "beyond floating point")
         has_known_duty = self._has_known_duty(block)
@@ -323,7 +325,7 @@ class Watch:
         awaits_explanation = self._test_step(estimator, block)
         if not has_known_duty:
             return BlockEstimate(self.blocks, block.end, "another duty" if self.leak is None else "alarm")
-        # a step that may not be a leak must not count in the test of the mean: begin a new group
+        # blocks since a step that may not be a leak must not count in the test of the mean: begin a new group
         self._grouped = 0 if awaits_explanation else self._grouped + 1
         if self._grouped == GROUP:
             self._grouped = 0
@@ -337,18 +339,16 @@ class Watch:
         return self._add_flows(estimate, estimator, blocks)
 
     def _has_known_duty(self, block: BlockConductance) -> bool:
-        """Return True if a block's mean |p_A - p_B| and pump flow are within the range of the baseline, with a margin.
-
-        Also True if there is no baseline yet.
-        """
+        """Test whether mean |p_A - p_B| and pump flow are in the range of the baseline; True without a baseline."""
         baseline = self.baseline
         return baseline is None or is_known_duty(block.duty, baseline.duty_low, baseline.duty_high)
 
     def _add_to_tests(self, block: BlockConductance, row: NDArray[Any], *, has_known_duty: bool) -> None:
         """Add a block to the tests for a leak, which restart after a pause or a change of duty.
 
-        The duty is the mean pressure difference and pump flow; a change is one from the duties of the baseline to
-        others, or back. `row` is the block as an array with one row of `_BLOCK`.
+        The duty is the mean pressure difference and pump flow. `has_known_duty` tells if it is within the range of the
+        baseline; the duty changes when it leaves this range or returns to it. `row` is the block as an array (1,) of
+        the type `_BLOCK`.
         """
         if not has_known_duty:
             self._samples.count("blocks: another duty")
@@ -363,7 +363,7 @@ class Watch:
         self._compared = np.append(self._compared[1 - RECENT :], row)
 
     def _learn(self, estimator: Estimator, block: BlockConductance) -> None:
-        """Add a block to the baseline, the healthy state; fix the baseline after `learn_hours` hours of operation."""
+        """Add a block to the baseline, the healthy state; freeze the baseline after `learn_hours` of operation."""
         self._learning.add(block.g, block.lpm, block.duty)
         hours = self._learning.blocks * self.block_seconds / 3600.0
         if self._learning.blocks >= LEARNED and hours >= self.learn_hours * (1.0 - 1e-12):  # rounding of `hours`
@@ -372,36 +372,44 @@ class Watch:
             self._learning = BaselineLearning()
 
     def _test_step(self, estimator: Estimator, block: BlockConductance) -> bool:
-        """Test for a step of the conductance after a block, and raise the alarm if a leak explains the step.
+        """Test for a step of the conductance up to `block`, and raise the alarm if a leak explains the step.
 
-        For `RECENT` blocks after the alarm, a higher score replaces its onset and size. Returns True if a step was
-        found that a leak does not, or not yet, explain.
+        For `RECENT` blocks after the alarm, a step with a higher score replaces onset and size of the leak. Returns
+        True if a step was found that is not, or not yet, explained by a leak.
         """
         leak = self.leak
         if leak is not None and (leak.test != STEP or block.end - leak.raised_s > RECENT * self.block_seconds):
             return False
-        threshold = -math.log(self._false_alarm_probability(STEP, block.end - block.begin))
-        min_log_e = threshold if leak is None else 0.5 * leak.score  # a score is twice the log e-value
+        log_threshold = -math.log(self._false_alarm_probability(STEP, block.end - block.begin))
+        # a score is twice the log e-value
+        min_log_e = log_threshold if leak is None else 0.5 * leak.score
         if not self._detector.log_e(min_log_e) > min_log_e:
             return False
-        rise, cause = self._detector.rise(), None if leak is None else leak.cause
+        rise = self._detector.rise()
         if leak is None:
             explanation = self._explain(estimator, rise, block)
             if not explanation.is_leak:
                 return True
             cause = OUTSIDE if explanation.is_outside else None
+        else:
+            cause = leak.cause
         reason = f"the leakage conductance rises at {clock_text(rise.interval.value)} beyond its random walk"
-        self._raise_leak(estimator, rise, block, 2.0 * threshold, reason, cause=cause)
+        self._raise_leak(estimator, rise, block, 2.0 * log_threshold, reason, cause=cause)
         return False
 
     def _explain(self, estimator: Estimator, rise: LiveRise, block: BlockConductance) -> RiseExplanation:
         """Find the cause of the increase `rise` of the conductance, from changes of other quantities at its onset.
 
-        These are tested in the stored blocks up to `block`, the present one. The cause is a leak if the blocks around
-        the onset are no longer stored, and unknown if too few blocks have followed. If it is the start of the machine,
-        or surely another event than a leak, the tests restart and the event is counted.
+        The other quantities are tested in the stored blocks up to `block`, the present block. The cause is
+
+        - unknown if too few blocks have followed the onset,
+        - the start of the machine, if it was shortly before: the tests restart, the start is counted, and the result is
+          `UNKNOWN`,
+        - a leak if the blocks around the onset are no longer stored,
+        - else by `explain_rise`. If this is another event than a leak and enough blocks have followed, the event is
+          counted, and tests and estimator restart.
         """
-        n_since = int(np.count_nonzero(self._compared["end"] > rise.interval.high))
+        n_since = int(np.count_nonzero(self._compared["end"] > rise.interval.high))  # blocks since the onset
         if n_since < _EXPLANATION.shows:
             return UNKNOWN
         if rise.interval.value < self._since + _EXPLANATION.start * (block.end - block.begin):
@@ -423,26 +431,30 @@ class Watch:
     def _test_level(self, estimator: Estimator, block: BlockConductance) -> None:
         """Test the mean conductance of the last `GROUP` blocks, and raise the alarm if it is too high.
 
-        It is too high if it is significantly above the mean of the healthy machine, given the scatter, and above the
-        lowest healthy value, increased for the warmest oil (`find_level_rise`). Healthy values are from the baseline
-        or, until there is one, from the healthy recordings. Without either there is no test.
+        The mean is too high if it exceeds that of the healthy machine (`find_level_rise`). The healthy machine is that
+        of the baseline or, until there is a baseline, of the healthy recordings, if the estimator states levels.
+        Without either there is no test.
         """
         has_baseline = self.baseline is not None
         healthy: HealthyLevel | None = self.baseline if has_baseline or not estimator.states_level else self.healthy
         if healthy is None:
             return
-        blocks, max_ratio, first_s = self._compared[-GROUP:], INFERENCE.oil.warmest, float(self._compared["end"][0])
-        offset, sd = float(blocks["offset"].mean()), math.sqrt(float(np.sum(blocks["sd"] ** 2))) / GROUP
+        blocks = self._compared[-GROUP:]
+        first_s = float(self._compared["end"][0])
+        max_ratio = INFERENCE.oil.warmest
+        offset = float(blocks["offset"].mean())
+        sd = math.sqrt(float(np.sum(blocks["sd"] ** 2))) / GROUP
         if has_baseline:
             name, mean, onset_s = "baseline", float(blocks["g"].mean()), float(blocks["end"].mean())
-            # the mean is compared with `max_ratio` times the baseline: a common error counts `max_ratio` - 1 times
+            # the mean is compared with `max_ratio` times the baseline, and both contain the same error `offset`
             deviation = math.hypot(sd, offset * (max_ratio - 1.0))
         else:
             name, mean, onset_s = "healthy recordings", float(blocks["total"].mean()), first_s
             deviation = math.hypot(sd, offset)
-        # the leak began after the machine was known to be healthy, if both are times of one clock
-        has_one_clock = has_baseline or counts_from_1970(block.end)
-        onset = Interval(onset_s, min(healthy.known_s, first_s) if has_one_clock else first_s, block.end)
+        # the leak began after the machine was known to be healthy, if that time is on the clock of the blocks
+        has_same_clock = has_baseline or counts_from_1970(block.end)
+        earliest_s = min(healthy.known_s, first_s) if has_same_clock else first_s
+        onset = Interval(onset_s, earliest_s, block.end)
         probability = self._false_alarm_probability(LEVEL, GROUP * self.block_seconds)
         rise = find_level_rise(healthy, onset, mean, deviation, probability)
         if rise is not None:
@@ -465,9 +477,9 @@ class Watch:
         """Set the leak alarm, `self.leak`, from a significant increase `rise` of the conductance.
 
         The increase was found at the end of `block`. `threshold` is the test's threshold, and `reason` the text of the
-        alarm. `before` is the conductance before the onset, by default the mean of the blocks before it. `cause` is by
-        default what the estimator states. If there is an alarm already, its time and its conductance before the onset
-        are kept.
+        alarm. `before` is the conductance before the onset, by default the mean of up to `GROUP` blocks before the
+        onset. `cause` is by default the cause that the estimator states. If there is an alarm already, its time and its
+        conductance before the onset are kept.
         """
         raised_s = block.end
         if self.leak is not None:
@@ -492,22 +504,19 @@ class Watch:
             score=rise.score,
             threshold=threshold,
         )
-        evidence = self.evidence
+        evidence = self.evidence  # which computes the flow of the new `self.leak`
         self.leak = replace(self.leak, leak_lpm=evidence.leak_lpm, leak_interval_lpm=evidence.leak_interval_lpm)
 
     def _blocks_of_leak(self, leak: WatchedLeak) -> NDArray[Any]:
-        """Return the stored blocks that contain the whole leak: those after its latest possible onset.
-
-        It is the last block if there is none.
-        """
+        """Return the stored blocks that begin after the latest possible onset of the leak, or else the last block."""
         is_after = self._compared["end"] - self.block_seconds >= leak.onset_interval_s[1]
         return self._compared[is_after] if is_after.any() else self._compared[-1:]
 
     def with_cycle_means(self, estimate: BlockEstimate) -> BlockEstimate:
         """Replace the flows in the last block's estimate by means over more blocks, so as to average over cycles.
 
-        The blocks are those since the tests began, which restart after a pause or a change of duty. After an alarm they
-        are those since the onset of the leak. At most the last `RECENT` are used.
+        The means are over the blocks since the tests restarted, as they do after a pause or a change of duty. After an
+        alarm, the means are over the blocks since the onset of the leak. At most the last `RECENT` blocks are used.
         """
         estimator = self._estimator
         if estimator is None or not (estimate.judged and len(self._compared)):
@@ -518,14 +527,15 @@ class Watch:
     def _add_flows(self, estimate: BlockEstimate, estimator: Estimator, blocks: NDArray[Any]) -> BlockEstimate:
         """Add the mean total flow and leak of `blocks` [L/min], with 95 % intervals, to an estimate.
 
-        The leak is the flow above that of the baseline or, after an alarm, above that before the onset. It is not added
-        if there is neither, nor the total flow if the `estimator` states only changes. The estimate is returned
-        unchanged if no L/min are stated.
+        The leak is the flow above the flow of the baseline or, after an alarm, above the flow before the onset. Without
+        baseline and alarm, no leak is added. If the `estimator` states only changes, no total flow is added. The
+        estimate is returned unchanged if no L/min are stated.
         """
         if not estimator.litres:
             return estimate
         lpm = blocks["pressure"] / LITRE_PER_MINUTE  # flow per unit of conductance
-        errors, mean_lpm = blocks["sd"] * lpm * math.sqrt(self._detector.noise), float(lpm.mean())
+        mean_lpm = float(lpm.mean())
+        errors = blocks["sd"] * lpm * math.sqrt(self._detector.noise)
         if estimator.states_level:
             total = mean_flow(blocks["total"] * lpm, errors)
             half_width = WITHIN_95 * math.hypot(total.deviation, float(np.mean(blocks["offset"] * lpm)))
@@ -576,7 +586,7 @@ class Watch:
         return watch
 
 
-#: Attributes saved in addition to rig and estimator; types of those that may be None.
+#: Attributes saved in addition to rig, litres and estimator; below, the types of those that may be None.
 _SAVED = (
     *("false_alarms_per_1000_h", "learn_hours", "blocks", "baseline_version", "_samples", "_detector"),
     *("_learning", "baseline", "leak", "healthy", "_compared", "_grouped", "_since", "_is_known"),

@@ -24,7 +24,7 @@ from sealscope.recordings.recording import Array, Recording
 from sealscope.signals.details import QUANTITIES, Details, details, mean_squares, segment_means
 from sealscope.signals.filters import IntArray
 
-#: Quantities that are judged; d1 is almost noise alone, d3d4 follows from d3 and d4.
+#: Wavelet quantities on which an alarm may rest: d1 is almost only noise, and d3d4 follows from d3 and d4.
 JUDGED = ("d2", "d3", "d4")
 #: Features of a block's duty, in the order of the columns of `RmsBlocks.duty`.
 DUTY = tuple(vars(RMS_PRIORS.duty))
@@ -34,7 +34,8 @@ DUTY = tuple(vars(RMS_PRIORS.duty))
 class RmsBlocks:
     """Logarithm of the RMS of every wavelet quantity (`QUANTITIES`) in n blocks of a recording.
 
-    From `log_rms` and `duty` the mean differences between the phases of a duty cycle are removed.
+    A cycle of the command has several blocks, its phases. From `log_rms` and `duty` the mean differences between the
+    phases are removed.
 
     Attributes
     ----------
@@ -52,7 +53,8 @@ class RmsBlocks:
     cycle : float or None
         Period of the command [s], None if nothing repeats.
     frozen : str or None
-        Description of the first block in which a pressure reading is stuck, which makes its log RMS meaningless.
+        Description of the first block in which a pressure reading is stuck; its log RMS is then meaningless. None if no
+        reading is stuck.
     n_left_out : int
         Number of blocks that were left out because samples are missing.
     """
@@ -73,12 +75,12 @@ class RmsBlocks:
 
     @property
     def names(self) -> list[str]:
-        """Names of the columns of `log_rms`, such as "d3 of p_A" for the third wavelet detail of p_A."""
+        """Names of the columns of `log_rms` (`column_names`)."""
         return column_names(self.chambers)
 
     @property
     def seconds(self) -> float:
-        """Length of a block [s]; 0 without blocks."""
+        """Length of a block [s], without gaps between blocks; 0 if there are no blocks."""
         return float(np.diff(self.edges).min()) if len(self.log_rms) else 0.0
 
     def without_start(self) -> RmsBlocks:
@@ -98,7 +100,7 @@ def column_names(chambers: Sequence[str]) -> list[str]:
 
 
 def judged_chambers(recording: Recording) -> tuple[str, ...]:
-    """Return the chamber pressures with at most half of the samples clipped, or all if every one has more."""
+    """Return the recorded chamber pressures that are not mostly clipped; all of them if all are mostly clipped."""
     chambers = chambers_of(recording)
     return tuple(name for name in chambers if not is_mostly_clipped(recording[name])) or chambers
 
@@ -106,8 +108,8 @@ def judged_chambers(recording: Recording) -> tuple[str, ...]:
 def measure_levels(recording: Recording) -> tuple[Array, Array]:
     """Compute the log RMS of wavelet details (5 per judged chamber,) and features of the duty (4,) of a recording.
 
-    The duty is how the machine is moved and loaded. Both are described for `RmsBlocks`. Samples at the ends, where the
-    wavelet transform depends on padding, are left out.
+    Both are described for `RmsBlocks`. Samples at the ends, where the wavelet transform depends on padding, are left
+    out.
     """
     transformed = [details(recording[chamber]) for chamber in judged_chambers(recording)]
     inside = transformed[0].inside()
@@ -119,8 +121,8 @@ def _measure_blocks(recording: Recording, transformed: list[Details], bounds: In
     """Compute the log RMS of wavelet details (n, 5 per chamber) and features of the duty (n, 4) of n blocks.
 
     Both are described for `RmsBlocks`. `transformed` holds the wavelet details of each chamber, and `bounds` (n + 1,)
-    the numbers of the samples at which blocks begin and end. If only one chamber is recorded, its pressure minus the
-    mean over the recording takes the place of the pressure difference.
+    the sample indices at which blocks begin and end. If only one chamber is recorded, the pressure difference is
+    replaced by the pressure of this chamber minus its mean over the recording.
     """
     chambers = chambers_of(recording)
     if len(chambers) == len(CHAMBERS):
@@ -129,20 +131,22 @@ def _measure_blocks(recording: Recording, transformed: list[Details], bounds: In
         load = recording[chambers[0]] - recording[chambers[0]].mean()
     command = recording.channels.get("u", np.zeros(len(recording)))
     squares = np.stack([command, np.gradient(command) * recording.rate, load]) ** 2
-    # keeps the logarithm finite in blocks at standstill
+    # lower limit, so that the logarithm is finite in blocks at standstill
     floor = np.maximum(RMS_PRIORS.blocks.standstill**2 * squares.mean(axis=1, keepdims=True), np.finfo(float).tiny)
     with np.errstate(divide="ignore", over="ignore"):
         energies = np.concatenate([mean_squares(signal, bounds) for signal in transformed], axis=1)
-        log_rms, duty = 0.5 * np.log(energies), 0.5 * np.log(segment_means(squares, bounds) + floor)
-    return log_rms, np.vstack([duty, segment_means(load[None], bounds) / np.exp(duty[-1:])]).T
+        log_rms = 0.5 * np.log(energies)
+        duty_log_rms = 0.5 * np.log(segment_means(squares, bounds) + floor)  # of command, its rate, and load
+    direction = segment_means(load[None], bounds) / np.exp(duty_log_rms[-1:])  # mean over RMS of the load
+    return log_rms, np.vstack([duty_log_rms, direction]).T
 
 
 def cut_blocks(recording: Recording) -> RmsBlocks:
     """Cut a recording into blocks and compute the log RMS of wavelet details and features of the duty of each.
 
     The duty is how the machine is moved and loaded. The recording must be uniformly sampled and its gaps filled in.
-    Blocks of which too many samples were missing are left out, and so are samples at the ends, where the wavelet
-    transform depends on padding. From the results the mean differences between the phases of a duty cycle are removed.
+    Blocks in which too many samples were missing are left out. So are samples at the ends, where the wavelet transform
+    depends on padding. The mean differences between the phases of a duty cycle are removed, unless a reading is stuck.
     """
     chambers = judged_chambers(recording)
     transformed = [details(recording[chamber]) for chamber in chambers]
@@ -152,26 +156,33 @@ def cut_blocks(recording: Recording) -> RmsBlocks:
         no_rms, no_duty = np.empty((0, len(QUANTITIES) * len(chambers))), np.empty((0, len(DUTY)))
         return RmsBlocks(recording.t[bounds], no_rms, no_duty, chambers, phases, cycle)
     log_rms, duty = _measure_blocks(recording, transformed, bounds)
-    times, is_complete = recording.t[0] + bounds / recording.rate, ~flag_bridged(recording, bounds)
+    times = recording.t[0] + bounds / recording.rate
+    is_complete = ~flag_bridged(recording, bounds)
     frozen = _find_frozen(recording, chambers, log_rms, is_complete, times)
-    log_rms, duty, phase = log_rms[is_complete], duty[is_complete], np.flatnonzero(is_complete) % phases
-    if frozen is None:
-        for values in (log_rms, duty):  # replace the mean of every phase by that of all
+    log_rms, duty = log_rms[is_complete], duty[is_complete]
+    phase_of_block = np.flatnonzero(is_complete) % phases
+    if frozen is None and phases > 1:
+        for values in (log_rms, duty):  # replace the mean of every phase by the mean of all blocks
             mean = values.mean(axis=0) if len(values) else 0.0
-            for number in np.unique(phase) if phases > 1 else ():
-                values[phase == number] += mean - values[phase == number].mean(axis=0)
+            for phase in np.unique(phase_of_block):
+                values[phase_of_block == phase] += mean - values[phase_of_block == phase].mean(axis=0)
     end = times[1:][is_complete][-1:] if is_complete.any() else times[:1]
-    edges, n_left_out = np.append(times[:-1][is_complete], end), int(np.count_nonzero(~is_complete))
+    edges = np.append(times[:-1][is_complete], end)
+    n_left_out = int(np.count_nonzero(~is_complete))
     return RmsBlocks(edges, log_rms, duty, chambers, phases, cycle, frozen, n_left_out)
 
 
 def _block_bounds(inside: slice, rate: float, cycle: float | None) -> tuple[IntArray, int]:
-    """Choose the sample numbers at which blocks begin and end (n + 1,), and the number of blocks per duty cycle.
+    """Choose the sample indices at which blocks begin and end (n + 1,), and the number of blocks per duty cycle.
 
     `inside` are the samples that do not depend on padding, `rate` is the sampling rate [Hz], and `cycle` the period
-    of the command [s], or None. The cycle is divided into equal parts of about the shortest allowed length, each of
-    which is a block; if the cycle itself is shorter, a block is several cycles. Without a cycle, a block has the
-    shortest allowed length. If there are too many blocks, they become longer and span whole cycles.
+    of the command [s], or None. The length of a block is
+
+    - a fraction 1, 1/2, 1/3, ... of the cycle that is closest to the shortest allowed length,
+    - several cycles if a cycle is shorter than that,
+    - the shortest allowed length if there is no cycle.
+
+    If there would be too many blocks, they become longer and span whole cycles.
     """
     prior, n_samples = RMS_PRIORS.blocks, inside.stop - inside.start
     block_s = min_block_s = max(prior.seconds, prior.samples / rate)
@@ -190,7 +201,7 @@ def _block_bounds(inside: slice, rate: float, cycle: float | None) -> tuple[IntA
 def _find_frozen(
     recording: Recording, chambers: Sequence[str], log_rms: Array, is_complete: NDArray[np.bool_], times: Array
 ) -> str | None:
-    """Describe the first block in which a pressure reading is stuck; None if there is none.
+    """Describe the first block in which a pressure reading is stuck; None if no reading is stuck.
 
     A reading is stuck if one of its wavelet details d1 to d4 is only rounding error or not finite. `log_rms`: log RMS
     of the details in n blocks; `is_complete` (n,): flags of the blocks without missing samples; `times` (n + 1,):

@@ -1,8 +1,8 @@
 """The thesis's method as a detector: changes of the RMS of the pressures' db8 wavelet details.
 
-The thesis compares the RMS of d1..d4 and of d3*d4 before and after (its ch. 5 and Appendix C) and calls a leak where
-it went down (p_A) or up (p_B). Here d2..d4 of all chambers are tested for a step of either sign within the recording
-(`inference.onset`), or for a rise or fall against leak-free recordings (`inference.scatter`).
+The thesis compares the RMS of d1 to d4 and of d3*d4 before and after (its ch. 5 and Appendix C). It states a leak if
+the RMS has decreased (p_A) or increased (p_B). Here d2 to d4 of all chambers are tested for a step of either sign
+within the recording (`inference.onset`), or for a rise or fall against leak-free recordings (`inference.scatter`).
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from sealscope.recordings.motion import is_constant
 from sealscope.recordings.recording import Array, Recording
 from sealscope.signals.details import min_samples
 
-#: Name of the data that these observables describe.
+#: Kind of data (`Observable.data`) of the judged details d2 to d4.
 DETAILS = "details"
 
 
@@ -44,10 +44,10 @@ class RmsChange:
     reads = ("u", "p_A", "p_B")
 
     def __init__(self, rig: object = None) -> None:
-        """Create the detector; `rig` is ignored, as the method assumes nothing of the machine."""
+        """Create the detector; `rig` is ignored, as the method needs no assumption on the machine."""
 
     def usable(self, recording: Recording) -> str | None:
-        """Return None if the recording is long enough and its chamber pressures vary, else the reason why not."""
+        """Return None if chamber pressures are recorded, long enough, and vary; otherwise the reason why not."""
         if missing := describe_missing_chambers(recording):
             return missing
         if len(recording) < min_samples():
@@ -58,9 +58,14 @@ class RmsChange:
     def learn(self, recording: Recording) -> Summary:
         """Summarise a healthy recording by the log RMS of its wavelet details, for comparison with later recordings.
 
-        Entries: `chambers`, the pressures that were used, without mostly clipped ones; `recorded`, all recorded chamber
-        pressures; `rate` [Hz]; `start_s` [s since 1970] or None; `levels` (5 per chamber,), the log RMS; and `duty`
-        (4,), features of how the machine is moved and loaded (`RmsBlocks.duty`).
+        The entries of the summary are:
+
+        - `chambers`: names of the chamber pressures that are used, i.e. not mostly clipped (`judged_chambers`),
+        - `recorded`: names of all recorded chamber pressures,
+        - `rate`: sampling rate [Hz],
+        - `start_s`: time of the first sample [s since 1970], None if unknown,
+        - `levels` (5 per chamber,): log RMS of the wavelet quantities,
+        - `duty` (4,): features of how the machine is moved and loaded (`RmsBlocks.duty`).
         """
         levels, duty = measure_levels(recording)
         return {
@@ -75,8 +80,9 @@ class RmsChange:
     def observe(self, recording: Recording, baseline: Sequence[Healthy] = ()) -> Observed:
         """Test the RMS of the pressures' wavelet details for changes.
 
-        The recording is compared with those of `baseline` or, without one, tested for a change within it. If the
-        sampling rate is too low or the recording too short, the report is empty and states the reason.
+        The recording is compared with the recordings of `baseline` or, without a baseline, tested for a change within
+        it. If the sampling rate is too low, a reading is stuck, or the recording is too short, the report is empty and
+        states the reason.
         """
         min_rate: float = RMS_PRIORS.rate.slowest
         if recording.rate < min_rate:
@@ -96,12 +102,12 @@ class RmsChange:
 def observe_within(blocks: RmsBlocks, rate: float, unused: tuple[str, ...] = ()) -> Observed:
     """Test the wavelet details of every chamber pressure for a step of their RMS within one recording.
 
-    Each detail is tested for a step up and a step down, and reported with the more significant one. All are assumed to
-    change at one onset. It is found from the sum of the log likelihoods of the judged details (d2 to d4), without those
-    whose step has a p-value of 0.5 or more. `rate` is the sampling rate [Hz], and `unused` are recorded columns that
-    belong to no channel. If a detail has too little information, the report is empty and states the reason.
+    Each detail is tested for a step up and a step down; the more significant step is reported. All details are assumed
+    to change at the same onset. It is estimated from the sum of the log likelihoods of the judged details (d2 to d4),
+    without details whose step has a p-value of 0.5 or more. `rate` is the sampling rate [Hz], and `unused` are recorded
+    columns that belong to no channel. If a detail has too little information, the report states only this reason.
     """
-    changes = dict[str, tuple[StepTest, float]]()  # likelier test of a step up or down, and the size of that step
+    changes = dict[str, tuple[StepTest, float]]()  # by detail: the more significant test, and the size of its step
     judged_steps, bounds = list[StepTest](), list[float]()
     for name, quantity, weight in zip(blocks.names, *change_information(blocks), strict=True):
         steps = step_tests(quantity, (1.0, -1.0))
@@ -114,31 +120,31 @@ def observe_within(blocks: RmsBlocks, rate: float, unused: tuple[str, ...] = ())
             judged_steps.append(step)
             bounds.append(max(up.bound(), down.bound()))
     rarest = min(judged_steps, key=lambda step: step.chance)
-    # a step that half of healthy recordings show dates nothing
+    # a step of a size that half of all healthy recordings show says nothing of the onset
     likelihood = np.sum([step.likelihood for step in judged_steps if step is rarest or step.chance < 0.5], axis=0)
     onset = replace(rarest, likelihood=likelihood, best=int(likelihood.argmax())).onset()
     observables = [
         _make_observable(name, size, step.score, step.chance, blocks.chambers, onset)
         for name, (step, size) in changes.items()
     ]
-    # blocks left out anywhere count as not judged at the end, so that few blocks do not exclude a leak
+    # `judged_until`: blocks that were left out anywhere count as not judged at the end of the recording
     return Observed(
         RmsChange.name,
         tuple(observables),
         share=blocks.share,
         judged_until=blocks.share,
-        ringing=Ringing(min(bounds), rate, 0, is_dated=True, unused=unused),
+        ringing=Ringing(min(bounds), rate, healthy=0, is_dated=True, unused=unused),
     )
 
 
 def observe_against(recording: Recording, baseline: Sequence[Healthy]) -> Observed:
     """Test the RMS of a recording's wavelet details for changes against leak-free recordings.
 
-    These must have the same chamber pressures and sampling rate. If there is none, the report is empty and states the
-    reason.
+    Only leak-free recordings with the same chamber pressures and sampling rate are used. If there are none, the report
+    is empty and states the reason.
     """
     chambers, recorded = judged_chambers(recording), list(chambers_of(recording))
-    # the duty is computed from all recorded chambers, and must be of the same ones
+    # the duty is computed from all recorded chambers, which must therefore be the same
     summaries = [
         summary
         for summary in healthy_summaries(RmsChange(), baseline)
@@ -161,23 +167,24 @@ def compare_summaries(
 ) -> tuple[tuple[Observable, ...], float]:
     """Test the RMS of every chamber pressure's wavelet details for a rise or fall against leak-free recordings.
 
-    `judged` is the summary of the judged recording and `summaries` are those of the leak-free ones, by
+    `judged` is the summary of the judged recording and `summaries` are the summaries of the leak-free recordings, by
     `RmsChange.learn`; `chambers` are the pressures to compare. Returns the tests, one observable for each detail and
-    chamber, and the 95 % upper bound of an undetected change of the log RMS. It is the smallest of the bounds of the
-    judged details d2 to d4.
+    chamber, and the 95 % upper bound of an undetected change of the log RMS. The bound is the smallest of the bounds of
+    the judged details d2 to d4.
     """
     starts = [*(summary.get("start_s") for summary in summaries), judged.get("start_s")]
     times = None if None in starts else np.array(starts, dtype=float)
     duties = np.array([summary["duty"] for summary in summaries], dtype=float)
     levels = np.array([_summary_levels(summary, chambers) for summary in summaries])
-    observables, bounds = list[Observable](), list[float]()
     judged_levels, judged_duty = _summary_levels(judged, chambers), np.asarray(judged["duty"], dtype=float)
+    observables, bounds = list[Observable](), list[float]()
     changes = estimate_rises(judged_levels, judged_duty, levels, duties, times)
     for name, rise, weight in zip(column_names(chambers), *changes, strict=True):
         change = rise._replace(value=abs(rise.value))
         score = 2.0 * change.log_ratio(change.value)
         observables.append(_make_observable(name, weight * rise.value, score, change.chance, chambers))
-        bounds += [change.bound()] if _is_judged(name) else []
+        if _is_judged(name):
+            bounds.append(change.bound())
     return tuple(observables), min(bounds)
 
 
@@ -192,8 +199,8 @@ def _make_observable(
     """Make the observable for the change of one wavelet detail, named by its `column`, such as "d3 of p_A".
 
     `size` is the change of the log RMS, `score` twice its log likelihood ratio, and `chance` the p-value of a single
-    test. It is multiplied by the number of tests: a rise and a fall of each judged quantity in each of the `chambers`.
-    `onset`: time of the change [s], None for a comparison with healthy recordings.
+    test. The p-value is multiplied by the number of tests: a rise and a fall of each judged quantity in each of the
+    `chambers`. `onset`: time of the change [s], None for a comparison with healthy recordings.
     """
     return Observable(
         name=f"{'rise' if size > 0.0 else 'fall'} of {column}",

@@ -1,13 +1,13 @@
 """Estimate how the ringing of a machine changes, from the RMS of wavelet details, with the noise removed.
 
-A detail d_j has the energy E_j = (1 + g)^2 S_j + E_1, with the machine's mean energy S_j in it, the relative change g
-of the machine's amplitude, and the energy E_1 of white noise, which is equal in every detail; d1 is almost only noise.
-To first order g follows from
+A detail d_j has the energy E_j = (1 + g)^2 S_j + E_1. S_j is the mean energy of the machine's ringing in d_j, g the
+relative change of the ringing's amplitude, and E_1 the energy of white noise, which is equal in every detail; d1 is
+almost only noise. To first order g follows from
 
     y = log RMS d_j - log sqrt(S_j + E_1) = w g + error,    w = S_j / (S_j + E_1),
 
-with E_1 measured in d1 of the same block or recording. A change of the noise therefore cancels, and where noise
-dominates the weight w is small. For d1, y is the log RMS itself. The effect of the duty (how the machine is moved and
+with E_1 measured in d1 of the same block or recording. A change of the noise therefore cancels, and the weight w is
+small where noise dominates. For d1, y is the log RMS itself. The effect of the duty (how the machine is moved and
 loaded) is eliminated: g follows powers of the duty's features (`blocks.DUTY`) with priors on the exponents
 (`priors.toml`). For a duty that does not repeat, g has a wider random walk.
 """
@@ -28,14 +28,14 @@ def subtract_noise(log_rms: Array, healthy: Array) -> tuple[Array, Array]:
     """Compute the change of the log RMS of wavelet details without noise, and the noise-free fraction of energy.
 
     `log_rms` (n, 5 per chamber): values of n blocks or recordings; `healthy` (k, 5 per chamber): values from which the
-    machine's mean energy S_j in each detail d_j is estimated, as the energy of d_j minus the energy of d1. The energy
-    E_1 of d1 in the same row is the noise. The changes y and the fractions w are
+    machine's mean energy S_j in each detail d_j is estimated, as the energy of d_j minus the energy of d1. The noise
+    E_1 is the energy of d1 in the same row of `log_rms`. The changes y and the fractions w are
 
-        y = log RMS - log sqrt(S_j + E_1),    w = S_j / (S_j + E_1).
+        d2, d3, d4:   y = log RMS - log sqrt(S_j + E_1),    w = S_j / (S_j + E_1)
+        d1:           y = log RMS,    w = 1
+        d3d4:         y = log RMS minus the terms log sqrt(S_j + E_1) of both d3 and d4,    w = 1.
 
-    Both results have the shape of `log_rms`. For d1 itself y is the log RMS, and w is 1. For the product d3d4, whose
-    RMS changes about as the product of those of d3 and d4, y is its log RMS minus the terms log sqrt(S_j + E_1) of d3
-    and d4, and w is 1.
+    Both results have the shape of `log_rms`.
     """
     y, weight = np.array(log_rms), np.ones_like(log_rms)
     min_signal_fraction = RMS_PRIORS.walk.least
@@ -47,7 +47,7 @@ def subtract_noise(log_rms: Array, healthy: Array) -> tuple[Array, Array]:
             signal = max(energy - noise_energy, min_signal_fraction * energy)
             y[:, column] -= 0.5 * np.log(signal + noise)
             weight[:, column] = signal / (signal + noise)
-        # to first order the log RMS of d3 d4 changes as those of d3 and d4 do together
+        # to first order the log RMS of d3d4 changes by the sum of the changes of d3 and d4
         y[:, product] += y[:, d3] - log_rms[:, d3] + y[:, d4] - log_rms[:, d4]
     return y, weight
 
@@ -61,14 +61,15 @@ def change_information(blocks: RmsBlocks) -> tuple[list[Information], Array]:
     and the mean of each column's fraction of energy that is not noise.
     """
     changes, weight = subtract_noise(blocks.log_rms, blocks.log_rms)
-    variances = np.mean(np.diff(changes, axis=0) ** 2, axis=0) / 2.0  # a difference of two has twice the variance
-    features = DUTY[:-1]  # without the direction: the levels of phases are already removed
+    variances = np.mean(np.diff(changes, axis=0) ** 2, axis=0) / 2.0  # the difference of two has twice the variance
+    features = DUTY[:-1]  # without the direction, as the mean differences between phases are already removed
     duty = (blocks.duty - blocks.duty.mean(axis=0))[:, : len(features)]
-    exponents, walks = vars(RMS_PRIORS.duty), RMS_PRIORS.walk
-    exponent_sd = np.array([exponents[name] for name in features])
+    exponent_sd = np.array([getattr(RMS_PRIORS.duty, name) for name in features])
     time = blocks.edges[:-1] + 0.5 * blocks.seconds
+    walks = RMS_PRIORS.walk
     walk_scale = float(np.sqrt(len(time) * blocks.seconds / walks.time))
-    machine_walk, results = walks.duty if blocks.cycle is None else walks.machine, list[Information]()
+    machine_walk = walks.duty if blocks.cycle is None else walks.machine
+    results = list[Information]()
     for name, y, w, variance in zip(blocks.names, changes.T, weight.T, variances, strict=True):
         drift = (walks.noise if name.startswith("d1 ") else machine_walk) * walk_scale
         precision, vector = w**2 / variance, w * y / variance
@@ -85,21 +86,19 @@ def estimate_rises(
 ) -> tuple[list[Rise], Array]:
     """Estimate the change g of the log RMS of wavelet details (ringing) relative to n leak-free recordings.
 
-    The effect of the duty, i.e. how the machine is moved and loaded, is corrected.
+    `log_rms` (5 per chamber,) and `duty` (4,), the features `DUTY`, are values of the judged recording. `healthy` (n, 5
+    per chamber) and `healthy_duty` (n, 4) are values of the leak-free recordings. `times` (n + 1,) are the start times
+    of the leak-free recordings and, last, of the judged recording [s], None if unknown. Returns the changes, one for
+    each wavelet quantity, and the fractions of their energy that are not noise, (5 per chamber,).
 
-    `log_rms` (5 per chamber,), `duty` (4,), the quantities `DUTY`: values of the judged recording; `healthy` (n, 5 per
-    chamber), `healthy_duty` (n, 4): values of the leak-free recordings. `times` (n + 1,) are the start times of the
-    leak-free recordings and of the judged one [s], None if unknown. Returns the changes, one for each wavelet
-    quantity, and the fractions of their energy that are not noise, (5 per chamber,).
-
-    The values are modelled by a common mean, an effect of the duty, independent scatter, and an Ornstein-Uhlenbeck
-    process over time, which is independent between sessions, i.e. recordings separated by a pause. The variance of the
-    process is that between sessions (`priors.toml`), and its rate is unknown.
+    The model of the values is the sum of a common mean, an effect of the duty (how the machine is moved and loaded),
+    independent scatter, and an Ornstein-Uhlenbeck process over time. The process is independent between sessions, which
+    are separated by pauses. Its variance is stated in `priors.toml` (`recordings.session`), and its rate is unknown.
     """
     prior, walk, n = RMS_PRIORS.recordings, RMS_PRIORS.walk, len(healthy)
-    exponents = np.array([vars(RMS_PRIORS.duty)[name] for name in DUTY])
+    exponents = np.array([getattr(RMS_PRIORS.duty, name) for name in DUTY])
     effects = (np.vstack([healthy_duty, duty]) - duty) * exponents
-    # the walk's standard deviation after `walk.time` has a half-Cauchy prior, here by its quantiles
+    # the standard deviation that the process gains in `walk.time` has a half-Cauchy prior, here some quantiles of it
     quantiles = (np.arange(walk.tried) + 0.5) / walk.tried
     walk_sd = walk.machine * np.tan(0.5 * np.pi * quantiles)
     rates = (walk_sd / prior.session) ** 2 / (2.0 * walk.time)

@@ -39,8 +39,8 @@ from sealscope.signals.details import QUANTITIES
 from sealscope.storage.folders import numeric_sort_key
 from sealscope.units import DAY
 
-#: What a level rests on, the most specific first: a conductance, but for `ringing`, the damping of the pressures'
-#: details.
+#: Methods of estimating a leakage level, the most specific first. The level is a conductance; for "ringing" it is the
+#: damping of the pressures' wavelet details.
 Basis = Literal["volume balance", "pressure response", "ringing"]
 BASES: tuple[Basis, ...] = get_args(Basis)
 
@@ -80,7 +80,7 @@ class LeakReading:
     problem : str
         Reason why there is no level, else "".
     pump : float
-        Mean flow of the pump [m^3/s]; by the volume balance only while the machine moves. nan without either method.
+        Mean flow of the pump [m^3/s]; by the volume balance only while the machine moves. nan for the basis "ringing".
     size_error : float
         Relative standard error of flows due to the machine's sizes (displacement, piston area).
     sums : RecordingSums or None
@@ -121,7 +121,7 @@ def estimate_reading(
     `rig` states the sizes of the machine: a Rig, the name of a packaged rig, or the path of its file. If it is None,
     the thesis's rig is assumed. The leakage can then be stated in L/min only if the recording was simulated with a rig
     of the same sizes, or if a flow meter was recorded (`LeakReading.states_flow`). `file` is the name of the recording,
-    by default the name of the file it was read from. A defect that rules out an estimate is stated as `problem`.
+    by default the name of the file from which it was read. If no estimate is possible, `problem` states the reason.
     """
     used_rig, machine = assumed_rig(rig, recording)
     inspection = inspect_recording(recording)
@@ -147,16 +147,16 @@ def _estimate_level(part: Recording, rig: Rig, machine: AssumedMachine) -> dict[
     """Estimate the leakage by the best method that the channels of a recording allow.
 
     `rig`, `machine`: assumed sizes. The methods are the volume balance, the pressure response and the damping of the
-    pressures' ringing, in this order. The recording `part` must have no defects. Returns a mapping with the fields of
-    `LeakReading` that depend on the method, or only with its `problem` if no method is possible.
+    pressures' ringing, in this order. The recording `part` must have no defects. Returns the fields of `LeakReading`
+    that depend on the method, by name; only the field `problem` if no method is possible.
     """
     balance, response, details = VolumeBalance(rig), PressureResponse(rig), RmsChange()
-    no_balance, no_response = unusable_reason(balance, part), unusable_reason(response, part)
+    balance_lack, response_lack = unusable_reason(balance, part), unusable_reason(response, part)
     fields: dict[str, Any] = {"ringing": details.learn(part) if unusable_reason(details, part) is None else None}
-    solution = balance.balance(part) if no_balance is None else None
+    solution = balance.balance(part) if balance_lack is None else None
     if solution is not None and len(solution.columns) == 1:  # several balances have no common leak
         return fields | _balance_level(solution, machine)
-    if no_response is None and (reading := response.reading(part)) is not None:
+    if response_lack is None and (reading := response.reading(part)) is not None:
         level, error = reading.level
         return fields | {
             "basis": "pressure response",
@@ -169,17 +169,20 @@ def _estimate_level(part: Recording, rig: Rig, machine: AssumedMachine) -> dict[
         }
     log_rms, _ = measure_levels(part)
     judged_columns = [QUANTITIES.index(name) for name in JUDGED]
-    damping = float(-np.mean(log_rms.reshape(-1, len(QUANTITIES))[:, judged_columns]))
+    log_rms_by_chamber = log_rms.reshape(-1, len(QUANTITIES))
+    damping = float(-np.mean(log_rms_by_chamber[:, judged_columns]))
     if np.isfinite(damping):
         return fields | {"basis": "ringing", "level": damping, "error": TREND.reading.ringing}
-    reasons = dict.fromkeys(filter(None, (no_balance, no_response))) or ["the pressures do not ring"]
+    # different reasons, in this order
+    reasons = list(dict.fromkeys(lack for lack in (balance_lack, response_lack) if lack is not None))
+    reasons = reasons or ["the pressures do not ring"]
     return {"problem": "no detector states a level: " + "; ".join(reasons)}
 
 
 def _balance_level(solution: RecordedBalance, machine: AssumedMachine) -> dict[str, Any]:
-    """Collect the leakage conductance, its error and other fields of `LeakReading` from a solved volume balance.
+    """Return the fields of `LeakReading` that a solved volume balance gives, by name, such as "level" and "error".
 
-    Returns them by name. `machine`: assumed sizes, of which only the piston area is taken.
+    `machine`: assumed sizes, of which only the piston area is used.
     """
     size, total = solution.size, solution.conductance
     return {
@@ -212,20 +215,20 @@ def scatter_prior(basis: Basis, usual: float) -> ScatterPrior:
 
 @dataclass(frozen=True, kw_only=True)
 class TrendPoint(LeakReading):
-    """The leakage of one recording in a trend, with its place in the order of time.
+    """The leakage of one recording in a trend, with the time and group of the recording.
 
     In addition to the fields of `LeakReading`:
 
     Attributes
     ----------
     start : float
-        Time of its first sample [s since 1970].
+        Time of the recording's first sample [s since 1970].
     day : float
         Time since the first recording [days].
     group : int
         Number of the group of recordings that can be compared with each other; -1 if the recording is left out.
     note : str
-        Reason why it is left out, or a remark; "" if there is none.
+        Reason why the recording is left out, or a remark on its level; "" if there is none.
     value, low, high : float or None
         Leakage and the 95 % interval of its error, in the trend's unit; None if the recording is left out.
     """
@@ -249,21 +252,23 @@ def build_timeline(
     """Sort leakage readings by time and group those that can be compared with each other.
 
     Only readings of the most frequent method are used. The readings of a group have nearly the same measured ratio of
-    pump displacement to piston area. This ratio is a constant of the machine; it changes if the scale of the sensor of
-    position or angle changes, i.e. if a sensor was exchanged, or if the recording is of another machine. `every` is the
-    time between readings [s], with which they are dated in the order of their file names; None if their times are
-    known. Returns (readings with their groups, texts). Each text tells how one group differs from the first. Raises
-    InputError if the time of a reading is unknown.
+    pump displacement to piston area. This ratio changes if a sensor of position or angle was exchanged and has another
+    scale, or if the recording is of another machine. `every` is the time between readings [s], with which they are
+    dated in the order of their file names; None if their times are known. Returns the readings with their groups, and
+    for each group a text on its difference from the first group, "" for the first. Raises InputError if the time of a
+    reading is unknown.
     """
     ordered = _sort_by_time(readings, every)
     notes = _note_problems(ordered)
-    points, scales = [], list[float | None]()  # the scale of each group is that of its first reading
+    points = []
+    scales: list[float | None] = []  # of the first reading of each group
     for reading, note in zip(ordered, notes, strict=True):
         group, start = -1, reading.start or 0.0
         if not note:
             changes = [abs(_relative_change(reading.scale, scale)) for scale in scales]
             group = next((k for k, change in enumerate(changes) if change <= TREND.reading.scale), len(scales))
-            scales += [reading.scale] if group == len(scales) else []
+            if group == len(scales):  # begin a new group
+                scales.append(reading.scale)
         fields = vars(reading) | {"start": start, "day": (start - (ordered[0].start or 0.0)) / DAY}
         points.append(TrendPoint(**fields, group=group, note=note))
     differences = [
@@ -278,7 +283,7 @@ def _sort_by_time(readings: Sequence[LeakReading], every: float | None) -> list[
     """Sort estimates of the leakage in single recordings by time.
 
     If `every` [s] is given, they are dated at equal intervals in the order of their file names. Raises InputError if
-    the time of one is unknown.
+    the time of a recording is unknown.
     """
     ordered = sorted(readings, key=lambda reading: numeric_sort_key(reading.file))
     if every is not None:
@@ -304,7 +309,8 @@ def _note_problems(readings: Sequence[LeakReading]) -> list[str]:
         original = reading.file
         if reading.basis is not None:
             original = file_of_digest.setdefault(reading.digest, reading.file)
-        notes.append(reading.problem or ("" if original == reading.file else f"the same samples as {original}"))
+        copy_note = "" if original == reading.file else f"the same samples as {original}"
+        notes.append(reading.problem or copy_note)
     bases = [reading.basis for reading, note in zip(readings, notes, strict=True) if not note]
     basis: Basis | None = max(BASES, key=bases.count) if bases else None
     return [
@@ -327,11 +333,11 @@ def list_findings(points: Sequence[TrendPoint], differences: Sequence[str]) -> l
             points_by_reason.setdefault(without_numbers, []).append(point)
     for left_out in points_by_reason.values():
         text = f"{len(left_out)} of {count} left out: {left_out[0].note} ({_join_files(left_out)})"
-        findings.append(Finding("left_out", "warning", None, len(left_out), None, text))
+        findings.append(Finding("left_out", "warning", channel=None, count=len(left_out), first_t=None, text=text))
     for number, difference in enumerate(differences[1:], 1):
         members = [point for point in points if point.group == number]
         text = f"{len(members)} of {count} compared among themselves only: {difference} ({_join_files(members)})"
-        findings.append(Finding("not_comparable", "note", None, len(members), None, text))
+        findings.append(Finding("not_comparable", "note", channel=None, count=len(members), first_t=None, text=text))
     return findings
 
 
@@ -341,18 +347,15 @@ def _join_files(readings: Iterable[LeakReading]) -> str:
 
 
 def _relative_change(scale: float | None, other: float | None) -> float:
-    """Compute `scale` / `other` - 1, where both are measured ratios of pump displacement to piston area.
-
-    They are from two readings of one machine. The result is 0 if one of them is unknown.
-    """
+    """Compute the relative difference of two measured ratios of displacement to area; 0 if one is unknown."""
     return 0.0 if scale is None or other is None else scale / other - 1.0
 
 
 def _find_clock_errors(ordered: Sequence[TrendPoint]) -> list[Finding]:
     """Find signs that a logger's clock was set back; return one finding, or an empty list.
 
-    The signs are recordings that overlap, and times that fall while the numbers in the file names rise. Recordings
-    dated without a time of day have the same start and do not count as overlapping.
+    The signs are recordings that overlap and, if no recordings overlap, times that fall while the numbers in the file
+    names rise. Recordings dated without a time of day have the same start and do not count as overlapping.
     """
     overlaps = [
         f"{early.file} was still recording when {late.file} began: a clock was set back, or they are of two machines"
@@ -364,7 +367,8 @@ def _find_clock_errors(ordered: Sequence[TrendPoint]) -> list[Finding]:
         for early, late in pairwise(sorted(ordered, key=lambda reading: numeric_sort_key(reading.file)))
         if late.start < early.start
     ]
-    same_stem = len({re.split(r"[\d\W_]", reading.file, maxsplit=1)[0].lower() for reading in ordered}) == 1
-    # names whose times fall more often are not numbered in the order of time
-    texts = overlaps or (falls if same_stem and len(falls) <= max(2, len(ordered) // 10) else [])
-    return [Finding("clock", "warning", None, len(texts), None, texts[0])] if texts else []
+    first_words = {re.split(r"[\d\W_]", reading.file, maxsplit=1)[0].lower() for reading in ordered}
+    # with different words, or many falls, the names are not numbered in the order of time
+    are_numbered = len(first_words) == 1 and len(falls) <= max(2, len(ordered) // 10)
+    texts = overlaps or (falls if are_numbered else [])
+    return [Finding("clock", "warning", None, count=len(texts), first_t=None, text=texts[0])] if texts else []

@@ -127,24 +127,21 @@ class Trend:
 
     @property
     def total(self) -> Interval | None:
-        """Present flow past pump and piston with its 95 % interval, in the trend's unit.
-
-        It is None if no recording states a level.
-        """
+        """Present flow past pump and piston with its 95 % interval, in the trend's unit; None if it is not known."""
         total = self.decision.total_leakage
         if total is None or total.lpm is None or total.interval_lpm is None:
-            return self.wear and self.wear.total
+            return None if self.wear is None else self.wear.total
         return Interval(total.lpm, *total.interval_lpm)
 
     @property
     def leak(self) -> Interval | None:
         """Increase of the flow past pump and piston since the machine was healthy, in the trend's unit.
 
-        It is given with its 95 % interval, and is None if there is no increase.
+        The increase has a 95 % interval. The result is None if neither the verdict nor the test states an increase.
         """
-        value, ends = self.decision.leak_lpm, self.decision.leak_interval_lpm
-        if value is not None and ends is not None:
-            return Interval(value, *ends)
+        value, interval = self.decision.leak_lpm, self.decision.leak_interval_lpm
+        if value is not None and interval is not None:
+            return Interval(value, *interval)
         return None if self.wear is None or self.wear.onset is None else self.wear.leak
 
     @property
@@ -155,8 +152,8 @@ class Trend:
     @property
     def alarm(self) -> TrendPoint | None:
         """First recording since the last repair at which the test raised an alarm; None if it did not."""
-        number = self.episodes[-1].alarm if self.episodes else None
-        return None if number is None else self.points[self.rows[number]]
+        row = self.episodes[-1].alarm if self.episodes else None
+        return None if row is None else self.points[self.rows[row]]
 
     @property
     def repairs(self) -> tuple[TrendPoint, ...]:
@@ -174,24 +171,24 @@ class Trend:
     def state(self) -> MachineState:
         """State of the machine by NAMUR NE 107, such as "good".
 
-        It is a failure if the verdict is `leak` and the 95 % interval of the present leakage lies above the repair
-        limit.
+        The state is a failure if the verdict is `leak` and the 95 % interval of the present leakage lies above the
+        repair limit.
         """
         condition: str = self.verdict
         if self.verdict == LEAK and self.wear is not None and self.limit is not None:
             condition = "leak over the limit" if self.wear.total.low > self.limit else LEAK
         elif self.verdict == NO_LEAK:
-            condition = "watched"
+            condition = "watched"  # as for a running machine; the condition "no leak" is that of a single recording
         return state_of(condition, self.decision.cause, action=self.next_check)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the trend as plain values for JSON; a number that is not finite becomes None."""
-        wear, total = self.wear, self.decision.total_leakage
-        alarm, days = self.alarm, [point.day for point in self.points] or [math.nan]
+        wear, alarm, total = self.wear, self.alarm, self.decision.total_leakage
+        days = [point.day for point in self.points] or [math.nan]
         limit_day = None
         if wear is not None and wear.reach is not None:
             last_compared = self.points[self.rows[-1]].day
-            limit_day = Interval(*(last_compared + wait for wait in wear.reach))
+            limit_day = Interval(*(last_compared + days_to_limit for days_to_limit in wear.reach))
         points = [
             {
                 "file": point.file,
@@ -258,10 +255,7 @@ class Trend:
         return str(time_ms)[:19]  # without the fraction of a second
 
     def _format_days(self, days: Interval | None) -> dict[str, str | float | None] | None:
-        """Format the value and the limits of an interval of days as ISO dates, or as numbers if no dates are known.
-
-        The result is None if `days` is None.
-        """
+        """Format value and limits of an interval of days by `_format_day`; None if `days` is None."""
         return days and {name: self._format_day(day) for name, day in days._asdict().items()}
 
 
@@ -328,8 +322,8 @@ def trend(
     rows = tuple(k for k, point in enumerate(points) if point.group >= 0)
     compared = [points[k] for k in rows]
     states_flow = bool(compared) and all(point.states_flow for point in compared)
-    first_note = [point.note for point in points if point.note][:1]
-    lack = ": ".join(["no recording states a level", *first_note])
+    notes = [point.note for point in points if point.note]
+    lack = f"no recording states a level: {notes[0]}" if notes else "no recording states a level"
     result = Trend(
         decision=decide(Observed("", lack=lack), (), HealthyNull(), false_alarm_probability=0.0),
         basis=compared[0].basis if compared else None,
@@ -352,7 +346,8 @@ def trend(
 def _add_episodes(trend: Trend) -> Trend:
     """Complete a trend by the leakage of each recording, the episodes between repairs, and the decision on a leak.
 
-    The trend must have at least one recording that can be compared.
+    The trend must have at least one recording that can be compared. Of very many recordings, averages are compared; the
+    trend's `rows` are then the recordings nearest to them.
     """
     levels, trend_units_per_level = _convert_levels(trend)
     points, findings = _add_values(trend, levels)
@@ -360,7 +355,7 @@ def _add_episodes(trend: Trend) -> Trend:
     n_healthy = max(1, _count_healthy(trend) * len(averages) // len(levels))
     allowed_rise = _allowed_rise(trend, trend_units_per_level)
     episodes = tuple(find_episodes(averages, years=trend.years, n_healthy=n_healthy, allowed_rise=allowed_rise))
-    if averages is not levels:  # an average belongs to the recording nearest in time
+    if averages is not levels:
         rows = tuple(rows[int(np.argmin(np.abs(levels.t - t)))] for t in averages.t)
     decision = decide_trend(
         [points[row] for row in rows[episodes[-1].begin :]],
@@ -378,7 +373,9 @@ def _add_values(trend: Trend, levels: Levels) -> tuple[tuple[TrendPoint, ...], t
 
     `levels` are the converted levels of the compared points. Returns (points, findings).
     """
-    points, findings, outliers = [*trend.points], [*trend.findings], np.flatnonzero(outlier_excess(levels)[1])
+    points, findings = [*trend.points], [*trend.findings]
+    _, excess = outlier_excess(levels)
+    outliers = np.flatnonzero(excess)
     remark = "apart from the recordings before and after: it counts as if it were near"
     for k, row in enumerate(trend.rows):
         value, half_width = float(levels.value[k]), WITHIN_95 * float(levels.error[k])
@@ -387,14 +384,14 @@ def _add_values(trend: Trend, levels: Levels) -> tuple[tuple[TrendPoint, ...], t
     if outliers.size:
         files = join_names((points[trend.rows[k]].file for k in outliers), 3)
         text = f"{outliers.size} of {len(points)} {remark} ({files})"
-        findings.append(Finding("outlier", "warning", None, outliers.size, None, text))
+        findings.append(Finding("outlier", "warning", channel=None, count=outliers.size, first_t=None, text=text))
     return tuple(points), tuple(findings)
 
 
 def _count_healthy(trend: Trend) -> int:
-    """Count the compared recordings among the first `trend.healthy` different recordings; at least 1.
+    """Count the compared recordings among the first `trend.healthy` recordings, which are known to be healthy.
 
-    These are known to be healthy. Of copies only the first is counted, and recordings left out do not count.
+    Copies are one recording. The result is at least 1.
     """
     digests = dict.fromkeys(point.digest for point in trend.points)  # copies count once
     healthy_digests = list(digests)[: trend.healthy]
@@ -402,7 +399,7 @@ def _count_healthy(trend: Trend) -> int:
 
 
 class _ConvertedLevels(NamedTuple):
-    """Leakage of each recording in the trend's unit, which is L/min or % (`_convert_levels`).
+    """Leakage of each recording in the trend's unit, L/min or % (`_convert_levels`).
 
     `trend_units_per_level`: factor from `LeakReading.level` to this unit.
     """
@@ -414,27 +411,29 @@ class _ConvertedLevels(NamedTuple):
 def _convert_levels(trend: Trend) -> _ConvertedLevels:
     """Convert the leakage levels of the compared recordings to the trend's unit and to one oil temperature.
 
-    The unit is L/min at the trend's pressure, or % of the mean level of the healthy recordings. Levels are conductances
-    [m^3/(s Pa)] or, for the ringing, minus the logarithm of an RMS, whose difference from the healthy mean, times 100,
-    is in %. If the oil temperature of every recording is known, conductances are converted to that of the first one.
+    Conductances [m^3/(s Pa)] are converted to L/min at the trend's pressure, or to % of the mean level of the healthy
+    recordings. If the oil temperature of every recording is known, they are also converted to the temperature of the
+    first recording. For the ringing, a level is minus the logarithm of an RMS. It is converted to the difference from
+    the healthy mean, times 100, in %.
     """
     compared = [trend.points[k] for k in trend.rows]
     t, group, value, error = (
         np.array([getattr(point, name) for point in compared]) for name in ("day", "group", "level", "error")
     )
-    usual, smallest_float = float(np.mean(value[: _count_healthy(trend)])), float(np.finfo(float).tiny)
+    usual = float(np.mean(value[: _count_healthy(trend)]))
     prior = scatter_prior(trend.basis or "ringing", usual)
-    warming, slope_sd = np.zeros(t.size), 0.0  # of the oil [K]; standard deviation of its effect per K
+    warming, slope_sd = np.zeros(t.size), 0.0  # warming of the oil [K], standard deviation of the level's change per K
     temperatures = [point.temperature for point in compared if point.temperature is not None]
     if trend.basis != "ringing" and len(temperatures) == t.size:
-        warming, slope_sd = np.array(temperatures) - temperatures[0], INFERENCE.oil.per_kelvin_deviation * abs(usual)
+        warming = np.array(temperatures) - temperatures[0]
+        slope_sd = INFERENCE.oil.per_kelvin_deviation * abs(usual)
         value, error = (values * np.exp(-INFERENCE.oil.per_kelvin * warming) for values in (value, error))
     if trend.basis == "ringing":
         factor, value = 100.0, value - usual
     elif trend.pressure is not None:
         factor = trend.pressure / LITRE_PER_MINUTE
     else:
-        factor = 100.0 / max(abs(usual), smallest_float)
+        factor = 100.0 / max(abs(usual), float(np.finfo(float).tiny))
     prior = prior._replace(scale=prior.scale * factor)
     levels = Levels(t, value * factor, error * factor, group, warming, prior, slope_sd * factor)
     return _ConvertedLevels(levels, factor)
@@ -443,14 +442,14 @@ def _convert_levels(trend: Trend) -> _ConvertedLevels:
 def _allowed_rise(trend: Trend, trend_units_per_level: float) -> float | None:
     """Convert the repair limit to the increase of the leakage at which a repair is due, in the trend's unit.
 
-    `trend_units_per_level` is the factor from the leakage level of a recording, a conductance [m^3/(s Pa)], to that
-    unit. A limit stated as a creep speed corresponds to the conductance (speed times piston area) / (median pressure
-    difference). The result is None if the limit cannot be converted.
+    `trend_units_per_level` is the factor from the leakage level of a recording, a conductance [m^3/(s Pa)], to the
+    trend's unit. A limit stated as a creep speed corresponds to the conductance (speed times piston area) / (median
+    pressure difference). The result is None if the limit cannot be converted.
     """
     compared = [trend.points[k] for k in trend.rows]
     if trend.repair.kind == "flow" and trend.pressure is not None:
         return trend.repair.value / LITRE_PER_MINUTE
     if trend.repair.kind == "creep" and compared[0].area is not None:
         pressure = float(np.median([point.pressure for point in compared]))
-        return trend.repair.value * compared[0].area / pressure * trend_units_per_level  # creep speed times area: flow
+        return trend.repair.value * compared[0].area / pressure * trend_units_per_level
     return None

@@ -4,8 +4,8 @@ The sequential test of `wear` gives the chance that a healthy machine shows such
 
     chance = time between two recordings / mean time to a false alarm.
 
-Other explanations are observed as in a diagnosis: terms of the volume balance in all recordings since the onset, and
-the ringing (RMS of the pressures' wavelet details) of the last recording.
+Other explanations are tested as in a diagnosis: changes of the terms of the volume balance in all recordings since the
+onset, and of the ringing (RMS of the pressures' wavelet details) in the last recording.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from sealscope.diagnosis.trend.wear import Episode, Wear
 from sealscope.diagnosis.verdict.evidence import RMS_CHANGE, Cause, Evidence, TotalLeakage
 from sealscope.units import DAYS_PER_YEAR
 
-#: Fewest comparable recordings with a verdict.
+#: Smallest number of comparable recordings for a verdict.
 MIN_RECORDINGS = 3
 
 
@@ -36,8 +36,8 @@ MIN_RECORDINGS = 3
 class TrendLeak:
     """Increase of the leakage from recording to recording, in the form that `decision.decide` judges.
 
-    The protocol `LeakMeasure` explains the fields. Flows are in the unit of the trend. There is no test for a step
-    within a recording, and no history other than the trend itself.
+    The protocol `observable.LeakMeasure` explains the fields; `present_leakage` is the result of `total`. Flows are in
+    the unit of the trend.
     """
 
     provider: str
@@ -64,20 +64,14 @@ class TrendLeak:
 
     @property
     def step_rise(self) -> LeakRise | None:
-        """The whole increase of the leakage; None if nothing increased.
-
-        No step within a recording explains a part of it.
-        """
+        """The whole increase of the leakage, as no step within a recording is tested; None if nothing increased."""
         return None if self.rise is None else LeakRise(self.rise)
 
     def relative(self, flow: Flow) -> None:
         """Return None, as a trend states no leak relative to the pump's flow."""
 
     def total(self, detectable_flow: float | None) -> TotalLeakage | None:
-        """Return the present flow past pump and piston [L/min] with its interval; None if no L/min are stated.
-
-        `detectable_flow` is not used.
-        """
+        """Return the present flow past pump and piston [L/min] with its interval; None if no L/min are stated."""
         return self.present_leakage
 
     def history(self, onset_s: float | None) -> None:
@@ -108,7 +102,8 @@ def decide_trend(
     interval : float
         Median time between two recordings [days].
     years : float
-        Mean time between false alarms [machine-years]. The allowed probability of a false alarm is `interval` over it.
+        Mean time between false alarms [machine-years]. The allowed probability of a false alarm is `interval` over
+        this time.
 
     Returns
     -------
@@ -116,7 +111,7 @@ def decide_trend(
         The verdict; "cannot tell" for fewer than three recordings.
     """
     wear = episode.wear
-    # interval over the mean time to a false alarm of this score
+    # `interval` over the mean time until a healthy machine reaches this score of the test, exp(log_days)
     chance = min(float(np.exp(np.log(interval) - episode.log_days)), 1.0)
     if points[0].basis == "ringing":
         report = _report_ringing(points, wear, chance)
@@ -136,19 +131,19 @@ def _measure_leak(
     """Describe the increase of the leakage since the last repair as a TrendLeak.
 
     `points` are the recordings since the repair, `wear` is the estimated state of the machine, and `chance` the
-    probability of such an increase in a healthy machine. `trend_units_per_level` is the factor from a level
-    (`LeakReading.level`) to the unit of the trend, and `pressure` the pressure difference at which L/min are stated
-    [Pa], None if the unit is %. The leak may be laminar or an orifice, so its flow is proportional to the pressure to
-    one of the powers `EXPONENTS`.
+    probability of such an increase in a healthy machine. The other arguments are those of `decide_trend`. The leak may
+    be laminar or an orifice, so its flow is proportional to the pressure to one of the powers `EXPONENTS`; the stated
+    flow is the mean over these laws.
     """
     onset_day = -np.inf if wear.onset is None else wear.onset.value
     pressures_since = [point.pressure for point in points if point.day >= onset_day]
     pressure_ratio = float(np.median(pressures_since)) / pressure if pressure and pressures_since else 1.0
-    # a level is a flow over a pressure: at the stated pressure the flow of each law differs from it by a factor
+    # A level is the flow over the pressure of the recording. The flow at the stated pressure is the level times this
+    # pressure only for a laminar leak; for the other laws there is a factor.
     flow_factors = pressure_ratio ** (1.0 - np.array(EXPONENTS))
     leak_sd = (wear.leak.high - wear.leak.low) / (2.0 * WITHIN_95)
-    pump = float(np.median([point.pump / point.pressure for point in points])) * trend_units_per_level
-    pump = pump if np.isfinite(pump) else 0.0
+    pump_flow = float(np.median([point.pump / point.pressure for point in points])) * trend_units_per_level
+    pump_flow = pump_flow if np.isfinite(pump_flow) else 0.0
     size_deviation = max(point.size_error for point in points)
     return TrendLeak(
         provider=str(points[0].basis),
@@ -157,7 +152,7 @@ def _measure_leak(
         rise_flow=mixture_flow(law_priors(), wear.leak.value * flow_factors, leak_sd * flow_factors),
         rise_onset=wear.onset and Interval(*(points[0].time_of_day(day) for day in wear.onset)),
         bound_flow=wear.bound,
-        pump_flow=(pump, pump),
+        pump_flow=(pump_flow, pump_flow),
         lpm_per_flow=None if pressure is None else 1.0,
         size_deviation=size_deviation,
         present_leakage=None if pressure is None else _total_leakage(wear.total, size_deviation, pressure),
@@ -167,9 +162,9 @@ def _measure_leak(
 def _normal_rise(wear: Wear, chance: float) -> Rise | None:
     """Describe the increase of the leakage by a normal distribution that is negative with the probability `chance`.
 
-    Its mean is the estimated increase or, if that is 0, its upper bound; its standard deviation is the mean over the
-    normal quantile of 1 - `chance`. The result is None if the chance is 0, or 0.5 or more, or if the upper bound is not
-    positive.
+    The mean is the estimated increase or, if this is 0, its upper bound. The standard deviation is the mean divided by
+    the normal quantile of 1 - `chance`. The result is None if the chance is 0, or 0.5 or more, or if the upper bound is
+    not positive.
     """
     from scipy.special import ndtri
 
@@ -183,9 +178,8 @@ def _normal_rise(wear: Wear, chance: float) -> Rise | None:
 def _total_leakage(total: Interval, size_deviation: float, pressure: float) -> TotalLeakage:
     """Compute the present leakage [L/min], with an interval that includes the error of area and displacement.
 
-    `total`: leakage with the 95 % interval of its estimate [L/min]; `size_deviation`: relative standard error due to
-    these sizes (displacement, area), which scale all flows; `pressure`: pressure difference at which the flow is stated
-    [Pa].
+    `total`: leakage with the 95 % interval of its estimate [L/min]; `size_deviation`: relative standard error of all
+    flows due to area and displacement; `pressure`: pressure difference at which the flow is stated [Pa].
     """
     below, above = (np.hypot(end - total.value, WITHIN_95 * total.value * size_deviation) for end in total[1:])
     return TotalLeakage(total.value, (total.value - float(below), total.value + float(above)), pressure)
@@ -201,15 +195,16 @@ def _report_ringing(points: Sequence[TrendPoint], wear: Wear, chance: float) -> 
     fall = Observable(name="fall of the ringing", data=DETAILS, score=-2.0 * np.log(chance), chance=chance, size=size)
     ringing = None
     if wear.onset is not None:
-        ringing = Ringing(np.inf, 0.0, len(_split_at_onset(points, wear)[0]), is_dated=True)
+        before, _ = _split_at_onset(points, wear)
+        ringing = Ringing(bound=np.inf, rate=0.0, healthy=len(before), is_dated=True)
     return Observed(RMS_CHANGE, (fall,), ringing=ringing)
 
 
 def _split_at_onset(points: Sequence[TrendPoint], wear: Wear) -> tuple[list[TrendPoint], list[TrendPoint]]:
     """Split recordings into those before the onset of the leak and those since; return both lists.
 
-    Only recordings that can be compared with the last one are included. Without an onset, the last recording alone is
-    in the second list.
+    Only recordings that can be compared with the last recording are included. Without an onset, the second list is the
+    last recording only.
     """
     onset = points[-1].day if wear.onset is None else wear.onset.value
     comparable = [point for point in points if point.group == points[-1].group]
@@ -218,10 +213,11 @@ def _split_at_onset(points: Sequence[TrendPoint], wear: Wear) -> tuple[list[Tren
 
 
 def _rival_changes(points: Sequence[TrendPoint], wear: Wear) -> tuple[Observable, ...]:
-    """Test the other terms of the volume balance for a change at the onset of the leak.
+    """Test the terms of the volume balance other than the leak for a change at the onset of the leak.
 
     Such a change could explain the increase instead of a leak. The recordings since the onset are compared with those
-    before. The result is empty unless a single balance with the same terms describes both.
+    before. Only recordings whose balance has the same terms as that of the last recording are used. The result is empty
+    if there are no such recordings before the onset, or if the last recording has several balances or no balance.
     """
     names = [roles.names for roles in points[-1].terms]
     sums_before, sums_since = (
@@ -230,7 +226,8 @@ def _rival_changes(points: Sequence[TrendPoint], wear: Wear) -> tuple[Observable
     )
     if not sums_before or not sums_since or len(names) != 1:
         return ()
-    flow, pressure = (float(np.mean([getattr(sums, name) for sums in sums_since])) for name in ("flow", "pressure"))
+    flow = float(np.mean([sums.flow for sums in sums_since]))
+    pressure = float(np.mean([sums.pressure for sums in sums_since]))
     judged = RecordingSums(np.sum([sums.sums for sums in sums_since], axis=0), flow, pressure)
     return rival_rises(judged, [sums._replace(held=None) for sums in sums_before], points[-1].terms)
 
@@ -238,17 +235,21 @@ def _rival_changes(points: Sequence[TrendPoint], wear: Wear) -> tuple[Observable
 def _report_rms_change(points: Sequence[TrendPoint], wear: Wear) -> Observed:
     """Test the pressures' ringing of the last recording for a change since the onset of the leak.
 
-    The ringing is an oscillation, measured by the RMS of the pressures' wavelet details. It is compared with the
-    recordings before the onset that have the same channels and sampling rate. The result contains no observations if
-    there are none.
+    The ringing is an oscillation, measured by the RMS of the pressures' wavelet details. The last recording is compared
+    with the recordings before the onset that have the same channels and sampling rate. The result contains no
+    observables if there are no such recordings, or if the ringing is itself the basis of the trend.
     """
     judged = points[-1].ringing
     if judged is None or points[-1].basis == "ringing":
         return Observed(RMS_CHANGE)
+    before, _ = _split_at_onset(points, wear)
     healthy = [
         point.ringing
-        for point in _split_at_onset(points, wear)[0]
+        for point in before
         if point.ringing is not None
         and all(point.ringing[name] == judged[name] for name in ("chambers", "recorded", "rate"))
     ]
-    return Observed(RMS_CHANGE, compare_summaries(judged, healthy, judged["chambers"])[0] if healthy else ())
+    if not healthy:
+        return Observed(RMS_CHANGE)
+    observables, _ = compare_summaries(judged, healthy, judged["chambers"])
+    return Observed(RMS_CHANGE, observables)

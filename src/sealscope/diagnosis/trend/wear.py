@@ -5,14 +5,14 @@ The level that recording i states at the time t_i is
     y_i = mu_l(i) + beta c_i + delta g(t_i) + d(t_i) + e_i.
 
 Here mu_l is the mean of the group l of comparable recordings, c a covariate with a normal prior on beta, and e_i the
-recording's own error of stated deviation s_i. The change g is a step, ``g = [t >= t_j]``, or a growth, ``g = max(t -
-t_(j-1), 0)``. The deviation d from recording to recording is normal with variance tau^2. A fraction r of this variance
-is correlated over time, half of it for an hour and half for a week, so that the covariance of d is ``tau^2 ((1 - r) [i
-= k] + r/2 sum_T exp(-|t_i - t_k|/T))``. tau has a scaled inverse chi-square prior (`ScatterPrior`), r is uniform on a
-few values, and both are summed on a grid. mu has a wide prior; delta has half-normal priors of several scales in units
-of tau. With L L' = cov(y), the rows of z = L^-1 y up to n depend on the first n recordings alone, so that one
-factorisation serves all n. With G = L^-1 g, a = sum G^2 and b = sum G z, a change of size delta has the likelihood
-ratio exp(b delta - a delta^2/2).
+recording's own error with the stated standard deviation s_i. The change g is a step, ``g = [t >= t_j]``, or a growth,
+``g = max(t - t_(j-1), 0)``. The deviation d from recording to recording is normal with variance tau^2. A fraction r of
+this variance is correlated over time, half of it for an hour and half for a week, so that the covariance of d is
+``tau^2 ((1 - r) [i = k] + r/2 sum_T exp(-|t_i - t_k|/T))``. tau has a scaled inverse chi-square prior (`ScatterPrior`),
+r is uniform on a few values, and both are summed on a grid. mu has a wide prior; delta has half-normal priors of
+several scales in units of tau. With L L' = cov(y), the rows of z = L^-1 y up to n depend on the first n recordings
+alone, so that one factorisation serves all n. With G = L^-1 g, a = sum G^2 and b = sum G z, a change of size delta has
+the likelihood ratio exp(b delta - a delta^2/2).
 
 The test is by Shiryaev and Roberts. With the likelihood ratio LR_j(n) of a change after recording j - 1 against none,
 
@@ -121,7 +121,6 @@ class Levels:
         For independent normal levels v_changes is the variance of a level, as a change has twice that variance.
         """
         prior = self.prior
-        # the step of two neighbours has twice the variance of one
         steps = np.abs(np.diff(self.value))[np.diff(self.group) == 0] / math.sqrt(2.0)
         prior_variance = prior.scale**2 + (float(np.mean(self.error**2)) if len(self) else 0.0)
         measured_variance = (_SD_PER_MEDIAN * float(np.median(steps))) ** 2 if steps.size else 0.0
@@ -129,11 +128,11 @@ class Levels:
         return math.sqrt(float(np.average([prior_variance, measured_variance], weights=weights)))
 
     def average_neighbours(self, max_count: int = 240) -> Levels:
-        """Average levels of successive recordings, so that about `max_count` levels remain; limits the computing time.
+        """Average levels of successive recordings, so that about `max_count` levels remain, to limit computing time.
 
-        With n > `max_count` levels, each average is of up to ceil(n / `max_count`) successive recordings of one group
-        of comparable recordings (`group`). As no average spans two groups, some more than `max_count` may remain.
-        Times and covariates are averaged, too; the standard error of an average is sqrt(sum of error^2) / number.
+        An average is over up to ceil(n / `max_count`) of the n recordings, all of one group. As no average spans two
+        groups, some more than `max_count` may remain. Times and covariates are averaged, too; the standard error of an
+        average is sqrt(sum of error^2) / number. With n <= `max_count` the levels are returned unchanged.
         """
         size = math.ceil(len(self) / max_count)
         if size <= 1:
@@ -156,10 +155,10 @@ def outlier_excess(levels: Levels) -> tuple[Array, Array]:
 
         sign(d) max(abs(d) - L, 0).
 
-    It is 0 for the first level of a group, and if the level before lies beyond the limit on the same side, as two such
-    levels are a change. Returns two variants, each (n,). The first treats each level as the latest one. The second is
-    for the whole series: it is also 0 for the last level of a group, and if the next level lies beyond the limit on the
-    same side.
+    The excess is 0 for the first level of a group, and if the level before lies beyond the limit on the same side, as
+    two such levels are a change. Returns two variants, each (n,). The first treats each level as the latest level. The
+    second is for the whole series: the excess is also 0 for the last level of a group, and if the next level lies
+    beyond the limit on the same side.
     """
     excess_as_last, excess = np.zeros((2, len(levels)))
     for group in np.unique(levels.group):
@@ -207,10 +206,10 @@ class _Changes(NamedTuple):
     def enumerate(cls, levels: Levels, n_healthy: int, *, steps_only: bool = False) -> _Changes:
         """Build the hypotheses of all steps and growths that may begin after the first `n_healthy` recordings.
 
-        Each has several prior scales of its size, which are hypotheses of their own. Those of a step are multiples of
-        the scatter tau (`change.steps` in `priors.toml`). A growth is a rise per month; its scales are tau over several
-        times (`change.intervals`, multiples of the median interval of recordings). With `steps_only` there are no
-        growths.
+        Each step or growth is combined with several prior scales of its size, each of which is a separate hypothesis.
+        The scales of a step are multiples of the scatter tau (`change.steps` in `priors.toml`). A growth is a rise per
+        month; its scales are tau over several times (`change.intervals`, multiples of the median interval of
+        recordings). With `steps_only` there are no growths.
         """
         scales = TREND.change
         begin = np.arange(max(n_healthy, 1), len(levels))
@@ -220,12 +219,12 @@ class _Changes(NamedTuple):
         n_steps = len(scales.steps)
         scale = np.array([*scales.steps, *slopes], dtype=float)[:, None]
         grows = np.arange(scale.size)[:, None] >= n_steps
-        # steps and growths are equally likely, and so are their scales
+        # w_j is shared equally by steps and growths, and by the scales of each
         n_rivals = np.where(grows, len(slopes), n_steps) * (1.0 if steps_only else 2.0)
         with np.errstate(divide="ignore"):
             log_weight = np.log(np.clip(levels.t[begin] - levels.t[begin - 1], 0.0, scales.wait) / n_rivals)
         profile_index = np.arange(begin.size) + begin.size * grows  # profiles of growths follow those of steps
-        fields = np.broadcast_arrays(profile_index, scale, begin, grows, log_weight)
+        fields = np.broadcast_arrays(profile_index, scale, begin, grows, log_weight)  # scales by begins
         return cls(np.hstack([step, growth]), *(values.ravel() for values in fields))  # type: ignore[call-arg]
 
     @classmethod
@@ -274,16 +273,14 @@ def _evaluate_grid(levels: Levels, profiles: Array, *, may_grow: bool = False) -
 
     tau is the standard deviation between recordings, and r the fraction of its variance that is correlated over time.
     `profiles` (n, m) are the effects of m changes of unit size on each recording. With `may_grow`, the level may have
-    grown evenly since the first recording even without a change.
-
-    With C the correlation over the time between recordings, `error` the standard errors that they state, and `shared`
-    what does not depend on tau (the wide priors on the level of each group and on the growth, and the prior on the
-    covariate's coefficient), the levels have the covariance
+    grown evenly since the first recording even without a change. The covariance of the levels is
 
         shared + tau^2 (r C + (1 - r) I) + diag(error^2) = L L'.
 
-    Multiplied by L^-1, the levels become z, the profiles G, and the covariance of the levels with the level of the last
-    group u. `_Node` stores a = sum G^2 and b = sum G z up to each recording.
+    Here `shared` is due to the priors on the level of each group, the growth and the covariate's coefficient. C is the
+    correlation over the time between recordings, and `error` are the standard errors that the recordings state.
+    Multiplied by L^-1, the levels become z and the profiles G; the covariances of the levels with the mean level of the
+    last group become u. `_Node` stores a = sum G^2 and b = sum G z up to each recording.
     """
     from scipy.linalg import solve_triangular
 
@@ -292,25 +289,25 @@ def _evaluate_grid(levels: Levels, profiles: Array, *, may_grow: bool = False) -
     values = levels.value - levels.value[0] - excess
     max_scatter = max(prior.scale, 0.3 * float(np.ptp(levels.value)))
     wide_variance = (_WIDE * max_scatter) ** 2
-    mean_covariance = wide_variance * (levels.group == levels.group[-1])  # of the values with the last group's level
-    # covariance that does not depend on tau: of the groups' levels, the covariate's coefficient, and the growth
+    mean_covariance = wide_variance * (levels.group == levels.group[-1])  # with the mean level of the last group
     shared = wide_variance * (levels.group[:, None] == levels.group)
     shared = shared + levels.slope_sd**2 * np.outer(levels.covariate, levels.covariate)
     if may_grow:
         growth = 10.0 * levels.scatter / levels.interval * (levels.t - levels.t[0])  # a wide prior
         shared += np.outer(growth, growth)
-    waits = np.abs(levels.t[:, None] - levels.t)
-    correlation = np.mean([np.exp(-waits / time) for time in between.times], axis=0)
+    elapsed = np.abs(levels.t[:, None] - levels.t)
+    correlation = np.mean([np.exp(-elapsed / time) for time in between.times], axis=0)
     right_sides = np.column_stack([values, mean_covariance, profiles])
     nodes = []
     for tau in np.geomspace(0.1 * prior.scale, 10.0 * max_scatter, between.nodes):
         log_prior = -prior.freedom * (math.log(tau) + 0.5 * (prior.scale / tau) ** 2)  # scaled inverse chi-square
-        for lasting in between.lasts:
-            covariance = shared + tau**2 * lasting * correlation
-            covariance[np.diag_indices(len(levels))] += tau**2 * (1.0 - lasting + _JITTER) + levels.error**2
+        for r in between.lasts:
+            covariance = shared + tau**2 * r * correlation
+            covariance[np.diag_indices(len(levels))] += tau**2 * (1.0 - r + _JITTER) + levels.error**2
             L = np.linalg.cholesky(covariance)
             z, u, G = np.split(solve_triangular(L, right_sides, lower=True, check_finite=False), [1, 2], axis=1)
-            # while a recording is the last one, more of it is ignored as an outlier, which changes its own row only
+            # `_as_last`: as long as a recording is the last, more of its level is ignored as an outlier; this changes
+            # only the row of this recording
             z_as_last = z - ((excess_as_last - excess) / L.diagonal())[:, None]
             square = np.cumsum(z**2) - (z**2 - z_as_last**2)[:, 0]
             log_null = log_prior - np.cumsum(np.log(L.diagonal())) - 0.5 * square
@@ -324,9 +321,9 @@ def _evaluate_grid(levels: Levels, profiles: Array, *, may_grow: bool = False) -
 def _log_mean_ratio(a: Array, b: Array, scale: Array) -> Array:
     """Compute the log of the mean likelihood ratio of a change whose size delta has a half-normal prior.
 
-    A change of size delta has the likelihood ratio exp(b delta - a delta^2/2) to no change. With the scale k of the
-    prior, the argument `scale`, the mean over delta > 0 is ``2 (1 + a k^2)^(-1/2) exp(b^2 v/2) Phi(b sqrt(v))`` with
-    ``v = 1/(a + 1/k^2)``. The arguments are broadcast together.
+    A change of size delta has the likelihood ratio exp(b delta - a delta^2/2) to no change. For a prior with the
+    `scale` k, the mean over delta > 0 is ``2 (1 + a k^2)^(-1/2) exp(b^2 v/2) Phi(b sqrt(v))`` with ``v = 1/(a +
+    1/k^2)`` and the normal distribution function Phi. The arguments are broadcast together.
     """
     from scipy.special import log_ndtr
 
@@ -346,10 +343,7 @@ class ChangeScores(NamedTuple):
     begin: IntArray
 
     def find_alarm(self, days: float) -> int | None:
-        """Find the index of the first recording with a test statistic R above `days`; None if there is none.
-
-        `days` is the mean time to a false alarm [days], which is the threshold of R.
-        """
+        """Return the index of the first recording with R > `days`, the mean time to a false alarm [days]; else None."""
         alarms = np.flatnonzero(self.log_R > math.log(days))
         return int(alarms[0]) if alarms.size else None
 
@@ -381,12 +375,13 @@ def score_changes(levels: Levels, n_healthy: int = 1, *, falls: bool = False, ma
 def _draw_normal(random: np.random.Generator, mean: Array, sd: Array, *, positive: bool) -> Array:
     """Draw one number from each of d normal distributions.
 
-    `mean` (d,) and `sd` (d,) are their means and standard deviations. With `positive` they are cut off below 0.
-    `random`: source of random numbers. Uses the inverse distribution function.
+    `mean` (d,) and `sd` (d,) are their means and standard deviations. With `positive` the distributions are truncated
+    to numbers above 0. `random`: source of random numbers.
     """
     from scipy.special import ndtr, ndtri
 
     p_negative = ndtr(-mean / sd) if positive else np.zeros(len(mean))
+    # inverse distribution function of random probabilities
     p = p_negative + (1.0 - p_negative) * random.random(len(mean))
     return np.asarray(mean + sd * ndtri(np.clip(p, 1e-300, 1.0 - 1e-16)))  # clipped, so that it is finite
 
@@ -406,10 +401,10 @@ class _Draws(NamedTuple):
 
     @classmethod
     def sample(cls, levels: Levels, changes: _Changes, *, signed: bool = False) -> _Draws:
-        """Draw scatter, change, its size and the mean level before it from their joint posterior distribution.
+        """Draw scatter, change, its size and the mean level before it from their posterior, given the leakage `levels`.
 
-        The distribution is conditional on the leakage `levels`. `changes` are the hypotheses, one of which is drawn.
-        The size of a change has a half-normal prior or, with `signed`, a normal one of either sign. The seed is fixed.
+        `changes` are the hypotheses, one of which is chosen in each draw. The size of a change has a half-normal prior
+        or, with `signed`, a normal prior, i.e. may be negative. The seed is fixed.
         """
         random = np.random.default_rng(20)  # a fixed seed, so that results repeat
         nodes = _evaluate_grid(levels, changes.profiles)
@@ -429,11 +424,7 @@ class _Draws(NamedTuple):
         return cls(tau, change, amplitude, level - slope * amplitude + error)
 
     def last_rises(self, changes: _Changes) -> Array:
-        """Compute the rise (d,) of the last recording's leakage level above the mean level before the change.
-
-        There is one value for each of the d draws from the posterior distribution. `changes` are the hypotheses from
-        which they were made.
-        """
+        """Compute the rise (d,) of the last recording's level over the mean before it, for draws from `changes`."""
         return np.asarray(self.amplitude * changes.profiles[-1, changes.profile_index[self.change]])
 
 
@@ -489,10 +480,11 @@ def estimate_wear(levels: Levels, allowed_rise: float | None, change_begin: int 
 
     `allowed_rise` is the rise above the healthy level at which a repair is due, None if there is no limit.
     `change_begin` is the index of the first recording after the change that the test has found. If it is None, an
-    even growth or decrease over all recordings is estimated, with a wide prior. The growth per month is NaN if the
-    recordings span less than a day.
+    even growth or decrease over all recordings is estimated, with a wide prior. Growth and time to the limit are NaN if
+    the recordings span less than a day.
     """
-    is_changed, is_long = change_begin is not None, levels.t[-1] - levels.t[0] >= 1.0
+    is_changed = change_begin is not None
+    is_long = levels.t[-1] - levels.t[0] >= 1.0
     # without a change the growth may begin with the first recording
     months = (levels.t - levels.t[0]) / DAYS_PER_MONTH if is_long else np.zeros(len(levels))
     even_growth = _Changes.from_profile(months, _WIDE * DAYS_PER_MONTH / levels.interval)
@@ -500,13 +492,14 @@ def estimate_wear(levels: Levels, allowed_rise: float | None, change_begin: int 
     draws = _Draws.sample(levels, changes, signed=not is_changed)
     leak, leak_upper_95 = Interval(0.0, -math.inf, math.inf), math.inf
     if len(levels) > 1:
-        # without a change, the rise that the levels allow bounds a leak
+        # a leak is bounded by the rise that the levels allow, even if the test has found no change
         rises = changes if is_changed else _Changes.enumerate(levels, 1)
         leak_draws = (draws if is_changed else _Draws.sample(levels, rises)).last_rises(rises)
         leak, leak_upper_95 = _interval_of_draws(leak_draws), float(np.quantile(leak_draws, BOUND_PROBABILITY))
     current_level = draws.mean_before + draws.last_rises(changes)
     is_growth = changes.grows[draws.change]
-    growth, mostly_grows = np.where(is_growth, draws.amplitude, 0.0), float(np.mean(is_growth)) >= 0.5
+    growth = np.where(is_growth, draws.amplitude, 0.0)
+    mostly_grows = float(np.mean(is_growth)) >= 0.5
     healthy, scatter = _estimate_healthy_range(levels.select(slice(0, change_begin)))
     limit = reach = None
     if allowed_rise is not None:
@@ -531,9 +524,8 @@ def estimate_wear(levels: Levels, allowed_rise: float | None, change_begin: int 
 def _days_to_limit(level: Array, growth: Array, limit: float) -> Array:
     """Compute the days until each of d leakage levels reaches the limit, shape (d,).
 
-    `level`, `growth` (d,): present level and growth per month, in the unit of the limit.
-
-    The result is 0 for a level that has reached the limit, and infinite for one that never will.
+    `level`, `growth` (d,): present level and growth per month, in the unit of the limit. The result is 0 if the level
+    has reached the limit, and infinite if it does not grow.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         days = np.where(growth > 0.0, (limit - level) / growth, math.inf) * DAYS_PER_MONTH
@@ -543,13 +535,14 @@ def _days_to_limit(level: Array, growth: Array, limit: float) -> Array:
 def _estimate_healthy_range(levels: Levels) -> tuple[Interval, float]:
     """Estimate the mean leakage level and the scatter of recordings without a change.
 
-    Returns (mean level, standard deviation between recordings). The limits of the first contain 95 % of the levels of
-    single recordings, with their scatter and standard errors.
+    Returns the mean level, whose interval contains 95 % of the levels of single recordings with their scatter and
+    standard errors, and the standard deviation between recordings.
     """
-    draws = _Draws.sample(levels, _Changes.from_profile(np.zeros(len(levels)), 1.0))
-    error = float(np.mean(levels.error[levels.group == levels.group[-1]] ** 2))
-    noise = np.random.default_rng(21).standard_normal(draws.tau.size)
-    interval = _interval_of_draws(draws.mean_before + np.sqrt(draws.tau**2 + error) * noise)
+    no_change = _Changes.from_profile(np.zeros(len(levels)), scale=1.0)
+    draws = _Draws.sample(levels, no_change)
+    error_variance = float(np.mean(levels.error[levels.group == levels.group[-1]] ** 2))
+    noise = np.random.default_rng(21).standard_normal(draws.tau.size)  # a fixed seed, so that results repeat
+    interval = _interval_of_draws(draws.mean_before + np.sqrt(draws.tau**2 + error_variance) * noise)
     return interval._replace(value=float(draws.mean_before.mean())), math.sqrt(float(np.mean(draws.tau**2)))
 
 
@@ -557,9 +550,9 @@ class Episode(NamedTuple):
     """A period between two repairs of a machine, and the result of the test for a leak in it.
 
     The period has the rows `begin` to `end` - 1 of the compared recordings. `alarm` is the row at which the test
-    raised an alarm, or None. `log_days` is the logarithm of the largest mean time to a false alarm [days] at which
-    the test would raise one. `wear` is the state after the last row. `fell` is True if the period began with a
-    repair, i.e. a fall of the level.
+    raised an alarm, or None. `log_days` is the logarithm of the largest mean time to a false alarm [days] for which the
+    test would raise an alarm. `wear` is the state after the last row. `fell` is True if the period began with a repair,
+    i.e. a fall of the level.
     """
 
     begin: int
@@ -577,14 +570,15 @@ def find_episodes(
 
     `years` is the smallest mean time between false alarms. The first `n_healthy` recordings are known to be healthy.
     `allowed_rise` is the rise of the level at which a repair is due, or None. A repair is a fall of the level that
-    the same test detects. After it the level is estimated anew, and the scatter before it becomes the prior.
+    the same test detects. After a repair the level is estimated anew, with the scatter before the repair as prior.
     """
-    days, begin, episodes = years * DAYS_PER_YEAR, 0, list[Episode]()
+    days = years * DAYS_PER_YEAR
+    begin, episodes = 0, list[Episode]()
     while begin < len(levels):
         remaining = levels.select(slice(begin, None))
         rise = score_changes(remaining, n_healthy)
         alarm, end = rise.find_alarm(days), _find_repair(remaining, rise, n_healthy, days)
-        if alarm is not None and alarm >= end:  # of the next episode
+        if alarm is not None and alarm >= end:  # the alarm belongs to the next episode
             alarm = None
         change_begin = None if alarm is None else int(rise.begin[end - 1])
         wear = estimate_wear(remaining.select(slice(0, end)), allowed_rise, change_begin)
@@ -597,17 +591,18 @@ def find_episodes(
 
 
 def _find_repair(levels: Levels, rise: ChangeScores, n_healthy: int, days: float) -> int:
-    """Find the index of the first recording after the first repair; the number of recordings if there was none.
+    """Find the index of the first recording after the first repair; the number of recordings if there is no repair.
 
-    `rise` is the result of the test for a rise of the leakage level, and `days` the mean time to a false alarm
-    [days]. The first `n_healthy` recordings are known to be healthy. If the test has raised an alarm, a fall is
-    looked for only after the rise.
+    A repair is a fall of the leakage level that the sequential test detects. `rise` is the result of the test for a
+    rise, and `days` the mean time to a false alarm [days]. The first `n_healthy` recordings are known to be healthy. If
+    the rise is detected before a fall, only falls below the worn level since that rise count.
     """
-    fall, worn_from = score_changes(levels, n_healthy, falls=True), 0
-    alarm, repair = rise.find_alarm(days), fall.find_alarm(days)
-    if alarm is not None and (repair is None or alarm < repair):
-        worn_from = int(rise.begin[alarm])
-        # two recordings at least show the worn level
-        fall = score_changes(levels.select(slice(worn_from, None)), n_healthy=2, falls=True, may_grow=True)
-        repair = fall.find_alarm(days)
-    return len(levels) if repair is None else max(worn_from + int(fall.begin[repair]), 1)
+    first = 0  # index of the first recording that is tested for a fall
+    fall = score_changes(levels, n_healthy, falls=True)
+    rise_alarm, fall_alarm = rise.find_alarm(days), fall.find_alarm(days)
+    if rise_alarm is not None and (fall_alarm is None or rise_alarm < fall_alarm):
+        first = int(rise.begin[rise_alarm])
+        # at least two recordings must show the worn level, which may grow
+        fall = score_changes(levels.select(slice(first, None)), n_healthy=2, falls=True, may_grow=True)
+        fall_alarm = fall.find_alarm(days)
+    return len(levels) if fall_alarm is None else first + int(fall.begin[fall_alarm])
