@@ -59,9 +59,9 @@ def law_shapes(blocks: Blocks, columns: Sequence[ColumnRoles]) -> dict[float, Ar
 def law_flows(blocks: Blocks) -> dict[float, Array]:
     """Compute the mean flow in each of K blocks of a leak with the flow |p_A - p_B|^e times a coefficient.
 
-    With <> for the mean over a block, the flow divided by the coefficient is <|p_A - p_B|>^(2 e - 1) <|p_A -
-    p_B|^(1/2)>^(2 - 2 e), exact for e = 1 (laminar) and e = 1/2 (orifice). The result maps each exponent e of
-    `EXPONENTS` to an array (K,) of these values [Pa^e].
+    With dp = p_A - p_B, and <> for the mean over a block, the flow divided by the coefficient is approximated by
+    <|dp|>^(2 e - 1) <|dp|^(1/2)>^(2 - 2 e), which is exact for e = 1 (laminar) and e = 1/2 (orifice). The result maps
+    each exponent e of `EXPONENTS` to an array (K,) of these values [Pa^e].
     """
     pressure, root = blocks.mean_pressure(), blocks.mean_root()
     return {exponent: pressure ** (2.0 * exponent - 1.0) * root ** (2.0 - 2.0 * exponent) for exponent in EXPONENTS}

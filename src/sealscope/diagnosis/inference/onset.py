@@ -63,7 +63,7 @@ WITHIN_95 = round(NormalDist().inv_cdf(0.5 + 0.5 * BOUND_PROBABILITY), 2)
 UPPER_95 = round(NormalDist().inv_cdf(BOUND_PROBABILITY), 3)
 #: Minimum number of blocks, for a level, a slope, a step and its standard error.
 MIN_BLOCKS = 5
-#: Number of possible onsets per block, and number of blocks at either end of a recording in which none is tried.
+#: Number of possible onsets per block, and number of blocks at either end of a recording without a possible onset.
 PARTS, EDGE = 5, 2
 #: Grid of the variance q of the random walk over the variance of the noise, from 0 (no walk).
 WALKS = np.concatenate([[0.0], 10.0 ** np.linspace(-4.0, 3.0, 29)])

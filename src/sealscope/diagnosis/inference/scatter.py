@@ -64,7 +64,7 @@ MIN_WITH_HOLDS = 2
 MAX_LOG = 4.0
 #: Lower limit of divisors and of arguments of logarithms.
 TINY = 1e-300
-#: Number of narrower normal distributions that replace one of z, and their standard deviation over that of the one.
+#: A normal distribution of z is replaced by this number of narrower ones, with this fraction of its deviation.
 PARTS, PART_WIDTH = 7, 0.5
 #: Limit of abs(z).
 MAX_Z = 30.0
