@@ -55,12 +55,12 @@ _BLOCKS = INFERENCE.blocks
 #: Maximum and minimum length of a block [s].
 MAX_BLOCK_TIME: float = _BLOCKS.longest
 MIN_BLOCK_TIME: float = _BLOCKS.shortest
-#: Offset of p_A - p_B from which the terms are evaluated again about it [standard deviations of its prior], since the
-#: root and the carrying side are not linear in it.
+#: Sensor offset of p_A - p_B [standard deviations of its prior] from which the terms are computed again without it,
+#: since the root of p_A - p_B and the side that carries the load do not depend on the offset linearly.
 NEGLIGIBLE_OFFSET = 3.0
 #: Channels that balances read.
 READ = ("u", "theta", "omega", "q_pump", "x", "p_1", "p_2", "p_A", "p_B")
-#: Name of the samples that are 1 in a bridged hole, else 0; absent without holes.
+#: Name of a signal that is 1 in holes (long gaps of missing samples that were filled in), else 0; absent without holes.
 HOLE = "hole"
 #: Number of samples whose increments are computed together, so that they stay in the processor's cache.
 BATCH_SAMPLES = 8192
@@ -86,7 +86,7 @@ class BlockStream:
     offset : float
         Sensor offset [Pa] that is subtracted from p_A - p_B.
     on_samples : callable, optional
-        Called with the start time [s] and the samples of each block before the block is closed.
+        Called with the start time [s] and the samples of each block before the block is computed.
     """
 
     def __init__(
@@ -103,8 +103,8 @@ class BlockStream:
         self.columns = tuple(ColumnRoles(balance) for balance in balances)
         self._balances, self._rate, self._offset = balances, rate, offset
         self._stride = stride_samples(rate)
-        self._strides = max(SPAN, round(block_s / STRIDE))
-        # samples on either side of a block that its speeds and rests depend on
+        self._strides_per_block = max(SPAN, round(block_s / STRIDE))
+        # number of samples on either side of a block that its speeds and rests depend on
         self._margin = max(1, round(HALF_DIFFERENCE * rate)) + 2
         self._finds_rests = any(MOVING_BIAS in columns.names for columns in self.columns)
         if self._finds_rests:
@@ -130,25 +130,28 @@ class BlockStream:
         """Add samples of the stream and return the blocks that they complete; None if they complete none.
 
         A block is a few seconds of samples, reduced to Gram matrices of the volume balances' regressions (`Blocks`).
-        `samples`: equally long arrays by channel name, NaN where a sample is missing. `last`: true if no samples
-        follow; blocks are then closed that would otherwise wait for the samples after them.
+        The first `n_first` blocks are returned together. `samples`: equally long arrays by channel name, NaN where a
+        sample is missing; `last`: true if no samples follow. Complete blocks then do not wait for the samples after
+        them, or for `n_first` blocks.
         """
         if samples:
             self._pieces.append(samples)
             self._end += len(next(iter(samples.values())))
-        length = self._strides * self._stride
-        # samples after a block that its last rows extend over, and that its speeds and rests depend on
+        length = self._strides_per_block * self._stride
+        # number of samples after a block that its last rows extend over, and that its speeds and rests depend on
         tail = (SPAN - 1) * self._stride + 1 + (0 if last else self._margin)
         n_complete = max(0, (self._end - tail) // length)
         min_blocks = 1 if last or self._weighting.has_blocks else self._n_first or 1
         if n_complete <= self._n_closed or (self._n_closed == 0 and n_complete < min_blocks):
             return None
-        joined, ends = self._join_pieces(), [n_complete]
-        if self._n_first is not None:  # the first together, later ones one by one, however many samples arrive
+        joined = self._join_pieces()
+        # groups of blocks whose rows are weighted together, by the index past their last block
+        group_ends = [n_complete]
+        if self._n_first is not None:  # the first blocks in one group, later ones one by one
             first_end = self._n_closed + 1 if self._weighting.has_blocks else min(self._n_first, n_complete)
-            ends = list(range(first_end, n_complete + 1))
-        starts = [self._n_closed, *ends[:-1]]
-        blocks = Blocks.join([self._build_blocks(joined, *pair) for pair in zip(starts, ends, strict=True)])
+            group_ends = list(range(first_end, n_complete + 1))
+        groups = zip([self._n_closed, *group_ends[:-1]], group_ends, strict=True)
+        blocks = Blocks.join([self._build_blocks(joined, first, end) for first, end in groups])
         self._n_closed = n_complete
         first_stored = max(0, n_complete * length - self._margin)
         self._pieces = [{name: values[first_stored - self._first :].copy() for name, values in joined.items()}]
@@ -186,12 +189,13 @@ class BlockStream:
         samples = require_part(state, "samples", Mapping)
         self.restart(float(require_part(state, "begin", (float, int))))
         self._pieces = [{name: restore_array(values, name) for name, values in samples.items()}] if samples else []
-        self._first, self._n_closed = (int(require_part(state, name, int)) for name in ("first", "done"))
+        self._first = int(require_part(state, "first", int))
+        self._n_closed = int(require_part(state, "done", int))
         self._end = self._first + min((len(values) for piece in self._pieces for values in piece.values()), default=0)
-        to_absolute = require_part(state, "zeros", (Mapping, type(None)))
-        self._absolute_offsets = (
-            None if to_absolute is None else {name: float(to_absolute[name]) for name in to_absolute}
-        )
+        absolute_offsets = require_part(state, "zeros", (Mapping, type(None)))
+        if absolute_offsets is not None:
+            absolute_offsets = {name: float(offset) for name, offset in absolute_offsets.items()}
+        self._absolute_offsets = absolute_offsets
         self._left_signs = tuple(float(sign) for sign in require_part(state, "signs", Sequence))
         self._weighting.load_state(require_part(state, "weighting", Mapping))
 
@@ -200,12 +204,16 @@ class BlockStream:
 
         `rows`: for each balance the rows (r, m) of its regression, one for each test function of the weak form.
 
-        The log odds of a correct sign are the sum over three symptoms of correct wiring. Friction dissipates energy, so
-        p_A - p_B correlates with the flow into A; oil leaks from high to low pressure; the position x grows with the
-        flow into A. The last one counts only if it is positive, since x itself may be reversed. A constant load does
-        work in strokes that do not return; therefore the mean of p_A - p_B, weighted by the magnitude of the flow, is
-        subtracted first. Each symptom has a z score, with the probability Phi(z) of a correct sign, except for a
-        fraction of machines in which something else causes it.
+        The log odds of a correct sign are the sum over three symptoms of correct wiring:
+
+        - Oil leaks from high to low pressure.
+        - p_A - p_B correlates with the flow into A, since friction dissipates energy. A constant load also does work in
+          strokes that do not return; therefore the mean of p_A - p_B, weighted by the magnitude of the flow, is
+          subtracted first.
+        - The position x grows with the flow into A. A negative correlation does not count, since x may be reversed.
+
+        Each symptom has a z score, with the probability Phi(z) of a correct sign, except for a fraction of machines in
+        which something else causes the score (`_sign_log_odds`).
         """
         signs = []
         for balance, columns, values in zip(self._balances, self.columns, rows, strict=True):
@@ -215,8 +223,9 @@ class BlockStream:
             if (flow := np.abs(left)).any():
                 constant_load = np.average(pressure, weights=flow)
                 odds += _sign_log_odds(_z_score((pressure - constant_load) * left), INFERENCE.sense.work)
-            if (agreement := _z_score(motion * left)) > 0.0:  # else either x or the flow may be reversed
-                odds += _sign_log_odds(agreement, INFERENCE.sense.sides)
+            motion_z = _z_score(motion * left)
+            if motion_z > 0.0:  # else either x or the flow may be reversed
+                odds += _sign_log_odds(motion_z, INFERENCE.sense.sides)
             signs.append(-1.0 if odds < 0.0 else 1.0)
         return tuple(signs)
 
@@ -224,42 +233,45 @@ class BlockStream:
         """Compute the blocks with the indices `first` to `end` - 1 from `samples`, arrays by channel name.
 
         A row is the volume balance integrated with one test function of the weak form. The rows of these blocks are
-        weighted together: one robust fit to all of them determines the weights.
+        weighted together: one robust fit to all of them determines the weights. The first call also estimates the
+        signs of the left sides, for all blocks of the stream. `on_samples` is called with the samples of each block.
         """
-        length = self._strides * self._stride  # of a block [samples]
+        length = self._strides_per_block * self._stride  # of a block [samples]
         self._estimate_stream_constants(samples, (self._n_first or end) * length)
         if self._on_samples is not None:
             for k in range(first * length, end * length, length):
                 block = slice(k - self._first, k - self._first + length)
                 self._on_samples(self._begin + k / self._rate, {name: samples[name][block] for name in samples})
-        batch = max(1, BATCH_SAMPLES // length)  # number of blocks
-        batches = [self._compute_rows(samples, k, min(k + batch, end)) for k in range(first, end, batch)]
-        weights, flow, pressures = (
-            np.concatenate([getattr(part, name) for part in batches]) for name in ("weights", "flow", "pressures")
-        )
-        # rows without missing samples, times the root of their weight
-        is_counted, roots = weights > 0.0, np.sqrt(weights[weights > 0.0])[:, None]
-        values = [
-            np.concatenate(parts)[is_counted] * roots for parts in zip(*(part.rows for part in batches), strict=True)
-        ]
-        self._left_signs = self._left_signs or self._left_side_signs(values)
-        for equation_rows, columns, sign in zip(values, self.columns, self._left_signs, strict=True):
+        step = max(1, BATCH_SAMPLES // length)  # [blocks]
+        batches = [self._compute_rows(samples, k, min(k + step, end)) for k in range(first, end, step)]
+        weights = np.concatenate([batch.weights for batch in batches])
+        is_counted = weights > 0.0  # rows without missing samples
+        roots = np.sqrt(weights[is_counted])[:, None]
+        by_balance = zip(*(batch.rows for batch in batches), strict=True)
+        rows = [np.concatenate(parts)[is_counted] * roots for parts in by_balance]
+        self._left_signs = self._left_signs or self._left_side_signs(rows)
+        for equation_rows, columns, sign in zip(rows, self.columns, self._left_signs, strict=True):
             equation_rows[:, columns.left] *= sign
-        gram = self._weighting.compute_gram_matrices(
-            values, np.cumsum(is_counted.reshape(-1, self._strides).sum(axis=1))
+        block_ends = np.cumsum(is_counted.reshape(-1, self._strides_per_block).sum(axis=1))  # [counted rows]
+        stride = self._stride / self._rate  # [s]
+        first_rows = np.arange(first, end, dtype=float) * self._strides_per_block
+        start = self._begin + (first_rows + 0.5 * SPAN) * stride
+        return Blocks(
+            start=start,
+            end=start + (self._strides_per_block - 1) * stride,
+            gram=self._weighting.compute_gram_matrices(rows, block_ends),
+            rows=weights.reshape(-1, self._strides_per_block).sum(axis=1),
+            flow=np.concatenate([batch.flow for batch in batches]),
+            pressures=np.concatenate([batch.pressures for batch in batches]),
+            zero=np.full(end - first, self._offset),
         )
-        stride = self._stride / self._rate
-        start = self._begin + (np.arange(first, end, dtype=float) * self._strides + 0.5 * SPAN) * stride
-        last = start + (self._strides - 1) * stride
-        offsets = np.full(end - first, self._offset)
-        return Blocks(start, last, gram, weights.reshape(-1, self._strides).sum(axis=1), flow, pressures, offsets)
 
     def _estimate_stream_constants(self, samples: Mapping[str, Array], n_samples: int) -> None:
-        """Estimate two constants of a recording: absolute minus gauge pressure, and the speed that counts as rest.
+        """Estimate and store two constants of the stream: absolute minus gauge pressure, and the speed of rests.
 
         They are estimated at the first call only. The difference of absolute and gauge pressure is estimated for each
-        sensor from its first `n_samples`. The speeds below which pump or piston count as resting are estimated only if
-        the volume balance needs them, and are otherwise None.
+        sensor from the first `n_samples` of `samples`. The speeds below which pump or piston count as resting are
+        estimated from all `samples`, and only if the volume balance needs them.
         """
         if self._absolute_offsets is None:
             self._absolute_offsets = {
@@ -276,8 +288,8 @@ class BlockStream:
         each block the result also contains the mean magnitude of the first balance's left side as a flow [m^3/s], and
         the means of equal parts of the sorted samples of p_A - p_B [Pa].
         """
-        length = self._strides * self._stride
-        # samples of the blocks; the test functions of the last rows extend beyond them, to SPAN strides
+        length = self._strides_per_block * self._stride  # of a block [samples]
+        # range of the samples of the blocks; the test functions of the last rows extend beyond the last block
         start, stop = first * length, end * length + (SPAN - 1) * self._stride + 1
         begin = max(self._first, start - self._margin)
         piece = {  # with margins
@@ -285,8 +297,9 @@ class BlockStream:
         }
         signals = Signals(piece, self._rate, self._absolute_offsets, self._offset, self._rest_limits)
         without_margins = slice(start - begin, stop - 1 - begin)  # of the increments, one fewer than samples
-        is_whole = np.ones((end - first) * self._strides, dtype=bool)
-        rows, lefts = [], [balance.left(signals) for balance in self._balances]
+        is_whole = np.ones((end - first) * self._strides_per_block, dtype=bool)
+        lefts = [balance.left(signals) for balance in self._balances]
+        rows = []
         for balance, left in zip(self._balances, lefts, strict=True):
             columns = [*(term.increments(signals) for term in balance.terms), left]
             weak_rows = weak_form_rows([column[without_margins] for column in columns], self._rate)
@@ -322,8 +335,8 @@ class _BlockRows(NamedTuple):
 def _z_score(products: Array) -> float:
     """Compute the z score of the sum of `products` (r,) under the hypothesis that their mean is zero.
 
-    Each row of the regression has one product: of the flow on the left side of the balance, and of a quantity that on
-    average has the same sign if the sensors are wired correctly, such as the motion of the piston. Then
+    A row of the regression has one product of two factors: the flow on the left side of the balance, and a quantity
+    that on average has the same sign if the sensors are wired correctly, such as the motion of the piston. Then
 
         z = sum(products) / sqrt(OVERLAP sum(products^2)).
 
@@ -371,14 +384,14 @@ def _leak_z_score(gram: Array, roles: ColumnRoles, n_rows: int) -> float:
 def max_rest_rate(increments: Array, rate: float, fraction: float = INFERENCE.rest.share) -> float:
     """Compute the speed [m/s] or flow [m^3/s] below which a piston or a pump counts as resting.
 
-    It is a `fraction` of the mean speed in motion, sum(v^2) / sum(abs(v)). If that is larger, it is three standard
+    It is the larger of two: a `fraction` of the mean speed in motion, sum(v^2) / sum(abs(v)), and three standard
     deviations of the noise of a speed that is averaged over `AVERAGING_TIME`. `increments` (n,): increments of the
     position [m] or of the pump's volume [m^3] between samples; `rate`: sampling rate [Hz].
     """
-    flow = increments[np.isfinite(increments)] * rate
-    speed = np.abs(flow)
+    velocity = increments[np.isfinite(increments)] * rate
+    speed = np.abs(velocity)
     mean_speed = float(speed @ speed) / max(float(speed.sum()), np.finfo(float).tiny)
-    differences = np.abs(np.diff(flow, 6))  # of white noise: 924 times its variance
+    differences = np.abs(np.diff(velocity, 6))  # sixth differences of white noise have 924 times its variance
     # 1.4826: standard deviation of normal values over the median of their magnitudes
     noise = 1.4826 * float(np.median(differences)) / math.sqrt(924.0) if len(differences) else 0.0
     return max(fraction * mean_speed, 3.0 * noise / math.sqrt(max(1.0, AVERAGING_TIME * rate)))
@@ -412,12 +425,13 @@ def bridged_samples(recording: Recording, names: Collection[str]) -> dict[str, A
     the values with which the recording fills them in. If there are holes, the additional entry `HOLE` is 1 there and
     0 elsewhere.
     """
-    samples, is_hole = {}, flag_holes(recording)
+    samples = {}
+    is_hole = flag_holes(recording)
     if is_hole.any():
         samples[HOLE] = is_hole.astype(float)
     for name, values in recording.channels.items():
         if name in names:
-            # rails: values at which the transducer clips
+            # rails: values at which the pressure transducer clips
             rails = [rail.value for rail in find_rails(values[np.isfinite(values)])] if name.startswith("p_") else []
             samples[name] = np.where(np.isin(values, rails), np.nan, values) if rails else values
     return samples
@@ -428,16 +442,17 @@ def derive_drive_signals(
 ) -> dict[str, Array]:
     """Add signals from a model of the drive to the samples of a recording, each an array (n,) by channel name.
 
-    `rig`: states the drive; `rate`: sampling rate [Hz]. The entry `START` is exp(-t/lag) since the first sample: the
-    effect of the drive's unknown initial state decays with the time constant lag. The pump's speed "omega" [rad/s] is
-    added if the command u is the only channel that shows it: it is the drive's response to u, NaN where u is missing.
-    With `loaded` the drive responds to the load p_A - p_B as well. Otherwise the droop of the real speed under load
-    counts as leakage.
+    `rig` states the drive; `rate`: sampling rate [Hz]. The entry `START` is exp(-t/lag) at the time t since the first
+    sample: the effect of the drive's unknown initial state decays with the time constant lag. If the command u is the
+    only channel that shows the pump's flow, the pump's speed "omega" [rad/s] is added: the drive's response to u, NaN
+    where u is missing. With `loaded` the drive responds to the load p_A - p_B as well. Otherwise the droop of the real
+    speed under load counts as leakage.
     """
     drive = Drive.from_rig(rig)
     derived = {START: np.exp(-np.arange(len(samples["p_A"])) / (rate * drive.lag))}
     if flow_source(samples) == "u":
-        u, load = _hold_missing(samples["u"]), np.zeros(len(samples["u"]))
+        u = _hold_missing(samples["u"])
+        load = np.zeros(len(u))
         if loaded:
             dp = _hold_missing(samples["p_A"] - samples["p_B"])
             # the order of the pump's ports is unknown: the load has the sign of p_A - p_B that correlates with u
@@ -456,18 +471,21 @@ def _hold_missing(values: Array) -> Array:
 def min_samples_for_step(rate: float) -> int:
     """Compute the minimum number of samples to test a recording for a leak that begins within it.
 
-    These are the samples of `MIN_BLOCKS` blocks at the sampling `rate` [Hz].
+    These are the samples of `MIN_BLOCKS` blocks of minimum length, and those beyond the last block over which its last
+    rows extend. `rate`: sampling rate [Hz].
     """
     stride = stride_samples(rate)
-    return MIN_BLOCKS * max(SPAN, round(MIN_BLOCK_TIME / STRIDE)) * stride + (SPAN - 1) * stride + 1
+    block = max(SPAN, round(MIN_BLOCK_TIME / STRIDE)) * stride  # [samples]
+    return MIN_BLOCKS * block + (SPAN - 1) * stride + 1
 
 
 class RegimeBlocks(NamedTuple):
     """Blocks, balances and columns of a recording, under one assumption on the valves while the pump rests.
 
-    `shut`: true if valves then cut the pump off from the cylinder, false if it stays connected. `blocks`: the blocks
-    after removal of the sensor offset of p_A - p_B; `plain`: the blocks with p_A - p_B as recorded; `equations`: the
-    volume balances; `columns`: for each balance the indices of its columns by role (leak, motion, left side).
+    - `blocks`, `plain`: the blocks after removal of the sensor offset of p_A - p_B, and with p_A - p_B as recorded;
+    - `equations`: the volume balances;
+    - `columns`: for each balance the indices of its columns by role (leak, motion, left side);
+    - `shut`: true if valves cut the pump off from the cylinder while it rests, false if it stays connected.
     """
 
     blocks: Blocks
@@ -480,8 +498,8 @@ class RegimeBlocks(NamedTuple):
 class RecordedBlocks(NamedTuple):
     """Blocks of a recording under both assumptions on the valves while the pump rests (`regimes`).
 
-    `open`: the pump stays connected to the cylinder; `shut`: valves cut it off, None if the pump never rests; `odds`:
-    log odds that valves cut it off.
+    `open`: the pump stays connected to the cylinder; `shut`: valves cut it off, None if the machine never rests or the
+    balance does not allow this case; `odds`: log odds that valves cut it off.
     """
 
     open: RegimeBlocks
@@ -491,7 +509,8 @@ class RecordedBlocks(NamedTuple):
     def regime(self, odds: float) -> RegimeBlocks:
         """Return the blocks for the more probable state of the valves at rest: shut if `odds` > 0, else open.
 
-        `odds`: log odds of shut valves, from all recordings of the machine.
+        `odds`: log odds of shut valves, from all recordings of the machine. If `shut` is None, the blocks for open
+        valves are returned in any case.
         """
         return self.shut if self.shut is not None and odds > 0.0 else self.open
 
@@ -499,9 +518,9 @@ class RecordedBlocks(NamedTuple):
 def recorded_blocks(recording: Recording, rig: Rig) -> RecordedBlocks | None:
     """Compute the blocks of a recording for a volume balance; None if its channels allow none, or it is too short.
 
-    A block is a few seconds of samples, reduced to Gram matrices of the volume balances' regressions. The result has
-    two versions of the blocks, since the pump may stay connected to the cylinder while it rests, or valves may cut it
-    off.
+    A block is a few seconds of samples, reduced to Gram matrices of the volume balances' regressions. If a
+    pump-controlled cylinder rests at times, the result has two versions of the blocks: while the pump rests, it may
+    stay connected to the cylinder, or valves may cut it off.
     """
     names = frozenset(name for name in recording.channels if name in READ)
     balances = equations(rig, names)
@@ -548,26 +567,27 @@ def recorded_blocks(recording: Recording, rig: Rig) -> RecordedBlocks | None:
 
 
 def _longest_hold(samples: Mapping[str, Array], rate: float, balance: Equation) -> float:
-    """Find the longest time [s] for which the piston rests while the pump turns, as to hold a load; 0 if there is none.
+    """Find the longest time [s] for which the piston rests while the pump turns to hold a load; 0 if it never does.
 
     `samples`: arrays by channel name at the `rate` [Hz]; `balance`: volume balance, whose left side is the pump's flow.
     """
     signals = Signals(samples, rate, rest_limits=_find_rest_limits(samples, rate, balance))
-    lengths = find_runs(signals.holding(balance.left) > 0.0)[:, 1]  # [samples]
+    _, lengths = find_runs(signals.holding(balance.left) > 0.0).T  # [samples]
     return float(lengths.max(initial=0)) / rate
 
 
 def _find_rest_limits(samples: Mapping[str, Array], rate: float, balance: Equation) -> RestLimits:
     """Compute the flow of the pump and the speed of the piston below which they count as resting.
 
-    A flow meter measures what enters the cylinder. If little does, the valves are closed: a piston that moves all the
-    same creeps because of a leak, which must not count as motion. `samples`: arrays by channel name at the `rate` [Hz];
+    A flow meter measures the oil that enters the cylinder. If little enters, the valves are closed, and a moving piston
+    only creeps because of a leak, which must not count as motion. With a flow meter, therefore, only the flow is
+    judged: the limit of the piston's speed is minus infinity. `samples`: arrays by channel name at the `rate` [Hz];
     `balance`: volume balance, whose left side is the flow of the pump or of the meter.
     """
     signals = Signals(samples, rate)
     if flow_source(samples) == "q_pump":
-        return RestLimits(max_rest_rate(balance.left(signals), rate, INFERENCE.rest.moves), -math.inf)
-    return RestLimits(max_rest_rate(balance.left(signals), rate), max_rest_rate(signals.step("x"), rate))
+        return RestLimits(max_rest_rate(balance.left(signals), rate, INFERENCE.rest.moves), piston=-math.inf)
+    return RestLimits(pump=max_rest_rate(balance.left(signals), rate), piston=max_rest_rate(signals.step("x"), rate))
 
 
 def _build_regime(balances: tuple[Equation, ...], blocks_about: Callable[[float], Blocks]) -> RegimeBlocks:
@@ -577,9 +597,10 @@ def _build_regime(balances: tuple[Equation, ...], blocks_about: Callable[[float]
     from the recorded blocks and removed from their Gram matrices. If it exceeds `NEGLIGIBLE_OFFSET` standard deviations
     of its prior, the blocks are instead computed again after subtracting it, and the remaining offset is removed.
     """
-    columns, plain = tuple(ColumnRoles(balance) for balance in balances), blocks_about(0.0)
+    columns = tuple(ColumnRoles(balance) for balance in balances)
+    plain = blocks_about(0.0)
     blocks = remove_pressure_offset(plain, columns)
     offset = float(blocks.zero[0])
-    if abs(offset) >= NEGLIGIBLE_OFFSET * INFERENCE.zero.pressure:  # else the terms are linear enough in it
+    if abs(offset) >= NEGLIGIBLE_OFFSET * INFERENCE.zero.pressure:  # else the terms are linear enough in the offset
         blocks = remove_pressure_offset(blocks_about(offset), columns)
     return RegimeBlocks(blocks.merge(), plain.merge(), balances, columns)

@@ -98,10 +98,10 @@ class Blocks:
         return replace(self, gram=self.gram[..., *np.triu_indices(self.gram.shape[-1])])
 
     def unpack(self, size: int) -> Blocks:
-        """Return the blocks with full Gram matrices, of which `pack` has stored the upper triangles only.
+        """Return the blocks with full Gram matrices, from blocks in which `pack` has stored the upper triangles only.
 
-        `size`: number of columns m, with which `gram` has the shape (K, E, m, m). Raise InputError if the stored shapes
-        do not fit it.
+        `size`: number of columns m of the full matrices (K, E, m, m). Raise InputError if the stored shapes do not fit
+        this number, or if the arrays have different numbers of blocks.
         """
         upper, lower = np.triu_indices(size)
         lengths = {len(getattr(self, name)) for name in self.__dataclass_fields__}
@@ -129,31 +129,32 @@ class Blocks:
     def is_moving(self) -> NDArray[np.bool_]:
         """Flags (K,) of the blocks in which the machine moves.
 
-        Their mean flow is at least the fraction `rest.moves` (`priors.toml`) of `moving_flow`. The flow of a pump that
-        only holds a load is smaller.
+        In these blocks the mean flow is at least the fraction `rest.moves` (`priors.toml`) of `moving_flow`. The flow
+        of a pump that only holds a load is smaller.
         """
         return np.asarray(self.flow >= INFERENCE.rest.moves * self.moving_flow)
 
     def merge(self, max_blocks: int = MAX_BLOCKS) -> Blocks:
         """Return at most `max_blocks` blocks, each the sum or weighted mean of several neighbouring ones.
 
-        Every result but the last combines equally many. Gram matrices and numbers of rows are added; flow and pressures
-        are averaged with the numbers of rows as weights; `zero` is that of the first block.
+        Groups of equally many neighbours are merged; the last group may be smaller. Gram matrices and numbers of rows
+        are added. Flow and pressures are averaged with the numbers of rows as weights. The first block of a group
+        gives `zero`.
         """
-        group = -(-len(self) // max_blocks)
-        if group <= 1:
+        group_size = -(-len(self) // max_blocks)  # rounded up
+        if group_size <= 1:
             return self
-        first = np.arange(0, len(self), group)
+        first = np.arange(0, len(self), group_size)
         end = np.append(first[1:], len(self))
         rows = np.add.reduceat(self.rows, first)
-        fractions = self.rows[:, None] / np.maximum(np.repeat(rows, end - first), 1.0)[:, None]
+        weights = self.rows / np.maximum(np.repeat(rows, end - first), 1.0)
         return Blocks(
             start=self.start[first],
             end=self.end[end - 1],
             gram=np.add.reduceat(self.gram, first, axis=0),
             rows=rows,
-            flow=np.add.reduceat(self.flow * fractions[:, 0], first),
-            pressures=np.add.reduceat(self.pressures * fractions, first, axis=0),
+            flow=np.add.reduceat(self.flow * weights, first),
+            pressures=np.add.reduceat(self.pressures * weights[:, None], first, axis=0),
             zero=self.zero[first],
         )
 
@@ -163,7 +164,8 @@ class Blocks:
         `offset` [Pa]: sensor offset of p_A - p_B, by default `zero`, which is already subtracted in `gram`. The mean
         flow of a laminar leak is its coefficient times this pressure.
         """
-        return np.asarray(np.abs(self.pressures - (self.zero[:, None] if offset is None else offset)).mean(axis=1))
+        subtracted = self.zero[:, None] if offset is None else offset
+        return np.asarray(np.abs(self.pressures - subtracted).mean(axis=1))
 
     def mean_root(self) -> Array:
         """Compute the mean of sqrt(abs(p_A - p_B - zero)) [Pa^0.5] in each block, shape (K,).
@@ -229,7 +231,7 @@ class ColumnRoles:
         )
         self.motion = tuple(k for k in self.nuisance if equation.terms[k].drift in ("motion", "edge"))
         self.fast = tuple(k for k in self.nuisance if equation.terms[k].drift in UNSTEADY)
-        # one leakage for all rests: one for each kind of rest would follow outliers
+        # without HOLDING: one leakage for all rests, since separate ones would follow outliers
         states = [self.names.index(name) for name in (TURNING, MOVING_BIAS)] if MOVING_BIAS in self.names else []
         self.slow = (*(k for k in self.nuisance if k not in self.fast), *states)
         self.bias = self.names.index(BIAS) if BIAS in self.names else None
@@ -255,17 +257,17 @@ class ColumnRoles:
         without a prior.
         """
         driver = self.drivers[test] if test < self.left else ""
-        pressure, root = (float(np.mean(values)) for values in (blocks.mean_pressure(), blocks.mean_root()))
+        pressure, root = float(np.mean(blocks.mean_pressure())), float(np.mean(blocks.mean_root()))
         per_conductance = {"": float("inf"), "pressure": 1.0, "root": pressure / root if root > 0.0 else 1.0}
         return self.healthy_conductance * per_conductance[driver]
 
     def offset_deviation(self, test: int, blocks: Blocks) -> float:
-        """Compute the prior standard deviation of the error of a regression column due to a pressure sensor's offset.
+        """Compute the prior standard deviation of the error that a pressure sensor's offset causes in a column.
 
-        `test`: index of the column. The result is in Pa for the column of a laminar leak, in Pa^0.5 for the column of
-        an orifice. It is 0 for columns that no pressure drives, or in an equation without flow offset. The standard
-        deviation of the offset itself is at most the mean of abs(p_A - p_B) over `blocks`, since recordings may be in
-        counts.
+        `test`: index of the regression's column. The result is in Pa for the column of a laminar leak, in Pa^0.5 for
+        the column of an orifice. It is 0 for columns that no pressure drives, or in an equation without flow offset.
+        The standard deviation of the offset itself is limited to the mean of abs(p_A - p_B) over `blocks`, since
+        recordings may be in counts instead of Pa.
         """
         driver = self.drivers[test] if test < self.left and self.bias is not None else ""
         root = float(np.mean(blocks.mean_root()))
@@ -310,18 +312,16 @@ class Weighting:
         """Compute the Gram matrices (K, E, m, m) of K blocks, in which outlying rows have smaller weights.
 
         `values`: for each equation the rows (r, m) of all blocks; `ends` (K,): index past the last row of each block.
-        Huber's weights follow from a fit to these and earlier blocks, in which the coefficients of fast columns are
-        free in each block and the coefficients of slow columns common to all (`ColumnRoles`). The sums over earlier
-        blocks are updated.
+        Huber's weights follow from a fit to these and earlier blocks. In this fit the coefficients of fast columns are
+        free in each block, the coefficients of slow columns are common to all blocks (`ColumnRoles`). The number of
+        blocks and the sums over earlier blocks are updated.
         """
         self._count += len(ends)
         update_fraction = min(1.0, SUPPORT / self._count)  # a mean at first, then exponential forgetting
         grams = []
         for equation_rows, columns, earlier_sums in zip(values, self._columns, self._earlier_sums, strict=True):
-            fast, slow = columns.fast, (*columns.slow, columns.left)  # the left side is the last slow column
-            grams.append(
-                block_gram_matrices(equation_rows, ends, np.array(fast), np.array(slow), earlier_sums, update_fraction)
-            )
+            fast, slow = np.array(columns.fast), np.array([*columns.slow, columns.left])
+            grams.append(block_gram_matrices(equation_rows, ends, fast, slow, earlier_sums, update_fraction))
         return np.stack(grams, axis=1)
 
 
@@ -334,13 +334,15 @@ def solve(matrix: Array, right: Array) -> Array:
     scale[~(scale > 0.0)] = 1.0
     column = scale[:, None]
     scaled = matrix / column / scale
-    scaled.flat[:: len(scale) + 1] += RIDGE
-    scaled_right = right / (scale if right.ndim == 1 else column)
-    dposv = _positive_definite_solver()
-    _, solution, failed = dposv(scaled, scaled_right) if scaled_right.size else (None, scaled_right, 0)
-    if failed:  # not positive definite, by rounding
+    scaled.flat[:: len(scale) + 1] += RIDGE  # on the diagonal
+    right_scale = scale if right.ndim == 1 else column
+    scaled_right = right / right_scale
+    if not scaled_right.size:  # nothing to solve
+        return np.asarray(scaled_right)
+    _, solution, has_failed = _positive_definite_solver()(scaled, scaled_right)
+    if has_failed:  # not positive definite, by rounding
         solution = np.asarray(np.linalg.solve(scaled, scaled_right))
-    return np.asarray(solution / (scale if right.ndim == 1 else column))
+    return np.asarray(solution / right_scale)
 
 
 @cache
@@ -358,8 +360,8 @@ def information(blocks: Blocks, columns: Sequence[ColumnRoles], test: int, repla
     """Compute the likelihood of one coefficient of a volume balance in each block, with all others eliminated.
 
     `columns`: for each equation the indices of its columns by role (leak, motion, left side); the likelihoods of the
-    equations are multiplied. `test`: index of the coefficient's column, or of the left side to test a change of its
-    scale. `replaces`: index of another column that is left out of the regression, None for none.
+    equations are multiplied. `test`: index of the coefficient's column, or of the left side to test a change of the
+    left side's scale. `replaces`: index of another column to leave out of the regression, or None.
     """
     count = len(blocks)
     precision, vector = np.zeros((count, count)), np.zeros(count)
@@ -384,11 +386,14 @@ def _drift_polynomials(blocks: Blocks) -> tuple[Array, float]:
 class _NormalEquations(NamedTuple):
     """Gram matrices and moments of a regression on nuisance columns, whose coefficients drift, and on a tested column.
 
-    The tested column belongs to the coefficient to estimate. The nuisance columns are multiplied by their drift
-    polynomials, c columns in all. `gram` (c, c) and `moment` (c,): products of these columns with each other and with
-    the left side. Sums of the tested column in each of K blocks: `coupling` (K, c), its products with the nuisance
-    columns; `energy` (K,), its sum of squares; `tested_moment` (K,), its product with the left side. `left_square`: sum
-    of squares of the left side.
+    The tested column belongs to the coefficient to estimate. Each nuisance column is multiplied by each drift
+    polynomial, which gives c columns in all. Sums over the rows of all blocks, or of each of K blocks:
+
+    - `gram` (c, c), `moment` (c,): products of these c columns with each other and with the left side;
+    - `coupling` (K, c): products of the tested column with the c columns, in each block;
+    - `energy` (K,): sum of squares of the tested column, in each block;
+    - `tested_moment` (K,): product of the tested column with the left side, in each block;
+    - `left_square`: sum of squares of the left side.
     """
 
     gram: Array
@@ -415,8 +420,9 @@ def _build_normal_equations(
 ) -> _NormalEquations:
     """Build the normal equations of a regression on drifting nuisance columns and one tested column.
 
-    `gram` (K, m, m): Gram matrices of K blocks; `polynomials` (K, degrees): drift polynomials, by each of which the
-    columns `nuisance` are multiplied; `test`, `left`: indices of the tested column and of the left side.
+    `gram` (K, m, m): Gram matrices of K blocks; `polynomials` (K, degrees): drift polynomials; `nuisance`: indices of
+    the columns that are multiplied by each polynomial; `test`, `left`: indices of the tested column and of the left
+    side.
     """
     n, degrees = len(nuisance), polynomials.shape[1]
     size = n * degrees
@@ -451,7 +457,7 @@ class _NuisanceFit(NamedTuple):
     """Fit of the nuisance coefficients: `coefficients` (c,), and `variance` of a row's residual.
 
     The variance is inflated for overlapping rows. `prior_precision` (c,): prior precision of the coefficients, times
-    `variance`; `prior_moment` (c,): its product with their prior mean.
+    `variance`; `prior_moment` (c,): product of `prior_precision` and the prior mean of the coefficients.
     """
 
     coefficients: Array
@@ -465,12 +471,14 @@ def _fit_nuisance(normal: _NormalEquations, prior: _Prior, degrees: int, n_rows:
 
     `normal`: normal equations of the regression, from which the tested coefficient, free in each block, is eliminated.
     Each other (nuisance) column has `degrees` coefficients: a constant one, and one for each polynomial of its drift.
-    `prior`: prior standard deviations of these; `n_rows`: number of rows in all blocks.
+    `prior`: prior standard deviations of these; `n_rows`: number of rows in all blocks. The variance determines the
+    weight of the prior, and so the fit; both are found by iteration, until the variance changes by at most the
+    fraction `TOLERANCE`.
     """
     gram, moment, left_square = normal.eliminate_tested()
     min_variance = 1e-14 * normal.left_square / n_rows  # rounding errors of the sums
     variance = max(left_square / n_rows, min_variance)
-    for _ in range(MAX_ITERATIONS):  # the variance scales the prior against the sums
+    for _ in range(MAX_ITERATIONS):
         precision, mean = np.zeros((2, len(prior.drift), degrees))
         with np.errstate(divide="ignore", over="ignore"):
             precision[:, 0] = OVERLAP * variance / prior.level**2
@@ -509,22 +517,23 @@ def _fit_equation(gram: Array, blocks: Blocks, roles: ColumnRoles, test: int, nu
     `gram` (K, m, m): Gram matrices of the equation in K blocks; `roles`: indices of its columns by role (leak, motion,
     left side); `test`: index of the column of g; `nuisance`: indices of the nuisance columns.
     """
-    offset, deviation = 0.0, roles.offset_deviation(test, blocks)
     polynomials, minutes = _drift_polynomials(blocks)
     n_rows, degrees = max(float(blocks.rows.sum()), 1.0), polynomials.shape[1]
     total = gram.sum(axis=0)
     constants = solve(total[np.ix_(nuisance, nuisance)], total[nuisance, roles.left])  # without drifts
     magnitudes = np.minimum(np.abs(constants), roles.level_deviation[nuisance])
     drift = np.append(magnitudes * roles.drift_rate[nuisance] * minutes, 0.0)
-    prior = _Prior(np.append(roles.level_deviation[nuisance], np.inf), drift, deviation)
-    with_offset, coefficients = [*nuisance, gram.shape[1]], np.zeros(len(blocks))
+    offset_deviation = roles.offset_deviation(test, blocks)
+    prior = _Prior(np.append(roles.level_deviation[nuisance], np.inf), drift, offset_deviation)
+    nuisance_and_offset = [*nuisance, gram.shape[1]]  # `_shift_offset` appends the offset's column
+    offset, coefficients = 0.0, np.zeros(len(blocks))  # z, and g in each block
     for iteration in range(_MAX_OFFSET_STEPS + 1):
         shifted = _shift_offset(gram, roles, test, coefficients, offset)
-        normal = _build_normal_equations(shifted, polynomials, with_offset, test, roles.left)
+        normal = _build_normal_equations(shifted, polynomials, nuisance_and_offset, test, roles.left)
         fit = _fit_nuisance(normal, prior._replace(current_offset=offset), degrees, n_rows)
         step = float(fit.coefficients[-degrees])  # constant part of the last coefficient, the offset's error
-        is_last = iteration == _MAX_OFFSET_STEPS or not deviation > 0.0
-        if is_last or (iteration > 0 and abs(step) <= TOLERANCE * deviation):
+        is_last = iteration == _MAX_OFFSET_STEPS or not offset_deviation > 0.0
+        if is_last or (iteration > 0 and abs(step) <= TOLERANCE * offset_deviation):
             break
         offset += step
         tested_residual = normal.tested_moment - normal.coupling @ fit.coefficients
@@ -539,12 +548,12 @@ def _shift_offset(gram: Array, roles: ColumnRoles, test: int, coefficients: Arra
     `test`: index of the tested column, a pressure times the sampling interval dt, whose coefficient g is to be
     estimated; `coefficients` (K,): g in each block; `offset` [Pa]: subtracted from the pressure. The appended column -g
     dt is the derivative of the volume balance with respect to the offset. It becomes the last of the m + 1 columns of
-    the result.
+    the result. In an equation without flow offset, nothing is corrected and the appended column is zero.
     """
     size = gram.shape[1]
     transform = np.zeros((len(gram), size, size + 1))
     transform[:, :, :size] = np.eye(size)
-    if roles.bias is not None:
+    if roles.bias is not None:  # its column is dt
         transform[:, roles.bias, test] -= offset
         transform[:, roles.bias, size] -= coefficients
     return np.asarray(transform.transpose(0, 2, 1) @ gram @ transform)
@@ -579,7 +588,7 @@ def _nuisance_columns(roles: ColumnRoles) -> list[int]:
 
 
 def offset_cost(offset: float) -> float:
-    """Compute -2 log of the prior density of a sensor offset of p_A - p_B [Pa], relative to that of no offset.
+    """Compute -2 log of the prior density of a sensor offset of p_A - p_B [Pa], relative to the density of no offset.
 
     The prior is a normal density of standard deviation s for good sensors or, with small odds o, a wide one of standard
     deviation w for sensors that are far off (`zero` in `priors.toml`). The more favourable of the two counts:
@@ -619,14 +628,14 @@ class LeakAndBias(NamedTuple):
 def estimate_leak_and_bias(blocks: Blocks, roles: ColumnRoles) -> LeakAndBias:
     """Compute the joint likelihood of leak coefficient and flow offset in each block, for the first equation.
 
-    `roles`: indices of its columns by role (leak, motion, left side), one of which must be the flow offset. All other
-    coefficients are eliminated.
+    `roles`: indices of the equation's columns by role (leak, motion, left side); they must include the flow offset
+    (`roles.bias`). All other coefficients are eliminated.
     """
     leak, bias = roles.leak, roles.bias
     assert bias is not None
     gram = blocks.gram[:, 0].copy()
     bias_energy = gram[:, bias, bias]
-    has_bias = bias_energy > RIDGE * bias_energy.max()  # false in a block at rest, but for rounding errors
+    has_bias = bias_energy > RIDGE * bias_energy.max()  # false if the offset's column is zero, as in a block at rest
     pressure = np.where(has_bias, gram[:, leak, bias], 0.0) / np.where(has_bias, bias_energy, 1.0)
     fit = _fit_equation(gram, blocks, roles, leak, _nuisance_columns(roles))
     # subtract from the leak's column its mean in the block, so that leak and bias are uncorrelated there

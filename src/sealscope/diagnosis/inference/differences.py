@@ -1,4 +1,4 @@
-"""Tests whether a number of a recording differs from that of healthy recordings, whose scatter is unknown.
+"""Test whether a quantity of a recording differs from its values in healthy recordings, whose scatter is unknown.
 
 *Without a prior on the scatter* (`compare_with_healthy`): n healthy values are normal about an unknown mean with an
 unknown standard deviation, at least the error e of a single value (Jeffreys prior). With their mean and standard
@@ -10,8 +10,9 @@ Five values that agree to a thousandth thus show that a sixth differs by a few t
 
 *With a prior on the scatter* (`compare_estimates`): each value y_i has an error e_i and varies about an unknown mean
 mu by the scatter s, y_i ~ N(mu, s^2 + (k e_i)^2). s^2 has a scaled inverse chi-square prior, with the weight of m
-recordings whose scatter is s_0. k >= 1, by which the errors are too small, is 1 or has a log-uniform prior: a day of
-few strokes then differs by more. On a grid of s and k, with the weights w_i = 1/(s^2 + (k e_i)^2) and W = sum w_i,
+recordings whose scatter is s_0. The errors may be too small by a factor k >= 1; k is 1, or has a log-uniform prior.
+With k > 1, imprecise values such as those of a day with few strokes may differ by more. On a grid of s and k, with the
+weights w_i = 1/(s^2 + (k e_i)^2) and W = sum w_i,
 
     p(s, k | y) ~ p(s) p(k) W^(-1/2) prod_i w_i^(1/2) exp(-w_i (y_i - mean)^2 / 2),    mean = sum w_i y_i / W,
 
@@ -32,9 +33,12 @@ from sealscope.diagnosis.priors.inference import StepSize
 
 #: Minimum number of healthy recordings for a scatter.
 MIN_HEALTHY = 3
-#: Number of grid points of the scatter, and the largest factor between it and the prior's, up or down. The grid also
-#: reaches a multiple of the standard deviation of the healthy values.
-NODES, MAX_RATIO, MAX_RATIO_TO_VALUES = 64, 100.0, 10.0
+#: Number of grid points of the scatter.
+NODES = 64
+#: The grid reaches from the prior's scatter over this factor to the prior's scatter times this factor, ...
+MAX_RATIO = 100.0
+#: ... and at least to this multiple of the standard deviation of the healthy values.
+MAX_RATIO_TO_VALUES = 10.0
 #: Number of grid points of the factor by which errors are too small.
 INFLATIONS = 9
 #: Smallest positive number that is divided by.
@@ -49,9 +53,9 @@ class Estimate(NamedTuple):
 
 
 class PriorScatter(NamedTuple):
-    """Prior on the scatter of a number between recordings of one machine.
+    """Prior on the scatter of a quantity between recordings of one machine.
 
-    `deviation`: expected standard deviation of the number; `recordings`: number of recordings that would tell as much
+    `deviation`: expected standard deviation of the quantity; `recordings`: number of recordings that would tell as much
     about the scatter as this prior; `inflation`: largest factor by which the standard errors may be too small, the
     same for all recordings.
     """
@@ -71,7 +75,7 @@ def compare_with_healthy(
     above: bool = False,
     prior_change: float = np.inf,
 ) -> Observable | None:
-    """Test a value by Student's t for a difference from those of healthy recordings.
+    """Test a value by Student's t for a difference from the values of healthy recordings.
 
     Parameters
     ----------
@@ -92,16 +96,17 @@ def compare_with_healthy(
     Returns
     -------
     Observable or None
-        Its size is the difference from the healthy mean, its score the square of t. None for fewer than `MIN_HEALTHY`
-        healthy recordings, or if a number is not finite.
+        Its size is the difference from the healthy mean, its score the square of t; with `above`, the score of a value
+        below the mean is 0. None for fewer than `MIN_HEALTHY` healthy recordings, or if a number is not finite.
     """
     from scipy.special import stdtr
 
     healthy_values = np.asarray(healthy, dtype=float)
     if len(healthy_values) < MIN_HEALTHY or not np.isfinite([value, error, *healthy_values]).all():
         return None
-    count, change = len(healthy_values), value - float(healthy_values.mean())
+    count = len(healthy_values)
     freedom = count - 1
+    change = value - float(healthy_values.mean())
     scatter_variance = float(healthy_values.var() * count) / freedom
     variance = (scatter_variance + error**2) * (1.0 + 1.0 / count)
     t = change / max(float(np.sqrt(variance)), TINY)
@@ -128,7 +133,7 @@ def compare_estimates(
     above: bool = False,
     further_deviation: float = 0.0,
 ) -> Observable | None:
-    """Test an estimate for a difference from those of healthy recordings, each with a known standard error.
+    """Test an estimate for a difference from the estimates of healthy recordings, each with a known standard error.
 
     Parameters
     ----------
@@ -148,8 +153,9 @@ def compare_estimates(
     Returns
     -------
     Observable or None
-        Its size is the difference from the weighted mean of the healthy estimates, its score the square of the size
-        over its variance. None for fewer than `MIN_HEALTHY` healthy recordings, or if a number is not finite.
+        Its size is the difference from the weighted mean of the healthy estimates, its score the square of this
+        difference over its variance; with `above`, the score of a negative difference is 0. None for fewer than
+        `MIN_HEALTHY` healthy recordings, or if a number is not finite.
     """
     from scipy.special import ndtr
 
@@ -160,7 +166,7 @@ def compare_estimates(
     ratios = np.exp(np.linspace(-np.log(MAX_RATIO), np.log(max_ratio), NODES))
     inflations = np.geomspace(1.0, prior.inflation, INFLATIONS) if prior.inflation > 1.0 else np.ones(1)
     ratios, inflations = (grid.ravel() for grid in np.meshgrid(ratios, inflations))
-    scatter = prior.deviation * ratios
+    scatter = prior.deviation * ratios  # at each point of the grid of scatter and inflation
     weights = 1.0 / (scatter[:, None] ** 2 + (inflations[:, None] * errors) ** 2)
     precision = weights.sum(axis=1)
     means = weights @ values / precision

@@ -1,10 +1,11 @@
-"""Mean flow of a leak, averaged over laws between laminar flow and an orifice, from the conductance in blocks.
+"""Mean flow of a leak whose law is unknown, from the conductance in blocks: laminar, an orifice, or between the two.
 
-A leak c |p_A - p_B|^e, in addition to the healthy leakage, changes a block's conductance by c r_k. Here r_k is the
-regression coefficient of the law's flow on the pressure difference within the block. A step test with a size
-proportional to r_k in each block thus covers every law, and the healthy laminar leakage does not enter. A seal that
-continues to wear leaks more towards the end: the step grows by a fraction of itself. The flow of a step is a mixture
-over laws, growths and onsets, each weighted by its likelihood and prior.
+The law of a leak is the exponent e of its flow c |p_A - p_B|^e. Such a leak, in addition to the healthy leakage,
+changes the conductance of block k by c r_k. Here r_k is the regression coefficient of |p_A - p_B|^e on the pressure
+difference within the block. A step test with a size proportional to r_k in each block thus covers every law, and the
+healthy laminar leakage does not enter. A seal that continues to wear leaks more towards the end: the step grows by a
+fraction of its size. The flow of a step is a mixture over laws, growths and onsets, each weighted by its likelihood and
+prior.
 
 A rise g, i.e. the conductance above that of the healthy recordings, is the regression coefficient of the leak's flow on
 p_A - p_B over the whole recording. With dp = p_A - p_B, <> the mean over the recording, and b_e the regression
@@ -42,25 +43,25 @@ _TINY = np.finfo(float).tiny
 def law_shapes(blocks: Blocks, columns: Sequence[ColumnRoles]) -> dict[float, Array]:
     """Compute the conductance that a leak with the flow |p_A - p_B|^e appears to have in each of K blocks.
 
-    It is the regression coefficient of this flow on p_A - p_B within the block. For an orifice, e = 1/2, it is r from
-    the Gram matrices; for the other exponents it is taken as r^(2 (1 - e)), which is 1 for laminar flow, e = 1. The
-    result maps each exponent e of `EXPONENTS` to an array (K,) [Pa^(e - 1)]. `blocks`: the K blocks, with the Gram
-    matrices of the volume balance; `columns`: for each equation the indices of the columns of these matrices by role
-    (leak, motion, left side).
+    It is the regression coefficient of this flow on p_A - p_B within the block. For an orifice, e = 1/2, the Gram
+    matrices give this coefficient r. For the other exponents r^(2 (1 - e)) approximates it; that is 1 for laminar flow,
+    e = 1. The result maps each exponent e of `EXPONENTS` to an array (K,) [Pa^(e - 1)]. `blocks`: the K blocks, with
+    the Gram matrices of the volume balance; `columns`: for each equation the indices of the columns of these matrices
+    by role (leak, motion, left side).
     """
     leak, orifice = columns[0].leak, columns[0].names.index(ORIFICE)
     gram = blocks.gram.sum(axis=1)
     energy = np.maximum(gram[:, leak, leak], _TINY)
-    root = np.maximum(gram[:, orifice, leak] / energy, _TINY)
-    return {exponent: root ** (2.0 * (1.0 - exponent)) for exponent in EXPONENTS}
+    by_orifice = np.maximum(gram[:, orifice, leak] / energy, _TINY)
+    return {exponent: by_orifice ** (2.0 * (1.0 - exponent)) for exponent in EXPONENTS}
 
 
 def law_flows(blocks: Blocks) -> dict[float, Array]:
     """Compute the mean flow in each of K blocks of a leak with the flow |p_A - p_B|^e times a coefficient.
 
-    With the means over a block it is <|p_A - p_B|>^(2 e - 1) <|p_A - p_B|^(1/2)>^(2 - 2 e), exact for e = 1 (laminar)
-    and e = 1/2 (orifice). The result maps each exponent e of `EXPONENTS` to an array (K,) of flows over the coefficient
-    [Pa^e].
+    With dp = p_A - p_B, and <> for the mean over a block, the flow divided by the coefficient is approximated by
+    <|dp|>^(2 e - 1) <|dp|^(1/2)>^(2 - 2 e), which is exact for e = 1 (laminar) and e = 1/2 (orifice). The result maps
+    each exponent e of `EXPONENTS` to an array (K,) of these values [Pa^e].
     """
     pressure, root = blocks.mean_pressure(), blocks.mean_root()
     return {exponent: pressure ** (2.0 * exponent - 1.0) * root ** (2.0 - 2.0 * exponent) for exponent in EXPONENTS}
@@ -80,16 +81,17 @@ def find_leak_step(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Informa
     """Test for a leak that begins within a recording, with a flow proportional to a power of |p_A - p_B| (its law).
 
     There is one test for each exponent of `EXPONENTS`. Its p-value (`chance`) is divided by the prior probability of
-    the law, and the test with the smallest p-value is returned. The step's size is the mean change of the conductance.
-    `blocks`: the K blocks, with the Gram matrices of the volume balance; `columns`: for each equation the indices of
-    the columns of these matrices by role (leak, motion, left side); `leak`: likelihood of the leak's coefficient in the
-    K blocks. Return None if too few blocks have information.
+    the law, and the test with the smallest p-value is returned. The step's size is the change of the conductance,
+    averaged over the blocks by their information. `blocks`: the K blocks, with the Gram matrices of the volume balance;
+    `columns`: for each equation the indices of the columns of these matrices by role (leak, motion, left side); `leak`:
+    likelihood of the leak's coefficient in the K blocks. Return None if too few blocks have information.
     """
     weights = np.maximum(leak.precision.sum(axis=0), 0.0)
+    shapes = law_shapes(blocks, columns)
     tests = []
-    for shape, prior in zip(law_shapes(blocks, columns).values(), law_priors(), strict=True):
-        mean = float(weights @ shape) / max(float(weights.sum()), _TINY)
-        test = step_test(leak, shape=shape / max(mean, _TINY))
+    for exponent, prior in zip(EXPONENTS, law_priors(), strict=True):
+        mean_shape = float(weights @ shapes[exponent]) / max(float(weights.sum()), _TINY)
+        test = step_test(leak, shape=shapes[exponent] / max(mean_shape, _TINY))
         if test is not None:
             tests.append(test.share_alarms(float(prior)))
     return min(tests, key=lambda test: (test.chance, -test.score), default=None)
@@ -99,7 +101,8 @@ def _growth_priors() -> list[tuple[float, float]]:
     """List possible relative growths of a leak, from its onset to the recording's end, each with its probability."""
     prior = INFERENCE.growth
     growths = prior.most * (np.arange(N_GROWTHS) + 1.0) / N_GROWTHS  # evenly spaced up to the largest
-    return [(0.0, prior.steady), *((float(growth), (1.0 - prior.steady) / N_GROWTHS) for growth in growths)]
+    probability = (1.0 - prior.steady) / N_GROWTHS
+    return [(0.0, prior.steady), *((float(growth), probability) for growth in growths)]
 
 
 def _onset_positions(leak: Information, onsets: NDArray[np.intp]) -> Array:
@@ -114,16 +117,17 @@ def _onset_positions(leak: Information, onsets: NDArray[np.intp]) -> Array:
 def estimate_step_flow(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Information, test: StepTest) -> Flow:
     """Estimate the mean flow [m^3/s] of a leak that begins within a recording, over the time from its onset to the end.
 
-    This mean over time is computed for each hypothesis on the leak: its law (exponent of |p_A - p_B|, `EXPONENTS`), its
-    growth (fraction by which it increases from the onset to the end) and its onset. The result is the mean over the
-    hypotheses, weighted by their probabilities, and the standard deviation of their mixture.
+    This mean over time is computed for each combination of a law (exponent of |p_A - p_B|, `EXPONENTS`), a growth
+    (fraction by which the leak increases from the onset to the end) and an onset. The result is the mean over these
+    combinations, weighted by their probabilities, and the standard deviation of their mixture.
 
     `blocks`: the K blocks, with the pressures and the Gram matrices of the volume balance; `columns`: for each equation
     the indices of the columns of these matrices by role (leak, motion, left side); `leak`: likelihood of the leak's
-    coefficient in the K blocks; `test`: test for a step of it, which gives the onsets; improbable ones are omitted.
+    coefficient in the K blocks; `test`: step test of this coefficient, whose more probable onsets are used.
     """
     onsets = np.flatnonzero(test.weights > NEGLIGIBLE * test.weights.max())
-    positions, rows = _onset_positions(leak, onsets), np.maximum(blocks.rows, 1e-9)
+    positions = _onset_positions(leak, onsets)
+    rows = np.maximum(blocks.rows, 1e-9)
     n_rows_after = np.maximum(rows @ step_shapes(len(blocks), positions), _TINY)
     shapes, unit_flows = law_shapes(blocks, columns), law_flows(blocks)
     log_weights, flows, standard_errors = [], [], []
@@ -140,10 +144,10 @@ def estimate_step_flow(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Inf
 
 
 class LawWeight(NamedTuple):
-    """Weight of one law of a leak, i.e. of one exponent e in flow = C |p_A - p_B|^e.
+    """Probability of one law of a leak, i.e. of one exponent e in flow = C |p_A - p_B|^e, and the flow by this law.
 
-    `flow`: mean flow [m^3/s] under this law if the leak's coefficient rises by 1 m^3/(s Pa); `log_weight`: logarithm
-    of the law's probability, up to a constant.
+    `flow`: mean flow [m^3/s] if the leak's conductance, fitted as if it were laminar, rises by 1 m^3/(s Pa);
+    `log_weight`: logarithm of the law's probability, up to a constant.
     """
 
     flow: float
@@ -155,7 +159,8 @@ def estimate_rise_flow(
 ) -> Flow:
     """Estimate the mean flow [m^3/s] of a leak after its onset, from the leakage above that of healthy recordings.
 
-    The most probable law gives the value; the other laws contribute to its standard deviation.
+    The most probable law gives the value; the other laws contribute to its standard deviation. The value is a mean over
+    the possible onsets.
 
     Parameters
     ----------
@@ -173,6 +178,7 @@ def estimate_rise_flow(
     Returns
     -------
     Flow
+        If every leak is excluded as too large, that of the first law from the start of the recording.
     """
     log_weights, fractions = _weigh_rise_onsets(leak, test, value)
     unit_flows, law_log_weights = np.array(laws).T
@@ -191,10 +197,10 @@ def _weigh_rise_onsets(leak: Information, test: StepTest | None, value: float) -
     """Weigh the possible onsets of a leak whose coefficient has risen by `value` on average over the recording.
 
     Returns the log weight of each onset, and the fraction of the recording's information after it, (o,) each. The first
-    onset is the recording's start, with the fraction 1. A leak that begins later must cause a larger step, `value` /
-    fraction. The weight is the likelihood of such a step relative to no step, divided by the number of onsets. Without
-    a `test`, or if `value` is not positive, only the first onset remains. `leak`: likelihood of the coefficient in the
-    blocks.
+    onset is the recording's start, with log weight 0 and fraction 1. The others are the onsets of `test` with a
+    fraction above `MIN_FRACTION`. A leak that begins later must cause a larger step, `value` / fraction. The weight is
+    the likelihood of such a step relative to no step, divided by the number of onsets. Without a `test`, or if `value`
+    is not positive, only the first onset remains. `leak`: likelihood of the coefficient in the blocks.
     """
     if test is None or not value > 0.0:
         return np.zeros(1), np.ones(1)

@@ -1,7 +1,8 @@
-"""Report of a detector on a recording: observables, i.e. tests of numbers for a change, and measurements of the leak.
+"""Report of a detector on a recording: observables and measurements of the leak.
 
-A provider (`detector.Detector`) estimates numbers from a recording, without a verdict or a threshold. What a change
-of each number means is stated in `decision/events.toml`, and `decision.decide` weighs the reports.
+An observable is the result of testing one quantity for a change. A detector (`detector.Detector`) estimates quantities
+from a recording, without a verdict or a threshold. `decision/events.toml` states what a change of each quantity means,
+and `decision.decide` weighs the reports.
 """
 
 from __future__ import annotations
@@ -19,16 +20,16 @@ from sealscope.diagnosis.verdict.evidence import Cause, LeakCourse, RelativeLeak
 
 @dataclass(frozen=True, kw_only=True)
 class Observable:
-    """Result of a test whether one number that a detector estimates has changed.
+    """Result of a test whether one quantity that a detector estimates has changed.
 
     Parameters
     ----------
     name : str
-        What changed: a term of the volume balance, "noise of the pressures", "RMS of d3 of p_A".
+        Name of the quantity: a term of the volume balance, "noise of the pressures", "RMS of d3 of p_A".
     data : str
-        What it is computed from, such as "volumes", "rise", "drift" or "details", as the patterns in
-        `decision/events.toml` list it, or "plug-in". Observables of the same data are alternative descriptions of one
-        change in it.
+        Kind of data from which the quantity is computed, such as "volumes", "rise", "drift" or "details", as the
+        patterns in `decision/events.toml` list it, or "plug-in". Observables of the same data are alternative
+        descriptions of one change in these data.
     score : float
         Twice the logarithm of the likelihood ratio of the change.
     chance : float
@@ -36,7 +37,7 @@ class Observable:
     onset : Interval, optional
         Time of the change [s]; None for a comparison with other recordings.
     size : float
-        The change, in the observable's own unit; negative for a fall.
+        Amount of the change, in the unit of the quantity; negative for a fall.
     advantage : float
         Twice the log odds of this description over the alternative ones, from sources other than the score, such as a
         prior on its size.
@@ -68,8 +69,8 @@ class Observable:
         """Make the observable of a step, a sudden lasting change, within the recording.
 
         `test`: the best of `n_tests` tests, whose chance is therefore multiplied by their number (Bonferroni);
-        `sign`: -1 for a step down, whose size the test states as positive. `name`, `data` and `advantage` are those
-        of the observable.
+        `sign`: -1 for a step down, whose size the test states as positive. `name`, `data` and `advantage` become the
+        fields of the observable.
         """
         return cls(
             name=name,
@@ -102,8 +103,8 @@ class Remark(NamedTuple):
 class LeakRise(NamedTuple):
     """Rise of the leakage, i.e. the leakage above that of healthy recordings, and its agreement with a step.
 
-    `step_log_ratio`: log likelihood ratio, by the estimated rise, of the rise that the step found within the recording
-    would cause to no rise. It is positive if the rise agrees with the step.
+    `step_log_ratio`: log likelihood ratio of two explanations of the estimated rise. One is the step found within the
+    recording, and the other that the leakage has not risen. It is positive if the rise agrees with the step.
     """
 
     rise: Rise
@@ -140,7 +141,7 @@ class DatedTest(RiseTest, Protocol):
 
 
 class LeakMeasure(Protocol):
-    """Interface of the leakage that one detector measures in a recording: tests, flows and factors, but no verdict."""
+    """Interface of the leakage that one detector measures in a recording: tests and flows, without a verdict."""
 
     @property
     def provider(self) -> str:
@@ -160,10 +161,10 @@ class LeakMeasure(Protocol):
 
     @property
     def flow_factors(self) -> tuple[float, float]:
-        """Smallest and largest true flow of the leak over the stated flow.
+        """Smallest and largest possible ratio of the leak's true flow to the stated flow.
 
-        They differ from 1 if the channels do not show on which path the oil leaks, or how its flow depends on the
-        pressure.
+        The ratios differ from 1 if the channels do not show on which path the oil leaks, or how the flow depends on
+        the pressure.
         """
 
     @property
@@ -176,9 +177,9 @@ class LeakMeasure(Protocol):
 
     @property
     def rise_flow(self) -> Flow | None:
-        """Mean flow [m^3/s] of the leakage above that of healthy recordings, or of the total leakage if there are none.
+        """Mean flow [m^3/s] of the leakage above that of healthy recordings; None if it is unknown.
 
-        None if it is unknown.
+        Without healthy recordings it is the flow of the total leakage.
         """
 
     @property
@@ -211,13 +212,13 @@ class LeakMeasure(Protocol):
     def lpm_per_flow(self) -> float | None:
         """Factor from this detector's flows [m^3/s], computed with an assumed machine, to the true flows [L/min].
 
-        A detector assumes what the rig's file does not state, such as the piston's area or the pump's displacement.
-        None if the true flows cannot be known without it.
+        A detector assumes dimensions that the rig's file does not state, such as the piston's area or the pump's
+        displacement. None if the true flows cannot be known without these dimensions.
         """
 
     @property
     def size_deviation(self) -> float:
-        """Relative standard deviation of the pump's displacement or the piston's area, whichever scales all flows."""
+        """Relative standard deviation of the dimension that scales all flows: pump's displacement or piston's area."""
 
     @property
     def ratio(self) -> Interval | None:
@@ -237,7 +238,7 @@ class LeakMeasure(Protocol):
         """
 
     def total(self, detectable_flow: float | None) -> TotalLeakage | None:
-        """Return the total leakage in the recording, and the smallest detectable leak; None if neither is known.
+        """Return the total leakage in the recording and the smallest detectable leak; None if both are unknown.
 
         `detectable_flow`: flow [m^3/s] of the smallest leak that would be detected if it began within the recording;
         None if that was not tested.
@@ -246,17 +247,20 @@ class LeakMeasure(Protocol):
     def history(self, onset_s: float | None) -> LeakCourse | None:
         """Return the leakage over the time of the recording; None if it is unknown.
 
-        With an onset `onset_s` [s] it is the growth since then, without one (None) the total leakage.
+        With an onset `onset_s` [s] of a leak it is the growth of the leakage since the onset, with None the total
+        leakage.
         """
 
 
 class Ringing(NamedTuple):
     """Facts on the comparison of the pressures' ringing, for a recording whose leakage cannot be measured.
 
-    The ringing is an oscillation, measured by the RMS of wavelet details. `bound`: 95 % upper bound of an undetected
-    change of the logarithm of this RMS; `rate`: sampling rate [Hz]; `healthy`: number of healthy recordings that it was
-    compared with; `is_dated`: true if their dates are known; `unused`: recorded columns that are not assigned to a
-    channel.
+    The ringing is an oscillation, measured by the RMS of wavelet details.
+
+    - `bound`: 95 % upper bound of an undetected change of the logarithm of this RMS;
+    - `rate`: sampling rate [Hz];
+    - `healthy`: number of healthy recordings in the comparison; `is_dated`: true if their dates are known;
+    - `unused`: recorded columns that are not assigned to a channel.
     """
 
     bound: float
@@ -275,7 +279,7 @@ class Observed:
     provider : str
         Name of the detector.
     observables : tuple of Observable
-        Tests of the numbers that the detector estimates.
+        Tests of the quantities that the detector estimates.
     leak : LeakMeasure, optional
         The leakage, if the detector measures it.
     ringing : Ringing, optional

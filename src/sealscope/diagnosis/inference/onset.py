@@ -58,14 +58,14 @@ from sealscope.recordings.recording import Array
 
 #: Probability with which a stated upper bound, or a stated interval, contains the true value.
 BOUND_PROBABILITY = 0.95
-#: Quantiles of the standard normal law for an interval and for an upper bound of this probability: 1.96 and 1.645.
+#: Quantiles of the standard normal distribution for such an interval and such an upper bound: 1.96 and 1.645.
 WITHIN_95 = round(NormalDist().inv_cdf(0.5 + 0.5 * BOUND_PROBABILITY), 2)
 UPPER_95 = round(NormalDist().inv_cdf(BOUND_PROBABILITY), 3)
 #: Minimum number of blocks, for a level, a slope, a step and its standard error.
 MIN_BLOCKS = 5
-#: Number of possible onsets per block, and number of blocks at either end without an onset.
+#: Number of possible onsets per block, and number of blocks at either end of a recording without a possible onset.
 PARTS, EDGE = 5, 2
-#: Grid of the variance q of the random walk over that of the noise, from none.
+#: Grid of the variance q of the random walk over the variance of the noise, from 0 (no walk).
 WALKS = np.concatenate([[0.0], 10.0 ** np.linspace(-4.0, 3.0, 29)])
 #: Log likelihood by which an allowed walk may be less likely than the best one: 99.7 % of chi square(1).
 ALLOWED = 4.5
@@ -77,9 +77,11 @@ class Information(NamedTuple):
     """Likelihood of one coefficient g (K,) in K blocks of a recording: exp(vector g - g precision g / 2).
 
     `time` (K,): middles of the blocks [s]; `precision` (K, K): inverse covariance of the estimates of g; `vector` (K,):
-    precision times these estimates. Scales of priors in the unit of g, infinite if there is none: `level`, standard
-    deviation of the coefficient before the first block; `slope`, standard deviation of a linear change over all blocks;
-    `walk`, scale of a half-Cauchy prior on the standard deviation that a random walk reaches over all blocks.
+    precision times these estimates. Scales of priors, in the unit of g, infinite without a prior:
+
+    - `level`: standard deviation of the coefficient before the first block;
+    - `slope`: standard deviation of a linear change over all blocks;
+    - `walk`: scale of a half-Cauchy prior on the standard deviation that a random walk reaches over all blocks.
     """
 
     time: Array
@@ -173,10 +175,10 @@ class StepTest:
         return bound_steps(self.weights, self.size, self.deviation, probability)
 
     def share_alarms(self, share: float) -> StepTest:
-        """Return this test with its p-value divided by `share`, as one of several tests of which the best counts.
+        """Return this test with its p-value divided by `share`, for use among several tests of which the best counts.
 
-        `share`: fraction of the total false-alarm probability that this test may use. It also applies to the
-        distribution of the score (`law`).
+        `share`: fraction of the total false-alarm probability that this test may use. The distribution of the score
+        (`law`) gets the same share.
         """
         return replace(self, chance=min(1.0, self.chance / share), law=self.law._replace(share=share))
 
@@ -198,8 +200,10 @@ class StepTest:
         The score is twice the logarithm of a likelihood ratio. The result is limited to the range from 0 to 10 000.
         """
         max_score = 1e4  # upper end of the search, with a probability of practically zero
-        if not self.law.chance(0.0) > chance > self.law.chance(max_score):
-            return 0.0 if self.law.chance(0.0) <= chance else max_score
+        if self.law.chance(0.0) <= chance:
+            return 0.0
+        if not chance > self.law.chance(max_score):
+            return max_score
         return find_root(lambda score: self.law.chance(score) - chance, 0.0, max_score)
 
 
@@ -207,13 +211,13 @@ def bound_steps(weights: Array, size: Array, deviation: Array, probability: floa
     """Compute the upper bound of a step: the quantile of its size at `probability`, given that the size is > 0.
 
     `weights`, `size`, `deviation` (k,): for each of k onsets its probability, and the size of the step there with its
-    standard error.
+    standard error. If no step up is possible, the result is 12 standard errors above the largest size, but at least 0.
     """
     from scipy.special import ndtr
 
     deviation = np.maximum(deviation, np.finfo(float).tiny)
     probability_up = float(weights @ ndtr(size / deviation))
-    max_step = float(np.max(size + 12.0 * deviation))  # beyond it the normal law has no probability
+    max_step = float(np.max(size + 12.0 * deviation))  # larger steps have practically no probability
     if not probability_up > 0.0 or not max_step > 0.0:
         return max(max_step, 0.0)
 
@@ -240,7 +244,7 @@ class History(NamedTuple):
         return Interval(value, value - half_width, value + half_width)
 
     def relative_to(self, before: NDArray[np.bool_]) -> History:
-        """Subtract from the coefficient's history its mean over the blocks that are flagged in `before` (K,)."""
+        """Return the history minus its mean over the blocks flagged in `before` (K,); unchanged if there are none."""
         transform = np.eye(len(before)) - before / max(int(np.count_nonzero(before)), 1)
         return History(transform @ self.mean, transform @ self.covariance @ transform.T)
 
@@ -249,24 +253,27 @@ def fit_history(information: Information, test: StepTest | None, *, with_step: b
     """Estimate a coefficient in each block of a recording, as the sum of a level, a slope and a random walk.
 
     `information`: likelihood of the coefficient; `test`: source of the variances of walk and noise. Without a test
-    there is no walk, and with fewer than `MIN_BLOCKS` blocks no slope. `with_step`: add a step at the best onset of
-    `test`.
+    there is no walk and the noise has the variance 1. With fewer than `MIN_BLOCKS` blocks there is no slope.
+    `with_step`: use the variances that were fitted with a step, and add a step at the best onset of `test`.
     """
-    count, time = len(information.time), information.time
-    noise = 1.0 if test is None else test.noise[with_step]  # indexed by False or True
-    columns = [np.ones(count)]
-    if count >= MIN_BLOCKS:
+    time = information.time
+    count = len(time)
+    noise, walk = 1.0, 0.0  # variances
+    if test is not None:
+        noise, walk = test.noise[with_step], test.walk[with_step]  # index 0: fitted without a step, 1: with a step
+    columns = [np.ones(count)]  # level
+    if count >= MIN_BLOCKS:  # slope
         columns.append((np.arange(count) - 0.5 * (count - 1)) / max(count, 1))
     if with_step and test is not None:
         block_s = float(time[1] - time[0]) if count > 1 else 1.0
         columns.append(np.clip((time - test.onsets[test.best]) / block_s + 0.5, 0.0, 1.0))
     n_fixed = len(columns)
-    walk = 0.0 if test is None else test.walk[with_step]
     if walk > 0.0:  # a walk is a step of normal size in each block, of variance `walk`
         columns += list(np.sqrt(walk) * np.tril(np.ones((count, count))).T)
     basis = np.column_stack(columns)
     precision = basis.T @ information.precision @ basis / noise
-    precision[np.arange(n_fixed, basis.shape[1]), np.arange(n_fixed, basis.shape[1])] += 1.0 / noise
+    walk_index = np.arange(n_fixed, basis.shape[1])
+    precision[walk_index, walk_index] += 1.0 / noise  # prior on the steps of the walk
     if count >= MIN_BLOCKS:
         precision[1, 1] += 1.0 / noise / information.slope**2  # prior on the slope
     inverse = _inverse(precision)
@@ -297,7 +304,7 @@ class NullLaw(NamedTuple):
 
         P is the fraction of the unit sphere in m dimensions that lies within a tube about a curve, with a radius that
         follows from the score. The curve consists of the whitened steps at all onsets (see the module for the
-        formula). If the test shares a false-alarm probability with others, P is divided by its share (Bonferroni).
+        formula). If several tests share a false-alarm probability, P is divided by the share of this test (Bonferroni).
         """
         from scipy.special import betainc
 
@@ -321,19 +328,9 @@ def step_test(information: Information, signs: Sequence[float] = (1.0,), shape: 
 def step_tests(information: Information, signs: Sequence[float], shape: Array | None = None) -> list[StepTest]:
     """Test a coefficient for a step up, a step down, or both, each at an unknown onset.
 
-    Parameters
-    ----------
-    information : Information
-        Likelihood of the coefficient in K blocks.
-    signs : sequence of float
-        1 for steps up, -1 for steps down.
-    shape : array of float, shape (K,), optional
-        Change of the coefficient in each block by a unit step, by default 1.
-
-    Returns
-    -------
-    list of StepTest
-        One for each sign; empty if too few blocks have information.
+    `information`: likelihood of the coefficient in K blocks; `signs`: 1 for steps up, -1 for steps down; `shape` (K,):
+    change of the coefficient in each block by a unit step, by default 1. The result has one test for each sign; it is
+    empty if too few blocks have information.
     """
     whitened = _whiten_blocks(information)
     if whitened is None:
@@ -354,23 +351,10 @@ class StepSizes(NamedTuple):
 def step_sizes(information: Information, onsets: NDArray[np.intp], shape: Array, growth: float) -> StepSizes:
     """Estimate the size of a step up of a coefficient, for each of o possible onsets.
 
-    Apart from the step the coefficient follows a random walk, whose likeliest variance is used at each onset.
-
-    Parameters
-    ----------
-    information : Information
-        Likelihood of the coefficient in K blocks.
-    onsets : array of int, shape (o,)
-        Indices of the onsets in `StepTest.onsets`.
-    shape : array of float, shape (K,)
-        Factor on the step in each block, 1 for a step of the coefficient itself.
-    growth : float
-        Relative growth of the step from its onset to the end of the recording, 0 for a constant step.
-
-    Returns
-    -------
-    StepSizes
-        Log likelihood, size and standard error of the step at each onset, shape (o,) each.
+    The coefficient also has a level, a slope and a random walk, whose likeliest variance is used at each onset.
+    `information`: likelihood of the coefficient in K blocks; `onsets` (o,): indices of the onsets in
+    `StepTest.onsets`; `shape` (K,): factor on the step in each block, 1 for a step of the coefficient itself;
+    `growth`: relative growth of the step from its onset to the end of the recording, 0 for a constant step.
     """
     whitened = _whiten_blocks(information)
     assert whitened is not None
@@ -382,9 +366,9 @@ def step_sizes(information: Information, onsets: NDArray[np.intp], shape: Array,
         + whitened.walk_log_priors[:, None]
         - 0.5 * n * np.log(fit.residual_squares / n)
     )
-    best = likelihoods.argmax(axis=0), np.arange(len(onsets))  # the likeliest walk at each onset
-    variances = fit.residual_squares / n / fit.energies
-    return StepSizes(likelihoods[best], (fit.moments / fit.energies)[best], np.sqrt(variances)[best])
+    likeliest_walk = likelihoods.argmax(axis=0), np.arange(len(onsets))  # index (walk, onset)
+    sizes, variances = fit.moments / fit.energies, fit.residual_squares / n / fit.energies
+    return StepSizes(likelihoods[likeliest_walk], sizes[likeliest_walk], np.sqrt(variances)[likeliest_walk])
 
 
 class _StepFits(NamedTuple):
@@ -423,8 +407,8 @@ def _fit_steps(z: Array, steps: Array, eigen: Array) -> _StepFits:
 def _residual_squares(total: Array, moments: Array, energies: Array) -> Array:
     """Compute the residual sum of squares after the fit of a step up, shape (w, o).
 
-    It is computed for w assumed variances of the coefficient's random walk and o onsets; a step down counts as none.
-    `total` (w,): sum of squares before the fit; `moments` and `energies` (w, o): products of the steps with the
+    It is computed for w assumed variances of the coefficient's random walk and o onsets. A step down does not reduce
+    it. `total` (w,): sum of squares before the fit; `moments` and `energies` (w, o): products of the steps with the
     whitened values and with themselves.
     """
     return np.asarray(np.maximum(total[:, None] - np.maximum(moments, 0.0) ** 2 / energies, 1e-12 * total[:, None]))
@@ -433,12 +417,14 @@ def _residual_squares(total: Array, moments: Array, energies: Array) -> Array:
 class _Whitened(NamedTuple):
     """Whitened values z (n,) of a coefficient, i.e. with independent noise of variance 1.
 
-    A constant and a linear change of the coefficient over the blocks (level and slope) do not change z, as these
-    directions are projected out. The components of z are along the eigenvectors of the random walk's covariance.
+    Level and slope of the coefficient over the blocks do not change z, as these directions are projected out. The
+    components of z are along the eigenvectors of the random walk's covariance.
 
-    `transform` (n, K): matrix from the coefficient in K blocks to z; `eigen` (n,): eigenvalues of the random walk's
-    covariance, times the scale `unit`; `positions` (o,): possible onsets, counted in blocks; `onsets` (o,): their times
-    [s]; `walk_log_priors` (w,): log prior of each variance in `WALKS`.
+    - `transform` (n, K): matrix from the coefficient in K blocks to z;
+    - `eigen` (n,): eigenvalues of the random walk's covariance, times the scale `unit`;
+    - `unit`: scale at which walk and noise change z equally on average;
+    - `positions`, `onsets` (o,): possible onsets, counted in blocks, and as times [s];
+    - `walk_log_priors` (w,): log prior of each variance in `WALKS`.
     """
 
     z: Array
@@ -480,8 +466,7 @@ class _Whitening(NamedTuple):
 
     `root` (r,) and `vectors` (K, r): square roots of the non-zero eigenvalues of the precision, and their eigenvectors;
     `complement` (n, r + s): directions orthogonal to level and slope, where s = 1 if a prior on the slope adds one more
-    value, else 0; `basis` (n, n): eigenvectors of the random walk's covariance. The other fields are those of
-    `_Whitened`.
+    value, else 0; `basis` (n, n): eigenvectors of the random walk's covariance. `_Whitened` gets the other fields.
     """
 
     root: Array
@@ -501,7 +486,7 @@ class _Whitening(NamedTuple):
         precision matrix times the estimates, as in `Information`.
         """
         z = (self.vectors.T @ vector) / self.root
-        z = np.append(z, np.zeros(self.complement.shape[1] - len(z)))  # the prior on the slope is one more reading
+        z = np.append(z, np.zeros(self.complement.shape[1] - len(z)))  # a prior on the slope is one more reading of 0
         return _Whitened(
             z=self.basis.T @ (self.complement @ z),
             transform=self.transform,
@@ -522,11 +507,11 @@ def _whiten_blocks(information: Information) -> _Whitened | None:
     time, precision, vector = _prepend_level_prior(information)
     if not np.isfinite(precision).all():
         return None
-    is_unit = np.array_equal(precision, np.eye(len(time)))
-    design = (
-        _unit_whitening(len(time), *information[4:6]) if is_unit else _build_whitening(precision, *information[4:6])
-    )
-    return None if design is None else design.whiten(time, vector)
+    if np.array_equal(precision, np.eye(len(time))):
+        whitening = _unit_whitening(len(time), information.slope, information.walk)
+    else:
+        whitening = _build_whitening(precision, information.slope, information.walk)
+    return None if whitening is None else whitening.whiten(time, vector)
 
 
 @lru_cache(maxsize=16)
@@ -554,7 +539,7 @@ def _build_whitening(precision: Array, slope: float, walk: float) -> _Whitening 
     root = np.sqrt(values[is_informative])
     design = (vectors[:, is_informative] * root).T
     index = np.arange(count)
-    fixed = design @ np.column_stack([np.ones(count), (index - index.mean()) / count])
+    fixed = design @ np.column_stack([np.ones(count), (index - index.mean()) / count])  # level and slope
     if np.isfinite(slope):  # the prior on the slope is one more reading
         fixed = np.vstack([fixed, [0.0, 1.0 / slope]])
         design = np.vstack([design, np.zeros(count)])
@@ -591,11 +576,12 @@ def _prepend_level_prior(information: Information) -> tuple[Array, Array, Array]
     Returns time (K,) [s], precision (K, K) and vector (K,) as in `Information`, where K includes the added block. No
     block is added without such a prior, or if there are fewer than `MIN_BLOCKS` blocks.
     """
-    time, precision, vector, level = information[:4]
+    time, precision, vector, level, _, _ = information
     if not np.isfinite(level) or len(time) < MIN_BLOCKS:
         return time, precision, vector
     with_prior = np.zeros((len(time) + 1, len(time) + 1))
-    with_prior[0, 0], with_prior[1:, 1:] = 1.0 / level**2, precision
+    with_prior[0, 0] = 1.0 / level**2
+    with_prior[1:, 1:] = precision
     return np.concatenate([[2.0 * time[0] - time[1]], time]), with_prior, np.concatenate([[0.0], vector])
 
 
@@ -617,9 +603,10 @@ def _test_step_up(whitened: _Whitened, steps: Array, fits: _StepFits) -> StepTes
     """
     n, walk_log_priors, unit = len(whitened.z), whitened.walk_log_priors, whitened.unit
     weight, total, moments, energies, residual_squares = fits
-    determinant = np.log(weight).sum(axis=1) + 2.0 * walk_log_priors
-    log_likelihood = 0.5 * determinant - 0.5 * n * np.log(total / n)
-    log_likelihood_with_step = 0.5 * determinant[:, None] - 0.5 * n * np.log(residual_squares / n)
+    # of each walk, twice the log of: square root of the determinant of the weights, times the prior
+    twice_log_factor = np.log(weight).sum(axis=1) + 2.0 * walk_log_priors
+    log_likelihood = 0.5 * twice_log_factor - 0.5 * n * np.log(total / n)
+    log_likelihood_with_step = 0.5 * twice_log_factor[:, None] - 0.5 * n * np.log(residual_squares / n)
     walk_without_step = int(log_likelihood.argmax())
     walk, best = np.unravel_index(int(log_likelihood_with_step.argmax()), log_likelihood_with_step.shape)
     score = 2.0 * float(log_likelihood_with_step[walk, best] - log_likelihood[walk_without_step])

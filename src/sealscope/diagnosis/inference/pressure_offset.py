@@ -1,21 +1,21 @@
-"""Constant error of the recorded pressure difference, estimated from a change of the leakage and removed.
+"""Sensor offset (constant error) of the recorded p_A - p_B, estimated from a change of the leakage and removed.
 
-With a constant error z of the sensors, the flow of a leak is g (d - z), where d is the recorded difference p_A - p_B. A
-change of g then also changes the constant flow, by -g z. A small z is a term of every fit (`blocks`). Here z is
-estimated even if it is larger than the pressure difference itself. In block k the Gram matrix determines two numbers:
-g_k, from the dependence of the flow on d within the block, and the flow o_k at the block's mean difference d_k. The
-leak's coefficient has a slow change F a (level and slope), a random walk w, and a step delta whose shape s is 0 before
-the onset and 1 after it. The constant flow has a slow change B b (level, slope and curvature). With the variance kappa
-of the noise and q kappa of the walk in a block,
+With a sensor offset z, the flow of a leak with the coefficient g is g (d - z), where d is the recorded difference
+p_A - p_B. A change of g then also changes the constant flow, by -g z. A small z is a term of every fit (`blocks`). Here
+z is estimated even if it is larger than the pressure difference itself. In block k the Gram matrix determines two
+values: g_k, from the dependence of the flow on d within the block, and the flow o_k at the block's mean difference d_k.
+The leak's coefficient has a slow change F a (level and slope), a random walk w, and a step delta whose shape s is 0
+before the onset and 1 after it. The constant flow has a slow change B b (level, slope and curvature). With the variance
+kappa of the noise and q kappa of the walk in a block,
 
-    g = F a + w + delta s,    o = (d_k - z) g + B b,    cov w = kappa q min(k, l);
+    g_k = F_k a + w_k + delta s_k,    o_k = (d_k - z) g_k + B_k b,    cov(w_k, w_l) = kappa q min(k, l);
 
 F and B are projected out. z maximises its prior times the restricted likelihood, over onsets and (q, kappa). The prior
-is a normal density for good sensors, with small odds of a wide one. The walk may be no larger than the one fitted
+is a normal density for good sensors, with small odds of a wide density. The walk may be no larger than the one fitted
 without z; otherwise z and a free walk would describe changes that no leak explains. The residual of the volume balance
-repeats from cycle to cycle: no more than `size.readings` residuals count as independent. If the leak does not change,
-there is no information on z. It then stays near zero, and no result depends on it. Behind a servo valve both chambers
-have the same leak, step and z, so their whitened rows are stacked.
+repeats from cycle to cycle, so no more than `size.readings` residuals count as independent. If the leak does not
+change, there is no information on z. It then stays near zero, and no result depends on it. Behind a servo valve both
+chambers have the same leak, step and z, so their whitened rows are stacked.
 
 Source: D. A. Harville, J. Am. Statist. Assoc. 72 (1977) 320 (restricted likelihood).
 """
@@ -34,17 +34,17 @@ from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.evaluation.scalar_search import find_minimum
 from sealscope.recordings.recording import Array
 
-#: Number of offsets on the first grid, which spans three standard deviations of the wide prior.
+#: Number of offsets on the first grid, which reaches to three standard deviations of the wide prior on either side.
 N_GRID = 21
 
 
 def remove_pressure_offset(blocks: Blocks, columns: Sequence[ColumnRoles]) -> Blocks:
     """Estimate the sensor offset of p_A - p_B in a recording, and return the blocks after subtracting it.
 
-    `columns`: indices of the columns of each equation's Gram matrix: the leak, the motion, and the left side of the
-    volume balance. The offset has the highest posterior probability. It is subtracted in the Gram matrices and added to
-    `Blocks.zero` [Pa], the offset removed so far. Return the blocks unchanged if an equation has no column for a
-    constant flow, or too few blocks have information.
+    `columns`: for each equation the indices of its columns by role (leak, motion, left side). The offset with the
+    highest posterior probability is subtracted in the Gram matrices and added to `Blocks.zero` [Pa], the offset removed
+    so far. Return the blocks unchanged if an equation has no column for a constant flow, or if too few blocks have
+    information.
     """
     if len(blocks) < MIN_BLOCKS or any(roles.bias is None for roles in columns):
         return blocks
@@ -56,63 +56,64 @@ def remove_pressure_offset(blocks: Blocks, columns: Sequence[ColumnRoles]) -> Bl
     ]
     if not equations:
         return blocks
-    leak_steps, offset_steps, z = (np.concatenate(parts) for parts in zip(*equations, strict=True))
-    unit = columns[0].offset_deviation(columns[0].leak, blocks)
-    offset, gram = unit * _find_relative_offset(leak_steps, unit * offset_steps, z), blocks.gram.copy()
+    leak_steps, flow_offset_steps, residuals = (np.concatenate(parts) for parts in zip(*equations, strict=True))
+    unit = columns[0].offset_deviation(columns[0].leak, blocks)  # [Pa]
+    offset = unit * _find_relative_offset(leak_steps, unit * flow_offset_steps, residuals)
+    gram = blocks.gram.copy()
     for k, roles in enumerate(columns):
         assert roles.bias is not None
-        # (p_A - p_B) dt minus offset dt, in the rows and in the columns of the sums
+        # (p_A - p_B) dt minus offset dt, in the rows and in the columns of the Gram matrices
         gram[:, k, roles.leak] -= offset * gram[:, k, roles.bias]
         gram[:, k, :, roles.leak] -= offset * gram[:, k, :, roles.bias]
     return replace(blocks, gram=gram, zero=blocks.zero + offset)
 
 
-def _find_relative_offset(leak_steps: Array, offset_steps: Array, z: Array) -> float:
+def _find_relative_offset(leak_steps: Array, flow_offset_steps: Array, residuals: Array) -> float:
     """Find the most probable sensor offset of p_A - p_B, in units of its usual standard deviation.
 
-    With the whitened residuals `z` (n,), a leak that steps up by `size` in block k, and S = `leak_steps` - offset
-    `offset_steps`, (n, K) each,
+    `residuals` (n,): whitened residuals. Column k of `leak_steps` and `flow_offset_steps`, (n, K) each: change of the
+    residuals by a unit step, from block k on, of the leak's coefficient and of the constant flow. With
+    S = leak_steps - offset flow_offset_steps, and a leak that steps up by `size` in block k,
 
-        z = size S[:, k] + noise,    cov noise = kappa (I + q S S'),
+        residuals = size S[:, k] + noise,    cov noise = kappa (I + q S S'),
 
-    where q S S' is the random walk of the leak's coefficient. Column k of `leak_steps` and `offset_steps` is the change
-    of z by a unit step, from block k on, of the leak's coefficient and of the constant flow. The likelihood is
-    maximised over size > 0, k, kappa and q, not averaged; `offset_cost` is the prior on the offset. The search is over
-    asinh of the offset, which is linear near zero and logarithmic for large offsets.
+    where q S S' is the random walk of the leak's coefficient. The likelihood is maximised over size > 0, k, kappa and
+    q, not averaged; `offset_cost` is the prior on the offset. The search is over asinh of the offset, which is linear
+    near zero and logarithmic for large offsets.
     """
     usual, far = INFERENCE.zero.pressure, INFERENCE.zero.far
-    # no larger random walk than fits without an offset: else offset and walk describe changes that no leak explains
-    walks = WALKS[: int(_walk_likelihoods(leak_steps, z, WALKS).argmax()) + 1]
+    # only walks up to the best one without an offset: else offset and walk describe changes that no leak explains
+    walks = WALKS[: int(_walk_likelihoods(leak_steps, residuals, WALKS).argmax()) + 1]
 
-    # what the balance leaves repeats from cycle to cycle, so that fewer residuals are independent
-    independent = min(1.0, INFERENCE.size.readings / len(z))
+    # the residual of the balance repeats from cycle to cycle, so not all residuals are independent
+    independent_fraction = min(1.0, INFERENCE.size.readings / len(residuals))
 
     def log_likelihood(position: float) -> float:
         """Compute the log likelihood of a sensor offset, maximised over the leak's step and random walk.
 
-        It is maximised over the block in which the leak steps up, the size of that step, and the variance of the random
-        walk of the leak's coefficient. It is scaled to the number of independent residuals. `position`: asinh of the
-        offset in units of its usual standard deviation.
+        It is scaled to the number of independent residuals. `position`: asinh of the offset in units of its usual
+        standard deviation.
         """
-        return independent * float(_walk_likelihoods(leak_steps - np.sinh(position) * offset_steps, z, walks).max())
+        steps = leak_steps - np.sinh(position) * flow_offset_steps
+        return independent_fraction * float(_walk_likelihoods(steps, residuals, walks).max())
 
     def cost(position: float) -> float:
-        """Compute minus the log posterior density of a sensor offset, up to a constant.
-
-        `position`: asinh of the offset in units of its usual standard deviation.
-        """
+        """Compute minus the log posterior density of a sensor offset, up to a constant, at its asinh `position`."""
         return 0.5 * offset_cost(usual * float(np.sinh(position))) - log_likelihood(position)
 
     positions = np.arcsinh(3.0 * far / usual) * np.linspace(-1.0, 1.0, N_GRID)
-    # start at the maxima of prior and likelihood: a far offset has a high likelihood and a low prior
+    # search about the maxima of prior and likelihood: a far offset has a high likelihood and a low prior
     starts = {N_GRID // 2, int(np.argmax([log_likelihood(position) for position in positions]))}
-    ends = [(positions[max(start - 1, 0)], positions[min(start + 1, N_GRID - 1)]) for start in starts]
-    position, _ = min((find_minimum(cost, *end, 1e-3) for end in ends), key=lambda fit: fit[1])
+    minima = []
+    for start in starts:
+        low, high = positions[max(start - 1, 0)], positions[min(start + 1, N_GRID - 1)]
+        minima.append(find_minimum(cost, low, high, tolerance=1e-3))
+    position, _ = min(minima, key=lambda minimum: minimum[1])  # by the cost
     return float(np.sinh(position))
 
 
 class _WhitenedSteps(NamedTuple):
-    """Whitened residuals `z` (n,), and their changes by unit steps that begin with each of K blocks.
+    """Whitened `residuals` (n,), and their changes by unit steps that begin with each of K blocks.
 
     `leak` (n, K): changes by a step of the leak's coefficient, including the flow at the recorded mean pressure
     difference; `flow_offset` (n, K): changes by a step of the constant flow.
@@ -120,21 +121,21 @@ class _WhitenedSteps(NamedTuple):
 
     leak: Array
     flow_offset: Array
-    z: Array
+    residuals: Array
 
 
 def _whiten_steps(blocks: Blocks, roles: ColumnRoles) -> _WhitenedSteps | None:
     """Whiten the residuals of leak and constant flow in blocks, and their changes by unit steps of both.
 
-    `roles`: indices of the columns of the first equation by role (leak, motion, left side). With the precision P (2 K,
-    2 K) and the vector of the joint likelihood of leak and constant flow in K blocks, z = P^(-1/2) vector has unit
-    noise, and P^(1/2) converts changes of the coefficients to changes of z. Slow changes are projected out: level and
-    slope of the leak, and a quadratic drift of the constant flow (F and B of the module). Return None if the blocks
-    have too little information.
+    `roles`: indices of the columns of the first equation by role (leak, motion, left side). Let P (2 K, 2 K) and
+    `vector` be the precision and the vector of the joint likelihood of leak and constant flow in K blocks. Then
+    P^(-1/2) vector are residuals with unit noise, and P^(1/2) converts changes of the coefficients to changes of the
+    residuals. Slow changes are projected out: level and slope of the leak, and a quadratic drift of the constant flow
+    (F and B of the module). Return None if the blocks have too little information.
     """
     count = len(blocks)
     precision, vector, pressure = estimate_leak_and_bias(blocks, roles)
-    energies = np.diag(precision).reshape(2, count)  # of leak and offset; a block at rest may have none
+    energies = np.diag(precision).reshape(2, count)  # of leak and constant flow; zero in some blocks at rest
     floors = np.maximum(np.finfo(float).eps * energies.max(axis=1), np.finfo(float).tiny)
     scale = np.sqrt(np.maximum(energies, floors[:, None])).ravel()
     values, vectors = np.linalg.eigh(precision / np.outer(scale, scale))
@@ -142,38 +143,40 @@ def _whiten_steps(blocks: Blocks, roles: ColumnRoles) -> _WhitenedSteps | None:
     index = np.linspace(-1.0, 1.0, count)
     trend, drift = (np.polynomial.legendre.legvander(index, degree) for degree in (1, 2))
     trend_and_drift = np.block([[trend, np.zeros_like(drift)], [pressure[:, None] * trend, drift]])
-    if np.count_nonzero(is_informative) < trend_and_drift.shape[1] + MIN_BLOCKS - 2:  # 2: the trend is in both
+    # `MIN_BLOCKS` counts level and slope as well, which are two of the columns of trend and drift
+    if np.count_nonzero(is_informative) < trend_and_drift.shape[1] + MIN_BLOCKS - 2:
         return None
     root = np.sqrt(values[is_informative])
     design = (vectors[:, is_informative] * root).T * scale
     fixed = design @ trend_and_drift
     fixed /= np.maximum(np.linalg.norm(fixed, axis=0), np.finfo(float).tiny)
     complement = np.linalg.qr(fixed, mode="complete")[0][:, fixed.shape[1] :].T  # orthogonal to trend and drift
-    z = complement @ ((vectors[:, is_informative].T @ (vector / scale)) / root)
+    residuals = complement @ ((vectors[:, is_informative].T @ (vector / scale)) / root)
     unit_steps = np.tril(np.ones((count, count)))
     flow_offset = complement @ design[:, count:]
     leak = complement @ design[:, :count] + flow_offset * pressure
-    return _WhitenedSteps(leak @ unit_steps, flow_offset @ unit_steps, z)
+    return _WhitenedSteps(leak @ unit_steps, flow_offset @ unit_steps, residuals)
 
 
-def _walk_likelihoods(steps: Array, z: Array, walks: Array) -> Array:
-    """Compute the log likelihood (w,) of whitened residuals z (n,) for each of w variances q of the random walk.
+def _walk_likelihoods(steps: Array, residuals: Array, walks: Array) -> Array:
+    """Compute the log likelihood (w,) of whitened `residuals` (n,) for each of w variances q of the random walk.
 
-    For each q the best step up and the variance kappa of the noise are fitted. A walk consists of steps of
-    independent sizes in all blocks: cov z = kappa (I + q S S'), with S = `steps` (n, K), the changes of z by unit
-    steps. Along the eigenvectors of S' S it is diagonal. `walks` (w,): values of q, scaled so that a walk with q = 1
-    changes z as much as the noise does on average.
+    For each q the best step up and the variance kappa of the noise are fitted. A walk consists of steps of independent
+    sizes in all blocks. Thus cov residuals = kappa (I + q S S'), with S = `steps` (n, K), the changes of the residuals
+    by unit steps. This covariance is diagonal along S times the eigenvectors of S' S. `walks` (w,): values of q, scaled
+    so that a walk with q = 1 changes the residuals as much as the noise does on average.
     """
     eigen, basis = np.linalg.eigh(steps.T @ steps)
     is_informative = eigen > RANK_TOLERANCE * max(float(eigen[-1]), np.finfo(float).tiny)
-    eigen, basis, n = eigen[is_informative], basis[:, is_informative], len(z)
+    eigen, basis = eigen[is_informative], basis[:, is_informative]
+    n = len(residuals)
     walks = walks * n / max(float(eigen.sum()), np.finfo(float).tiny)
-    variances = 1.0 + walks[:, None] * eigen  # of z along the eigenvectors, over that of the noise
+    variances = 1.0 + walks[:, None] * eigen  # of the residuals along the eigenvectors, over the noise's variance
     directions = steps @ (basis / np.sqrt(eigen))
-    in_span = directions.T @ z
-    off_span = z - directions @ in_span
+    in_span = directions.T @ residuals
+    off_span = residuals - directions @ in_span
     total = float(off_span @ off_span) + (in_span**2 / variances).sum(axis=1)
-    # products of a step from each block on, (w, K), with z and with itself
+    # products of a step from each block on, (w, K), with the residuals and with itself
     moments = (np.sqrt(eigen) * in_span / variances) @ basis.T
     energies = np.maximum((eigen / variances) @ (basis**2).T, np.finfo(float).tiny)
     residual_squares = np.maximum(total - (np.maximum(moments, 0.0) ** 2 / energies).max(axis=1), 1e-9 * total)

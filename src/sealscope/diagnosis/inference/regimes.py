@@ -1,20 +1,22 @@
 """Two hypotheses on the valves while the pump rests: they connect it to the cylinder (open), or cut it off (shut).
 
-If they are open, the leakage of pump and piston is in the volume balance at rest as in motion. If they are shut, the
-pump's flow offset counts in motion only, and its leakage has a coefficient of its own while it moves the piston: at
-rest only the piston leaks. A pump may also turn slowly to hold the load for seconds, and is then connected. The leakage
-of all holds then has a third coefficient within a recording, else a drive that is switched off would look like a leak
-that ends. Where a flow meter measures the flow to the cylinder, its flow alone tells motion from rest. Between
-recordings one coefficient is compared for all rests, since many machines show the piston's leak in such holds alone.
-Both balances select from the same columns, so one set of Gram matrices serves both. Let g be the leakage coefficient
-(of p_A - p_B) in motion and r that at rest; their covariance allows for errors that differ from block to block. With
-open valves r scatters about g; with shut valves and a healthy piston, about zero:
+With open valves, pump and piston leak at rest and in motion, and one coefficient describes both. With shut valves only
+the piston leaks at rest. The pump's leakage while it moves the piston then has a second coefficient, and the pump's
+flow offset counts in motion only. A pump may also turn slowly to hold the load for seconds, and is then connected. The
+leakage of all these holds has a third coefficient within a recording; otherwise a drive that is switched off would look
+like a leak that ends. Between recordings one coefficient is compared for all rests, since many machines show the
+piston's leak only in such holds. If a flow meter measures the flow to the cylinder, only its flow tells motion from
+rest. Both balances select from the same columns, so one set of Gram matrices serves both.
+
+Let g be the leakage coefficient (of p_A - p_B) in motion and r the coefficient at rest; their covariance allows for
+errors that differ from block to block. With open valves r scatters about g; with shut valves and a healthy piston,
+about zero:
 
     log odds = log N(r; 0, V_r + (s g)^2) - log N(r - g; 0, V_(r - g) + (w g)^2),
 
 where V are the variances of the estimates, and s and w the prior scatters of r over g (`shut` and `open` of `[rest]` in
 `priors.toml`). The odds of the recordings of one machine multiply. Since a leaking piston moves r towards g, the
-healthy recordings decide (`shut` in `volumes.detector`).
+healthy recordings decide (`volumes.detector`).
 
 Source: H. White, Econometrica 48 (1980) 817 (covariance where the errors differ).
 """
@@ -39,21 +41,23 @@ def apply_regime(blocks: Blocks, roles: ColumnRoles, shut: bool, has_holds: bool
     """Convert blocks to the volume balance for valves that are open, or `shut`, while the pump rests.
 
     `roles`: indices of the columns of `blocks` by role; they include the leakage of a pump that moves or holds the
-    piston, and the flow offset in motion (`terms.with_rests`). For open valves these columns are dropped from the Gram
-    matrices. For shut valves the flow offset in motion replaces that of all times (`terms.shut_at_rest`). The leakage
-    of a pump that holds the load has a column of its own only with `has_holds`, i.e. if it does so for seconds, and if
-    the pump is off at other times.
+    piston, and the flow offset in motion (`terms.with_rests`).
+
+    - Open valves: these columns are dropped from the Gram matrices.
+    - Shut valves: the flow offset in motion replaces the flow offset of all times (`terms.shut_at_rest`). The column
+      for the leakage of a pump that holds the load remains only with `has_holds` (some hold lasts for seconds), and
+      only if the pump is off at other times. Else it is set to zero.
     """
     names = (*roles.names, "left")
     if not shut:
-        kept = [k for k, name in enumerate(names) if name not in STATES]
-        return replace(blocks, gram=np.asarray(blocks.gram[..., kept, :][..., kept]))
-    bias, held = names.index(MOVING_BIAS), names.index(HOLDING)
-    kept = [bias if name == BIAS else k for k, name in enumerate(names) if name != MOVING_BIAS]
+        columns = [k for k, name in enumerate(names) if name not in STATES]
+        return replace(blocks, gram=np.asarray(blocks.gram[..., columns, :][..., columns]))
+    moving_bias, holding = names.index(MOVING_BIAS), names.index(HOLDING)
+    columns = [moving_bias if name == BIAS else k for k, name in enumerate(names) if name != MOVING_BIAS]
     gram = blocks.gram.copy()
     if not has_holds or _rest_share(blocks, roles, TURNING, HOLDING) < NEGLIGIBLE:
-        gram[..., held, :] = gram[..., held] = 0.0
-    return replace(blocks, gram=np.asarray(gram[..., kept, :][..., kept]))
+        gram[..., holding, :] = gram[..., holding] = 0.0
+    return replace(blocks, gram=np.asarray(gram[..., columns, :][..., columns]))
 
 
 def add_pump_columns(gram: Array, names: Sequence[str]) -> Array:
@@ -65,18 +69,19 @@ def add_pump_columns(gram: Array, names: Sequence[str]) -> Array:
     """
     leak = names.index(LEAK)
     index = [*range(len(names) + 1)]
-    index[leak:leak] = [leak, leak]
+    index[leak:leak] = [leak, leak]  # two copies of the leak's column in front of it
     expanded = np.asarray(gram[:, index][:, :, index])
-    expanded[:, leak + 1] = expanded[:, :, leak + 1] = 0.0
+    holding = leak + 1
+    expanded[:, holding] = expanded[:, :, holding] = 0.0
     return expanded
 
 
 def has_rests(blocks: Blocks, roles: ColumnRoles) -> bool:
     """Return True if the pump or the piston rests in any block.
 
-    More than the fraction `NEGLIGIBLE` of the sum of squares of p_A - p_B must then lie outside of motion. `roles`:
-    indices of the columns of `blocks` by role; they include the leakage of a pump that moves or holds the piston, and
-    the flow offset in motion (`terms.with_rests`).
+    More than the fraction `NEGLIGIBLE` of the sum of squares of p_A - p_B must then come from rests. `roles`: indices
+    of the columns of `blocks` by role; they include the leakage of a pump that moves or holds the piston, and the flow
+    offset in motion (`terms.with_rests`).
     """
     return _rest_share(blocks, roles, TURNING) > NEGLIGIBLE
 
@@ -102,15 +107,16 @@ def shut_odds(blocks: Blocks, roles: ColumnRoles) -> float:
     """
     if not has_rests(blocks, roles) or len(blocks) < 2:
         return 0.0
-    turning, bias = roles.names.index(TURNING), roles.names.index(MOVING_BIAS)
-    columns = [*roles.nuisance, turning, bias]
+    turning, moving_bias = roles.names.index(TURNING), roles.names.index(MOVING_BIAS)
+    columns = [*roles.nuisance, turning, moving_bias]
     coefficients, covariance = _fit_with_robust_covariance(blocks.gram[:, 0], columns, roles.left)
-    rest, extra_in_motion = (columns.index(k) for k in (roles.leak, turning))
-    rest_leak, motion = coefficients[rest], coefficients[rest] + coefficients[extra_in_motion]
-    rest_variance, extra_variance = float(covariance[rest, rest]), float(covariance[extra_in_motion, extra_in_motion])
+    # the leak's coefficient holds at rest; in motion the coefficient of the turning pump is added
+    rest, extra = columns.index(roles.leak), columns.index(turning)
+    rest_leak, motion_leak = coefficients[rest], coefficients[rest] + coefficients[extra]
+    rest_variance, extra_variance = float(covariance[rest, rest]), float(covariance[extra, extra])
     if not (rest_variance > 0.0 and extra_variance > 0.0):
         return 0.0
-    odds = rest_log_odds(rest_leak, rest_variance, motion, extra_variance)
+    odds = rest_log_odds(rest_leak, rest_variance, motion_leak, extra_variance)
     max_odds: float = INFERENCE.rest.most
     return float(np.clip(odds, -max_odds, max_odds))
 
@@ -122,9 +128,9 @@ def rest_log_odds(value: float, variance: float, motion: float, difference_varia
 
         log odds = log N(r; variance + (s g)^2) - log N(r - g; difference_variance + (w g)^2).
 
-    `variance` and `difference_variance` are those of the errors of r and of r - g; s and w are the prior scatters over
-    g (`rest.shut` and `rest.open` of `priors.toml`). All leakages are conductances [m^3/(s Pa)], or all are flows
-    [m^3/s].
+    `variance` and `difference_variance` are the variances of the errors of r and of r - g. s and w are the prior
+    scatters of r relative to g (`rest.shut` and `rest.open` of `priors.toml`). All leakages are conductances
+    [m^3/(s Pa)], or all are flows [m^3/s].
     """
     prior = INFERENCE.rest
     shut = _normal_log_density(value, variance + (prior.shut * motion) ** 2)

@@ -2,26 +2,30 @@
 
 The Gram matrices of the healthy recordings, without the flow's offset, are added up and give the coefficients of all
 terms of the volume balance. A recording's residual under these coefficients, projected on the leak's column, is its
-rise. Its other coefficients may differ from the healthy ones within a prior. The rise r_j of each healthy recording
-over the n - 1 others measures the scatter, including all effects that the model does not describe: y_j = r_j (n - 1)/n.
-For the judged recording y is its rise.
+rise. The recording's other coefficients may differ from the healthy ones within a prior. The rise r_j of each healthy
+recording over the n - 1 others measures the scatter, including all effects that the model does not describe. The
+comparison uses y_j = r_j (n - 1)/n, the rise over the mean of all n, and for the judged recording y, its rise.
 
-The width of that prior is known only to within a factor: one machine, held at one temperature, repeats its
-coefficients to a thousandth; another changes by a tenth from run to run. With too narrow a prior the rises scatter,
-with too wide a prior they are imprecise. Therefore y is computed for several widths, each weighted by its prior and
-by the likelihood of the healthy recordings, p(y_1 .. y_n).
+The width of the prior on the other coefficients is known only to within a factor: one machine, held at one temperature,
+repeats its coefficients to a thousandth; another changes by a tenth from run to run. With too narrow a prior the rises
+scatter, with too wide a prior they are imprecise. Therefore y is computed for several widths, each weighted by its
+prior and by the likelihood of the healthy recordings, p(y_1 .. y_n).
 
 Leakage is proportional to the inverse of the oil's viscosity. Levels that are clearly above zero are therefore compared
-as logarithms: z = asinh(a / 2 c), where a = mean level + y is a recording's level and c, from the errors of a, the
-level below which z is linear. For each width all z are normal about an unknown mean. Their covariance is sigma^2 on the
-diagonal plus one of several candidates. sigma has a log-uniform prior from a recording's standard error to a tenth of
-the flow, so five recordings that agree allow a smaller sigma than two do. Recordings of one session share oil and
-set-up (sessions are told by date; undated recordings form one session): the deviation tau of a session has a
-half-normal prior. If the oil's temperature T is known for all recordings, z has a slope in T with a prior, and a
-recording with oil outside of the known range is less certain. Otherwise the viscous pressure drop of the motion
-(`changes.viscous_drop`) may show the oil's viscosity, or tau covers its effect. Load and speed outside of the known
-range also make a recording less certain. The rise follows the mixture over all of these. The priors are in
-`priors.toml`.
+as logarithms: z = asinh(a / 2 c). Here a = mean level + y is the level (leak coefficient) of a recording, and c, which
+follows from the errors of a, is the level below which z is linear. For each width all z are normal about an unknown
+mean. These effects contribute to their covariance:
+
+- Scatter of single recordings: sigma^2 on the diagonal. sigma has a log-uniform prior from a recording's standard error
+  to a tenth of the flow, so five recordings that agree allow a smaller sigma than two do.
+- Sessions: recordings of one session share oil and set-up. The deviation tau of a session has a half-normal prior.
+  Sessions are separated by date; undated recordings form one session.
+- Oil: if its temperature T is known for all recordings, z has a slope in T with a prior, and a recording with oil
+  outside of the known range is less certain. Otherwise the viscous pressure drop of the motion
+  (`changes.viscous_drop`) may show the oil's viscosity, or tau covers its effect.
+- Conditions: load and speed outside of the known range make a recording less certain.
+
+The rise follows the mixture over all of these. The priors are in `priors.toml`.
 
 Source: A. Gelman et al., Bayesian Data Analysis, 3rd ed. (2013), sections 3.2, 5.4 and 5.7; C. E. Rasmussen and C. K.
 I. Williams, Gaussian Processes for Machine Learning (2006), section 2.7 (an unknown mean).
@@ -46,7 +50,7 @@ from sealscope.recordings.recording import Array
 
 #: `Observable.data` of the leakage against healthy recordings.
 RISE = "rise"
-#: Number of grid points of a standard deviation.
+#: Number of points of each grid, of standard deviations or of rises.
 NODES = 32
 #: Largest standard deviation between sessions on the grid, over its prior.
 MAX_SESSION_RATIO = 3.0
@@ -60,9 +64,13 @@ MIN_WITH_HOLDS = 2
 MAX_LOG = 4.0
 #: Lower limit of divisors and of arguments of logarithms.
 TINY = 1e-300
-#: Number of narrower normal laws that replace one of z, their relative width, limit of abs(z), negligible log weight.
-PARTS, PART_WIDTH, MAX_Z, NEGLIGIBLE = 7, 0.5, 30.0, 16.0
-#: Size of the sample of a large mixture's laws whose quantile starts the search, and step for the slope there.
+#: A normal distribution of z is replaced by this number of narrower ones, with this fraction of its deviation.
+PARTS, PART_WIDTH = 7, 0.5
+#: Limit of abs(z).
+MAX_Z = 30.0
+#: Parts of a mixture are omitted if their log weight is lower than the largest by more than this.
+NEGLIGIBLE = 16.0
+#: Number of parts of a large mixture that give the first estimate of a quantile, and step for the slope there.
 SAMPLED, SLOPE_STEP = 1000, 1e-3
 
 
@@ -77,23 +85,25 @@ class Mixture(NamedTuple):
         """Compute the quantile of the mixture: the value below which it lies with the given probability."""
         from scipy.special import ndtr, ndtri
 
+        # a typical deviation, in units of which the quantile is of the order of one
         scale = max(float(self.weights @ np.minimum(self.deviations, 1e3 * self.deviations.min())), TINY)
         scaled = self._replace(centres=self.centres / scale, deviations=self.deviations / scale)
 
-        def excess(value: float, laws: Mixture = scaled) -> float:
+        def excess(value: float, mixture: Mixture = scaled) -> float:
             """Compute the probability of values below `value`, minus the wanted `probability`."""
-            return float(laws.weights @ ndtr((value - laws.centres) / laws.deviations)) - probability
+            return float(mixture.weights @ ndtr((value - mixture.centres) / mixture.deviations)) - probability
 
         part_quantiles = scaled.centres + ndtri(probability) * scaled.deviations
-        low, high = float(part_quantiles.min()), float(part_quantiles.max())
+        low, high = float(part_quantiles.min()), float(part_quantiles.max())  # the quantile is between them
         root = None
-        if len(self.weights) > 4 * SAMPLED:  # begin at the quantile of a sample of the laws
-            weights, deviations, centres = (part[:: len(part) // SAMPLED] for part in scaled)
-            sample = partial(excess, laws=Mixture(weights / weights.sum(), deviations, centres))
-            if sample(low) < 0.0 < sample(high):
-                start = find_root(sample, low, high)
-                slope = (sample(start + SLOPE_STEP) - sample(start - SLOPE_STEP)) / (2.0 * SLOPE_STEP)
-                root = find_near_root(excess, start, slope, low, high)
+        if len(self.weights) > 4 * SAMPLED:  # begin at the quantile of a sample of the normal distributions
+            weights, deviations, centres = (values[:: len(values) // SAMPLED] for values in scaled)
+            sample = Mixture(weights / weights.sum(), deviations, centres)
+            sample_excess = partial(excess, mixture=sample)
+            if sample_excess(low) < 0.0 < sample_excess(high):
+                start = find_root(sample_excess, low, high)
+                difference = sample_excess(start + SLOPE_STEP) - sample_excess(start - SLOPE_STEP)
+                root = find_near_root(excess, start, difference / (2.0 * SLOPE_STEP), low, high)
         if root is None:
             root = low if not excess(low) < 0.0 < excess(high) else find_root(excess, low, high)
         return scale * root
@@ -103,9 +113,9 @@ class Rise(NamedTuple):
     """Amount by which a recording's leak coefficient exceeds that of healthy recordings, with its distribution.
 
     `value`: the estimate, and `deviation`: its standard deviation, both in the unit of the coefficient (of a laminar
-    leak m^3/(s Pa)). In a healthy recording `value` has the distribution `mixture`; if that is None, it is `deviation`
-    times a Student's t variable of `degrees_of_freedom`. `may_be_partial`: the leak may have begun within the
-    recording, whose mean then contains only a part of the rise.
+    leak m^3/(s Pa)). In a healthy recording `value` has the distribution `mixture`. If `mixture` is None, `value` over
+    `deviation` has Student's t distribution with `degrees_of_freedom`. `may_be_partial`: the leak may have begun within
+    the recording, whose mean then contains only a part of the rise.
     """
 
     value: float
@@ -117,7 +127,7 @@ class Rise(NamedTuple):
     def widen(self, variance: float) -> Rise:
         """Return the rise with an additional independent error of the given variance, in the square of its unit.
 
-        The variance is added to the variances of the rise and of each normal distribution of its mixture. The rise
+        The variance is added to the variance of the rise and to the variance of each part of its mixture. The rise
         remains unchanged if it has no mixture, or if the variance is not positive.
         """
         if self.mixture is None or not variance > 0.0:
@@ -158,7 +168,8 @@ class Rise(NamedTuple):
         """Compute the log likelihood ratio of a true rise of the leak's coefficient by `rise` to no rise.
 
         Both are compared with the estimate `value`, in whose unit `rise` is. `log_deviation`: standard deviation of
-        the logarithm of the true rise about log(`rise`); 0 if the true rise is known to be `rise`.
+        the logarithm of the true rise about log(`rise`); 0 if the true rise is known to be `rise`. In the latter case
+        the estimate may contain any fraction of the rise if `may_be_partial`.
         """
         if log_deviation > 0.0 and rise > 0.0:
             return self._log_ratio_lognormal(rise, log_deviation)
@@ -182,8 +193,8 @@ class Rise(NamedTuple):
         Each of the two densities of `value` is at least the density at the quantiles `tail` and 1 - `tail` of a healthy
         recording. Thus an estimate that neither a healthy recording nor the rise predicts is evidence for neither.
         """
-        tail_rises = [self.threshold(chance) * self.deviation for chance in (tail, 1.0 - tail)]
-        min_log_density = min(self._log_density(rise) for rise in tail_rises)
+        tail_values = [self.threshold(chance) * self.deviation for chance in (tail, 1.0 - tail)]
+        min_log_density = min(self._log_density(value) for value in tail_values)
         log_densities = [max(self._log_density(error), min_log_density) for error in (self.value - rise, self.value)]
         return log_densities[0] - log_densities[1]
 
@@ -199,17 +210,15 @@ class Rise(NamedTuple):
         )
         grid = np.unique(grid[grid > TINY])
         prior = -0.5 * (np.log(grid / rise) / log_deviation) ** 2 - np.log(grid * log_deviation * np.sqrt(2.0 * np.pi))
-        logarithms = (
-            prior + [self._log_density(self.value - true_rise) for true_rise in grid] - self._log_density(self.value)
-        )
-        log_max = float(logarithms.max())
-        return log_max + float(np.log(max(np.trapezoid(np.exp(logarithms - log_max), grid), TINY)))
+        log_densities = [self._log_density(self.value - true_rise) for true_rise in grid]
+        log_integrand = prior + log_densities - self._log_density(self.value)
+        log_max = float(log_integrand.max())
+        return log_max + float(np.log(max(np.trapezoid(np.exp(log_integrand - log_max), grid), TINY)))
 
     def _log_density(self, value: float) -> float:
         """Compute the log probability density at `value` of the estimated rise if the recording is healthy.
 
-        The rise is that of the leak's coefficient over the healthy recordings; `value` is in the unit of this
-        coefficient. A constant is left out.
+        `value` is in the unit of the leak's coefficient. A constant is left out.
         """
         if self.mixture is None:
             z = value / self.deviation
@@ -235,18 +244,19 @@ class Rise(NamedTuple):
     def interval(self, probability: float = BOUND_PROBABILITY) -> tuple[float, float]:
         """Compute the central interval (low, high) that contains the true rise of the leakage with a probability."""
         tail = 0.5 - 0.5 * probability
-        high, low = (self.threshold(chance) * self.deviation for chance in (tail, 1.0 - tail))
-        return self.value - high, self.value - low
+        max_error, min_error = (self.threshold(chance) * self.deviation for chance in (tail, 1.0 - tail))
+        return self.value - max_error, self.value - min_error
 
 
 class RecordingSums(NamedTuple):
     """Summary of one recording, for the comparison with other recordings of the same machine.
 
-    `sums` (E, m, m): Gram matrix of the m columns of each of E equations, divided by the residual variance of a row,
-    with the flow's offset eliminated. `flow`: mean magnitude of the pump's flow [m^3/s]; `pressure`: mean magnitude of
-    p_A - p_B [Pa]. The others are None if unknown: `start_s`, date [s since 1970]; `oil_degC`, temperature of the oil;
-    `held` (6,), leaks while shut valves hold the load, as `locked_holds.HeldLeaks`; `viscous_drop` (2,), logarithm of
-    the pressure drop due to motion over the speed, and its standard error.
+    - `sums` (E, m, m): Gram matrix of the m columns of each of E equations, divided by the residual variance of a row,
+      with the flow's offset eliminated;
+    - `flow`, `pressure`: mean magnitudes of the pump's flow [m^3/s] and of p_A - p_B [Pa];
+    - `start_s`, `oil_degC`: date [s since 1970] and temperature of the oil, None if unknown;
+    - `held` (6,): leaks while shut valves hold the load, in the order of `locked_holds.HeldLeaks`, or None;
+    - `viscous_drop` (2,): logarithm of (pressure drop due to motion / speed) and its standard error, or None.
     """
 
     sums: Array
@@ -273,14 +283,13 @@ class RecordingSums(NamedTuple):
         are.
         """
         weights = np.maximum(blocks.rows, 1e-9)
-        flow, pressure = (
-            float(np.average(values, weights=weights)) for values in (blocks.flow, blocks.mean_pressure())
-        )
+        flow = float(np.average(blocks.flow, weights=weights))
+        pressure = float(np.average(blocks.mean_pressure(), weights=weights))
         return cls(_eliminate_unshared(sum_blocks(blocks, columns), columns), flow, pressure, start_s, oil_degC)
 
 
 def _conductance_of_flow(recording: RecordingSums) -> float:
-    """Compute the conductance [m^3/(s Pa)] of a leak as large as the pump's mean flow; 0 without pressure."""
+    """Compute the conductance [m^3/(s Pa)] of a leak as large as the pump's mean flow; 0 if the mean pressure is 0."""
     return recording.flow / recording.pressure if recording.pressure > 0.0 else 0.0
 
 
@@ -292,12 +301,11 @@ def rise(judged: RecordingSums, baseline: Sequence[RecordingSums], columns: Sequ
     for all recordings. The rise and its standard deviation are in the unit of the leak's coefficient, for the laminar
     leak m^3/(s Pa).
     """
-    healthy_sums, count = np.sum([recording.sums for recording in baseline], axis=0), len(baseline)
-    prior, conductance_of_flow = INFERENCE.scatter, _conductance_of_flow(judged)
-    exponents = np.linspace(-MAX_SCALE, MAX_SCALE, SCALES)
-    widths = prior.between**exponents
+    healthy_sums = np.sum([recording.sums for recording in baseline], axis=0)
+    count, prior = len(baseline), INFERENCE.scatter
+    widths = prior.between ** np.linspace(-MAX_SCALE, MAX_SCALE, SCALES)
     rises, rise_errors = np.zeros((SCALES, count)), np.zeros((SCALES, count))
-    if count > 1:  # of each healthy recording over the others, scaled to its rise over the mean of all
+    if count > 1:  # rises of each healthy recording over the others, scaled to its rise over the mean of all
         projections = [
             _project_on_leak(recording.sums, healthy_sums - recording.sums, columns, widths) for recording in baseline
         ]
@@ -307,22 +315,24 @@ def rise(judged: RecordingSums, baseline: Sequence[RecordingSums], columns: Sequ
     values, error = _project_on_leak(judged.sums, healthy_sums, columns, widths)
     level, level_error = _leak_level(healthy_sums, columns)
     errors = prior.estimate * np.median(np.column_stack([error, rise_errors]), axis=1)
-    errors = np.maximum(errors, max(prior.finest * conductance_of_flow, 1.0 / MAX_READING))
+    errors = np.maximum(errors, max(prior.finest * _conductance_of_flow(judged), 1.0 / MAX_READING))
     return _compare_levels(judged, baseline, _Estimates(values, rises, errors, level, level_error))
 
 
 def held_rise(judged: RecordingSums, baseline: Sequence[RecordingSums]) -> Rise | None:
-    """Estimate the rise of the leakage past the piston over healthy recordings, from the times of a held load (holds).
+    """Estimate the rise of the leakage past the piston over healthy recordings, from holds.
 
-    In a hold shut valves keep the load in place. `judged`: summary of the recording; `baseline`: those of the healthy
-    ones. The leak may have begun within the recording, whose mean then contains only a part of it. Return None if the
-    judged recording has no holds, or fewer than `MIN_WITH_HOLDS` healthy ones have any.
+    A hold is a time in which shut valves keep the load in place. `judged`: summary of the recording; `baseline`:
+    summaries of the healthy recordings. The leak may have begun within the recording, whose mean then contains only a
+    part of it (`Rise.may_be_partial`). Return None if the judged recording has no holds, or if fewer than
+    `MIN_WITH_HOLDS` healthy recordings have holds.
     """
     baseline = [recording for recording in baseline if recording.held is not None]
     if judged.held is None or len(baseline) < MIN_WITH_HOLDS:
         return None
     healthy = np.array([recording.held for recording in baseline])
-    healthy_leaks, healthy_errors = healthy[:, :2].T  # `HeldLeaks`: leak past the piston, and its standard deviation
+    # the first two values of `HeldLeaks`: leak past the piston, and its standard deviation
+    healthy_leaks, healthy_errors = healthy[:, :2].T
     leak, leak_error = judged.held[:2]
     level = float(healthy_leaks.mean())
     conductance_of_flow = _conductance_of_flow(judged)
@@ -336,8 +346,9 @@ def held_rise(judged: RecordingSums, baseline: Sequence[RecordingSums]) -> Rise 
         level_error=error / np.sqrt(len(baseline)),
         min_crossover=INFERENCE.scatter.largest * conductance_of_flow,
     )
-    rise = _compare_levels(judged, baseline, estimates)
-    return rise.widen(float(leak_error) ** 2 - float(error) ** 2)._replace(may_be_partial=True)
+    held = _compare_levels(judged, baseline, estimates)
+    # `error` is included already; a less precise judged recording adds the difference
+    return held.widen(float(leak_error) ** 2 - float(error) ** 2)._replace(may_be_partial=True)
 
 
 class _Estimates(NamedTuple):
@@ -358,7 +369,7 @@ class _Estimates(NamedTuple):
 
 
 def _compare_levels(judged: RecordingSums, baseline: Sequence[RecordingSums], estimates: _Estimates) -> Rise:
-    """Estimate by how much the judged leak coefficient exceeds the one that the healthy recordings predict.
+    """Estimate by how much the judged leak coefficient exceeds the coefficient that the healthy recordings predict.
 
     `estimates`: rises of all recordings over the healthy mean. A level is the leak coefficient of one recording. Levels
     are compared as z = asinh(level / 2 c), which is logarithmic for large levels (`_LevelScale`) and normal about an
@@ -368,6 +379,7 @@ def _compare_levels(judged: RecordingSums, baseline: Sequence[RecordingSums], es
     values, rises, errors, level, level_error, min_crossover = estimates
     prior = INFERENCE.scatter
     conductance_of_flow = _conductance_of_flow(judged)
+    # log widths of the prior on the other coefficients, in standard deviations; estimates from holds have no such prior
     exponents = np.linspace(-MAX_SCALE, MAX_SCALE, SCALES) if len(values) == SCALES else np.zeros(len(values))
     recordings = [*baseline, judged]
     oils = _oil_hypotheses(recordings)
@@ -384,7 +396,7 @@ def _compare_levels(judged: RecordingSums, baseline: Sequence[RecordingSums], es
     max_sigma = np.maximum(max_relative, 10.0 * steepness * errors)
     sigma = np.geomspace(steepness * errors, max_sigma, NODES, axis=1)
     transformed, healthy = scale.transform(values), scale.transform(rises)
-    # log Jacobian of z, and log prior of the width
+    # log Jacobian of z, plus log prior of the width
     estimate_logarithms = np.log(scale.slope(level + rises)).sum(axis=1) - 0.5 * exponents**2
     predictions = []
     for oil in oils:
@@ -395,14 +407,13 @@ def _compare_levels(judged: RecordingSums, baseline: Sequence[RecordingSums], es
             session_deviation=steepness * prior.session * conductance_of_flow,
             condition_deviation=relative_slope * (excess * INFERENCE.conditions.leak),
         )
-        shifts = relative_slope * oil.thinning
+        shifts = relative_slope * oil.thinning  # effect of the oil on z
         predicted = Population(*candidates).predict(
             transformed - shifts[-1], healthy - shifts[:-1], sigma, estimate_logarithms + oil.log_probability
         )
         predictions.append(scale.to_levels(predicted, transformed))
-    return _rise_of_mixture(
-        Mixture(*(np.concatenate(parts, axis=1) for parts in zip(*predictions, strict=True))), values
-    )
+    all_oils = Mixture(*(np.concatenate(parts, axis=1) for parts in zip(*predictions, strict=True)))
+    return _rise_of_mixture(all_oils, values)
 
 
 def _candidate_covariances(
@@ -435,24 +446,25 @@ def _candidate_covariances(
     log_priors = 0.5 * np.log(ratios) - 0.5 * ratios**2
     if len(set(sessions)) == 1:
         ratios, log_priors = np.zeros(1), np.zeros(1)
-    by_unknown_oil = relative_slope * oil.session_deviation
-    session_variances = (np.hypot(by_unknown_oil, session_deviation) * ratios) ** 2
-    # recordings of one session share its deviation; the predicted effect of the oil has errors of slope and value
+    oil_deviation = relative_slope * oil.session_deviation  # of z between sessions, by unknown oil
+    session_variances = (np.hypot(oil_deviation, session_deviation) * ratios) ** 2
+    # recordings of one session share its deviation
     covariances = session_variances[:, None, None] * np.equal.outer(np.array(sessions), np.array(sessions))
+    # the predicted effect of the oil has errors of its slope and of its values
     covariances = covariances + np.outer(oil.thinning, oil.thinning) * (relative_slope * oil.slope_deviation) ** 2
     covariances += np.diag(relative_slope**2 * oil.variances)
     covariances[:, -1, -1] += condition_deviation**2
-    if by_unknown_oil > 0.0 and sessions[-1] not in sessions[:-1]:
-        # the oil of the judged recording's day is like that of the known days, or unlike it
+    if oil_deviation > 0.0 and sessions[-1] not in sessions[:-1]:
+        # two cases: the oil in the judged recording's session is like the oil in the healthy sessions, or unlike it
         unlike = INFERENCE.scatter.unlike
         log_priors = (np.log([[1.0 - unlike], [unlike]]) + log_priors).ravel()
         covariances = np.tile(covariances, (2, 1, 1))
-        covariances[len(ratios) :, -1, -1] += 2.0 * by_unknown_oil**2
+        covariances[len(ratios) :, -1, -1] += 2.0 * oil_deviation**2
     return covariances, log_priors
 
 
 class _LevelScale(NamedTuple):
-    """Transform z = asinh(a / 2 c) of a leak coefficient a: logarithmic for a far above c, linear for a far below.
+    """Transform z = asinh(a / 2 c) of a leak coefficient a: logarithmic for a far above c, linear for a far below c.
 
     `level`: mean coefficient of the healthy recordings; `crossover`: c. Both are in the unit of the coefficient.
     """
@@ -495,18 +507,19 @@ def _rise_of_mixture(predicted: Mixture, values: Array) -> Rise:
     """Estimate the rise of a judged value over the value that healthy recordings predict for it.
 
     `values` (s,): the judged value by s alternative estimates; `predicted`: mixture of predicted values of shape
-    (s, ...), for each of these estimates along the first axis, with log weights over all. The rise follows the mixture
-    over all estimates.
+    (s, ...), for each of these estimates along the first axis, with log weights. The difference of judged and predicted
+    value follows the mixture over all estimates. The rise is its median, and the standard deviation half of its central
+    68 % interval.
     """
-    offset = np.reshape(values, (-1, *[1] * (predicted.centres.ndim - 1)))
-    logs, deviations, centres = (
-        part.ravel() for part in (predicted.weights, predicted.deviations, predicted.centres - offset)
-    )
-    is_counted = logs > logs.max() - NEGLIGIBLE
-    weights = np.exp(logs[is_counted] - logs.max())
-    mixture = Mixture(weights / weights.sum(), deviations[is_counted], centres[is_counted])
-    low, middle, high = (mixture.quantile(probability) for probability in (0.16, 0.5, 0.84))
-    return Rise(-middle, 0.5 * (high - low), np.inf, mixture._replace(centres=mixture.centres - middle))
+    judged = np.reshape(values, (-1, *[1] * (predicted.centres.ndim - 1)))
+    log_weights, deviations = predicted.weights.ravel(), predicted.deviations.ravel()
+    centres = (predicted.centres - judged).ravel()
+    is_counted = log_weights > log_weights.max() - NEGLIGIBLE
+    weights = np.exp(log_weights[is_counted] - log_weights.max())
+    mixture = Mixture(weights / weights.sum(), deviations[is_counted], centres[is_counted])  # predicted minus judged
+    low, median, high = (mixture.quantile(probability) for probability in (0.16, 0.5, 0.84))
+    errors = mixture._replace(centres=mixture.centres - median)
+    return Rise(value=-median, deviation=0.5 * (high - low), degrees_of_freedom=np.inf, mixture=errors)
 
 
 class UnusualCondition(NamedTuple):
@@ -525,12 +538,13 @@ class UnusualCondition(NamedTuple):
 
 
 def find_unusual_conditions(judged: RecordingSums, baseline: Sequence[RecordingSums]) -> list[UnusualCondition]:
-    """List the conditions (load, speed, oil temperature) of a recording that no healthy recording has covered.
+    """List the conditions (load, speed, oil temperature) of a recording outside of the range of healthy recordings.
 
-    A condition counts once it lies outside of the healthy range by more than a tolerance (`conditions` in
-    `priors.toml`).
+    A condition counts if it lies outside of the healthy range by more than a tolerance (`conditions` in
+    `priors.toml`). Unknown temperatures are not compared, nor loads (or speeds) if any of them is 0.
     """
-    allowed, unusual = INFERENCE.conditions, list[UnusualCondition]()
+    allowed = INFERENCE.conditions
+    unusual: list[UnusualCondition] = []
     loads_and_speeds = (
         ("load", judged.pressure, [healthy.pressure for healthy in baseline]),
         ("speed", judged.flow, [healthy.flow for healthy in baseline]),
@@ -553,9 +567,9 @@ def find_unusual_conditions(judged: RecordingSums, baseline: Sequence[RecordingS
 def leak_deviations_from_mean(recordings: Sequence[RecordingSums], columns: Sequence[ColumnRoles]) -> Array:
     """Compute the deviation of each recording's leak coefficient from the mean of all n recordings, shape (n,).
 
-    deviation = (n - 1)/n (its coefficient - the common coefficient of the other n - 1 recordings). The coefficients of
-    all other terms may differ between recordings within the usual prior. `columns`: for each equation the indices of
-    its columns by role (leak, motion, left side).
+    It is (n - 1)/n times the difference of the recording's coefficient from the common coefficient of the other n - 1
+    recordings. The coefficients of all other terms may differ between recordings within the usual prior. `columns`: for
+    each equation the indices of its columns by role (leak, motion, left side).
     """
     usual_width = np.ones(1)
     all_sums = np.sum([recording.sums for recording in recordings], axis=0)
@@ -579,17 +593,18 @@ class Population:
 
     def __init__(self, candidates: Array, log_priors: Array) -> None:
         n = candidates.shape[1] - 1
-        # a sample of the healthy values, which limits the time; covariances along the eigenvectors of the sample's
+        # only a sample of the healthy values is used, which limits the time
         self._sample = np.unique(np.linspace(0, n - 1, min(n, MAX_RECORDINGS)).astype(int))
         healthy = candidates[:, self._sample[:, None], self._sample]
         eigen, basis = np.linalg.eigh(healthy)
-        self._eigen, self._basis = np.maximum(eigen, 0.0)[:, None], basis  # (g, 1, n): 1 for the nodes of sigma
+        # the other quantities are stored along these eigenvectors; axes (g, 1, n): 1 for the nodes of sigma
+        self._eigen, self._basis = np.maximum(eigen, 0.0)[:, None], basis
         self._cross = np.einsum("gij,gi->gj", basis, candidates[:, self._sample, n])[:, None]
         self._ones = basis.sum(axis=1)[:, None]
         self._judged_variance, self._log_priors = candidates[:, n, n, None], log_priors[:, None]
 
     def rise(self, values: Array, healthy_values: Array, prior_sigma: float, freedom: float) -> Rise:
-        """Estimate by how much the judged value exceeds its prediction from the healthy values, of unknown scatter.
+        """Estimate by how much the judged value exceeds its prediction from healthy values of unknown scatter.
 
         Parameters
         ----------
@@ -611,7 +626,7 @@ class Population:
         sums_of_squares = freedom * prior_sigma**2 + np.sum(
             (healthy - healthy.mean(axis=1, keepdims=True)) ** 2, axis=1
         )
-        if not 1e4 * sums_of_squares.max() < MAX_READING:  # would overflow: return no bound
+        if not 1e4 * sums_of_squares.max() < MAX_READING:  # would overflow: return a rise without a bound
             return Rise(float(values.mean()), np.inf, freedom)
         min_sigma = np.sqrt(np.maximum(0.1 * freedom * prior_sigma**2, 1e-9 * sums_of_squares) / (freedom + count))
         max_sigma = np.maximum(100.0 * np.sqrt(sums_of_squares), 10.0 / MAX_READING)
@@ -687,10 +702,11 @@ def number_sessions(starts: Sequence[float | None], pause: float) -> list[int]:
 class _Oil(NamedTuple):
     """Hypothesis on how the oil's viscosity changed the leakage of n + 1 recordings, the judged one last.
 
-    `thinning` (n + 1,): predicted logarithm of the leakage, relative to the mean over the n healthy recordings. It is
-    proportional to an uncertain slope with the relative standard deviation `slope_deviation`. `variances` (n + 1,):
-    of the further error of each prediction; `session_deviation`: standard deviation of the logarithm between
-    sessions, 0 if the oil is known; `log_probability`: log prior probability of the hypothesis.
+    - `thinning` (n + 1,): predicted logarithm of the leakage, relative to the mean over the n healthy recordings;
+    - `variances` (n + 1,): variance of the error of each prediction, without the error of its slope;
+    - `log_probability`: log prior probability of the hypothesis;
+    - `slope_deviation`: relative standard deviation of the slope of `thinning` in temperature or pressure drop;
+    - `session_deviation`: standard deviation of the logarithm between sessions, 0 if the oil is known.
     """
 
     thinning: Array
@@ -703,9 +719,9 @@ class _Oil(NamedTuple):
 def _oil_hypotheses(recordings: Sequence[RecordingSums]) -> list[_Oil]:
     """List the hypotheses on how the oil changed the leakage of `recordings`, the judged one last.
 
-    If all recordings have an oil temperature, it predicts the effect. Otherwise there are two hypotheses if all have
-    a viscous pressure drop: the drop shows the viscosity, or the oil is unknown. Without the drop only the latter
-    remains.
+    If all recordings have an oil temperature, the temperature predicts the effect. Otherwise, if all have a viscous
+    pressure drop, there are two hypotheses: the drop shows the viscosity, or the oil is unknown. In all other cases
+    only the second remains.
     """
     prior, zeros = INFERENCE.oil, np.zeros(len(recordings))
     temperatures = [recording.oil_degC for recording in recordings if recording.oil_degC is not None]
@@ -713,7 +729,7 @@ def _oil_hypotheses(recordings: Sequence[RecordingSums]) -> list[_Oil]:
         warmer = np.array(temperatures) - np.mean(temperatures[:-1])
         slope_deviation = prior.per_kelvin_deviation / prior.per_kelvin
         return [_Oil(prior.per_kelvin * warmer, zeros, slope_deviation=slope_deviation)]
-    # half the range is the standard deviation of the difference of two sessions; that of one is smaller by sqrt(2)
+    # half the log range is the standard deviation between two sessions, which is sqrt(2) times that of one session
     unknown = _Oil(zeros, zeros, session_deviation=float(np.sqrt(0.125) * np.log(prior.warmest)))
     drops = [recording.viscous_drop for recording in recordings if recording.viscous_drop is not None]
     if len(drops) < len(recordings):
@@ -750,8 +766,8 @@ def _leak_level(gram: Array, columns: Sequence[ColumnRoles]) -> tuple[float, flo
 def motion_change(judged: Array, healthy: Array, roles: ColumnRoles) -> tuple[float, float]:
     """Estimate the log ratio of a recording's motion coefficient (area of the piston) to that of healthy recordings.
 
-    Returns the logarithm and its standard error, which contains the error of the recording's fit but not that of the
-    healthy ones. The ratio differs from 1 if area over displacement changed: another machine, or another scale of a
+    Returns the logarithm and its standard error, which contains the error of the recording's fit but not the error of
+    the healthy fit. The ratio differs from 1 if area over displacement changed: another machine, or another scale of a
     sensor.
 
     The regression is the volume balance. `judged`, `healthy`: its Gram matrices (m, m) of the recording and of the sum
@@ -777,7 +793,7 @@ def motion_change(judged: Array, healthy: Array, roles: ColumnRoles) -> tuple[fl
 
 
 def student_rise(value: float, deviations: Sequence[float] | Array, prior_scatter: float) -> Rise:
-    """Make a rise by `value` whose error follows Student's t, scaled by the scatter of n healthy recordings.
+    """Make a rise by `value` whose error follows Student's t, with the scatter of n healthy recordings as its scale.
 
     `deviations` (n,): deviation d_j of each healthy recording from the mean of the others; `prior_scatter`: prior
     standard deviation s of a recording, which counts as much as m recordings (`scatter.freedom` of `priors.toml`). All
@@ -797,10 +813,11 @@ def student_rise(value: float, deviations: Sequence[float] | Array, prior_scatte
 def _eliminate_unshared(gram: Array, columns: Sequence[ColumnRoles]) -> Array:
     """Eliminate the coefficients that recordings do not share, such as the flow's offset, from each equation.
 
-    They are those without a prior on differences between recordings. The leakage of a pump that holds the load, which
-    counts only within a recording (`ColumnRoles.hold_leak`), is left out. `gram` (E, m, m): Gram matrices of E
-    equations; `columns`: for each equation the indices of its columns by role (leak, motion, left side). The result is
-    the Schur complement of the same shape, in which the rows and columns of the eliminated coefficients are zero.
+    These are the coefficients without a prior on differences between recordings. The leakage of a pump that holds the
+    load is not eliminated, but set to zero first, since it counts only within a recording (`ColumnRoles.hold_leak`).
+    `gram` (E, m, m): Gram matrices of E equations; `columns`: for each equation the indices of its columns by role
+    (leak, motion, left side). The result is the Schur complement of the same shape, in which the rows and columns of
+    the eliminated coefficients are zero.
     """
     reduced = gram.copy()
     for e, roles in enumerate(columns):
@@ -833,25 +850,27 @@ def compare_laws(
 
     Each leak is fitted to the residual of the recording `judged` under the coefficients of the healthy recordings,
     `baseline`. `columns`: for each equation the indices of its columns by role (leak, motion, left side). Return None
-    if the volume balance has no column of an orifice, or the recording has no information on one of the two leaks.
+    if the volume balance has no column of an orifice, if the recording has no information on one of the two leaks, or
+    if the columns of the two leaks are not positively correlated.
     """
     if any(ORIFICE not in roles.names for roles in columns):
         return None
     reference = np.sum([recording.sums for recording in baseline], axis=0)
     grams, moments, left_square = np.zeros((2, 2)), np.zeros(2), 0.0
     for e, roles in enumerate(columns):
-        gram, tests = judged.sums[e], [roles.leak, roles.names.index(ORIFICE)]
+        gram, leaks = judged.sums[e], [roles.leak, roles.names.index(ORIFICE)]  # laminar, orifice
         residual, nuisance, prior = _residual_products(gram, reference[e], roles)
         regularised = gram[np.ix_(nuisance, nuisance)] + np.diag(prior)
-        solved = solve(regularised, np.column_stack([gram[np.ix_(nuisance, tests)], residual[nuisance]]))
-        grams += gram[np.ix_(tests, tests)] - gram[np.ix_(tests, nuisance)] @ solved[:, :2]
-        moments += residual[tests] - gram[np.ix_(tests, nuisance)] @ solved[:, 2]
-        left_square += float(residual[-1] - residual[nuisance] @ solved[:, 2])
-    energies = np.diag(grams)
-    if not energies.min() > 0.0 or not grams[0, 1] > 0.0:
+        solved = solve(regularised, np.column_stack([gram[np.ix_(nuisance, leaks)], residual[nuisance]]))
+        solved_leaks, solved_residual = solved[:, :2], solved[:, 2]
+        grams += gram[np.ix_(leaks, leaks)] - gram[np.ix_(leaks, nuisance)] @ solved_leaks
+        moments += residual[leaks] - gram[np.ix_(leaks, nuisance)] @ solved_residual
+        left_square += float(residual[-1] - residual[nuisance] @ solved_residual)
+    energies, cross = np.diag(grams), grams[0, 1]
+    if not energies.min() > 0.0 or not cross > 0.0:
         return None
-    residual_squares = np.maximum(left_square - moments**2 / energies, 1e-9 * abs(left_square) + TINY)
-    return LawFit(float(grams[0, 1] / energies[0]), float(-0.5 * np.log(residual_squares[1] / residual_squares[0])))
+    laminar, orifice = np.maximum(left_square - moments**2 / energies, 1e-9 * abs(left_square) + TINY)
+    return LawFit(regression=float(cross / energies[0]), log_ratio=float(-0.5 * np.log(orifice / laminar)))
 
 
 def compare_with_leak(
@@ -865,9 +884,10 @@ def compare_with_leak(
         -log(residual sum of squares with the rival / the same with the leak) / 2.
 
     A recording counts as `size.readings` independent residuals (`priors.toml`). While the rival (for example an
-    external leak) is fitted, the leak may differ as it does between healthy recordings. `columns`: for each equation
-    the indices of its columns by role (leak, motion, left side). Return None if the balance has no column of that name,
-    or the recording has no information on the leak or on the rival.
+    external leak) is fitted, the leak may differ as it does between healthy recordings. A negative coefficient of leak
+    or rival is not fitted. `columns`: for each equation the indices of its columns by role (leak, motion, left side).
+    Return None if the balance has no column named `rival`, or if the recording has no information on the leak or on the
+    rival.
     """
     if any(rival not in roles.names for roles in columns):
         return None
@@ -876,7 +896,8 @@ def compare_with_leak(
     for is_rival in (False, True):
         energy = moment = left_square = 0.0
         for e, roles in enumerate(columns):
-            gram, tested = judged.sums[e], roles.names.index(rival) if is_rival else roles.leak
+            gram = judged.sums[e]
+            tested = roles.names.index(rival) if is_rival else roles.leak
             residual, nuisance, prior = _residual_products(gram, reference[e], roles, has_leak=is_rival)
             regularised = gram[np.ix_(nuisance, nuisance)] + np.diag(prior)
             solved = solve(regularised, np.column_stack([gram[nuisance, tested], residual[nuisance]]))
@@ -887,7 +908,8 @@ def compare_with_leak(
             return None
         gain = max(moment, 0.0) ** 2 / energy  # oil only leaves
         residual_squares.append(max(left_square - gain, 1e-9 * abs(left_square) + TINY))
-    return float(-0.5 * np.log(residual_squares[1] / residual_squares[0]))
+    with_leak, with_rival = residual_squares
+    return float(-0.5 * np.log(with_rival / with_leak))
 
 
 class _Residual(NamedTuple):
@@ -907,8 +929,9 @@ def _residual_products(gram: Array, reference: Array, roles: ColumnRoles, *, has
     """Compute the residual of a recording under the coefficients fitted to other recordings (`_Residual`).
 
     `gram`, `reference` (m, m): Gram matrices of the recording and of the sum of the others; `roles`: indices of their
-    columns by role (leak, motion, left side). The coefficients of `roles.compared` may differ from those of the others
-    within a prior, except for the leak's. With `has_leak` the leak's may differ, too, by the prior `between.pump`.
+    columns by role (leak, motion, left side). Compared coefficients with a prior on their differences may differ from
+    the coefficients of the other recordings within this prior. The leak's coefficient may differ only with `has_leak`,
+    by the prior `between.pump`.
     """
     compared = [k for k in roles.compared if k == roles.leak or np.isfinite(roles.between_deviation[k])]
     coefficients = np.zeros(len(gram))
@@ -931,9 +954,9 @@ def _project_on_leak(
 
     `gram`, `reference` (E, m, m): Gram matrices of the recording and of the sum of the others, for each equation.
     `columns`: for each equation the indices of its columns by role (leak, motion, left side); `widths` (s,): factors on
-    the usual prior standard deviations of the other coefficients' differences. These coefficients are eliminated (Schur
-    complement): rise = moment / precision, both summed over the equations. Both results have the shape (s,) and are 0
-    where there is no information.
+    the usual prior standard deviations of the differences of all other coefficients, which are eliminated (Schur
+    complement). Then the excess is moment / precision, both summed over the equations. Both results have the shape (s,)
+    and are 0 where there is no information.
     """
     precision, moment = np.zeros((2, len(widths)))
     for e, roles in enumerate(columns):

@@ -5,11 +5,11 @@ leakage. It is linear in the unknown coefficients of the machine. For a pump-con
 
     D dtheta = sum_j c_j f_j dg_j + G (p_A - p_B) dt,
 
-with the pump's displacement D [m^3/rad], the leakage conductance G [m^3/(s Pa)] and a coefficient c_j for each term;
-f_j and g_j are functions of the recorded channels. A term computes its increment f_j dg_j over each sampling
-interval, so no signal is differentiated (`weak_form`). With a servo valve, each chamber has a balance: its left side
-is the volume displaced by the piston, its terms are the orifice flows of the valve's metering edges; G is the same in
-both.
+with the pump's displacement D [m^3/rad] and angle theta, the leakage conductance G [m^3/(s Pa)] and a coefficient c_j
+for each term; f_j and g_j are functions of the recorded channels. A term computes its increment f_j dg_j over each
+sampling interval dt, so no signal is differentiated (`weak_form`). With a servo valve, each chamber has a balance. Its
+left side is the volume displaced by the piston, and its terms include the orifice flows of the valve's metering edges.
+G is the same in both chambers.
 
 The priors on the drift of each coefficient are in `priors.toml`, with unit and source.
 
@@ -20,7 +20,7 @@ edges).
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
@@ -51,13 +51,15 @@ class RestLimits(NamedTuple):
 
 
 class Signals:
-    """Samples of recorded channels, and signals derived from them, each computed once.
+    """Samples of recorded channels, and signals derived from them.
 
-    `channels`: samples (n,) of each channel by name, in SI units; `rate`: sampling rate [Hz]; `to_absolute`: absolute
-    minus gauge pressure [Pa] by the name of the channel, by default the atmosphere; `offset`: sensor offset that is
-    subtracted from p_A - p_B [Pa]; `rest_limits`: speeds below which the machine rests, None to find no rests.
+    - `channels`: samples (n,) of each channel by name, in SI units; `rate`: sampling rate [Hz];
+    - `to_absolute`: absolute minus gauge pressure [Pa] by the name of the channel, by default atmospheric pressure;
+    - `offset`: sensor offset [Pa] that is subtracted from p_A - p_B;
+    - `rest_limits`: speeds below which the machine rests, None to find no rests.
+
     `step(name)` returns the differences of a channel between consecutive samples, and `mean(name)` the means of
-    neighbouring samples, (n - 1,) each.
+    neighbouring samples, (n - 1,) each. Both are computed only once for each channel.
     """
 
     def __init__(
@@ -102,7 +104,7 @@ class Signals:
 
     @cached_property
     def port_difference(self) -> Array:
-        """p_1 - p_2 [Pa], between the pump's or the valve's ports, in the middle of each interval, shape (n - 1,)."""
+        """p_1 - p_2 [Pa] of the two ports of pump or valve, in the middle of each sampling interval, shape (n - 1,)."""
         return self.mean("p_1") - self.mean("p_2")
 
     @cached_property
@@ -118,7 +120,7 @@ class Signals:
 
     @cached_property
     def speed(self) -> Array:
-        """Speed of the piston [m/s] at each sample, by a central difference of the position."""
+        """Speed of the piston [m/s] at each sample, by a central difference of the position (constant at the ends)."""
         half_width = max(1, round(HALF_DIFFERENCE * self.rate))  # [samples]
         x = self._channels["x"]
         padded = np.concatenate([x[:1].repeat(half_width), x, x[-1:].repeat(half_width)])
@@ -151,7 +153,8 @@ class Signals:
         `pump_volume` computes from these signals the volume [m^3] that the pump delivers in each interval. All flags
         are 1 if this object has no `rest_limits`, i.e. speeds below which the machine counts as resting.
         """
-        return self._find_states(pump_volume)[0]
+        is_moving, _ = self._find_states(pump_volume)
+        return is_moving
 
     def holding(self, pump_volume: Callable[[Signals], Array]) -> Array:
         """Flag each sampling interval in which the pump turns and the piston rests: 1 there, else 0; shape (n - 1,).
@@ -159,13 +162,15 @@ class Signals:
         The pump then holds the load by replacing what leaks. `pump_volume` computes from these signals the volume [m^3]
         that the pump delivers in each interval. All flags are 0 if this object has no `rest_limits`.
         """
-        return self._find_states(pump_volume)[1]
+        _, is_holding = self._find_states(pump_volume)
+        return is_holding
 
     def _find_states(self, pump_volume: Callable[[Signals], Array]) -> tuple[Array, Array]:
-        """Return two sets of flags (n - 1,) of the sampling intervals: pump and piston move, and only the pump moves.
+        """Flag the sampling intervals in which pump and piston move, and those in which only the pump moves.
 
-        `pump_volume` computes the volume [m^3] that the pump delivers in each interval. The flags are computed only
-        once, since all terms of a balance have the same `pump_volume`.
+        Returns both flags, 1 or 0, of shape (n - 1,) each. `pump_volume` computes the volume [m^3] that the pump
+        delivers in each interval. The flags are computed only once, since all terms of a balance have the same
+        `pump_volume`. Without `rest_limits` pump and piston always move.
         """
         limits = self._rest_limits
         if limits is None:
@@ -182,19 +187,21 @@ def find_rests(increments: Array, rate: float, limit: float) -> NDArray[np.bool_
     """Flag the sampling intervals at rest, i.e. with a speed of at most `limit` for a time of at least `MIN_REST`.
 
     `increments` (n,): increments of the pump's volume [m^3] or of the position [m]; `rate`: sampling rate [Hz];
-    `limit` [m^3/s] or [m/s]. The speed is averaged over `AVERAGING_TIME`. Missing samples (NaN) are not at rest.
+    `limit` [m^3/s] or [m/s]. The speed is averaged over `AVERAGING_TIME`. Missing samples (NaN) are not at rest. Fewer
+    samples than the averaging time and a rest together contain no rest.
     """
     window, min_length = max(1, round(AVERAGING_TIME * rate)), max(2, round(MIN_REST * rate))  # [samples]
     if len(increments) < window + min_length:
         return np.zeros(len(increments), dtype=bool)
     is_known = np.isfinite(increments)
-    sums, n_missing = (
-        np.concatenate([[0], np.cumsum(values)]) for values in (np.where(is_known, increments, 0.0), ~is_known)
-    )
-    is_slow = np.abs(sums[window:] - sums[:-window]) <= limit * window / rate  # in the window that begins at a sample
+    sums = np.concatenate([[0], np.cumsum(np.where(is_known, increments, 0.0))])
+    n_missing = np.concatenate([[0], np.cumsum(~is_known)])
+    # windows by their first sample: slow, and without a missing sample
+    is_slow = np.abs(sums[window:] - sums[:-window]) <= limit * window / rate
     is_slow &= n_missing[window:] == n_missing[:-window]
     n_moving = np.concatenate([[0], np.cumsum(~_extend_flags(is_slow, window))])
-    return _extend_flags(n_moving[min_length:] == n_moving[:-min_length], min_length)
+    is_rest_start = n_moving[min_length:] == n_moving[:-min_length]
+    return _extend_flags(is_rest_start, min_length)
 
 
 def _extend_flags(starts: NDArray[np.bool_], length: int) -> NDArray[np.bool_]:
@@ -236,15 +243,15 @@ class Term(NamedTuple):
     increments : callable
         Computes the increments f dg from `Signals` over each sampling interval, shape (n - 1,).
     cause : str
-        What a sudden change of the coefficient means, for example "external leak".
+        Cause of a sudden change of the coefficient, for example "external leak".
     drift : str
         Entry of `priors.toml` with the prior on the coefficient's drift; "" if the coefficient is zero unless `cause`
         is present.
     needs : tuple of str
         Channels from which the increments are computed.
     driver : str
-        "pressure" or "root" if the flow is driven by a pressure or by its root, so that sensor offsets affect it;
-        else "".
+        "pressure" if a pressure drives the flow, "root" if the square root of a pressure does, else "". Sensor offsets
+        affect the first two.
     """
 
     name: str
@@ -262,9 +269,9 @@ class Term(NamedTuple):
 
     @property
     def compared(self) -> bool:
-        """True for a term that is left out of the fit of a single recording.
+        """True if the coefficient is fitted only when several recordings are compared, not in a single recording.
 
-        Its coefficient is fitted only when recordings with different motion and load are compared.
+        A single recording has too little variety of motion and load to determine it.
         """
         return self.drift == "speed"
 
@@ -297,30 +304,34 @@ class Equation(NamedTuple):
     flow_sign: float = 1.0
 
 
-#: The leak past the piston or in the pump, laminar and through an orifice; the first is the one that is tested.
+#: Names of terms: first the leak past the piston or in the pump, laminar (the tested term) and through an orifice.
 LEAK, ORIFICE = "leak", "leak through an orifice"
-#: Free air in both chambers at once, instead of the coefficients of each chamber.
+#: Free air in both chambers together, instead of one term for each chamber.
 AIR = "free air"
-#: The pump's leakage, driven by the pressures at its ports. If a valve cuts the pump off at rest, its leakage driven by
-#: p_A - p_B while it moves the piston, and while it turns only to hold the load.
-PUMP, TURNING, HOLDING = "pump leak", "pump leak while it turns", "pump leak while it holds"
-#: Constant flow, as by an offset of a flow sensor; an offset of the pressure sensors changes it, too.
+#: The pump's leakage, driven by the pressures at its ports.
+PUMP = "pump leak"
+#: The pump's leakage driven by p_A - p_B, if a valve cuts the pump off at rest: while the pump moves the piston, and
+#: while it turns only to hold the load.
+TURNING, HOLDING = "pump leak while it turns", "pump leak while it holds"
+#: Constant flow, for example by an offset of a flow sensor; an offset of the pressure sensors changes it, too.
 BIAS = "bias"
-#: Suffix of the name of an external leak that a check valve compensates.
+#: Suffix for an external leak that a check valve compensates.
 MADE_UP = ", made up"
 #: A delay between position and flow.
 LAG = "lag"
 #: Loss of the pump that grows with speed: incomplete filling, and slip that depends on no recorded pressure.
 SPEED_LOSS = "loss over speed"
-#: Names of the balance of a pump-controlled cylinder with a recorded position, and of that of a load held by valves.
-CYLINDER, LOCKED = "cylinder", "locked"
-#: Decay of the speed loop's unknown initial state (time constant 19 s for the thesis's drive).
-START = "start"
-#: The constant flow while pump and piston move, and all columns that are zero in some states of the machine.
+#: The constant flow while pump and piston move.
 MOVING_BIAS = "bias in motion"
+#: All terms that are zero in some states of the machine.
 STATES = TURNING, HOLDING, MOVING_BIAS
+#: Names of two balances: of a pump-controlled cylinder with a recorded position, and of a load held by valves.
+CYLINDER, LOCKED = "cylinder", "locked"
+#: Name of a derived signal: the decay, with the drive's time constant, of the speed loop's unknown initial state.
+START = "start"
 
 _PRESSURES = ("p_A", "p_B")
+_sensor_term = partial(Term, cause="sensor fault")
 
 
 def _conductance_term(
@@ -332,16 +343,16 @@ def _conductance_term(
 ) -> Term:
     """Make a term of a flow that is an unknown conductance [m^3/(s Pa)] times a pressure.
 
-    `increments` computes from `Signals` that pressure times the sampling interval [Pa s], shape (n - 1,). Fields of
-    `Term`: `name`; `cause`, what a sudden change of the conductance means; `needs`, the channels it is computed from;
-    `drift`, the prior on its drift.
+    `increments` computes from `Signals` that pressure times the sampling interval [Pa s], shape (n - 1,). The other
+    arguments are fields of `Term`.
     """
-    return Term(name, "m^3/(s Pa)", increments, cause, drift, needs, "pressure")
+    return Term(name, "m^3/(s Pa)", increments, cause, drift=drift, needs=needs, driver="pressure")
 
 
+_LEAK_CAUSE: Cause = "piston or pump leak"
 _LEAKS = (
-    _conductance_term(LEAK, lambda s: s.pressure_difference * s.dt, "piston or pump leak", drift="leak"),
-    Term(ORIFICE, "m^3/(s Pa^0.5)", lambda s: s.pressure_root * s.dt, "piston or pump leak", "", _PRESSURES, "root"),
+    _conductance_term(LEAK, lambda s: s.pressure_difference * s.dt, _LEAK_CAUSE, drift="leak"),
+    Term(ORIFICE, "m^3/(s Pa^0.5)", lambda s: s.pressure_root * s.dt, _LEAK_CAUSE, needs=_PRESSURES, driver="root"),
 )
 
 
@@ -352,23 +363,26 @@ def _motion_term(outward: bool, by_A: bool) -> Term:
     `outward`: true for motion towards B, false for motion towards A; `by_A`: true for p_A > p_B, false otherwise.
     """
     name = f"motion {'out' if outward else 'in'}, {'A' if by_A else 'B'} carries"
-    return Term(name, "m^2", lambda s: s.directed_step(outward, by_A), "sensor fault", "motion", ("x",))
+    return _sensor_term(name, "m^2", lambda s: s.directed_step(outward, by_A), drift="motion", needs=("x",))
 
 
 def _chamber_terms(side: str) -> tuple[Term, ...]:
     """Make the four terms of one chamber, `side` "A" or "B": two of its compliance, and two of the air in its oil.
 
     With the pressure p of the chamber, the position x of the piston, and changes d over a sampling interval, the
-    increments are dp and x dp (compliance, constant and over the stroke), d(1/p) (free air) and d ln p (air that
-    dissolves). p is absolute in the last two.
+    increments are
+
+    - dp for a constant compliance, and x dp for its change over the stroke;
+    - d(1/p) for free air, and d ln p for air that dissolves, where p is absolute.
     """
     p, name = f"p_{side}", f"compliance {side}"
-    cause: Cause = "air in the oil"
+    compliance_term = partial(Term, cause="air in the oil", drift="compliance")
+    air_term = partial(Term, cause="air in the oil", drift="air")
     return (
-        Term(name, "m^3/Pa", lambda s: s.step(p), cause, "compliance", (p,)),
-        Term(f"{name} over the stroke", "m^2/Pa", lambda s: s.mean("x") * s.step(p), cause, "compliance", (p, "x")),
-        Term(f"free air {side}", "m^3 Pa", lambda s: np.diff(1.0 / s.absolute[p]), cause, "air", (p,)),
-        Term(f"dissolving air {side}", "m^3", lambda s: np.diff(np.log(s.absolute[p])), cause, "air", (p,)),
+        compliance_term(name, "m^3/Pa", lambda s: s.step(p), needs=(p,)),
+        compliance_term(f"{name} over the stroke", "m^2/Pa", lambda s: s.mean("x") * s.step(p), needs=(p, "x")),
+        air_term(f"free air {side}", "m^3 Pa", lambda s: np.diff(1.0 / s.absolute[p]), needs=(p,)),
+        air_term(f"dissolving air {side}", "m^3", lambda s: np.diff(np.log(s.absolute[p])), needs=(p,)),
     )
 
 
@@ -406,8 +420,8 @@ def _free_air_term(rig: Rig, weight_A: Callable[[Signals], Array | float]) -> Te
 def _external_leak_term(side: str, weight: float = 1.0) -> Term:
     """Make the term of an external leak from one side of the cylinder: its increments are `weight` max(p, 0) dt [Pa s].
 
-    p is the gauge pressure of the `side`, "A" or "B", and dt the sampling interval. `weight`: effect of a flow out of
-    that side on the volume balance, with its sign: 1 or 0 for A, -1 or 0 for B.
+    p is the gauge pressure of the `side`, "A" or "B", and dt the sampling interval. `weight`: factor of this flow in
+    the volume balance, 1 or 0 for a leak from A, -1 or 0 for a leak from B.
     """
     p = f"p_{side}"
 
@@ -426,36 +440,35 @@ def _compensated_leak_term(side: str) -> Term:
     """
 
     def lost_volume(s: Signals) -> Array:
-        """Compute the increments of the term [Pa s], shape (n - 1,).
-
-        They are max(p, 0) dt for A or -max(p, 0) dt for B while that side has the higher pressure, else 0.
-        """
-        weight = _interval_means(s.carried_by_A) - float(side == "B")
+        """Compute the increments of the term [Pa s], shape (n - 1,)."""
+        weight = _interval_means(s.carried_by_A) - float(side == "B")  # 1 or 0 for side A, 0 or -1 for side B
         return np.asarray(weight * np.maximum(s.mean(f"p_{side}"), 0.0) * s.dt)
 
     return _conductance_term(f"external leak {side}{MADE_UP}", lost_volume, "external leak")
 
 
-_START = Term("start of the drive", "m^3/s", lambda s: s.mean(START) * s.dt, "sensor fault", "bias", (START,))
-_BIAS = Term(BIAS, "m^3/s", lambda s: s.time_step, "sensor fault", "bias")
-_SPEED_LOSS = Term(
-    SPEED_LOSS, "m s", lambda s: _interval_means(np.abs(s.speed)) * s.step("x"), "sensor fault", "speed", ("x",)
+_START = _sensor_term("start of the drive", "m^3/s", lambda s: s.mean(START) * s.dt, drift="bias", needs=(START,))
+_BIAS = _sensor_term(BIAS, "m^3/s", lambda s: s.time_step, drift="bias")
+_SPEED_LOSS = _sensor_term(
+    SPEED_LOSS, "m s", lambda s: _interval_means(np.abs(s.speed)) * s.step("x"), drift="speed", needs=("x",)
 )
-_PUMP = _conductance_term(PUMP, lambda s: s.port_difference * s.dt, "pump leak", ("p_1", "p_2"))
-#: The pressure drop of the lines acts on the pump's leakage only. With this term the leak's coefficient remains that
-#: of pump and piston together.
+_PUMP = _conductance_term(PUMP, lambda s: s.port_difference * s.dt, "pump leak", needs=("p_1", "p_2"))
+#: The pressure drop of the lines acts on the pump's leakage only. With this term the leak's coefficient remains the
+#: conductance of pump and piston together.
 _LINES = _conductance_term(
     "pump leak by the lines",
     lambda s: (s.port_difference - s.pressure_difference) * s.dt,
     "pump leak",
-    ("p_1", "p_2", *_PRESSURES),
-    "pump",
+    needs=("p_1", "p_2", *_PRESSURES),
+    drift="pump",
 )
+#: The increments are changes of the piston's speed.
+_LAG = _sensor_term(LAG, "m^2 s", lambda s: np.gradient(s.step("x") * s.rate), drift="motion", needs=("x",))
 _CYLINDER = (
     *(_motion_term(outward, by_A) for outward in (True, False) for by_A in (True, False)),
     *_chamber_terms("A"),
     *_chamber_terms("B"),
-    Term(LAG, "m^2 s", lambda s: np.gradient(s.step("x") * s.rate), "sensor fault", "motion", ("x",)),  # dv
+    _LAG,
     _SPEED_LOSS,
     _BIAS,
     _LINES,
@@ -471,8 +484,8 @@ _CYLINDER = (
 def _metering_edge_terms(edge: str, upstream: str, downstream: str, sign: float) -> tuple[Term, ...]:
     """Make the three terms of the flow over one metering edge of a servo valve: gain, delay and overlap.
 
-    `edge`: its name, for example "P to A"; `upstream`, `downstream`: channels of the pressures; `sign`: sign of the
-    command u that opens the edge, 1 or -1. With dp = upstream pressure - downstream pressure, the flow is
+    `edge`: name of the edge, for example "P to A"; `upstream`, `downstream`: channels of the pressures; `sign`: sign of
+    the command u that opens the edge, 1 or -1. With dp = upstream pressure - downstream pressure, the flow is
 
         flow = (gain abs(u) - overlap) sign(dp) sqrt(abs(dp)),    overlap = gain (dead band of u),
 
@@ -486,23 +499,20 @@ def _metering_edge_terms(edge: str, upstream: str, downstream: str, sign: float)
     def proportional_flow(s: Signals) -> Array:
         """Compute the increments abs(u) sign(dp) sqrt(abs(dp)) dt [V Pa^0.5 s] of the term "edge", shape (n - 1,).
 
-        dp is the pressure drop over the metering edge, dt the sampling interval. An increment times the gain of the
-        edge, the unknown coefficient [m^3/(s V Pa^0.5)], is the volume [m^3] that flows over an edge without delay and
-        overlap. It is 0 unless u has the sign that opens the edge.
+        They are 0 unless u has the sign that opens the edge.
         """
         return np.asarray(np.maximum(sign * s.mean("u"), 0.0) * unit_flow(s) * s.dt)
 
     def overlap_flow(s: Signals) -> Array:
         """Compute the increments sign(dp) sqrt(abs(dp)) dt [Pa^0.5 s] of the term "overlap", shape (n - 1,).
 
-        dp is the pressure drop over the metering edge, dt the sampling interval. They are 0 unless u has the sign that
-        opens the edge.
+        They are 0 unless u has the sign that opens the edge.
         """
         return np.asarray((sign * s.mean("u") > 0.0) * unit_flow(s) * s.dt)
 
     def make_term(name: str, unit: str, increments: Callable[[Signals], Array]) -> Term:
         """Make a term of the flow over the metering edge: a coefficient, in `unit`, times `increments` (`Term`)."""
-        return Term(f"{name} {edge}", unit, increments, "sensor fault", "edge", ("u", upstream, downstream))
+        return _sensor_term(f"{name} {edge}", unit, increments, drift="edge", needs=("u", upstream, downstream))
 
     return (
         make_term("edge", "m^3/(s V Pa^0.5)", proportional_flow),
@@ -515,11 +525,12 @@ def _chamber_equation(side: str, rig: Rig) -> Equation:
     """Make the volume balance of one chamber, `side` "A" or "B", of a cylinder behind a servo valve.
 
     The volume displaced by the piston equals the flow over the valve's edges, less compression and leakage. An overlap
-    of the edges (dead band) reduces the flow in both directions of motion. So does a leak, if p_A - p_B reverses with
-    the motion as friction does. Only the prior on a healthy piston separates a leak from an overlap and from a change
-    of friction.
+    of the edges (dead band) reduces the flow in both directions of motion. So does a leak, if p_A - p_B changes its
+    sign with the direction of motion, as friction does. Only the prior on a healthy piston separates a leak from an
+    overlap and from a change of friction.
     """
-    area, is_A = (rig.cylinder.A_A, True) if side == "A" else (rig.cylinder.A_B, False)
+    is_A = side == "A"
+    area = rig.cylinder.A_A if is_A else rig.cylinder.A_B
     sign = 1.0 if is_A else -1.0  # a positive command connects A to the supply and B to the return
     terms = (
         *_metering_edge_terms(f"P to {side}", "p_1", f"p_{side}", sign),
@@ -537,9 +548,10 @@ def _chamber_equation(side: str, rig: Rig) -> Equation:
 def equations(rig: Rig, channels: frozenset[str]) -> tuple[Equation, ...]:
     """Return the volume balances of a machine that can be computed from the recorded channels.
 
-    If a valve meters the flow into the chambers, there is one balance for each chamber. Otherwise there is one of the
-    cylinder, in which the pump's flow is computed from its angle, its speed, a flow meter or, without these, the
-    command. `channels`: names of the recorded channels. The result is empty if they do not suffice.
+    Where a valve meters the flow into the chambers, and x, u, p_1 and p_2 are recorded, there is one balance for each
+    chamber. Otherwise there is one balance of the cylinder, in which the pump's flow is computed from its angle, its
+    speed, a flow meter or, without these, the command. `channels`: names of the recorded channels. The result is empty
+    if they do not suffice.
     """
     if not rig.circuit.pump_feeds_chambers and {"x", "u", "p_1", "p_2"} <= channels:
         if not channels.issuperset(_PRESSURES):
@@ -550,7 +562,9 @@ def equations(rig: Rig, channels: frozenset[str]) -> tuple[Equation, ...]:
         return ()
     # an angle has no offset of speed, so that a constant flow is external leakage, not a sensor error
     bias = _BIAS._replace(cause="external leak", drift="outside") if "theta" in channels else _BIAS
-    terms = [bias if term is _BIAS else term for term in ((_START, *_CYLINDER) if source == "u" else _CYLINDER)]
+    terms = [bias if term is _BIAS else term for term in _CYLINDER]
+    if source == "u":
+        terms.insert(0, _START)
     if source == "q_pump":  # a meter is downstream of the filling loss
         terms.remove(_SPEED_LOSS)
     single_rod = rig.cylinder.single_rod
@@ -581,13 +595,15 @@ def circulation(rig: Rig, channels: frozenset[str]) -> Equation | None:
 
 
 def locked(rig: Rig, channels: frozenset[str]) -> Equation | None:
-    """Return the volume balance of a load that is held by shut valves; None if circuit or channels allow none.
+    """Return the volume balance of a load that is held by shut valves; None if circuit or channels do not suffice.
 
     The piston moves only as far as oil leaks from the loaded side. The left side of the balance is minus the volume
     that the loaded side of the piston displaces; x is assumed to grow as A fills. Leaks of seal, valve and line cannot
-    be separated. The balance needs the position and both pressures. If a command or a flow is recorded, the circuit
-    must have valves that hold the load, and the command must be recorded: it is constant while they are shut. If
-    neither is recorded, a slow piston may be held by valves or by a control loop that replaces what leaks.
+    be separated.
+
+    The balance needs the position and both pressures. If a command or the pump's flow is recorded, the circuit must
+    have valves that hold the load, and the command must be recorded: it is constant while they are shut. If neither is
+    recorded, any circuit is accepted, although a control loop may then hold the load and replace the leaking oil.
     """
     if not {"x", *_PRESSURES} <= channels:
         return None
@@ -595,6 +611,7 @@ def locked(rig: Rig, channels: frozenset[str]) -> Equation | None:
         return None
 
     def displaced_volume(s: Signals) -> Array:
+        """Compute minus the displaced volume [m^3] of the side that on average carries the load, shape (n - 1,)."""
         area_A, area_B = rig.cylinder.A_A, rig.cylinder.A_B
         area = area_A if np.nanmean(s["p_A"] * area_A - s["p_B"] * area_B) > 0.0 else area_B
         return -area * s.step("x")
@@ -605,9 +622,10 @@ def locked(rig: Rig, channels: frozenset[str]) -> Equation | None:
 def pump_volume(rig: Rig, channels: frozenset[str]) -> Callable[[Signals], Array] | None:
     """Return a function that computes the volume [m^3] delivered by the pump in each sampling interval, from `Signals`.
 
-    The volume follows from the pump's angle, its speed, a flow meter, or the speed derived from the command, whichever
-    is recorded; return None if none is. If a flow meter has different scale errors in the two directions, the fitted
-    piston areas of the two directions differ.
+    The volume follows from the best recorded channel (`flow_source`): the pump's angle, its speed, a flow meter, or the
+    command, from which the speed is derived. Return None if none of them is recorded, or only the command of a pump
+    that does not feed the chambers. If a flow meter has different scale errors in the two directions, the fitted piston
+    areas of the two directions differ.
     """
     displacement, source = rig.pump.q_b / (2.0 * np.pi), flow_source(channels)
     if source == "theta":
@@ -622,9 +640,11 @@ def pump_volume(rig: Rig, channels: frozenset[str]) -> Callable[[Signals], Array
 def with_rests(equation: Equation) -> Equation:
     """Return a pump's volume balance with three more terms, which are zero in some states of the machine (`STATES`).
 
-    Their increments are (p_A - p_B) dt while the pump moves the piston, (p_A - p_B) dt while it turns and the piston
-    rests (a held load), and dt while pump and piston move. Otherwise each is 0. They are inserted before the terms of
-    the leak.
+    They are inserted before the terms of the leak. Their increments are 0 except for
+
+    - (p_A - p_B) dt while the pump moves the piston (`TURNING`),
+    - (p_A - p_B) dt while the pump turns and the piston rests, to hold the load (`HOLDING`),
+    - dt while pump and piston move (`MOVING_BIAS`).
     """
     left = equation.left
     in_motion = Term(MOVING_BIAS, "m^3/s", lambda s: s.moving(left) * s.dt, "pump leak", driver="pressure")
@@ -653,8 +673,7 @@ def _pump_leakage_terms(
     """Make the terms of a pump's leakage, driven by p_A - p_B, while it moves the piston and while it holds the load.
 
     `pump_volume` computes from `Signals` the volume [m^3] that the pump delivers in each interval; `drift`: entry of
-    `priors.toml` with the prior on the drift of both coefficients, or "" for terms that not every recording is fitted
-    with.
+    `priors.toml` with the prior on the drift of both coefficients, or "" for terms that are not part of every fit.
     """
 
     def turning(s: Signals) -> Array:
@@ -672,7 +691,7 @@ def _pump_leakage_terms(
 
 
 def _insert_before_leaks(equation: Equation, *terms: Term) -> Equation:
-    """Return a volume balance with additional terms, inserted before those of the leak, which remain the last."""
+    """Return a volume balance with additional terms before the leak's terms, which stay last."""
     first_leak = len(equation.terms) - len(_LEAKS)
     return equation._replace(terms=(*equation.terms[:first_leak], *terms, *equation.terms[first_leak:]))
 

@@ -1,9 +1,9 @@
 """The distribution of p_A - p_B over a block, from which a sensor offset may be subtracted afterwards.
 
-Means over `SMOOTHED` seconds hide the ringing of a stiff circuit, but samples contain noise. In each stride of the weak
-form the deviations of the samples from these means, of variance v, are therefore multiplied by sqrt(max(v - s^2, 0) /
-v). The variance of white noise is s^2 = (variance of the sixth differences of the samples) / 924, where 924 is the sum
-of the squared coefficients of such a difference.
+Means over `SMOOTHED` seconds hide the ringing of a stiff circuit, but single samples contain noise. Therefore the
+samples' deviations from these means are reduced. If their variance within a stride of the weak form is v, they are
+multiplied by sqrt(max(v - s^2, 0) / v). The variance of white noise is s^2 = (mean square of the sixth differences of
+the samples) / 924, where 924 is the sum of the squared coefficients of such a difference.
 """
 
 from __future__ import annotations
@@ -15,8 +15,10 @@ import numpy as np
 from sealscope.diagnosis.inference.rows.weak_form import stride_samples
 from sealscope.recordings.recording import Array
 
-#: Number of equal parts of the sorted samples, and averaging time of the pressure [s].
-PARTS, SMOOTHED = 9, 0.025
+#: Number of equal parts of the sorted samples.
+PARTS = 9
+#: Averaging time of the pressure [s].
+SMOOTHED = 0.025
 #: Order of the differences that remove the signal and leave the noise.
 _ORDER = 6
 
@@ -24,18 +26,18 @@ _ORDER = 6
 def sorted_part_means(pressure: Array, rate: float) -> Array:
     """Summarise the distribution of a pressure by the means of `PARTS` equal parts of its sorted samples [Pa].
 
-    The spread due to white noise is removed first. `pressure` (n,): samples [Pa] at the sampling `rate` [Hz], NaN
-    where missing. Samples after the last whole stride of the weak form are omitted. The means, of shape (PARTS,), are
-    zeros if all samples are missing.
+    The spread due to white noise is removed first, as described in the module. `pressure` (n,): samples [Pa] at the
+    sampling `rate` [Hz], NaN where missing. Only whole averaging times within whole strides of the weak form count. The
+    means, of shape (PARTS,), are zeros if all samples are missing.
     """
-    # lengths [samples] of the means of the pressure, and of the strides within which the noise is removed
-    piece, stride = max(1, round(SMOOTHED * rate)), min(stride_samples(rate), max(len(pressure), 1))
+    piece = max(1, round(SMOOTHED * rate))  # averaging time [samples]
+    stride = min(stride_samples(rate), max(len(pressure), 1))  # [samples]
     n_pieces = stride // piece
     strides = pressure[: len(pressure) // stride * stride].reshape(-1, stride)[:, : n_pieces * piece]
     pieces = strides.reshape(-1, n_pieces, piece)
     mean = pieces.mean(axis=2, keepdims=True)
     deviation = pieces - mean
-    if piece > 1:
+    if piece > 1:  # else each sample is its own mean
         differences = np.diff(pressure, _ORDER)
         differences = differences[np.isfinite(differences)]
         noise_gain = math.comb(2 * _ORDER, _ORDER)  # variance of a difference of white noise of variance 1
@@ -45,5 +47,7 @@ def sorted_part_means(pressure: Array, rate: float) -> Array:
         deviation *= np.sqrt(1.0 - noise / np.maximum(variance, max(noise, np.finfo(float).tiny)))
     values = (mean + deviation).ravel()
     values = np.sort(values[np.isfinite(values)])
-    bounds, sums = np.linspace(0.0, len(values), PARTS + 1), np.concatenate([[0.0], np.cumsum(values)])
-    return np.asarray(np.diff(np.interp(bounds, np.arange(len(sums)), sums)) * (PARTS / max(len(values), 1)))
+    # sum of each part from the cumulative sum, interpolated where a part ends between two samples
+    part_ends, cumulative_sums = np.linspace(0.0, len(values), PARTS + 1), np.concatenate([[0.0], np.cumsum(values)])
+    part_sums = np.diff(np.interp(part_ends, np.arange(len(cumulative_sums)), cumulative_sums))
+    return np.asarray(part_sums * (PARTS / max(len(values), 1)))

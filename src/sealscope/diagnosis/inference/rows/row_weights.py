@@ -1,10 +1,10 @@
 """Huber's weights of the rows of blocks, and Gram matrices of the weighted rows.
 
-A row of a block is v = (fast columns, slow columns, left side). Coefficients of fast columns are free in each block;
-coefficients of slow columns are the same in all blocks, with a prior from the sums of earlier blocks. The weights are
-min(1, HUBER sigma / abs(residual)), where sigma follows from the median of abs(residual). Weights and fit depend on
-each other and are found by iteration. The functions are compiled and write to arrays of the caller. They allocate no
-memory, since a unit for other simulators (`fmu`) runs the same functions in C.
+A row of a block consists of fast columns, slow columns, and the left side of the regression. Coefficients of fast
+columns are free in each block. Coefficients of slow columns are the same in all blocks, with a prior from the sums of
+earlier blocks. The weights are min(1, HUBER sigma / abs(residual)), where sigma follows from the median of
+abs(residual). Weights and fit depend on each other and are found by iteration. The functions are compiled and write to
+arrays of the caller. They allocate no memory, since a unit for other simulators (`fmu`) runs the same functions in C.
 
 Source: P. J. Huber, Ann. Math. Statist. 35 (1964) 73 (weights).
 """
@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from sealscope.compiled import large_law, law
 from sealscope.recordings.recording import Array
 
-#: Number of blocks whose rows are weighted together at the beginning of a stream; later the weight of the prior.
+#: Number of blocks whose rows are weighted together at the beginning of a stream. Later the prior from all earlier
+#: blocks counts as this many.
 SUPPORT = 5
 #: Where Huber's function turns from square to linear, in standard deviations: 95 % efficiency for normal errors.
 HUBER = 1.345
@@ -33,14 +34,16 @@ _Indices = NDArray[np.intp]
 
 
 class Workspace(NamedTuple):
-    """Scratch arrays of `weigh_rows`, for r rows of K blocks with c columns, of which s are slow.
+    """Scratch arrays of `weigh_rows`, for r rows of K blocks.
 
-    The left side is one of the c columns. A slow column has one coefficient for all blocks, a fast one a coefficient in
-    each block.
+    The c columns are fast ones with a coefficient in each block, s slow ones with one coefficient for all blocks, and
+    the left side.
 
-    `weights` and `residual` (r,) of the rows; `ordered` (r,), the magnitudes of the residuals, which the median
-    reorders; `reduced` (K, c, c), Gram matrices after elimination of the fast coefficients; `fit` (K, c - 1),
-    coefficients in each block; `normal` (s + 1, s + 1), normal equations of the slow coefficients.
+    - `weights`, `residual` (r,): weight and magnitude of the residual of each row;
+    - `ordered` (r,): copy of `residual`, which the median reorders;
+    - `reduced` (K, c, c): Gram matrices after elimination of the fast coefficients;
+    - `fit` (K, c - 1): coefficients in each block;
+    - `normal` (s + 1, s + 1): normal equations of the slow coefficients.
     """
 
     weights: Any
@@ -54,8 +57,8 @@ class Workspace(NamedTuple):
 def workspace_shapes(rows: int, blocks: int, columns: int, slow: int) -> tuple[tuple[int, ...], ...]:
     """Return the shapes of the scratch arrays of a `Workspace`, in the order of its fields.
 
-    The arguments are the numbers of rows, of blocks, of columns with the left side, and of slow columns without it. A
-    slow column has the same coefficient in all blocks.
+    `columns`: number of columns, including the left side; `slow`: number of slow columns, i.e. with the same
+    coefficient in all blocks, without the left side.
     """
     return (rows,), (rows,), (rows,), (blocks, columns, columns), (blocks, columns - 1), (slow + 1, slow + 1)
 
@@ -65,7 +68,8 @@ def eliminate(matrix: Any, count: int) -> None:
     """Eliminate the first `count` unknowns of a positive semidefinite system with appended right sides, in place.
 
     After this Gauss-Jordan elimination the first `count` rows of `matrix` express the unknowns by the other columns,
-    and the other rows contain the reduced system. Unknowns without information become zero.
+    and the other rows contain the reduced system. A small ridge (`RIDGE`) on the diagonal limits rounding errors.
+    Unknowns without information become zero.
     """
     rows, columns = matrix.shape
     for i in range(count):
@@ -138,10 +142,11 @@ def _eliminate_fast(gram: Any, column_order: Any, n_fast: int, reduced: Any) -> 
 
 @large_law
 def _reweigh(values: Any, ends: Any, column_order: Any, workspace: Any) -> bool:
-    """Compute Huber's weights of the rows from the residuals of the current fit; return True if these have converged.
+    """Compute Huber's weights of the rows from the residuals of the current fit; return True once they have converged.
 
-    `values` (r, m): rows; `ends`: index past the last row of each block; `column_order`: indices of the fitted
-    columns, the left side last; `workspace`: a `Workspace` with the fit and with the weights, which are replaced.
+    They have converged if their mean relative change is below `TOLERANCE`, or if the median residual is 0. `values`
+    (r, m): rows; `ends`: index past the last row of each block; `column_order`: indices of the fitted columns, the left
+    side last; `workspace`: a `Workspace` with the fit, whose weights and residuals are replaced.
     """
     count, left, block = len(values), len(column_order) - 1, 0
     for r in range(count):
@@ -183,9 +188,9 @@ def weigh_rows(
     n_fast : int
         Number of fast columns, whose coefficients are free in each block.
     earlier_sums : array of float, shape (s + 1, s + 1)
-        Sums over earlier blocks for the s slow columns and the left side, scaled to `SUPPORT` blocks. They are the
-        prior of the fit. They are changed in place, by `update_fraction` of their difference from the sums of these
-        blocks.
+        Sums over earlier blocks for the s slow columns and the left side, scaled to `SUPPORT` blocks: the prior of the
+        fit. In the end they are moved in place towards the sums of these K blocks, by `update_fraction` of the
+        difference.
     update_fraction : float
         Weight of these blocks in the updated `earlier_sums`, from 0 to 1.
     workspace : Workspace
@@ -211,8 +216,8 @@ def weigh_rows(
                     normal[i, j] += reduced[block, n_fast + i, n_fast + j]
         if converged:
             break
-        eliminate(normal, n_slow)  # gives the slow coefficients; then the fast ones of each block
-        for block in range(n_blocks):
+        eliminate(normal, n_slow)  # gives the slow coefficients
+        for block in range(n_blocks):  # the fast coefficients of each block follow from them
             for i in range(left):
                 workspace.fit[block, i] = reduced[block, i, left] if i < n_fast else normal[i - n_fast, n_slow]
             for i in range(n_fast):
@@ -230,12 +235,13 @@ def block_gram_matrices(
     """Compute the Gram matrices (K, m, m) of K blocks from rows with Huber's weights, and update `earlier_sums`.
 
     `values` (r, m): rows of all blocks; `ends` (K,): index past the last row of each block; `fast`: indices of the
-    columns whose coefficients are free in each block; `slow`: indices of those with coefficients common to all blocks,
-    the left side last. `earlier_sums`: sums over earlier blocks for the slow columns, the prior of the fit; they move
-    towards the sums of these blocks by the fraction `update_fraction` of the difference (`weigh_rows`).
+    columns whose coefficients are free in each block; `slow`: indices of the columns with one coefficient for all
+    blocks, the left side last. `earlier_sums`: sums over earlier blocks for the slow columns, the prior of the fit;
+    they move towards the sums of these blocks by the fraction `update_fraction` of the difference (`weigh_rows`).
     """
     column_order = np.concatenate([fast, slow])
-    workspace = Workspace(*map(np.empty, workspace_shapes(len(values), len(ends), len(column_order), len(slow) - 1)))
+    shapes = workspace_shapes(rows=len(values), blocks=len(ends), columns=len(column_order), slow=len(slow) - 1)
+    workspace = Workspace(*(np.empty(shape) for shape in shapes))
     gram = np.empty((len(ends), values.shape[1], values.shape[1]))
     weigh_rows(values, ends, column_order, len(fast), earlier_sums, update_fraction, workspace, gram)
     return gram

@@ -1,13 +1,13 @@
-"""The weak form of a volume balance: rows of a linear regression from samples, without derivatives or a cycle.
+"""The weak form of a volume balance: rows of a linear regression from samples, without differentiating any signal.
 
-A balance  dl = sum_j c_j f_j dg_j  is multiplied by test functions phi_i of compact support, with the middle t_i and
-the half-width h, and integrated,
+A balance  dl = sum_j c_j f_j dg_j  has unknown coefficients c_j; l, f_j and g_j are functions of the recorded channels.
+It is multiplied by test functions phi_i of compact support, with the middle t_i and the half-width h, and integrated,
 
     integral of phi_i dl = sum_j c_j integral of phi_i f_j dg_j,    phi_i(t) = (1 - s^2)^4 / norm,  s = (t - t_i) / h,
 
-which gives one row for each test function, computed from the increments over each sampling interval. Summation by
-parts would move all derivatives to phi. phi and its first three derivatives vanish at its ends, so noise there and
-the truncation do not matter. Rows are `STRIDE` apart and overlap, at any sampling rate.
+which gives one row for each test function, computed from the increments over each sampling interval. Noise is not
+amplified, since summation by parts could move all derivatives to the smooth phi. phi and its first three derivatives
+vanish at its ends, so noise there and the truncation do not matter. Test functions are `STRIDE` apart and overlap.
 
 Sources: M. Shinbrot, Trans. ASME 79 (1957) 547 (modulating functions); H. A. Preisig and D. W. T. Rippin, Computers
 and Chemical Engineering 17 (1993) 1; D. A. Messenger and D. M. Bortz, Multiscale Model. Simul. 19 (2021) 1474 (weak
@@ -30,7 +30,7 @@ STRIDE = 0.125
 SPAN = 4
 #: Weight below which a row next to holes is omitted.
 MIN_WEIGHT = 0.1
-#: Maximum sum of increments that counts as a reading of a sensor: squares of larger ones would overflow.
+#: Limit of integrals that count as readings of a sensor: squares of larger ones might overflow.
 MAX_READING = 1e100
 #: Sampling rate at which the overlap of test functions is computed [Hz]; fine enough that the factor has converged.
 _FINE_RATE = 1e4
@@ -61,8 +61,8 @@ def stride_samples(rate: float) -> int:
 def test_function(rate: float) -> Array:
     """Compute the test function phi [1/s] in the middle of each sampling interval of its support.
 
-    It is bell-shaped with the integral 1. The result has the shape (SPAN, stride), with one row for each stride of
-    samples; `rate`: sampling rate [Hz].
+    It is bell-shaped with the integral 1. `rate`: sampling rate [Hz]. The result has the shape (SPAN, stride): each row
+    is the part of the test function over one stride of samples.
     """
     stride = stride_samples(rate)
     s = (np.arange(SPAN * stride) + 0.5) * 2.0 / (SPAN * stride) - 1.0
@@ -96,15 +96,16 @@ OVERLAP = _variance_inflation()
 def weak_form_rows(increments: Sequence[Array], rate: float) -> Rows:
     """Compute the rows of a regression: integrals of each test function times the increments of c columns.
 
-    `increments`: arrays (n,), with NaN for missing samples; `rate`: sampling rate [Hz]. There are
-    n // stride - SPAN + 1 rows, one for each test function that lies within the samples.
+    `increments`: an array (n,) for each column, with NaN for missing samples; `rate`: sampling rate [Hz]. There are
+    n // stride - SPAN + 1 rows, one for each test function that lies within the samples. Strides with a missing sample,
+    or with integrals beyond `MAX_READING`, count as zeros, and their rows are not flagged as `whole`.
     """
     stride = stride_samples(rate)
     n_pieces = len(increments[0]) // stride
     n_rows = max(0, n_pieces - SPAN + 1)
     strides = np.concatenate([increment[: n_pieces * stride] for increment in increments]).reshape(-1, stride)
     integrals: Array = (strides @ _transposed_test_function(rate)).reshape(len(increments), n_pieces, SPAN)
-    is_reading = np.asarray((np.abs(integrals) < MAX_READING).all(axis=(0, 2)))
+    is_reading = np.asarray((np.abs(integrals) < MAX_READING).all(axis=(0, 2)))  # False for NaN
     integrals[:, ~is_reading] = 0.0
     values: Array = np.zeros((n_rows, len(increments)))
     is_whole = np.ones(n_rows, dtype=bool)
@@ -121,5 +122,6 @@ def weights_near_holes(holes: Array, rate: float) -> Array:
     Holes are long gaps of missing samples that were filled in. `holes` (n,): 1 for a sample in a hole, else 0;
     `rate`: sampling rate [Hz]. The weights (r,) are between 0 and 1; a weight below `MIN_WEIGHT` is replaced by 0.
     """
-    weights = 1.0 - weak_form_rows([np.maximum(holes[1:], holes[:-1]) / rate], rate).values[:, 0]
+    hole_time = np.maximum(holes[1:], holes[:-1]) / rate  # of each interval that touches a hole [s]
+    weights = 1.0 - weak_form_rows([hole_time], rate).values[:, 0]
     return np.where(weights < MIN_WEIGHT, 0.0, np.minimum(weights, 1.0))
