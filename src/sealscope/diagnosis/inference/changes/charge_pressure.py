@@ -33,10 +33,8 @@ from sealscope.recordings.recording import Array, Recording
 from sealscope.signals.smoothing import average_over
 from sealscope.units import P_ATM
 
-#: `Observable.data` of all drifts, which are rival descriptions of the same change.
-DRIFT = "drift"
-#: Names of the observables: a fall of both low pressures, and a drift of one low pressure.
-FALL, LOW = "fall of the charge pressure", "drift of low p_{}"
+#: `Observable.data` of all drifts, and names of a fall of both low pressures and of a drift of one low pressure.
+DRIFT, FALL, LOW = "drift", "fall of the charge pressure", "drift of low p_{}"
 #: Channels of a pump that feeds the cylinder directly; behind a valve neither chamber is at a charge pressure.
 PUMP = ("theta", "omega")
 #: Quantile of a pressure that counts as its lowest value.
@@ -56,10 +54,7 @@ TINY = 1e-300
 
 
 class LowDrifts(NamedTuple):
-    """Drifts of p_A and p_B near the charge pressure, with standard errors [Pa/s].
-
-    Drift and error are NaN for a chamber that is too rarely near the charge pressure.
-    """
+    """Drifts of p_A and p_B near the charge pressure, with standard errors [Pa/s]; NaN for a chamber rarely near it."""
 
     low_A: float
     low_A_error: float
@@ -79,10 +74,9 @@ class LowDrifts(NamedTuple):
 def estimate_low_drifts(recording: Recording) -> LowDrifts | None:
     """Estimate the drifts [Pa/s] of the lowest pressures of both chambers.
 
-    In a closed circuit a chamber that carries no load is at the charge pressure, so that its lowest pressures drift
-    with the charge pressure. The drift of a chamber is unknown if its lowest pressure lies far above the other
-    chamber's, or if too few samples are near the lowest pressure. Return None if neither drift is known, without both
-    pressures, or without the pump's angle or speed.
+    In a closed circuit a chamber that carries no load is at the charge pressure. The drift of a chamber is unknown if
+    its lowest pressure is far above the other chamber's, or if too few samples are near the lowest pressure. Return
+    None if neither drift is known, without both pressures, or without the pump's angle or speed.
     """
     source = flow_source(recording.channels)
     if len(recording) < MIN_SAMPLES or source not in PUMP or not {"p_A", "p_B"} <= set(recording.channels):
@@ -102,9 +96,8 @@ def estimate_low_drifts(recording: Recording) -> LowDrifts | None:
 class ChargeTrend(NamedTuple):
     """Trend of the charge pressure in a recording, which shows whether oil may have left the circuit.
 
-    - `fall`, `error`: rate at which the charge pressure falls, and its standard error [Pa/s].
-    - `pressure`: charge pressure, absolute [Pa].
-    - `begin`, `end`: times of the first and the last sample [s].
+    `fall`, `error`: rate at which the charge pressure falls, and its standard error [Pa/s]; `pressure`: absolute charge
+    pressure [Pa]; `begin`, `end`: times of the first and the last sample [s].
     """
 
     fall: float
@@ -150,13 +143,8 @@ def estimate_charge_trend(recording: Recording) -> ChargeTrend | None:
     if fall is None:
         return None
     lowest = min(float(np.nanquantile(recording[name], LOWEST)) for name in ("p_A", "p_B"))
-    return ChargeTrend(
-        fall=fall.value,
-        error=fall.deviation,
-        pressure=max(lowest, 0.0) + P_ATM,
-        begin=float(recording.t[0]),
-        end=float(recording.t[-1]),
-    )
+    pressure = max(lowest, 0.0) + P_ATM
+    return ChargeTrend(*fall, pressure, begin=float(recording.t[0]), end=float(recording.t[-1]))
 
 
 def _regressors(recording: Recording, source: str) -> Array:
@@ -179,11 +167,9 @@ def _regressors(recording: Recording, source: str) -> Array:
 def _fit_drift(t: Array, pressure: Array, regressors: Array, rows: NDArray[np.intp]) -> tuple[float, float]:
     """Estimate the drift [Pa/s] of the lower envelope of a pressure, and the standard error of the drift.
 
-    - `t` [s] and `pressure` [Pa], (n,): the samples.
-    - `regressors` (n, k): position and pump flow, which are fitted together with the drift.
-    - `rows`: indices of the samples to fit, which are thinned out if they are many.
-
-    Both results are NaN for fewer than `MIN_SAMPLES` samples.
+    `t` [s] and `pressure` [Pa], (n,): the samples; `regressors` (n, k): position and pump flow, which are fitted
+    together with the drift; `rows`: indices of the samples to fit, which are thinned out if they are many. Both results
+    are NaN for fewer than `MIN_SAMPLES` samples.
     """
     rows = rows[:: max(1, len(rows) // MAX_SAMPLES)]
     if len(rows) < MIN_SAMPLES:
@@ -192,9 +178,7 @@ def _fit_drift(t: Array, pressure: Array, regressors: Array, rows: NDArray[np.in
     varying = regressors[rows][:, np.ptp(regressors[rows], axis=0) > 0.0]
     design = np.column_stack([time, np.ones(len(rows)), varying])
     equations = stack_equations(design, values)
-    weight = np.zeros(
-        len(rows)
-    )  # in the first iteration 1 for the lowest samples of each part of the recording, else 0
+    weight = np.zeros(len(rows))  # at first 1 for the lowest samples of each part of the recording, else 0
     for part in np.array_split(np.arange(len(rows)), PARTS):
         weight[part] = values[part] <= np.quantile(values[part], BEGIN)
     for _ in range(ITERATIONS):
@@ -211,13 +195,10 @@ def _fit_drift(t: Array, pressure: Array, regressors: Array, rows: NDArray[np.in
 def _envelope_error(time: Array, residual: Array) -> float:
     """Compute the standard error [Pa/s] of a lower envelope's slope from its scatter between n parts of a recording.
 
-    A part of the recording that lies off the envelope as a whole gets low weights in the robust fit, and would not
-    show in the standard error of that fit. With the quantile r_k (`BEGIN`) of the residuals in part k, the mean time
-    t_k of that part, and the means r and t over the parts,
+    A part that lies off the envelope as a whole gets low weights in the robust fit, whose own standard error therefore
+    does not show it. With the quantile r_k (`BEGIN`) of the residuals in part k, and the mean time t_k of the part,
 
-        error^2 = (sum (r_k - r)^2 / (n - 2)) / sum (t_k - t)^2.
-
-    `time` [s] and `residual` [Pa]: samples of the fit.
+        error^2 = (sum (r_k - mean of r)^2 / (n - 2)) / sum (t_k - mean of t)^2.
     """
     parts = [part for part in np.array_split(np.arange(len(residual)), PARTS) if part.size]
     levels = np.array([np.quantile(residual[part], BEGIN) for part in parts])

@@ -102,7 +102,7 @@ def amplitude_step_tests(time: Array, amplitudes: Mapping[str, Array]) -> list[S
 
 
 def sensor_tests(recording: Recording) -> list[tuple[str, StepTest]]:
-    """Test features of the pressures, such as their noise, for a step, i.e. a lasting change, that only a sensor causes.
+    """Test features of the pressures, such as their noise, for a lasting change that only a sensor causes.
 
     Returns pairs of a feature's name and its test; features that cannot be tested are left out. The list is empty if
     a chamber pressure is not recorded, or if p_A has no samples in one of the blocks.

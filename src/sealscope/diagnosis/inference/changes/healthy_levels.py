@@ -41,10 +41,8 @@ from sealscope.recordings.recording import Recording, compute_once
 
 #: Smallest number that is divided by.
 TINY = 1e-300
-#: Name of the observable of friction, which is also its data.
-FRICTION = "friction"
-#: Names of the observables of drifts, which are rival descriptions of the same data.
-DRIFTS = ("drift of p_A", "drift of p_B", "drift of both")
+#: Names of the observables: of friction, and of drifts, which are rival descriptions of the same data.
+FRICTION, DRIFTS = "friction", ("drift of p_A", "drift of p_B", "drift of both")
 
 
 class HealthyLevels:

@@ -66,13 +66,10 @@ class PressureLevels(NamedTuple):
 class LevelChange(NamedTuple):
     """Result of the test for a step of the pressure levels in one pattern, i.e. one combination of levels.
 
-    - `name`: cause that changes these levels, such as "friction".
-    - `rank`: the score minus log(number of blocks) for each coefficient of the pattern after the first; patterns are
-      compared by their rank.
-    - `score`: twice the log likelihood ratio of a step to no step.
-    - `chance`: probability that a healthy recording scores as high.
-    - `onset`: time of the step [s].
-    - `block`: length of a block [s].
+    `name`: cause that changes these levels, such as "friction"; `rank`: the score minus log(number of blocks) for each
+    coefficient of the pattern after the first, by which patterns are compared; `score`: twice the log likelihood ratio
+    of a step to no step; `chance`: probability that a healthy recording scores as high; `onset`: time of the step [s];
+    `block`: length of a block [s].
     """
 
     name: str
@@ -112,8 +109,7 @@ def motion_scales(motion: Array) -> Array:
 
 def top_speed(motion: Array) -> float:
     """Compute the 99 % quantile of the magnitude of the speed, the first column of a `motion` (`motion_columns`)."""
-    (scale,) = motion_scales(motion[:, :1])
-    return float(scale)
+    return float(motion_scales(motion[:, :1])[0])
 
 
 def _central_difference(values: Array, half_length: int) -> Array:
@@ -276,11 +272,6 @@ def _test_pattern(name: str, rows: Array, whitened: Array, time: Array) -> Level
     best = int(np.argmax(gains))
     score = n_blocks * float(gains[best])
     chance = 2.0 * n_directions * min(test.law.chance(score) for test in tests)  # up or down in each direction
-    return LevelChange(
-        name=name,
-        rank=score - (n_directions - 1) * float(np.log(n_blocks)),
-        score=score,
-        chance=min(1.0, chance),
-        onset=float(tests[0].onsets[best]),
-        block=float(time[1] - time[0]),
-    )
+    rank = score - (n_directions - 1) * float(np.log(n_blocks))
+    onset, block = float(tests[0].onsets[best]), float(time[1] - time[0])
+    return LevelChange(name, rank, score, min(1.0, chance), onset, block)

@@ -102,9 +102,9 @@ def level_observables(changes: Sequence[LevelChange]) -> Iterator[Observable]:
     """Convert tests for steps of the pressure levels to observables.
 
     `changes`: one test for each pattern, the highest rank first. The rank (`LevelChange`) becomes the score. The
-    p-value of change k is chance_k = min(1, chance_1 exp(rank_1 - rank_k)). Half of the exponent is the log Bayes factor of
-    change 1 over change k (Schwarz's approximation). The other half is a prior against descriptions that need further
-    coefficients. The interval of an onset is one block to either side.
+    p-value of change k is chance_k = min(1, chance_1 exp(rank_1 - rank_k)). Half of this exponent is the log Bayes
+    factor of change 1 over change k (Schwarz's approximation). The other half is a prior against descriptions that need
+    further coefficients. The interval of an onset is one block to either side.
     """
     for change in changes:
         onset = Interval(change.onset, change.onset - change.block, change.onset + change.block)
