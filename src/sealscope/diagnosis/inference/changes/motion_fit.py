@@ -74,13 +74,13 @@ def select_motion(recording: Recording) -> Motion | None:
     if len(rows) < MIN_ROWS:
         return None
     rows = rows[:: max(1, len(rows) // MAX_ROWS)]
-    speed, acceleration, *positions = motion[rows].T
+    speed = motion[rows, 0]
     time = (recording.t[rows] - recording.t[rows].mean()) / recording.duration
-    position = positions[0] if positions else np.zeros(len(rows))
+    position = motion[rows, 2] if motion.shape[1] > 2 else np.zeros(len(rows))
     bins = np.minimum(BINS * (position - position.min()) / max(float(np.ptp(position)), TINY), BINS - 1).astype(int)
     is_in_bin = np.eye(BINS)[bins]
     is_used = is_in_bin.any(axis=0)
-    design = np.column_stack([np.sign(speed), time, speed, acceleration, is_in_bin[:, is_used]])
+    design = np.column_stack([np.sign(speed), time, motion[rows, :2], is_in_bin[:, is_used]])
     return Motion(rows, design, top_speed=float(scales[0]))
 
 
