@@ -33,12 +33,14 @@ from sealscope.recordings.recording import Array, Recording
 from sealscope.signals.smoothing import average_over
 from sealscope.units import P_ATM
 
-#: `Observable.data` of all drifts, rival descriptions of one another; names of those of low pressures.
+#: `Observable.data` of all drifts, and names of a fall of both low pressures and of a drift of one low pressure.
 DRIFT, FALL, LOW = "drift", "fall of the charge pressure", "drift of low p_{}"
 #: Channels of a pump that feeds the cylinder directly; behind a valve neither chamber is at a charge pressure.
 PUMP = ("theta", "omega")
-#: Quantile of a pressure that counts as its lowest value, and fraction of the lowest samples with which a fit begins.
-LOWEST, BEGIN = 0.02, 0.3
+#: Quantile of a pressure that counts as its lowest value.
+LOWEST = 0.02
+#: Fraction of the samples, the lowest ones, with which the fit of an envelope begins.
+BEGIN = 0.3
 #: Maximum and minimum number of samples of a fit, and its number of iterations.
 MAX_SAMPLES, MIN_SAMPLES, ITERATIONS = 4000, 200, 15
 #: Weight of samples above the fit, over that of samples below.
@@ -52,7 +54,7 @@ TINY = 1e-300
 
 
 class LowDrifts(NamedTuple):
-    """Drifts of p_A and p_B near the charge pressure, with standard errors [Pa/s]; NaN for a chamber never near it."""
+    """Drifts of p_A and p_B near the charge pressure, with standard errors [Pa/s]; NaN for a chamber rarely near it."""
 
     low_A: float
     low_A_error: float
@@ -62,39 +64,40 @@ class LowDrifts(NamedTuple):
     def estimate(self, side: str) -> Estimate | None:
         """Return the drift [Pa/s] of the pressure of chamber `side`, "A" or "B", near the charge pressure.
 
-        It is an estimate with its standard error, or None if the drift is unknown.
+        Return None if the drift is unknown.
         """
-        estimate = Estimate(self.low_A, self.low_A_error) if side == "A" else Estimate(self.low_B, self.low_B_error)
-        return estimate if np.isfinite(estimate).all() else None
+        drift = Estimate(self.low_A, self.low_A_error) if side == "A" else Estimate(self.low_B, self.low_B_error)
+        return drift if np.isfinite(drift).all() else None
 
 
 @np.errstate(all="ignore")
 def estimate_low_drifts(recording: Recording) -> LowDrifts | None:
-    """Estimate how fast the lowest pressures of each chamber, i.e. the charge pressure there, drift [Pa/s].
+    """Estimate the drifts [Pa/s] of the lowest pressures of both chambers.
 
-    In a closed circuit a chamber that carries no load is at the charge pressure. The result is None without both
-    pressures and the pump's angle or speed, or if neither pressure can be fitted.
+    In a closed circuit a chamber that carries no load is at the charge pressure. The drift of a chamber is unknown if
+    its lowest pressure is far above the other chamber's, or if too few samples are near the lowest pressure. Return
+    None if neither drift is known, without both pressures, or without the pump's angle or speed.
     """
     source = flow_source(recording.channels)
     if len(recording) < MIN_SAMPLES or source not in PUMP or not {"p_A", "p_B"} <= set(recording.channels):
         return None
-    regressors = _regressors(recording, source)
-    pressures = [average_over(CHANGES.charge.seconds, recording[name], recording.rate) for name in ("p_A", "p_B")]
+    prior, regressors = CHANGES.charge, _regressors(recording, source)
+    is_known = np.isfinite(regressors).all(axis=1)
+    pressures = [average_over(prior.seconds, recording[name], recording.rate) for name in ("p_A", "p_B")]
     lowest = [float(np.nanquantile(p, LOWEST)) for p in pressures]
     drifts = list[float]()
     for p, low in zip(pressures, lowest, strict=True):
-        near = CHANGES.charge.near
-        is_low = np.isfinite(p) & np.isfinite(regressors).all(axis=1) & (p < low + near) & (low < min(lowest) + near)
-        is_fed = is_low.mean() > CHANGES.charge.share
-        drifts += _fit_drift(recording.t, p, regressors, np.flatnonzero(is_low & is_fed))
+        is_low = is_known & np.isfinite(p) & (p < low + prior.near)
+        is_at_charge = low < min(lowest) + prior.near and is_low.mean() > prior.share
+        drifts += _fit_drift(recording.t, p, regressors, np.flatnonzero(is_low & is_at_charge))
     return LowDrifts(*drifts) if np.isfinite(drifts).any() else None
 
 
 class ChargeTrend(NamedTuple):
-    """Trend of the charge pressure in a recording, which tells if oil may have left the circuit.
+    """Trend of the charge pressure in a recording, which shows whether oil may have left the circuit.
 
-    `fall` [Pa/s]: rate at which the charge pressure falls, with its standard `error` [Pa/s]; `pressure`: charge
-    pressure, absolute [Pa]; `begin`, `end`: times of the first and the last sample [s].
+    `fall`, `error`: rate at which the charge pressure falls, and its standard error [Pa/s]; `pressure`: absolute charge
+    pressure [Pa]; `begin`, `end`: times of the first and the last sample [s].
     """
 
     fall: float
@@ -104,25 +107,26 @@ class ChargeTrend(NamedTuple):
     end: float
 
     def loss_support(self, flow: float, onset: float) -> float:
-        """Compute twice the log likelihood ratio of a loss of oil to none, by the fall of the charge pressure.
+        """Compute twice the log likelihood ratio of a loss of oil to no loss, by the fall of the charge pressure.
 
-        A constant loss `flow` [m^3/s] since `onset` [s] empties an accumulator with the gas volume V. The rate fitted
-        over the whole recording is then, with the fraction f of the recording before the onset,
+        A constant loss `flow` [m^3/s] since `onset` [s] empties an accumulator with the gas volume V. A straight line
+        fitted to the pressure over the whole recording then falls at the rate
 
-            fall = (pressure flow / V) (1 - f)^2 (1 + 2 f).
+            fall = (pressure flow / V) (1 - f)^2 (1 + 2 f),
 
-        V has a log-normal prior. A measured fall may also have another cause, with a small probability.
+        where f is the fraction of the recording before the onset. V has a log-normal prior, over which the likelihood
+        is averaged. A measured fall may also have another cause, with a small probability.
         """
-        prior, deviations = CHANGES.accumulator, np.linspace(-3.0, 3.0, N_VOLUMES)
-        weights = np.exp(-0.5 * deviations**2) / np.exp(-0.5 * deviations**2).sum()
-        before = float(np.clip((onset - self.begin) / max(self.end - self.begin, TINY), 0.0, 1.0))
-        volumes = prior.size * np.exp(prior.spread * deviations)
-        expected = self.pressure * abs(flow) / volumes * (1.0 - before) ** 2 * (1.0 + 2.0 * before)
+        prior, z = CHANGES.accumulator, np.linspace(-3.0, 3.0, N_VOLUMES)  # standard normal, of log V
+        weights = np.exp(-0.5 * z**2) / np.exp(-0.5 * z**2).sum()
+        volumes = prior.size * np.exp(prior.spread * z)
+        f = float(np.clip((onset - self.begin) / max(self.end - self.begin, TINY), 0.0, 1.0))
+        expected = self.pressure * abs(flow) / volumes * (1.0 - f) ** 2 * (1.0 + 2.0 * f)
         deviation = float(np.hypot(self.error, CHANGES.charge.scatter))
-        unlike = CHANGES.charge.unlike * deviation / CHANGES.zero_drift.size  # density of a fall of another cause
-        loss = float(weights @ np.exp(-0.5 * ((self.fall - expected) / deviation) ** 2)) + unlike
-        none = float(np.exp(-0.5 * (self.fall / deviation) ** 2)) + unlike
-        return 2.0 * float(np.log(loss / none))
+        other_cause = CHANGES.charge.unlike * deviation / CHANGES.zero_drift.size  # likelihood of any fall by it
+        with_loss = float(weights @ np.exp(-0.5 * ((self.fall - expected) / deviation) ** 2)) + other_cause
+        without_loss = float(np.exp(-0.5 * (self.fall / deviation) ** 2)) + other_cause
+        return 2.0 * float(np.log(with_loss / without_loss))
 
 
 def estimate_charge_trend(recording: Recording) -> ChargeTrend | None:
@@ -134,22 +138,21 @@ def estimate_charge_trend(recording: Recording) -> ChargeTrend | None:
     drifts = estimate_low_drifts(recording)
     if drifts is None:
         return None
-    variances = {side: drift.deviation**2 for side in "AB" if (drift := drifts.estimate(side)) is not None}
-    fall = _mean_fall(drifts, {side: max(variance, TINY) for side, variance in variances.items()})
+    known_drifts = {side: drift for side in "AB" if (drift := drifts.estimate(side)) is not None}
+    fall = _mean_fall(drifts, {side: max(drift.deviation**2, TINY) for side, drift in known_drifts.items()})
     if fall is None:
         return None
     lowest = min(float(np.nanquantile(recording[name], LOWEST)) for name in ("p_A", "p_B"))
-    return ChargeTrend(
-        fall.value, fall.deviation, max(lowest, 0.0) + P_ATM, float(recording.t[0]), float(recording.t[-1])
-    )
+    pressure = max(lowest, 0.0) + P_ATM
+    return ChargeTrend(*fall, pressure, begin=float(recording.t[0]), end=float(recording.t[-1]))
 
 
 def _regressors(recording: Recording, source: str) -> Array:
-    """Compute what moves a chamber pressure near the charge pressure (n, 2 or 3): flow of the pump, and position.
+    """Compute the quantities (n, 2 or 3) that also change the charge pressure: flow of the pump, and position.
 
-    The first column is the positive part of the flow, the second its negative part, over the largest magnitude of the
-    flow. The third is the position [m] minus its mean, if it is recorded. `source`: channel of the pump from which the
-    flow is computed, "theta" or "omega". All are averaged over `charge.seconds` of `priors.toml`.
+    The first two columns are the positive and the negative part of the flow, relative to its largest magnitude. The
+    third column, if the position is recorded, is the position [m] minus its mean. All are averaged over
+    `charge.seconds` of `priors.toml`. `source`: channel from which the flow is computed, "theta" or "omega".
     """
     drive = average_over(CHANGES.charge.seconds, recording[source], recording.rate)
     flow = np.gradient(drive) if source == "theta" else drive
@@ -162,11 +165,11 @@ def _regressors(recording: Recording, source: str) -> Array:
 
 
 def _fit_drift(t: Array, pressure: Array, regressors: Array, rows: NDArray[np.intp]) -> tuple[float, float]:
-    """Estimate the drift [Pa/s] of the lower envelope of a pressure, and its standard error.
+    """Estimate the drift [Pa/s] of the lower envelope of a pressure, and the standard error of the drift.
 
-    `t` [s] and `pressure` [Pa], (n,): the samples; `regressors` (n, k): quantities that also change the pressure,
-    such as position and pump flow, which are fitted together with the drift; `rows`: indices of the samples to fit,
-    thinned out if they are many. Both results are NaN for fewer than `MIN_SAMPLES` samples.
+    `t` [s] and `pressure` [Pa], (n,): the samples; `regressors` (n, k): position and pump flow, which are fitted
+    together with the drift; `rows`: indices of the samples to fit, which are thinned out if they are many. Both results
+    are NaN for fewer than `MIN_SAMPLES` samples.
     """
     rows = rows[:: max(1, len(rows) // MAX_SAMPLES)]
     if len(rows) < MIN_SAMPLES:
@@ -174,8 +177,9 @@ def _fit_drift(t: Array, pressure: Array, regressors: Array, rows: NDArray[np.in
     time, values = t[rows] - t[rows].mean(), pressure[rows]
     varying = regressors[rows][:, np.ptp(regressors[rows], axis=0) > 0.0]
     design = np.column_stack([time, np.ones(len(rows)), varying])
-    equations, weight = stack_equations(design, values), np.zeros(len(rows))
-    for part in np.array_split(np.arange(len(rows)), PARTS):  # each part begins with its lowest samples
+    equations = stack_equations(design, values)
+    weight = np.zeros(len(rows))  # at first 1 for the lowest samples of each part of the recording, else 0
+    for part in np.array_split(np.arange(len(rows)), PARTS):
         weight[part] = values[part] <= np.quantile(values[part], BEGIN)
     for _ in range(ITERATIONS):
         coefficients = solve_weighted(equations, weight)
@@ -183,17 +187,18 @@ def _fit_drift(t: Array, pressure: Array, regressors: Array, rows: NDArray[np.in
         below = np.abs(residual[residual < 0.0])
         scale = WEIGHT_SCALE * float(np.median(below) if below.size else 0.0) + MIN_SCALE
         weight = np.where(residual > 0.0, ABOVE, 1.0) / np.hypot(1.0, residual / scale)
-    errors = cluster_errors(design * weight[:, None], residual * weight, [0])[0], _envelope_error(time, residual)
-    return float(coefficients[0]), float(np.hypot(*errors))
+    slope = 0  # column of the time
+    (cluster_error,) = cluster_errors(design * weight[:, None], residual * weight, [slope])
+    return float(coefficients[slope]), float(np.hypot(cluster_error, _envelope_error(time, residual)))
 
 
 def _envelope_error(time: Array, residual: Array) -> float:
     """Compute the standard error [Pa/s] of a lower envelope's slope from its scatter between n parts of a recording.
 
-    The robust weights of the fit hide a part that lies off the envelope as a whole, but this error does not. With the
-    low quantile r_k of the residuals in part k, and the mean time t_k of that part, it is
+    A part that lies off the envelope as a whole gets low weights in the robust fit, whose own standard error therefore
+    does not show it. With the quantile r_k (`BEGIN`) of the residuals in part k, and the mean time t_k of the part,
 
-        error^2 = (sum (r_k - mean)^2 / (n - 2)) / sum (t_k - mean)^2.
+        error^2 = (sum (r_k - mean of r)^2 / (n - 2)) / sum (t_k - mean of t)^2.
     """
     parts = [part for part in np.array_split(np.arange(len(residual)), PARTS) if part.size]
     levels = np.array([np.quantile(residual[part], BEGIN) for part in parts])
@@ -204,9 +209,9 @@ def _envelope_error(time: Array, residual: Array) -> float:
 def compare_low_drifts(judged: LowDrifts, healthy: Sequence[LowDrifts]) -> Iterator[Observable]:
     """Compare the drifts of p_A and p_B near the charge pressure with those of healthy recordings.
 
-    Yields a test for each explanation of a change that can be compared: a drift of the sensor of p_A, one of the
-    sensor of p_B, and a fall of the charge pressure, which lowers both pressures alike. A fall does not explain a
-    difference of the two drifts. If both are known, its p-value (`chance`) is therefore
+    Yields a test for each of three explanations, if enough healthy recordings have the drift: the sensor of p_A drifts,
+    the sensor of p_B drifts, or the charge pressure falls, which lowers both pressures alike. A fall does not explain a
+    difference between the two drifts. If both drifts are known, the p-value (`chance`) of a fall is therefore
 
         chance = min(1, chance of the weighted mean of both drifts / chance of their difference).
     """
@@ -218,14 +223,14 @@ def compare_low_drifts(judged: LowDrifts, healthy: Sequence[LowDrifts]) -> Itera
         change = compare_estimates(LOW.format(side), DRIFT, drift, known[side], scatter)
         if change is not None:
             yield _with_size(change, CHANGES.zero_drift)
-    # the variance of each side's drift, with the scatter between the healthy recordings that have one
+    # variance of each side's drift, including the scatter between the healthy recordings
     variances = {
         side: prior.scatter**2 + drift.deviation**2 + float(np.var([day.value for day in known[side]] or [0.0]))
         for side, drift in sides.items()
     }
     falls = [mean for day in healthy if (mean := _mean_fall(day, variances)) is not None]
     judged_fall = _mean_fall(judged, variances)
-    assert judged_fall is not None
+    assert judged_fall is not None  # at least one of its drifts is known
     fall = compare_estimates(FALL, DRIFT, judged_fall, falls, scatter, above=True)
     if fall is None:
         return
@@ -238,23 +243,24 @@ def compare_low_drifts(judged: LowDrifts, healthy: Sequence[LowDrifts]) -> Itera
 
 
 def _mean_fall(drifts: LowDrifts, variances: Mapping[str, float]) -> Estimate | None:
-    """Compute the rate at which the charge pressure falls [Pa/s], the mean of both chambers, with its standard error.
+    """Compute the rate at which the charge pressure falls [Pa/s], as a mean of both chambers, with its standard error.
 
-    It is -sum(drift / variance) / sum(1 / variance) over the chambers with a known drift, weighted by the `variances`
-    [Pa^2/s^2] of the sides "A" and "B". None if `drifts` has none of the sides in `variances`.
+    The rate is -sum(drift / variance) / sum(1 / variance) over the chambers with a known drift. `variances`: variance
+    [Pa^2/s^2] of the drift of the sides "A" and "B". Return None if no drift of these sides is known.
     """
     known = [
         (drift, 1.0 / variance) for side, variance in variances.items() if (drift := drifts.estimate(side)) is not None
     ]
     if not known:
         return None
-    total = sum(weight for _, weight in known)
-    mean = sum(weight * drift.value for drift, weight in known) / total
-    return Estimate(-mean, float(np.sqrt(sum((weight * drift.deviation) ** 2 for drift, weight in known))) / total)
+    total_weight = sum(weight for _, weight in known)
+    mean = sum(weight * drift.value for drift, weight in known) / total_weight
+    error = float(np.sqrt(sum((weight * drift.deviation) ** 2 for drift, weight in known))) / total_weight
+    return Estimate(-mean, error)
 
 
 def _difference(drifts: LowDrifts) -> Estimate:
-    """Compute the drift of p_A near the charge pressure minus that of p_B [Pa/s], with its standard error.
+    """Compute the drift of p_A minus the drift of p_B near the charge pressure [Pa/s], with its standard error.
 
     NaN if one of the two drifts is unknown.
     """
@@ -263,8 +269,8 @@ def _difference(drifts: LowDrifts) -> Estimate:
 
 
 def _with_size(observable: Observable, size: StepSize) -> Observable:
-    """Return the observable of a drift with its `advantage` set by the prior on the size of drifts.
+    """Return the observable of a drift with the `advantage` that the prior on the size of drifts gives it.
 
-    advantage = 2 log(prior density of its size / largest prior density).
+    advantage = 2 log(prior density of the drift / largest prior density).
     """
     return replace(observable, advantage=-size_penalty(size, observable.size))

@@ -1,9 +1,12 @@
-"""Tests of steps of features that no volume balance contains: of the amplitude of motion, of sensor noise, of hum.
+"""Tests of features that no volume balance contains for a step: amplitude of motion, sensor noise, hum.
 
 Each feature is one number in each block with motion, tested against its scatter between blocks. Blocks at rest, with a
-pump's ripple, a held load or a drive that is off, cannot be compared with them. A leak changes none of them: the
-operator gives the command, the noise is above the frequency of the ringing, which a leak damps, and p_A + p_B does not
-ring.
+pump's ripple, a held load or a drive that is off, cannot be compared with blocks in motion. A leak changes none of the
+features:
+
+- The operator gives the command.
+- A leak damps the ringing, but the noise is measured at higher frequencies.
+- The hum is measured in p_A + p_B, which does not ring.
 """
 
 from __future__ import annotations
@@ -32,17 +35,18 @@ _NEIGHBOURS = _PRIORS.neighbours
 def duty_tests(recording: Recording) -> list[StepTest]:
     """Test the amplitudes of command and motion for a step, a sudden lasting change.
 
-    Returns a test for each of the two that is recorded; the list is empty if either is constant. A change of what the
-    machine is commanded to do (its duty) changes both alike; a leak changes one of them, in open or closed loop.
+    Returns a test for each of the two that is recorded. The list is empty if either amplitude cannot be tested
+    (`amplitude_step_tests`). A change of what the machine is commanded to do (its duty) changes both amplitudes alike;
+    a leak changes only one of them, in open or closed loop.
     """
     length, cycle = len(recording) // BLOCKS, find_cycle(recording)
     if "x" in recording and cycle is not None:
-        # whole cycles: without a position both are the drive's, which a leak changes within a cycle as well
+        # blocks of whole cycles; not without a position, where a leak also changes the drive's motion within a cycle
         cycle_samples = cycle * recording.rate
         length = round(max(1, math.ceil(length / cycle_samples)) * cycle_samples)
     time, blocks = _split_blocks(recording, length)
     is_moving = _find_moving_blocks(recording, length)
-    amplitudes = {kind: values[is_moving] for kind, values in log_amplitudes(blocks)}
+    amplitudes = {name: values[is_moving] for name, values in log_amplitudes(blocks)}
     return amplitude_step_tests(time[is_moving], amplitudes)
 
 
@@ -56,51 +60,49 @@ def time_in_motion(speeds: Array, max_speed: float) -> Array:
 
 
 def is_in_motion(fractions: Array) -> NDArray[np.bool_]:
-    """Flag the blocks (K,) in which the piston moves for long enough.
+    """Flag the blocks (K,) in which the piston moves for long enough, compared with the block with the most motion.
 
-    `fractions` (K,): fraction of each block's time in motion, from `time_in_motion`. It must be at least
-    `features.busy` (`priors.toml`) times the fraction of the busiest block.
+    `fractions` (K,): fraction of each block's time in motion (`time_in_motion`). A block is flagged if its fraction is
+    at least `features.busy` (`priors.toml`) times the largest one.
     """
     return np.asarray(fractions >= _PRIORS.busy * fractions.max(initial=0.0))
 
 
 def _find_moving_blocks(recording: Recording, length: int) -> NDArray[np.bool_]:
-    """Flag the blocks of `length` samples with motion (K,); all of them if no motion is recorded."""
-    count, motion = len(recording) // length, motion_columns(recording.channels, recording.rate)
+    """Flag the blocks of `length` samples in which the piston moves (K,); all of them if no motion is recorded."""
+    count = len(recording) // length
+    motion = motion_columns(recording.channels, recording.rate)
     if motion is None:
         return np.ones(count, dtype=bool)
-    speeds = motion[: count * length, 0].reshape(count, length)
+    speeds = motion[: count * length, 0].reshape(count, length)  # the first column is the speed
     return is_in_motion(time_in_motion(speeds, top_speed(motion)))
 
 
 def log_amplitudes(blocks: Mapping[str, Array]) -> Iterator[tuple[str, Array]]:
     """Yield the names "command" and "motion", each with the log amplitude (K,) of its channel in K blocks.
 
-    The amplitude is the range from the 2 % to the 98 % quantile; it is NaN for a block without samples. `blocks`:
-    samples (K, length) of each channel, by its name. A name without a recorded channel is left out.
+    The amplitude is the range from the 2 % to the 98 % quantile, NaN for a block without samples. `blocks`: samples
+    (K, length) of each channel, by the channel's name. "command" or "motion" is left out if none of its channels is
+    recorded.
     """
-    for kind, names in (("command", COMMANDS), ("motion", MOTIONS)):
-        if name := next((channel for channel in names if channel in blocks), None):
-            values = blocks[name]
-            low, high = (
-                _row_statistic(partial(np.percentile, q=percent), partial(np.nanpercentile, q=percent), values)
-                for percent in (2.0, 98.0)
-            )
-            yield kind, np.log(high - low)
+    for name, candidates in (("command", COMMANDS), ("motion", MOTIONS)):
+        if channel := next((candidate for candidate in candidates if candidate in blocks), None):
+            low, high = (_row_percentile(blocks[channel], percent) for percent in (2.0, 98.0))
+            yield name, np.log(high - low)
 
 
 def amplitude_step_tests(time: Array, amplitudes: Mapping[str, Array]) -> list[StepTest]:
     """Test the log amplitudes of command and motion in K blocks for a step; return one test for each.
 
     `time` (K,): middles of the blocks [s]; `amplitudes`: log amplitudes (K,) by the names "command" and "motion". The
-    list is empty if one of them is constant, has missing values or too few blocks.
+    list is empty if one amplitude is constant, has missing values or too few blocks.
     """
     tests = [feature_step_test(time, values) for values in amplitudes.values()]
     return [test for test in tests if test is not None] if None not in tests else []
 
 
 def sensor_tests(recording: Recording) -> list[tuple[str, StepTest]]:
-    """Test features of the pressures, such as their noise, for a sudden lasting change that only a sensor causes.
+    """Test features of the pressures, such as their noise, for a lasting change that only a sensor causes.
 
     Returns pairs of a feature's name and its test; features that cannot be tested are left out. The list is empty if
     a chamber pressure is not recorded, or if p_A has no samples in one of the blocks.
@@ -133,15 +135,16 @@ def _split_blocks(recording: Recording, length: int) -> tuple[Array, dict[str, A
 
 
 def sensor_features(blocks: Mapping[str, Array], rate: float) -> Iterator[tuple[str, Array]]:
-    """Yield name and values (K,) of each feature that only a change of a sensor shifts: wiring, noise, and hum.
+    """Yield the name and the values (K,) of each feature of the pressures that only a change of a sensor shifts.
 
-    `blocks`: samples (K, length) by channel name, among them p_A and p_B, NaN where missing; `rate`: sampling rate
-    [Hz].
+    The features are the sign of p_A - p_B relative to the flow, the noise of both pressures, the difference of their
+    noise, and the hum at the frequencies of the mains. `blocks`: samples (K, length) by channel name, including p_A and
+    p_B, NaN where missing; `rate`: sampling rate [Hz].
     """
     p_A, p_B = blocks["p_A"], blocks["p_B"]
-    if name := next((channel for channel in ("omega", "u", "theta", "x") if channel in blocks), None):
-        # 1 if p_A - p_B is in phase with the flow into A, as friction makes it, else -1: sensors exchanged or reversed
-        flow = blocks[name] if name in ("omega", "u") else np.gradient(blocks[name], axis=1)
+    if channel := next((name for name in ("omega", "u", "theta", "x") if name in blocks), None):
+        # friction puts p_A - p_B in phase with the flow into A (1); with exchanged or reversed sensors the sign is -1
+        flow = blocks[channel] if channel in ("omega", "u") else np.gradient(blocks[channel], axis=1)
         difference = p_A - p_B - np.nanmean(p_A - p_B)
         yield "sense of p_A - p_B", np.sign(_row_statistic(np.mean, np.nanmean, difference * flow))
     # median instead of mean: pressure jumps at reversals are outliers
@@ -150,46 +153,56 @@ def sensor_features(blocks: Mapping[str, Array], rate: float) -> Iterator[tuple[
     )
     yield "noise of the pressures", noise_A + noise_B
     yield "noise of p_A beside that of p_B", noise_A - noise_B
+    bin_width = rate / (p_A.shape[1] // 2)  # [Hz], of the spectra of half a block
     for hertz in _PRIORS.mains:
-        if hertz + _NEIGHBOURS[-1] * rate / (p_A.shape[1] // 2) < _PRIORS.highest * rate:
+        if hertz + _NEIGHBOURS[-1] * bin_width < _PRIORS.highest * rate:
             yield f"hum of {hertz:g} Hz", _log_hum(p_A + p_B, hertz / rate)
 
 
 def _log_hum(blocks: Array, frequency: float) -> Array:
     """Compute the log power (K,) of a spectral line in blocks (K, n), relative to the power of the neighbouring bins.
 
-    `frequency`: frequency of the line over the sampling rate. Ringing is wider than a line and raises the neighbouring
-    bins as well. The spectrum is Welch's estimate from both halves of each block.
+    Ringing is wider than a line, so it raises the neighbouring bins as well and cancels. `frequency`: frequency of the
+    line over the sampling rate. The power is the mean over both halves of each block (Welch's estimate).
     """
     length = blocks.shape[1] // 2
     halves = blocks[:, : 2 * length].reshape(-1, 2, length)
-    bins = np.array([0.0, *_NEIGHBOURS, *np.negative(_NEIGHBOURS)])
-    cycles = np.outer(np.arange(length), frequency + bins / length)
-    window = np.hanning(length)[:, None] * np.exp(-2j * np.pi * cycles)
-    power = np.log((np.abs((halves - halves.mean(axis=2, keepdims=True)) @ window) ** 2).mean(axis=1))
-    return np.asarray(power[:, 0] - power[:, 1:].mean(axis=1))
+    halves = halves - halves.mean(axis=2, keepdims=True)
+    distances = np.array([0.0, *_NEIGHBOURS, *np.negative(_NEIGHBOURS)])  # [bins], from the line
+    cycles = np.outer(np.arange(length), frequency + distances / length)
+    fourier = np.hanning(length)[:, None] * np.exp(-2j * np.pi * cycles)
+    log_power = np.log((np.abs(halves @ fourier) ** 2).mean(axis=1))
+    return np.asarray(log_power[:, 0] - log_power[:, 1:].mean(axis=1))
+
+
+def _row_percentile(values: Array, percent: float) -> Array:
+    """Compute the percentile `percent` of the known values of each row (K, n); NaN for a row without known values."""
+    return _row_statistic(partial(np.percentile, q=percent), partial(np.nanpercentile, q=percent), values)
 
 
 def _row_statistic(statistic: Callable[..., Array], without_missing: Callable[..., Array], values: Array) -> Array:
-    """Compute a statistic of the known values of each row (K, n); NaN for a row without any.
+    """Compute a statistic of the known values of each row (K, n); NaN for a row without known values.
 
-    `statistic`: function for complete rows, such as `np.median`; `without_missing`: function for the others, such as
-    `np.nanmedian`, which takes ten times longer.
+    `statistic`: function for rows without missing values, such as `np.median`; `without_missing`: function that skips
+    missing values, such as `np.nanmedian`. It takes ten times longer and is used only for rows that have some.
     """
     results = np.full(len(values), np.nan)
-    has_values, is_complete = (test(np.isfinite(values), axis=1) for test in (np.any, np.all))
-    for rows, function in ((is_complete, statistic), (has_values & ~is_complete, without_missing)):
+    is_known = np.isfinite(values)
+    is_complete = is_known.all(axis=1)
+    for rows, function in ((is_complete, statistic), (is_known.any(axis=1) & ~is_complete, without_missing)):
         if rows.any():
             results[rows] = function(values[rows], axis=1)
     return results
 
 
 def feature_step_test(time: Array, values: Array) -> StepTest | None:
-    """Test the values (K,) of a feature in K blocks at times (K,) [s] for a step up or down.
+    """Test the values (K,) of a feature in K blocks for a step up or down, against their scatter between blocks.
 
-    Return None if they are constant, if one is missing, or for fewer than `MIN_BLOCKS` blocks.
+    `time` (K,): middles of the blocks [s]. Return None if the values are constant, if a value is missing, or for fewer
+    than `MIN_BLOCKS` blocks.
     """
     if len(values) < MIN_BLOCKS or not np.isfinite(values).all() or not np.ptp(values) > 0.0:
         return None
-    unit_precision, drift = np.eye(len(values)), _PRIORS.wander
-    return two_sided_step_test(Information(time, unit_precision, values, slope=drift, walk=drift))
+    drift = _PRIORS.wander
+    precision = np.eye(len(values))  # independent errors of equal variance, which the test estimates
+    return two_sided_step_test(Information(time, precision, values, slope=drift, walk=drift))

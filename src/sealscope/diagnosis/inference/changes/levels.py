@@ -6,12 +6,13 @@ same way throughout a recording,
 
     p_i = level_i + half_i sign(v) + b_i v + c_i dv/dt + d_i x,    i = A, B.
 
-A leak between the chambers changes none of them: the force that the piston needs determines their difference, the
-enclosed oil their mean. Another cause changes some of them at one instant in a known pattern: each pattern, a subspace
-of the four, is a hypothesis. Let S be the covariance of the differences of neighbouring blocks, which contain little of
-drifts and walks: the four numbers times S^(-1/2) have white noise. A pattern then has an orthonormal basis of m
-directions. In n blocks, score_j is twice the log likelihood ratio of a step in direction j alone, and F_j the residual
-sum of squares without that step over the one with it, minus 1:
+A leak between the chambers changes none of the four: the force that the piston needs determines the difference of the
+pressures, the enclosed oil their mean. Another cause changes some of the four at one instant in a known pattern, a
+subspace of the four dimensions. Each pattern is a hypothesis. Let S be the covariance of the differences between
+neighbouring blocks, which contain little of slow drifts. Multiplied by S^(-1/2), the four numbers have white noise, and
+each pattern has an orthonormal basis of m directions. In n blocks, score_j is twice the log likelihood ratio of a step
+in direction j, without steps in the other directions. F_j is the ratio of the residual sums of squares without and with
+that step, minus 1:
 
     F_j = exp(score_j / n) - 1,    rank = max over onsets of n log(1 + sum_j F_j) - (m - 1) log n.
 
@@ -35,9 +36,10 @@ from sealscope.recordings.recording import Array, Recording
 _PRIORS = CHANGES.levels
 _TINY = float(np.finfo(float).tiny)
 A, B, HALF_A, HALF_B = np.eye(4)
-#: Loss of oil lowers both levels; a rise has many causes.
+#: Names of a fall of both levels, by a loss of oil, and of a rise, which has many causes.
 CHARGE, SUPPLY = "a loss of oil", "what feeds both chambers"
-#: Name of each pattern, and bases of its subspace: one for each simpler pattern within it, which is the first vectors.
+#: Name of each pattern, and bases of its subspace. If the subspace contains simpler patterns, each of them supplies the
+#: first vectors of one basis.
 PATTERNS: tuple[tuple[str, list[list[Array]]], ...] = (
     (CHARGE, [[A + B]]),
     ("friction", [[A + B, HALF_A, HALF_B]]),
@@ -64,9 +66,9 @@ class PressureLevels(NamedTuple):
 class LevelChange(NamedTuple):
     """Result of the test for a step of the pressure levels in one pattern, i.e. one combination of levels.
 
-    `name`: cause that changes these levels, such as "friction"; `score`: twice the log likelihood ratio of a step to
-    none; `chance`: probability that a healthy recording scores as high; `rank`: the score less a penalty of log(blocks)
-    for each coefficient of the pattern after the first, by which patterns are compared; `onset`: time of the step [s];
+    `name`: cause that changes these levels, such as "friction"; `rank`: the score minus log(number of blocks) for each
+    coefficient of the pattern after the first, by which patterns are compared; `score`: twice the log likelihood ratio
+    of a step to no step; `chance`: probability that a healthy recording scores as high; `onset`: time of the step [s];
     `block`: length of a block [s].
     """
 
@@ -85,30 +87,28 @@ def motion_columns(channels: Mapping[str, Array], rate: float) -> Array | None:
     The acceleration is the difference of the speed over that time. The position is relative to its mean. Missing values
     are NaN. Return None if none of these channels is recorded.
     """
-    name = next((name for name in ("x", "theta", "omega", "u") if name in channels), None)
+    name = next((channel for channel in ("x", "theta", "omega", "u") if channel in channels), None)
     if name is None:
         return None
+    values = channels[name]
     half_length = max(1, round(HALF_DIFFERENCE * rate))  # [samples]
-    speed = _central_difference(channels[name], half_length) if name in ("x", "theta") else channels[name]
+    speed = _central_difference(values, half_length) if name in ("x", "theta") else values
     motion = [speed, _central_difference(speed, half_length)]
     if name == "x":
-        motion.append(channels[name] - np.nanmean(channels[name]))
+        motion.append(values - np.nanmean(values))
     return np.column_stack(motion)
 
 
 def motion_scales(motion: Array) -> Array:
-    """Compute the 99 % quantiles (m,) of the magnitudes of the columns of a motion (n, m).
+    """Compute the 99 % quantile of the magnitude of each column of a motion (n, m), shape (m,).
 
-    The columns are speed, acceleration and, if m = 3, position (`motion_columns`), whose units the quantiles have.
+    The columns are speed, acceleration and, if m = 3, position (`motion_columns`).
     """
     return np.asarray(np.maximum(np.nanpercentile(np.abs(motion), 99.0, axis=0), _TINY))
 
 
 def top_speed(motion: Array) -> float:
-    """Compute the 99 % quantile of the magnitude of the speed in a motion (n, m), whose first column it is.
-
-    It has the unit of that column (`motion_columns`).
-    """
+    """Compute the 99 % quantile of the magnitude of the speed, the first column of a `motion` (`motion_columns`)."""
     return float(motion_scales(motion[:, :1])[0])
 
 
@@ -126,21 +126,23 @@ def estimate_levels(recording: Recording) -> PressureLevels | None:
 
     The samples in motion are fitted by least squares with p = level + half sign(v) + b v + c dv/dt + d x. Level and
     half difference are free in each block; the slopes b, c and d on speed v, acceleration and position x are common to
-    the recording. Without a recorded motion the levels are means and the half differences zero. Return None if a
-    pressure is missing, or if some block has too few samples of one direction, whichever length of blocks is tried.
+    the recording. Without a recorded motion the levels are means and the half differences zero. Several lengths of
+    blocks are tried. Return None if a pressure is not recorded, or if for each length some block has too few samples of
+    one direction.
     """
     if not {"p_A", "p_B"} <= set(recording.channels):
         return None
     means = np.array([recording["p_A"].mean(), recording["p_B"].mean()])
     rows = pressure_level_rows(recording.channels, recording.rate, means)
-    # the first length of blocks [samples] that suffices, whole cycles if there are any
-    lengths, cycle = [len(recording) // count for count in _PRIORS.blocks], find_cycle(recording)
-    if cycle is not None:
+    lengths = [len(recording) // count for count in _PRIORS.blocks]  # [samples], from the shortest on
+    cycle = find_cycle(recording)
+    if cycle is not None:  # try blocks of whole cycles first
         cycle_samples = cycle * recording.rate
         lengths.insert(0, round(math.ceil(lengths[0] / cycle_samples) * cycle_samples))
+    min_count = _PRIORS.blocks[-1]
     for length in lengths:
         count = len(recording) // max(length, 1)
-        if length < 2 or count < _PRIORS.blocks[-1]:
+        if length < 2 or count < min_count:
             continue
         blocks = rows[: count * length].reshape(count, length, rows.shape[1])
         values = fit_pressure_levels(blocks.transpose(0, 2, 1) @ blocks, length, means)
@@ -155,9 +157,9 @@ def pressure_level_rows(
     """Build the rows (n, m) of the fit of pressure levels: 1, sign of the speed, motion (`motion_columns`), p_A, p_B.
 
     The rows of samples at rest or without a known motion are zero. If no motion is recorded, the rows are 1, p_A, p_B.
-    `channels`: samples by channel name; `rate`: sampling rate [Hz]; `means` (2,) [Pa]: subtracted from the pressures.
-    Samples faster than a fixed fraction of `max_speed` count as moving; by default it is the `top_speed` of these
-    samples.
+    `channels`: samples by channel name; `rate`: sampling rate [Hz]; `means` (2,) [Pa]: subtracted from the pressures;
+    `max_speed`: highest speed, of which moving samples exceed a fixed fraction; by default the `top_speed` of
+    `channels`.
     """
     motion = motion_columns(channels, rate)
     pressures = np.column_stack([channels["p_A"], channels["p_B"]]) - means
@@ -176,11 +178,13 @@ def fit_pressure_levels(gram: Array, length: float, means: Array) -> Array | Non
 
     The result (K, 4) contains level_A, level_B, half_A and half_B [Pa], with half = (p for v > 0 - p for v < 0) / 2
     (`PressureLevels`). It is None if a block has too few samples of one direction. `gram` (K, m, m): Gram matrices of
-    the rows of `pressure_level_rows`; `length`: samples in a block; `means` (2,) [Pa]: were subtracted from the
-    pressures.
+    the rows of `pressure_level_rows`; `length`: samples in a block; `means` (2,) [Pa]: means that were subtracted from
+    the pressures.
     """
-    n_free = min(2, gram.shape[1] - 2)  # constant and sign(v) are free in each block, unless no motion is recorded
+    # free in each block: the constant and, if a motion is recorded, sign(v); the last two columns are p_A and p_B
+    n_free = min(2, gram.shape[1] - 2)
     if n_free == 2:
+        # (number of moving samples +- sum of sign(v)) / 2, with v > 0 and with v < 0
         samples_each_way = 0.5 * (gram[:, 0, :1] + np.multiply.outer(gram[:, 0, 1], [1.0, -1.0]))
         if samples_each_way.min() < _PRIORS.least * length:
             return None
@@ -213,15 +217,18 @@ def pattern_tests(time: Array, values: Array) -> tuple[LevelChange, ...]:
     more likely pattern. Patterns that cannot be tested are left out.
     """
     whitening = _whitening_matrix(values)
-    mean, sum_of_levels, changes = values.mean(axis=0), values[:, :2].sum(axis=1), list[LevelChange]()
-    # a step of a sensor's scale is proportional to its pressure's level and half difference
+    mean = values.mean(axis=0)
+    sum_of_levels = values[:, :2].sum(axis=1)
+    # a step of a sensor's scale changes level and half difference of that pressure in proportion to their means
     scales = (("scale of p_A", [[mean * (A + HALF_A)]]), ("scale of p_B", [[mean * (B + HALF_B)]]))
+    changes = list[LevelChange]()
     for name, bases in (*PATTERNS, *scales):
         tests = [_test_pattern(name, np.array(rows) @ whitening.T, values @ whitening.T, time) for rows in bases]
+        # of several bases of one pattern the lowest rank counts
         change = min((test for test in tests if test is not None), key=lambda test: test.rank, default=None)
         if change is None:
             continue
-        # only a fall of both levels can be a loss of oil
+        # only a fall of the sum of both levels can be a loss of oil
         after = time > change.onset
         is_falling = after.any() and not after.all() and sum_of_levels[after].mean() <= sum_of_levels[~after].mean()
         changes.append(change._replace(name=SUPPLY) if name == CHARGE and not is_falling else change)
@@ -229,14 +236,14 @@ def pattern_tests(time: Array, values: Array) -> tuple[LevelChange, ...]:
 
 
 def _whitening_matrix(values: Array) -> Array:
-    """Compute the matrix (c, 4) that transforms pressure levels to numbers with independent errors of unit variance.
+    """Compute the matrix (c, 4) that transforms pressure levels to c numbers with independent errors of unit variance.
 
-    It is S^(-1/2), with the covariance S of the differences between neighbouring blocks. `values` (K, 4): the four
-    levels in each of K blocks (`PressureLevels`); c is the number of these levels that vary at all.
+    The matrix is S^(-1/2), with the covariance S of the differences between neighbouring blocks. `values` (K, 4): the
+    four levels in each of K blocks (`PressureLevels`), of which c vary at all.
     """
     varying = np.flatnonzero(np.ptp(values, axis=0) > 0.0)
-    change = np.diff(values[:, varying], axis=0)
-    covariance = change.T @ change / len(change)
+    differences = np.diff(values[:, varying], axis=0)
+    covariance = differences.T @ differences / len(differences)
     deviations = np.sqrt(np.diag(covariance))
     eigen, basis = np.linalg.eigh(covariance / np.outer(deviations, deviations))
     matrix = np.zeros((len(varying), 4))
@@ -259,12 +266,12 @@ def _test_pattern(name: str, rows: Array, whitened: Array, time: Array) -> Level
     if not tests:
         return None
     n_blocks, n_directions = len(time), len(tests)
-    # log likelihood ratio of a step in each direction at each onset, then log(1 + sum_j F_j) of the module
+    # log likelihood ratio of a step in each direction at each onset, then log(1 + sum_j F_j) at each onset (see module)
     log_ratios = np.array([test.likelihood - test.likelihood.max() + 0.5 * test.score for test in tests])
     gains = np.log1p(np.expm1(np.maximum(log_ratios, 0.0) / (0.5 * n_blocks)).sum(axis=0))
     best = int(np.argmax(gains))
     score = n_blocks * float(gains[best])
-    chance = 2.0 * n_directions * min(test.law.chance(score) for test in tests)
+    chance = 2.0 * n_directions * min(test.law.chance(score) for test in tests)  # up or down in each direction
     rank = score - (n_directions - 1) * float(np.log(n_blocks))
     onset, block = float(tests[0].onsets[best]), float(time[1] - time[0])
     return LevelChange(name, rank, score, min(1.0, chance), onset, block)

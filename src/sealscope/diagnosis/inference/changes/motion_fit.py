@@ -4,10 +4,10 @@ A pressure, or p_A - p_B, is fitted by
 
     p = level(x) + half sign(v) + b v + c dv/dt + drift t/T,
 
-with the level free in each of some bins of the position and t/T the time over the recording's duration, by iteratively
-reweighted least squares (weights of Cauchy's law), so that contact with a workpiece does not count. Standard errors
-allow for residuals that are correlated within each of some parts of the recording (cluster-robust). Called for friction
-and drifts (`healthy_levels`) and for the viscous drop (`viscous_drop`).
+with position x, speed v, and the time t over the recording's duration T. The level is free in each of `BINS` bins of
+the position. The fit is iteratively reweighted least squares with Cauchy weights, so that contact with a workpiece
+hardly counts. Standard errors allow for residuals that are correlated within each of `PARTS` parts of the recording
+(cluster-robust). Called for friction and drifts (`healthy_levels`) and for the viscous drop (`viscous_drop`).
 
 Sources: P. W. Holland, R. E. Welsch, Communications in Statistics A6 (1977) 813 (the weights); K.-Y. Liang, S. L.
 Zeger, Biometrika 73 (1986) 13 (the standard error).
@@ -39,15 +39,15 @@ TINY, MIN_RESIDUAL = 1e-300, 1.0
 ROUNDING = float(np.finfo(float).eps)
 #: Number of parts of a recording whose residuals count as independent.
 PARTS = 20
-#: Indices of the columns sign(v), t/T and v.
+#: Indices of the columns sign(v), t/T and v in a design matrix.
 DIRECTION, TIME, SPEED = 0, 1, 2
 
 
 class Motion(NamedTuple):
-    """Samples in motion: their indices `rows` (n,), and the columns `design` (n, m) of the module's equation.
+    """Samples in which the piston moves, with the design matrix of their fit.
 
-    The columns are the sign of the speed, time, speed, acceleration, and bins of the position; the speed is relative to
-    `top_speed`.
+    `rows` (n,): indices of the samples; `design` (n, m): sign of the speed, time, speed, acceleration, and a column of
+    0 and 1 for each bin of the position; `top_speed`: speed that counts as 1 in the column of the speed.
     """
 
     rows: NDArray[np.intp]
@@ -59,8 +59,8 @@ def select_motion(recording: Recording) -> Motion | None:
     """Select the samples in which the piston moves, and build the design matrix of their fit (`Motion`).
 
     The piston moves if its speed exceeds a fraction (`healthy.slowest` in `priors.toml`) of the 99 % quantile of its
-    speed. If they are many, the samples are thinned out. Returns None if a chamber pressure or a signal of the motion
-    is not recorded, or if fewer than `MIN_ROWS` samples move.
+    speed. Samples in motion are thinned out if they are many. Return None if a chamber pressure or a signal of the
+    motion is not recorded, or if the piston moves in fewer than `MIN_ROWS` samples.
     """
     if len(recording) < MIN_ROWS or not set(CHAMBERS) <= set(recording.channels):
         return None
@@ -74,12 +74,14 @@ def select_motion(recording: Recording) -> Motion | None:
     if len(rows) < MIN_ROWS:
         return None
     rows = rows[:: max(1, len(rows) // MAX_ROWS)]
-    speed, time = motion[rows, 0], (recording.t[rows] - recording.t[rows].mean()) / recording.duration
+    speed = motion[rows, 0]
+    time = (recording.t[rows] - recording.t[rows].mean()) / recording.duration
     position = motion[rows, 2] if motion.shape[1] > 2 else np.zeros(len(rows))
-    bins = np.minimum((BINS * (position - position.min()) / max(float(np.ptp(position)), TINY)), BINS - 1)
-    occupied = np.eye(BINS)[bins.astype(int)]
-    design = np.column_stack([np.sign(speed), time, motion[rows, :2], occupied[:, occupied.any(axis=0)]])
-    return Motion(rows, design, float(scales[0]))
+    bins = np.minimum(BINS * (position - position.min()) / max(float(np.ptp(position)), TINY), BINS - 1).astype(int)
+    is_in_bin = np.eye(BINS)[bins]
+    is_used = is_in_bin.any(axis=0)
+    design = np.column_stack([np.sign(speed), time, motion[rows, :2], is_in_bin[:, is_used]])
+    return Motion(rows, design, top_speed=float(scales[0]))
 
 
 def stack_equations(design: Array, values: Array) -> Array:
@@ -88,14 +90,15 @@ def stack_equations(design: Array, values: Array) -> Array:
 
 
 def solve_weighted(equations: Array, weight: Array) -> Array:
-    """Solve a weighted least-squares problem by a QR decomposition; returns the coefficients c (m,).
+    """Solve a weighted least-squares problem by a QR decomposition; return the coefficients c (m,).
 
-    They minimise sum((weight (values - design c))^2). If the weighted design matrix has not full rank, they are the
-    shortest of all solutions, as from `numpy.linalg.lstsq`. `equations` (m + 1, n): columns of the design and values
-    (`stack_equations`), with n > m; `weight` (n,): factors of the rows.
+    The coefficients minimise sum((weight (values - design c))^2). If the weighted design matrix does not have full
+    rank, c is the shortest of all solutions, as from `numpy.linalg.lstsq`. `equations` (m + 1, n): columns of the
+    design and values (`stack_equations`), with n > m; `weight` (n,): factors of the rows.
     """
-    factor = qr((equations * weight).T, mode="raw", overwrite_a=True, check_finite=False)[1]
-    return np.asarray(np.linalg.lstsq(factor[:-1, :-1], factor[:-1, -1], rcond=ROUNDING * len(weight))[0])
+    _, triangle = qr((equations * weight).T, mode="raw", overwrite_a=True, check_finite=False)
+    solution = np.linalg.lstsq(triangle[:-1, :-1], triangle[:-1, -1], rcond=ROUNDING * len(weight))
+    return np.asarray(solution[0])
 
 
 def fit_robustly(design: Array, values: Array) -> tuple[Array, Array]:
@@ -114,13 +117,14 @@ def fit_robustly(design: Array, values: Array) -> tuple[Array, Array]:
 
 
 def cluster_errors(design: Array, residual: Array, columns: Sequence[int]) -> Array:
-    """Compute standard errors of the coefficients `columns` of a weighted least-squares fit.
+    """Compute standard errors of some coefficients of a weighted least-squares fit.
 
-    The residuals (n,), in the order of time, are correlated within each of P = `PARTS` parts of the recording:
+    The residuals may be correlated within each of P = `PARTS` parts of the recording:
 
         error^2 = P / (P - 1) sum over parts of influence^2,    influence = (X' X)^-1 (X' residual of the part).
 
-    X = `design` (n, m) and `residual` are both multiplied by the weights.
+    `design` (n, m): the matrix X; `residual` (n,): residuals in the order of time; both are multiplied by the weights
+    of the fit. `columns`: indices of the coefficients.
     """
     edges = np.linspace(0, len(residual), PARTS + 1).astype(int)[:-1]
     scores = np.add.reduceat(design * residual[:, None], edges, axis=0)
@@ -131,8 +135,8 @@ def cluster_errors(design: Array, residual: Array, columns: Sequence[int]) -> Ar
 class DifferenceFit(NamedTuple):
     """Fit of p_A - p_B by friction, which reverses with the motion, and a drop proportional to the speed.
 
-    `friction` [Pa]: half the difference between the directions of motion; `drop`: pressure drop at the highest speed of
-    the recording [Pa]; `friction_error`, `drop_error`: standard errors of both.
+    `friction`: half the difference between the directions of motion [Pa]; `drop`: viscous pressure drop per speed, in
+    Pa per unit of the speed of `motion_columns`; `friction_error`, `drop_error`: standard errors of both.
     """
 
     friction: float
@@ -163,11 +167,11 @@ def _fit_difference(recording: Recording) -> DifferenceFit | None:
     coefficients, weight = fit_robustly(design, difference)
     weighted = design * weight[:, None]
     residual = (difference - design @ coefficients) * weight
-    errors = cluster_errors(weighted, residual, [DIRECTION, SPEED])
+    friction_error, speed_error = cluster_errors(weighted, residual, [DIRECTION, SPEED])
     fit = DifferenceFit(
-        float(coefficients[DIRECTION]),
-        float(errors[0]),
-        float(coefficients[SPEED] / top_speed),
-        float(errors[1] / top_speed),
+        friction=float(coefficients[DIRECTION]),
+        friction_error=float(friction_error),
+        drop=float(coefficients[SPEED] / top_speed),
+        drop_error=float(speed_error / top_speed),
     )
     return fit if np.isfinite(fit).all() else None

@@ -1,4 +1,4 @@
-"""Cross-spectra of the pressures with other channels in octaves, by which a filter of one pressure is told.
+"""Cross-spectra of the pressures with other channels in octaves, which show a filter of one pressure.
 
 A low-pass filter of first order with the cut-off frequency f_c multiplies one pressure by
 
@@ -11,11 +11,11 @@ the phase of sum(A B*) in each octave are compared with those of healthy recordi
 or a leak turns the phase of one pressure by arctan(f / f_c) at all frequencies.
 
 The ratios of an octave vary between healthy recordings by an unknown variance with a prior, and neighbouring octaves
-vary together: a recording's ratios follow a multivariate t distribution. Its phases follow von Mises distributions,
-whose variance is learnt likewise and is larger where the pressures are hardly coherent; a fraction of the phases is
-uniform. The observable is the Bayes factor of a filter, averaged over the pairs, the filtered pressure, f_c and the
-noise; as its mean over healthy recordings is 1, a healthy recording exceeds b with a probability of at most 1 / b
-(Markov).
+vary together: a recording's ratios follow a multivariate t distribution. The phases follow von Mises distributions.
+Their variance is also estimated from the healthy recordings, and is larger where the pressures are hardly coherent; a
+fraction of the phases is uniform. The test statistic is the Bayes factor of a filter, averaged over the pairs, the
+filtered pressure, f_c and the noise. The mean of a Bayes factor over healthy recordings is 1, so a healthy recording
+exceeds b with a probability of at most 1 / b (Markov).
 
 Source: P. D. Welch, IEEE Transactions on Audio and Electroacoustics 15 (1967) 70; J. S. Bendat, A. G. Piersol, Random
 Data, 4th ed. (2010), section 9.2 (error of a phase); K. V. Mardia, P. E. Jupp, Directional Statistics (2000), section
@@ -36,8 +36,10 @@ from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array, Recording
 
-#: `Observable.data` of the comparison of spectra, and its name by the filtered pressure.
-SIDES, FILTER_NAMES = "sides", {channel: f"filter of {channel}" for channel in CHAMBERS}
+#: `Observable.data` of the comparison of spectra.
+SIDES = "sides"
+#: `Observable.name` of a filter, by the filtered pressure.
+FILTER_NAMES = {channel: f"filter of {channel}" for channel in CHAMBERS}
 #: Pairs of channels whose spectra are compared, by their names in a recording's summary.
 PAIRS = {
     "octaves": CHAMBERS,
@@ -50,20 +52,22 @@ PAIRS = {
 MIN_OCTAVES = 3
 #: Number of samples of the median that removes single wrong ones.
 GLITCH = 3
-#: Minimum power that is divided by, of pressures [Pa^2], the position [m^2] and the pump's speed [rad^2/s^2], and
-#: minimum coherence.
-MIN_POWER, MIN_COHERENCE = {"p_A": 1e-6, "p_B": 1e-6, "x": 1e-24, "omega": 1e-18}, 1e-3
+#: Minimum power that is divided by, of pressures [Pa^2], the position [m^2] and the pump's speed [rad^2/s^2].
+MIN_POWER = {"p_A": 1e-6, "p_B": 1e-6, "x": 1e-24, "omega": 1e-18}
+#: Minimum coherence.
+MIN_COHERENCE = 1e-3
 #: Number of cut-off frequencies, between the limits of the prior.
 CUTOFFS = 15
-#: Largest variance of a phase [rad^2]: beyond, it is nearly uniform.
+#: Largest variance of a phase [rad^2], at which a phase is nearly uniform.
 MAX_VARIANCE = 4.0
 
 
 class Octaves(NamedTuple):
     """Spectra of two channels A and B of a recording in k octaves, (k,) each.
 
-    `log_A`, `log_B`: logarithms of the RMS of A and B, in their units; `phase`: phase of the cross-spectrum [rad],
-    positive if A leads; `phase_variance`: variance of the error of the phase [rad^2].
+    - `log_A`, `log_B`: logarithms of the amplitudes of A and B in busy windows, up to a constant.
+    - `phase`: phase of the cross-spectrum [rad], positive if A leads.
+    - `phase_variance`: variance of the error of the phase [rad^2].
     """
 
     log_A: Array
@@ -73,15 +77,18 @@ class Octaves(NamedTuple):
 
 
 def compute_octaves(recording: Recording, pair: tuple[str, str] = CHAMBERS) -> Octaves | None:
-    """Compute the RMS of each channel of a `pair` in octaves of frequency, and the phase between them.
+    """Compute the amplitude of both channels of a `pair` in octaves of frequency, and the phase between the channels.
 
-    Return None without both channels, or if the recording is too short or has too few octaves.
+    The power of an octave is a high quantile (`octaves.busy` of `priors.toml`) over windows, since a machine may often
+    rest. Return None if a channel is not recorded, if the recording is too short or has too few octaves, or if all
+    windows have missing samples.
     """
     priors = CHANGES.octaves
     if not set(pair) <= set(recording.channels):
         return None
-    length = round(priors.seconds * recording.rate)
-    n_octaves = int(np.log2(max(min(priors.highest, priors.share * recording.rate) / priors.lowest, 1.0)))
+    length = round(priors.seconds * recording.rate)  # of a window [samples]
+    highest = min(priors.highest, priors.share * recording.rate)
+    n_octaves = int(np.log2(max(highest / priors.lowest, 1.0)))
     if n_octaves < MIN_OCTAVES or len(recording) < length:
         return None
     powers = _octave_powers(recording, pair, length, _octave_edges(n_octaves))
@@ -91,12 +98,12 @@ def compute_octaves(recording: Recording, pair: tuple[str, str] = CHAMBERS) -> O
     min_A, min_B = (MIN_POWER[channel] for channel in pair)
     log_A = 0.5 * np.log(np.quantile(powers_A, priors.busy, axis=0) + min_A)
     log_B = 0.5 * np.log(np.quantile(powers_B, priors.busy, axis=0) + min_B)
-    cross_power = np.abs(cross_powers.sum(axis=0))
-    total_power = np.sqrt((powers_A.sum(axis=0) + min_A) * (powers_B.sum(axis=0) + min_B))
-    coherence_squared = np.clip(cross_power / total_power, MIN_COHERENCE, 1.0) ** 2
-    # windows overlap by half, so that every second one is independent
+    cross_power = cross_powers.sum(axis=0)
+    mean_power = np.sqrt((powers_A.sum(axis=0) + min_A) * (powers_B.sum(axis=0) + min_B))  # geometric mean
+    coherence_squared = np.clip(np.abs(cross_power) / mean_power, MIN_COHERENCE, 1.0) ** 2
+    # (1 - c^2) / (2 n c^2) for n independent windows; windows overlap by half, so that n is half of their number
     phase_variance = (1.0 - coherence_squared) / coherence_squared / len(powers_A)
-    phase = np.angle(cross_powers.sum(axis=0))
+    phase = np.angle(cross_power)
     octaves = Octaves(log_A, log_B, phase, np.minimum(phase_variance, MAX_VARIANCE))
     return octaves if np.isfinite(octaves).all() else None
 
@@ -114,18 +121,18 @@ def _octave_powers(
 
     `length`: samples of a window; `edges` (k + 1,): limits of the octaves [Hz]. Single wrong samples are removed by a
     median of three. The results are sums of abs(A)^2, abs(B)^2 and A B* over the lines of each octave, (windows, k)
-    each. Windows with missing samples are left out; None if all have some.
+    each. Windows with missing samples are left out; None if no window is left.
     """
     from scipy.ndimage import median_filter
 
     values = np.stack([median_filter(recording[name], GLITCH, mode="nearest") for name in pair])
     first_lines = np.searchsorted(np.fft.rfftfreq(length, 1.0 / recording.rate), edges)
-    taper, powers = np.hanning(length), []
+    hann, powers = np.hanning(length), []
     for start in range(0, len(recording) - length + 1, max(length // 2, 1)):
         window = values[:, start : start + length]
         if not np.isfinite(window).all():
             continue
-        spectrum_A, spectrum_B = np.fft.rfft((window - window.mean(axis=1, keepdims=True)) * taper)
+        spectrum_A, spectrum_B = np.fft.rfft((window - window.mean(axis=1, keepdims=True)) * hann)
         products = np.stack([np.abs(spectrum_A) ** 2, np.abs(spectrum_B) ** 2, spectrum_A * spectrum_B.conj()])
         powers.append(np.add.reduceat(products[:, : first_lines[-1]], first_lines[:-1], axis=1))
     if not powers:
@@ -137,17 +144,17 @@ def _octave_powers(
 def compare_spectra(judged: Mapping[str, Octaves], healthy: Sequence[Mapping[str, Octaves]]) -> Observable | None:
     """Test for a new low-pass filter of one pressure, such as a clogged line, against healthy recordings.
 
-    `judged`, `healthy`: spectra of each recording's pairs of channels, by their names in `PAIRS`. The observable is
-    named after the pressure that is more probably filtered; its size is the most probable cut-off frequency [Hz]. For
-    each pair, healthy recordings with fewer octaves than the judged one are left out. Return None if no pair has
-    enough healthy recordings.
+    `judged`, `healthy`: spectra of the pairs of channels in each recording, by the names of the pairs in `PAIRS`. The
+    observable is named after the pressure that is more probably filtered; its size is the most probable cut-off
+    frequency [Hz]. For each pair, healthy recordings with fewer octaves than the judged recording are left out. Return
+    None if no pair has enough healthy recordings.
     """
     from scipy.special import logsumexp
 
     factors = list[_FilterFactor]()
     for name, octaves in judged.items():
-        known = [day[name] for day in healthy if name in day]
-        factor = _compare_pair(octaves, known, PAIRS[name])
+        healthy_octaves = [spectra[name] for spectra in healthy if name in spectra]
+        factor = _compare_pair(octaves, healthy_octaves, PAIRS[name])
         if factor is not None:
             factors.append(factor)
     if not factors:
@@ -175,10 +182,10 @@ class _FilterFactor(NamedTuple):
 
 
 def _compare_pair(judged: Octaves, healthy: Sequence[Octaves], pair: tuple[str, str]) -> _FilterFactor | None:
-    """Compute the Bayes factor of a filter to none, by the spectra of a `pair` of channels.
+    """Compute the Bayes factor of a filter to no filter, by the spectra of a `pair` of channels.
 
-    It is averaged over filters of each pressure in the pair. Return None for too few healthy recordings with as many
-    octaves, or if the factor is not finite.
+    The factor is averaged over possible filters of each pressure in the pair. Return None for too few healthy
+    recordings with at least as many octaves, or if the factor is not finite.
     """
     from scipy.special import logsumexp
 
@@ -187,16 +194,16 @@ def _compare_pair(judged: Octaves, healthy: Sequence[Octaves], pair: tuple[str, 
     if len(known) < MIN_HEALTHY:
         return None
     filters = _filter_effects(known, sides=[side for side, channel in enumerate(pair) if channel in CHAMBERS])
-    log_ratios = _ratio_log_likelihoods(judged, known, filters) + _phase_log_likelihoods(judged, known, filters)
-    log_ratios = log_ratios[1:] - log_ratios[0]  # the first hypothesis is no filter
+    log_likelihoods = _ratio_log_likelihoods(judged, known, filters) + _phase_log_likelihoods(judged, known, filters)
+    log_ratios = log_likelihoods[1:] - log_likelihoods[0]  # the first hypothesis is no filter
     log_factor = float(logsumexp(log_ratios) - np.log(len(log_ratios)))
-    best = int(np.argmax(log_ratios)) + 1
-    channel, cutoff = pair[filters.side[best]], float(filters.cutoff[best])
-    return _FilterFactor(log_factor, channel, cutoff) if np.isfinite(log_factor) else None
+    best = 1 + int(np.argmax(log_ratios))  # index in `filters`
+    factor = _FilterFactor(log_factor, channel=pair[filters.side[best]], cutoff=float(filters.cutoff[best]))
+    return factor if np.isfinite(log_factor) else None
 
 
 class _Filters(NamedTuple):
-    """Effects of m filters on k octaves; the first "filter" is none.
+    """Effects of m filters on k octaves; the first entry stands for no filter.
 
     `log_ratio`, `phase` (m, k): changes of log abs(A / B) and of the phase of A B* [rad]; `side` (m,): 0 for a filter
     of channel A, 1 for channel B; `cutoff` (m,): cut-off frequency [Hz].
@@ -211,16 +218,16 @@ class _Filters(NamedTuple):
 def _filter_effects(healthy: Sequence[Octaves], sides: Sequence[int]) -> _Filters:
     """Compute how a low-pass filter of one channel changes the spectra of healthy recordings.
 
-    All cutoff frequencies and noises are tried, for each of the `sides`: 0 filters channel A, 1 filters channel B. The
-    sensor's white noise is not filtered. Its power is a fraction (`filtered.noises` in `priors.toml`) of the power in
-    the octave with the least power per frequency.
+    `sides`: channels that may be filtered, 0 for channel A and 1 for channel B. Each is combined with several cut-off
+    frequencies and levels of noise. The sensor's white noise is not filtered. Its power per frequency is a fraction
+    (`filtered.noises` in `priors.toml`) of the power per frequency of the octave where this is least.
     """
     from itertools import product
 
     priors, edges = CHANGES.filtered, _octave_edges(len(healthy[0].log_A))
     frequencies, widths = np.sqrt(edges[:-1] * edges[1:]), np.diff(edges)
-    none = np.zeros_like(frequencies)
-    log_ratios, phases, filtered_sides, cutoffs = [none], [none], [0], [np.inf]
+    unchanged = np.zeros_like(frequencies)
+    log_ratios, phases, filtered_sides, cutoffs = [unchanged], [unchanged], [0], [np.inf]  # no filter
     grid = np.geomspace(priors.lowest, priors.highest, CUTOFFS)
     for side, noise_fraction, cutoff in product(sides, priors.noises, grid):
         power = np.exp([2.0 * octaves[side] for octaves in healthy]).mean(axis=0)
@@ -241,14 +248,15 @@ def _ratio_log_likelihoods(judged: Octaves, healthy: Sequence[Octaves], filters:
     """
     prior = CHANGES.octaves
     ratios = np.array([octaves.log_A - octaves.log_B for octaves in healthy])
-    count, freedom, octave = len(ratios), prior.recordings + len(ratios) - 1.0, np.arange(ratios.shape[1])
+    count, octave = len(ratios), np.arange(ratios.shape[1])
+    freedom = prior.recordings + count - 1.0
     mean = ratios.mean(axis=0)
     squares = ((ratios - mean) ** 2).sum(axis=0)
     deviations = np.sqrt((prior.recordings * prior.scatter**2 + squares) / freedom)
     correlations = np.exp(-np.abs(np.subtract.outer(octave, octave)) / prior.neighbours)
     scale = np.outer(deviations, deviations) * correlations * (1.0 + 1.0 / count) + prior.error**2 * np.eye(len(mean))
-    changes = judged.log_A - judged.log_B - mean - filters.log_ratio
-    whitened = np.linalg.solve(np.linalg.cholesky(scale), changes.T)
+    residuals = judged.log_A - judged.log_B - mean - filters.log_ratio
+    whitened = np.linalg.solve(np.linalg.cholesky(scale), residuals.T)
     log_likelihoods: Array = -0.5 * (freedom + len(mean)) * np.log1p((whitened**2).sum(axis=0) / freedom)
     return log_likelihoods
 
@@ -268,9 +276,9 @@ def _phase_log_likelihoods(judged: Octaves, healthy: Sequence[Octaves], filters:
     squares = (np.angle(directions * np.exp(-1j * mean)) ** 2).sum(axis=0)
     variances = (prior.recordings * prior.scatter**2 + squares) / (prior.recordings + count - 1.0)
     variances = variances * (1.0 + 1.0 / count) + judged.phase_variance
-    changes = judged.phase - mean - filters.phase
+    residuals = judged.phase - mean - filters.phase
     is_filtered = np.any(filters.phase != 0.0, axis=1)[:, None]
     concentrations = 1.0 / (variances + np.where(is_filtered, prior.error**2, 0.0))
-    densities = np.exp(concentrations * (np.cos(changes) - 1.0)) / i0e(concentrations)
+    densities = np.exp(concentrations * (np.cos(residuals) - 1.0)) / i0e(concentrations)
     log_likelihoods: Array = np.log((1.0 - prior.uniform) * densities + prior.uniform).sum(axis=1)
     return log_likelihoods

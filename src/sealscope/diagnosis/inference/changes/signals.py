@@ -1,6 +1,7 @@
-"""Observables that no volume balance contains: duty (motion and load), noise, hum, sense and levels of the pressures.
+"""Observables that no volume balance contains and that a leak does not change.
 
-A leak changes none of them. Called for each recording, whichever provider measures the leak.
+They are the amplitudes of command and motion (duty), noise, hum, sign and levels of the pressures. Called for each
+recording, whichever detector measures the leak.
 """
 
 from __future__ import annotations
@@ -24,14 +25,14 @@ SIGNALS = "signals"
 def observe_signals(recording: Recording) -> Observed:
     """Test duty, sensors and mean pressures of a recording for sudden lasting changes that a leak does not cause.
 
-    The duty is how the machine is moved and loaded. The report is computed only once for a recording.
+    The duty is how far the machine is commanded to move. The report is computed only once for a recording.
     """
     return compute_once(recording, (SIGNALS,), _test_signals)
 
 
 @np.errstate(all="ignore")
 def _test_signals(recording: Recording) -> Observed:
-    """Test commanded motion, sensors and pressure levels for steps; the report is empty for too short a recording."""
+    """Test duty, sensors and pressure levels for steps; for too short a recording report only that it is too short."""
     shortest = CHANGES.features.shortest
     if len(recording) < BLOCKS * max(ORDER + 2, shortest * recording.rate):
         return Observed(SIGNALS, lack="too short for changes of its signals")
@@ -46,7 +47,7 @@ def _test_signals(recording: Recording) -> Observed:
 def run_tests(*tests: Callable[[], Iterator[Observable]]) -> tuple[Observable, ...]:
     """Run all tests and collect the observables that they yield.
 
-    If numbers overflow or a matrix is singular, the test ends there; what it has yielded before is kept.
+    If numbers overflow or a matrix is singular, that test ends early; the observables yielded before are kept.
     """
     observables: list[Observable] = []
     for test in tests:
@@ -55,16 +56,18 @@ def run_tests(*tests: Callable[[], Iterator[Observable]]) -> tuple[Observable, .
     return tuple(observables)
 
 
-#: Minimum ratio of the smaller step to the larger one: 22.5 degrees, half way between one step alone and equal steps.
+#: Minimum ratio of the smaller to the larger of two steps (a, b). As an angle of the vector (a, b) it is half way
+#: between a single step, 0 degrees, and equal steps, 45 degrees.
 _MIN_STEP_RATIO = math.tan(math.pi / 8.0)
 
 
 def duty_observables(tests: Sequence[StepTest]) -> Iterator[Observable]:
-    """Yield an observable of the step of the duty (motion and load) if command and motion change by similar ratios.
+    """Yield an observable of a step of the duty if the amplitudes of command and motion change by similar ratios.
 
-    The smaller step of the two log amplitudes must be at least `_MIN_STEP_RATIO` of the larger one. Otherwise nothing
-    is yielded: a leak changes only one of them. `tests`: step tests of the log amplitudes of command and motion
-    (`duty_tests`).
+    The smaller step of the two log amplitudes must exceed `_MIN_STEP_RATIO` times the larger one. Otherwise nothing is
+    yielded, since a leak changes only one of the amplitudes. Score, onset and size are those of the test with the lower
+    score; the p-value is twice the higher one, since each test covers a rise and a fall. `tests`: step tests of the log
+    amplitudes of command and motion (`duty_tests`).
     """
     steps = np.abs([test.fitted.size for test in tests])
     if tests and steps.min() > _MIN_STEP_RATIO * steps.max():
@@ -87,21 +90,21 @@ def sensor_observables(tests: Iterable[tuple[str, StepTest]]) -> Iterator[Observ
     its p-value is doubled.
     """
     for name, test in tests:
-        data = name.split()[0]
+        data = name.split()[0]  # "noise of the pressures", "hum of 50 Hz" or "sense of p_A - p_B"
         yield Observable.from_test(name, data if data in ("noise", "hum") else "sense", test, n_tests=2.0)
 
 
-#: Maximum argument of an exponential, whose value fits into a float.
+#: Largest exponent whose exponential fits into a float.
 _MAX_EXPONENT = 700.0
 
 
 def level_observables(changes: Sequence[LevelChange]) -> Iterator[Observable]:
     """Convert tests for steps of the pressure levels to observables.
 
-    `changes`: one test for each pattern, the highest rank first. The rank is twice the log likelihood ratio, less
-    log(blocks) for each coefficient after the first. The p-value of change k is chance_k = min(1, chance_1 exp(rank_1 -
-    rank_k)). Half of the exponent is the log Bayes factor of the first over change k (Schwarz's approximation); the
-    other half is a prior against descriptions that need further coefficients.
+    `changes`: one test for each pattern, the highest rank first. The rank (`LevelChange`) becomes the score. The
+    p-value of change k is chance_k = min(1, chance_1 exp(rank_1 - rank_k)). Half of this exponent is the log Bayes
+    factor of change 1 over change k (Schwarz's approximation). The other half is a prior against descriptions that need
+    further coefficients. The interval of an onset is one block to either side.
     """
     for change in changes:
         onset = Interval(change.onset, change.onset - change.block, change.onset + change.block)

@@ -1,6 +1,6 @@
-"""Pressure drop over the speed of the motion, which goes with the oil's viscosity: a thermometer where none is logged.
+"""Viscous pressure drop per speed of the motion, a substitute for the temperature of the oil where none is logged.
 
-The friction of seals and the drop in lines rise with the speed and with the viscosity of the oil. The coefficient b of
+The drop in lines and the friction of seals rise with the speed and with the viscosity of the oil. The coefficient b of
 the speed is fitted to p_A - p_B over the samples in motion (`motion_fit`).
 """
 
@@ -13,14 +13,15 @@ from sealscope.recordings.recording import Array, Recording
 
 
 def estimate_viscous_drop(recording: Recording) -> Array | None:
-    """Estimate the logarithm of the ratio of viscous pressure drop [Pa] to speed, and its standard error, (2,).
+    """Estimate the logarithm of the viscous pressure drop [Pa] per speed, and its standard error, shape (2,).
 
-    A drop below its standard error, also a negative one, is replaced by this error. Returns None without enough motion.
+    A drop below its standard error is replaced by this error, so that the logarithm exists. Return None without
+    enough motion.
     """
     fit = fit_difference(recording)
     if fit is None:
         return None
-    # friction and viscous drop both resist the motion: their coefficients have the same sign
+    # friction and viscous drop both resist the motion: a drop with the sign of the friction counts as positive
     drop = max(fit.drop * np.sign(fit.friction), fit.drop_error)
     with np.errstate(divide="ignore", invalid="ignore"):
         log_drop = np.array([np.log(drop), fit.drop_error / drop])

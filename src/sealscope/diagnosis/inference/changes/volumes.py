@@ -1,7 +1,7 @@
 """Steps of the coefficients of a volume balance's terms, as observables: rival descriptions of the same residual.
 
-Each hypothesis is one step of one coefficient, at an unknown onset. They differ only in the term, so that twice their
-log likelihood ratios can be compared directly.
+Each hypothesis is one step of one coefficient, at an unknown onset. The hypotheses differ only in the term, so that
+their scores (twice the log likelihood ratios) can be compared directly.
 """
 
 from __future__ import annotations
@@ -43,11 +43,11 @@ from sealscope.recordings.recording import Array
 
 #: Name of the data that these observables describe.
 VOLUMES = "volumes"
-#: A change of the scale of the left side: displacement, angle, speed, or the position behind a valve.
+#: Observable of a change of the scale of the motion: displacement, angle or speed, or the position behind a valve.
 SCALE = "scale"
-#: A constant loss of flow, if the flow has no sensor offset.
+#: Observable of a constant loss of flow, if the sensor of the flow has no offset.
 OUTSIDE = "loss to the outside"
-#: A constant flow that the sensor of the flow shows in addition to the true one.
+#: Observable of the offset of the flow's sensor.
 FLOW_ZERO = "zero of the flow"
 #: Causes whose coefficients wear can only raise: leaks.
 _ONE_WAY = ("piston leak", "piston or pump leak", "pump leak", "external leak")
@@ -65,13 +65,17 @@ def volume_observables(
 ) -> tuple[Observable, ...]:
     """Test the coefficients of a volume balance for a step up or down, or only up for leaks; highest score first.
 
-    A leak is also tested for flows that are proportional to another power of p_A - p_B than 1, and the motion of the
-    piston for a change of its scale by one factor. `blocks`: Gram matrices of the columns in blocks of the recording,
-    without the sensor offset of p_A - p_B, for the tests of laminar leaks; `plain`: the same with the pressures as
-    recorded, for all other tests. `balances`, `columns`: the equations, and for each the indices of its columns by role
-    (leak, motion, left side); `oil_loss`: tests for an external leak by the oil that the accumulator lost, by the name
-    of the term; `volume_ratio`: measured over assumed ratio of area to displacement; `charge`: trend of the charge
-    pressure, None if it is unknown; `flow_scale`: true flow over the flow of the balance.
+    A leak is also tested for flows proportional to a power of p_A - p_B below 1, and the motion of the piston for a
+    change of its scale by one factor. The `advantage` of an observable comes from the prior on its size, the sensor
+    offset, and the oil that the accumulator lost.
+
+    - `blocks`: Gram matrices of the columns in blocks of the recording, without the sensor offset of p_A - p_B, for the
+      tests of laminar leaks; `plain`: the same with the pressures as recorded, for all other tests.
+    - `balances`, `columns`: the equations, and for each the indices of its columns by role (leak, motion, left side).
+    - `oil_loss`: tests for an external leak by the oil that the accumulator lost, by the name of the term.
+    - `volume_ratio`: measured over assumed ratio of area to displacement.
+    - `charge`: trend of the charge pressure, None if it is unknown.
+    - `flow_scale`: true flow over the flow of the balance.
     """
     centred, recorded = (series.merge(INFERENCE.blocks.coarse) for series in (blocks, plain))
     leak_disadvantage = offset_cost(estimate_offset(blocks, columns))
@@ -81,8 +85,7 @@ def volume_observables(
         steps = step_tests(coefficient, signs, shape)
         if not steps:
             continue
-        best = max(range(len(steps)), key=lambda k: steps[k].score)
-        step = steps[best]
+        step, sign = max(zip(steps, signs, strict=True), key=lambda pair: pair[0].score)
         if name in (LEAK, PUMP):
             advantage = -leak_disadvantage
         else:
@@ -95,7 +98,7 @@ def volume_observables(
             flow = step.fitted.size * unit_flow * flow_scale
             advantage += charge.loss_support(flow, float(step.onsets[step.best]))
         observables.append(
-            Observable.from_test(name, VOLUMES, step, n_tests=len(steps), sign=signs[best], advantage=advantage)
+            Observable.from_test(name, VOLUMES, step, n_tests=len(steps), sign=sign, advantage=advantage)
         )
     return tuple(sorted(observables, key=lambda observable: -observable.score))
 
@@ -103,11 +106,11 @@ def volume_observables(
 def _size_penalty(
     name: str, size: float, blocks: Blocks, names: Sequence[str], volume_ratio: float, flow_scale: float
 ) -> float:
-    """Compute how improbable the size of a step of the term `name` is: -2 log(prior density / largest density).
+    """Compute how improbable the size of a step is: -2 log(prior density / largest density), 0 without a prior on it.
 
-    `size`: size of the step, in the unit of the coefficient; `names`: names of the columns of `blocks`; `volume_ratio`:
-    measured over assumed ratio of area to displacement; `flow_scale`: true flow over the flow of the balance. The
-    result is 0 for a term without a prior on the size.
+    `name`: name of the observable; `size`: size of the step, in the unit of the coefficient; `names`: names of the
+    columns of `blocks`; `volume_ratio`: measured over assumed ratio of area to displacement; `flow_scale`: true flow
+    over the flow of the balance.
     """
     if name == SCALE:
         return size_penalty(INFERENCE.scale, size)
@@ -126,7 +129,8 @@ class _Hypothesis(NamedTuple):
     """A step (sudden lasting change) of one coefficient of the volume balance, to be tested.
 
     `name`: name of the observable; `signs`: 1 to test for a step up, -1 for a step down; `coefficient`: likelihood of
-    the coefficient in K blocks; `shape` (K,): change of the coefficient in each block by a unit step, None for 1.
+    the coefficient in K blocks; `shape` (K,): change of the coefficient in each block by a unit step, None for 1 in all
+    blocks.
     """
 
     name: str
@@ -151,38 +155,37 @@ def _step_hypotheses(
             blocks = centred if term.name in (LEAK, PUMP) else recorded
             signs = (1.0,) if term.cause in _ONE_WAY and term.name != BIAS else (1.0, -1.0)
             yield _Hypothesis(_observable_name(term), signs, information(blocks, columns, index))
-    # an offset of p_A - p_B looks like another law, so that one of the two is enough
+    # from blocks with the offset of p_A - p_B, since an offset has the same effect as another law
     leak = information(recorded, columns, first.leak)
     for exponent, shape in law_shapes(recorded, columns).items():
         if exponent < 1.0:
             yield _Hypothesis(f"{LEAK} of exponent {exponent:g}", (1.0,), leak, shape)
-    orifice = first.names.index(ORIFICE)
-    scaled = _with_scale(recorded, columns, orifice)
-    yield _Hypothesis(SCALE, (1.0, -1.0), information(scaled, columns, orifice))
+    scale = first.names.index(ORIFICE)  # the column of the orifice, no longer needed, takes the motion's volume
+    yield _Hypothesis(SCALE, (1.0, -1.0), information(_with_scale(recorded, columns, scale), columns, scale))
 
 
 def _is_tested(term: Term, roles: ColumnRoles, has_accumulator: bool) -> bool:
     """Return True if the coefficient of a term of the volume balance is tested for a step by itself.
 
-    It is not if the coefficient changes only together with others, is zero within a recording, or is covered by another
-    test. `roles`: indices of the balance's columns by role (leak, motion, left side); `has_accumulator`: True if the
-    recording shows the volume of an accumulator.
+    It is not tested by itself if it changes only together with others, or if another test covers its steps. `roles`:
+    indices of the balance's columns by role (leak, motion, left side); `has_accumulator`: True if the recording shows
+    the volume of an accumulator.
     """
     if term.name.startswith("motion"):
         return False  # area and displacement change together, as a scale
     if term.name in (SPEED_LOSS, ORIFICE):
-        return False  # zero within a recording; the orifice is tested by its shape
+        return False  # taken as zero within a recording; an orifice is tested as another law of the leak
     if term.name == HOLDING:
-        return False  # a piston that leaks raises it as well: the leak's step covers it
+        return False  # a leaking piston raises this coefficient as well: the test of the leak covers it
     if AIR in roles.names and term.cause == "air in the oil" and term.nuisance:
-        return False  # free air changes them together
-    return not (has_accumulator and term.name == BIAS)  # an accumulator's pressure drives what leaves its circuit
+        return False  # free air, which is tested, changes these coefficients together
+    return not (has_accumulator and term.name == BIAS)  # with an accumulator, its pressure drives an external leak
 
 
 def _observable_name(term: Term) -> str:
-    """Return the name of the observable of a term.
+    """Return the name of the observable of a term: its own name, except for the flow offset.
 
-    A step of the flow offset is an external leak if the flow's sensor has no offset, else a zero error of the flow.
+    A step of the flow offset is an external leak if the flow's sensor has no offset, else a zero error of the sensor.
     """
     if term.name != BIAS:
         return term.name
@@ -190,31 +193,32 @@ def _observable_name(term: Term) -> str:
 
 
 def _accumulator_support(balance_test: StepTest, accumulator_test: StepTest) -> float:
-    """Compute twice the log likelihood ratio of an external leak to none, by the oil that the accumulator lost.
+    """Compute twice the log likelihood ratio of an external leak to no leak, by the oil that the accumulator lost.
 
-    With the size a of the leak by the accumulator, its standard error s, and the size b by the volume balance, it is
-    (a/s)^2 - ((a - b)/s)^2, at the onset by the balance. `balance_test`, `accumulator_test`: tests for a step of the
-    leak by the volume balance and by the accumulator.
+    The leak under test has the size b and the onset that the volume balance finds. With the size a that the accumulator
+    shows for this onset, and its standard error s, the result is (a/s)^2 - ((a - b)/s)^2. `balance_test`,
+    `accumulator_test`: tests for a step of the leak by the volume balance and by the accumulator.
     """
-    nearest = int(np.abs(accumulator_test.onsets - balance_test.onsets[balance_test.best]).argmin())
+    onset = balance_test.onsets[balance_test.best]
+    nearest = int(np.abs(accumulator_test.onsets - onset).argmin())
     sizes = np.array([accumulator_test.size[nearest], balance_test.fitted.size])
     measured, expected = sizes / accumulator_test.deviation[nearest]  # in standard errors
     return float(measured**2 - (measured - expected) ** 2)
 
 
 def _with_scale(blocks: Blocks, columns: Sequence[ColumnRoles], index: int) -> Blocks:
-    """Return the blocks with column `index` replaced by the volume that the piston's motion takes, as fitted.
+    """Return the blocks with column `index` replaced by the fitted volume that the piston's motion takes.
 
-    It is the sum of the columns of motion, each times its coefficient over the whole recording. A step of the new
-    column's coefficient by s is a relative change of the scale of position or speed by s. `columns`: for each equation
-    the indices of its columns by role (leak, motion, left side).
+    The new column is the sum of the columns of motion, each times its coefficient over the whole recording. A step of
+    its coefficient by s is a relative change of the scale of position or speed by s. `columns`: for each equation the
+    indices of its columns by role (leak, motion, left side).
     """
     gram = blocks.gram.copy()
     for e, (roles, total) in enumerate(zip(columns, sum_blocks(blocks, columns), strict=True)):
         nuisance, motion = list(roles.nuisance), list(roles.motion)
         coefficients = np.zeros(len(total))
         coefficients[nuisance] = solve(total[np.ix_(nuisance, nuisance)], total[nuisance, roles.left])
-        transform = np.eye(len(total))
+        transform = np.eye(len(total))  # from the old columns to the new ones
         transform[:, index] = 0.0
         transform[motion, index] = coefficients[motion]
         gram[:, e] = transform.T @ gram[:, e] @ transform

@@ -5,16 +5,20 @@ Such a hold leaves each chamber a closed volume with leaks. From the beginning o
     m_A dx + V_A (dp_A/K - alpha p_0 d(1/p_A)) = -G I - e_A I_A,
    -m_B dx + V_B (dp_B/K - alpha p_0 d(1/p_B)) = +G I - e_B I_B,
 
-with G, e_A and e_B the coefficients of the leaks past the piston and to the outside from A and B, the piston's areas
-m_A and m_B as measured with the pump's assumed displacement, the volumes V of oil, their bulk modulus K and free air
-alpha. I is the time integral of a power of p_A - p_B - z; I_A and I_B are the time integrals of the gauge pressures;
-p_0 is the atmospheric pressure. A leaking piston moves oil from A to B. A leaking rod seal drains one side only: the
-piston gives way, while a check valve may fill the other side. A reading is the mean of neighbouring samples of a hold
-(`LockedHold.edges`). The readings of all holds form one regression, each side of a hold about its mean. The logarithms
-of K, alpha and the volumes that are not recorded have normal priors (`held_oil` in `priors.toml`), so that no oil is
-incompressible; the regression is linearised about the estimate, iteratively. The onset of the leak and the sensor
-offset z of p_A - p_B have the highest posterior; a leak that has equalised the pressures determines z. The three leaks
-are hypotheses, each with its probability.
+with
+
+- G, e_A, e_B: coefficients of the leaks past the piston, to the outside from A, and to the outside from B;
+- m_A, m_B: areas of the piston, as measured with the pump's assumed displacement;
+- V_A, V_B: volumes of oil, with the bulk modulus K and the fraction alpha of free air;
+- I: time integral of a power of p_A - p_B - z, where z is the sensor offset; I_A, I_B: those of the gauge pressures;
+- p_0: atmospheric pressure.
+
+A leaking piston moves oil from A to B. A leaking rod seal drains one side only: the piston gives way, while a check
+valve may fill the other side. A reading is the mean of neighbouring samples of a hold (`LockedHold.edges`). The
+readings of all holds form one regression, each side of a hold about its mean. The logarithms of K, alpha and the dead
+volumes have normal priors (`held_oil` in `priors.toml`); the regression is linearised about the estimate, iteratively.
+The onset of the leak and the offset z are those with the highest posterior; a leak that has equalised the pressures
+determines z. The three leaks are hypotheses, each with its probability.
 
 Source: Merritt, Hydraulic Control Systems, 1967, section 6.3 (continuity of the chambers).
 """
@@ -39,19 +43,20 @@ from sealscope.recordings.recording import Array
 from sealscope.signals.smoothing import average_over
 from sealscope.units import P_ATM
 
-#: Length of a hold's first reading [s], ratio of each length to the one before, minimum number of readings.
+#: Length of a hold's first reading [s], ratio of the lengths of successive readings, minimum number of readings.
 FIRST_READING, GROWTH, MIN_READINGS = 0.05, 1.2, 8
 #: Maximum sampling rate [Hz]; enough for pressures in shut chambers.
 MAX_RATE = 100.0
-#: First grid of offsets of p_A - p_B [standard deviations of the prior], and number of points of the second.
-OFFSET_GRID = np.array([0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0])
-N_REFINED = 17
+#: Coarse grid of offsets of p_A - p_B [standard deviations of the prior], and number of points of the refined grid.
+OFFSET_GRID, N_REFINED = np.array([0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0]), 17
 #: Number of evenly spaced onsets within a hold.
 N_ONSETS = 4
 #: Standard deviation of a leak without information.
 UNKNOWN = 1e30
-#: Maximum number of iterations of a fit, relative change of the variance that ends them, relative ridge of a matrix.
-MAX_ITERATIONS, TOLERANCE, RIDGE = 20, 1e-3, 1e-12
+#: Maximum number of iterations of a fit; largest relative change of variance and properties in the last iteration.
+MAX_ITERATIONS, TOLERANCE = 20, 1e-3
+#: Ridge that is added to the unit diagonal of a scaled matrix.
+RIDGE = 1e-12
 #: Largest change of the logarithm of a property of the oil in one iteration.
 MAX_STEP = 0.5
 #: Quantile of the lower chamber pressure that counts as charge pressure.
@@ -61,10 +66,9 @@ TAIL = 0.05
 
 
 class CylinderSides(NamedTuple):
-    """Piston areas of both sides, and ends `low` and `high` of the recorded stroke [m].
+    """Piston areas of both sides [m^2], and ends `low` and `high` of the recorded stroke [m].
 
-    The areas [m^2] are measured with the pump's assumed displacement; they are negative if the position x is
-    reversed.
+    The areas are measured with the pump's assumed displacement; they are negative if the position x is reversed.
     """
 
     area_A: float
@@ -94,15 +98,16 @@ class LockedHold(NamedTuple):
     def own_offset(self, offset: float) -> tuple[float, float]:
         """Estimate the sensor offset of p_A - p_B [Pa] in this hold, given the recording's `offset` [Pa].
 
-        The two differ where the gains of the sensors do, with the standard deviation s = `held_oil.gain`
-        (`priors.toml`) times the pressure. The difference p_A - p_B at the end of the hold is either the own offset, if
-        a leak has equalised the pressures, or due to a load, of which all up to the higher pressure are equally
-        probable. The more probable of the two is assumed. Returns the own offset, and ((own - `offset`) / s)^2, its
-        cost as -2 log of a relative probability density.
+        Different gains of the two sensors make the offset vary with the pressure: in a hold it differs from `offset`
+        with the standard deviation s = `held_oil.gain` (`priors.toml`) times the pressure. If a leak has equalised the
+        pressures by the end of the hold, p_A - p_B there is the offset of the hold. Otherwise p_A - p_B is due to a
+        load, of which all up to the higher pressure are equally probable; the offset is then `offset`. The more
+        probable case is assumed. Returns the offset of the hold, and ((offset of the hold - `offset`) / s)^2, which is
+        -2 log of a relative probability density.
         """
         last = self.mean(np.stack([self.p_A, self.p_B]))[:, -1]
-        pressure, deviation = float(last.max()), INFERENCE.held_oil.gain * float(last.max())
-        difference = float(last[0] - last[1])
+        pressure, difference = float(last.max()), float(last[0] - last[1])
+        deviation = INFERENCE.held_oil.gain * pressure
         cost = ((difference - offset) / deviation) ** 2
         is_equalised = -0.5 * cost - np.log(deviation * np.sqrt(2.0 * np.pi)) > -np.log(pressure)
         return (difference, cost) if is_equalised else (offset, 0.0)
@@ -121,9 +126,9 @@ class LockedHold(NamedTuple):
 def find_charge_pressure(lower_pressure: Array, rests: NDArray[np.bool_], rate: float) -> float:
     """Find the pressure [Pa] that check valves maintain in a chamber without load: the lowest while the pump rests.
 
-    A moving piston draws oil through lines and check valves, which drop pressure. `lower_pressure` (n,): the lower of
-    the chamber pressures [Pa], which is averaged over a time to remove noise; `rests` (n - 1,): flags of the sampling
-    intervals in which the pump rests, all of them if none does; `rate`: sampling rate [Hz].
+    If the pump never rests, it is the lowest pressure of the recording. This may be too low, since a moving piston
+    draws oil through lines and check valves, which drop pressure. `lower_pressure` (n,): the lower chamber pressure
+    [Pa]; `rests` (n - 1,): flags of the sampling intervals in which the pump rests; `rate`: sampling rate [Hz].
     """
     steady_pressure = average_over(INFERENCE.held_oil.steady, lower_pressure, rate)
     return float(np.nanquantile(steady_pressure[:-1][rests] if rests.any() else steady_pressure, LOWEST))
@@ -138,13 +143,13 @@ def find_locked_holds(channels: Sequence[Array], rests: NDArray[np.bool_], rate:
     `MAX_RATE`.
     """
     prior, holds = INFERENCE.held_oil, list[LockedHold]()
-    decimation = max(1, int(rate / MAX_RATE))  # samples that are averaged to one
-    # samples to omit at the beginning and at the end, where rests are blurred by their averaging time
+    decimation = max(1, int(rate / MAX_RATE))  # number of samples that are averaged to one
+    # samples to omit; the end of a rest is uncertain by the time over which the flow was averaged to find it
     settling, opening = (max(1, round(s * rate)) for s in (prior.settles, prior.settles + INFERENCE.rest.averaged))
-    for first, length in find_runs(rests).tolist():
-        begin, end = first + settling, first + length + 1 - opening
-        if length + 1 < prior.shortest * rate:
+    for first, n_intervals in find_runs(rests).tolist():
+        if n_intervals + 1 < prior.shortest * rate:
             continue
+        begin, end = first + settling, first + n_intervals + 1 - opening
         n_samples = (end - begin) // decimation
         t, p_A, p_B, x = (
             values[begin : begin + n_samples * decimation].reshape(n_samples, decimation).mean(axis=1)
@@ -159,22 +164,22 @@ def find_locked_holds(channels: Sequence[Array], rests: NDArray[np.bool_], rate:
 def _reading_edges(n_samples: int, width: float) -> NDArray[np.intp]:
     """Divide the samples of a hold into k intervals that lengthen geometrically; return their bounds, shape (k + 1,).
 
-    The samples of an interval are averaged later, to one reading. The first interval has `width` samples, and each
-    later one `GROWTH` times as many as the one before; the last one takes the rest.
+    The samples of an interval will be averaged to one reading. The first interval has `width` samples, and each later
+    interval `GROWTH` times as many as its predecessor. The last interval extends to the end of the hold.
     """
     edges = [0]
     while edges[-1] + max(round(width), 1) < n_samples:
         edges.append(edges[-1] + max(round(width), 1))
         width *= GROWTH
-    return np.array([*edges[:-1], n_samples])  # the last reading takes the rest
+    return np.array([*edges[:-1], n_samples])
 
 
 class UnitLeak(NamedTuple):
     """Flow of a leak with a coefficient of 1 while shut valves hold the load.
 
-    `flows`: flow over the coefficient at the samples (n,) of each hold, in Pa^e for the exponent e of the law (laminar:
-    1); `signs`: sign of this flow in the balances of sides A and B, or 0; `is_refilled`: true if check valves replace
-    displaced oil once a chamber is at the charge pressure.
+    `flows`: flow at the samples (n,) of each hold, over the coefficient, in Pa^e for the exponent e of the law
+    (laminar: 1); `signs`: sign of this flow in the balances of sides A and B, or 0; `is_refilled`: true if check valves
+    replace displaced oil once a chamber is at the charge pressure.
     """
 
     flows: Sequence[Array]
@@ -183,15 +188,17 @@ class UnitLeak(NamedTuple):
 
 
 class _OilRegression(NamedTuple):
-    """Regression of displaced volumes on the properties of the oil, over r readings of all holds.
+    """Regression of displaced volumes on the properties of the oil, over r readings (sample means) of all holds.
 
-    A reading is the mean of several neighbouring samples of a hold (`LockedHold.edges`). The properties are
-    compressibility, dead volume of A and of B, and free air, each relative to its usual value; the regression is on
-    their logarithms (4,), with a normal prior about 0. `displaced` (r,): volume displaced by the piston [m^3];
-    `strained` and `aired` (r, 3): volumes [m^3] taken up by the compression of the oil and of the free air with the
-    usual properties, in the stroke, and in the dead volumes of A and of B; `inflation`: number of readings over the
-    number of independent ones; `misfit_variance`: variance of a reading [m^6] in addition to the variance of the noise,
-    since the model describes the compressed volume only to within a fraction.
+    The properties are compressibility, dead volume of A, dead volume of B, and free air, each relative to its usual
+    value. The regression is on their logarithms (4,), with a normal prior about 0.
+
+    - `displaced` (r,): volume displaced by the piston [m^3].
+    - `strained`, `aired` (r, 3): volumes [m^3] taken up by the compression of the oil and of the free air, with the
+      usual properties, in the stroke, in the dead volume of A, and in that of B.
+    - `inflation`: number of readings over the number of independent readings.
+    - `misfit_variance`: variance of a reading [m^6] in addition to the variance of the noise, since the model describes
+      the compressed volume only to within a fraction.
     """
 
     displaced: Array
@@ -209,12 +216,10 @@ class _OilRegression(NamedTuple):
         return self.displaced - (oil * self.strained + air * self.aired) @ volumes
 
     def slopes(self, logs: Array) -> Array:
-        """Compute the derivatives of the r readings' compressed volumes by the logarithms of the oil's properties.
+        """Compute the derivatives (r, 4) of the compressed volumes [m^3] by the logarithms of the oil's properties.
 
-        A compressed volume [m^3] is the part of the displaced volume that the compression of oil and free air takes
-        up. `logs` (4,): the logarithms at which the derivatives are taken, of compressibility, dead volume of A, dead
-        volume of B and free air, each relative to its usual value. Returns the derivatives (r, 4) [m^3], with columns
-        in this order.
+        A compressed volume is the part of the displaced volume that the compression of oil and free air takes up.
+        `logs` (4,): the logarithms at which the derivatives are taken.
         """
         oil, air, volumes = _oil_factors(logs)
         strained, aired = oil * self.strained * volumes, air * self.aired * volumes
@@ -225,28 +230,24 @@ class _OilRegression(NamedTuple):
 def _oil_factors(logs: Array) -> tuple[float, float, Array]:
     """Convert logarithms (4,) of the oil's properties to factors on their usual values.
 
-    `logs`: of compressibility, dead volume of A, dead volume of B, and free air. Returns the factor on the
-    compressibility, the one on free air, and those on three volumes (3,): the stroke's, which is always 1, and the dead
-    volumes.
+    `logs`: of compressibility, dead volume of A, dead volume of B, and free air. Returns the factor on compressibility,
+    the factor on free air, and factors (3,) on the volume of the stroke, which is always 1, and on the dead volumes.
     """
     compressibility, dead_A, dead_B, air = np.exp(logs)
     return float(compressibility), float(air), np.array([1.0, dead_A, dead_B])
 
 
 def _oil_deviations() -> Array:
-    """Return the prior standard deviations (4,) of the logarithms of the oil's properties.
-
-    They are compressibility, dead volume of A, dead volume of B, and free air.
-    """
+    """Return prior standard deviations (4,) of the logs of compressibility, dead volumes of A and B, and free air."""
     prior = INFERENCE.held_oil
     return np.array([prior.deviation, prior.dead_deviation, prior.dead_deviation, prior.air_deviation])
 
 
 class _LeakRegression(NamedTuple):
-    """Fit of c leaks to the holds: `coefficients` (c,), their covariances (c, c), and `variance` of a reading [m^6].
+    """Fit of c leaks to the holds: `coefficients` (c,), their covariance (c, c), and `variance` of a reading [m^6].
 
-    A reading is the mean of a volume over several neighbouring samples of a hold. The covariance is the sum of two
-    parts: `by_noise`, due to the noise of the readings, and `by_oil`, due to the uncertain properties of the oil.
+    A reading is a mean of samples. The covariance is the sum of two parts: `by_noise`, due to the noise of the
+    readings, and `by_oil`, due to the uncertain properties of the oil.
     """
 
     coefficients: Array
@@ -319,24 +320,19 @@ class HeldChambers:
         Each of the two sides of a hold counts as `held_oil.independent` readings (`priors.toml`).
         """
         independent: float = INFERENCE.held_oil.independent
-        return independent * 2.0 * len(self.holds)  # on both sides of each hold
+        return independent * 2.0 * len(self.holds)
 
     @cached_property
     def _regressions(self) -> tuple[_OilRegression, _OilRegression]:
-        """Two regressions on the oil's properties: without check valves, and with check valves that refill a chamber.
-
-        The left side of each is the volume that the piston displaces in holds. The four unknowns are the logarithms of
-        compressibility, dead volume of A, dead volume of B, and free air, each relative to its usual value.
-        """
+        """Regressions on the oil's properties: without check valves, and with check valves that refill a chamber."""
         return self._build_regression(False), self._build_regression(True)
 
     def _build_regression(self, is_refilled: bool) -> _OilRegression:
         """Build the regression of displaced volumes on the oil's properties from all holds (`_OilRegression`).
 
-        The properties are compressibility, dead volumes of A and B, and free air. The rows are the readings of each
-        hold, side A before side B, relative to their mean over the hold. A reading is a mean of several samples
-        (`LockedHold.edges`). With `is_refilled`, check valves keep a chamber at the charge pressure, so displacement
-        counts only while the chamber's pressure is higher.
+        The rows are the readings (sample means) of each hold, side A before side B, relative to their mean over the
+        hold. With `is_refilled`, check valves keep a chamber at the charge pressure, so displacement counts only while
+        the chamber's pressure is higher.
         """
         prior, stroke = INFERENCE.held_oil, self.sides.high - self.sides.low
         displaced, strained, aired = list[Array](), list[Array](), list[Array]()
@@ -368,8 +364,8 @@ class HeldChambers:
     def _is_closed(self, hold: LockedHold, p: Array) -> NDArray[np.bool_]:
         """Flag the samples (n,) of a hold in which the check valve of a chamber is closed and does not refill it.
 
-        There the chamber's pressure, averaged here over `held_oil.steady` (`priors.toml`) to remove noise, exceeds the
-        charge pressure by a margin. `p` (n,): absolute pressure of the chamber in the `hold` [Pa].
+        It is closed while the chamber's pressure exceeds the charge pressure by a margin. `p` (n,): absolute pressure
+        of the chamber in the `hold` [Pa], which is averaged over `held_oil.steady` (`priors.toml`) to remove noise.
         """
         prior = INFERENCE.held_oil
         steady_pressure = average_over(prior.steady, p, 1.0 / float(np.diff(hold.t).mean()))
@@ -378,8 +374,8 @@ class HeldChambers:
     def _unit_piston_leak(self, offset: float, exponent: float = 1.0) -> UnitLeak:
         """Compute the flow past the piston in each hold for a leak with a coefficient of 1, in Pa^`exponent`.
 
-        It is sign(dp) |dp|^`exponent` of dp = p_A - p_B - z. z is the sensor offset in the hold, which may differ a
-        little from the `offset` [Pa] of the recording (`LockedHold.own_offset`).
+        The flow is sign(dp) |dp|^`exponent` with dp = p_A - p_B - z, where z is the sensor offset in the hold. It may
+        differ a little from the `offset` [Pa] of the recording (`LockedHold.own_offset`).
         """
         differences = [hold.p_A - hold.p_B - hold.own_offset(offset)[0] for hold in self.holds]
         return UnitLeak([np.sign(values) * np.abs(values) ** exponent for values in differences], (1.0, -1.0))
@@ -387,18 +383,18 @@ class HeldChambers:
     def _unit_outside_leak(self, is_A: bool) -> UnitLeak:
         """Compute the flow of a laminar leak with a conductance of 1 from one chamber to the outside.
 
-        The chamber is A if `is_A` is True, else B. The flow is its gauge pressure [Pa], or 0 while a check valve
-        refills it.
+        The chamber is A if `is_A` is True, else B. The flow is the chamber's gauge pressure [Pa], or 0 while a check
+        valve refills the chamber.
         """
         pressures = [(hold, hold.p_A if is_A else hold.p_B) for hold in self.holds]
         flows = [np.maximum(p - P_ATM, 0.0) * self._is_closed(hold, p) for hold, p in pressures]
         return UnitLeak(flows, (1.0, 0.0) if is_A else (0.0, 1.0), is_refilled=True)
 
     def _unit_pump_leak(self, is_A: bool) -> UnitLeak:
-        """Compute the flow with a conductance of 1 through open valves and the pump out of one chamber into the other.
+        """Compute the flow with a conductance of 1 out of one chamber through open valves and the pump into the other.
 
-        The chamber is A if `is_A` is True, else B. The other one stays at its pressure, since check valves or a
-        shuttle valve connect it to the charge pressure.
+        The oil leaves chamber A if `is_A` is True, else B. The other chamber stays at its pressure, since check valves
+        or a shuttle valve connect it to the charge pressure.
         """
         sign = 1.0 if is_A else -1.0
         differences = [sign * (hold.p_A - hold.p_B - hold.own_offset(0.0)[0]) for hold in self.holds]
@@ -408,20 +404,22 @@ class HeldChambers:
     def _fit(self, columns: Array, is_refilled: bool) -> _LeakRegression:
         """Fit the coefficients of c leaks together with the properties of the oil.
 
-        `columns` (r, c): volumes leaked with coefficients of 1, at each reading (mean of several samples of a hold);
-        `is_refilled`: true if check valves replace displaced oil. The variance of a reading, which weights the priors
-        of the oil against the readings, is found by iteration.
+        `columns` (r, c): volumes leaked with coefficients of 1, at each reading (mean of samples); `is_refilled`: true
+        if check valves replace displaced oil. The properties, and the variance of a reading, which weights the priors
+        of the properties against the readings, are found by iteration.
         """
-        regression, n_leaks, logs = self._regressions[is_refilled], columns.shape[1], np.zeros(4)
+        regression, n_leaks = self._regressions[is_refilled], columns.shape[1]
+        logs = np.zeros(4)  # of the oil's properties
         left, misfit_variance = regression.leaked(logs), regression.misfit_variance
         degrees_of_freedom = max(self.n_readings - n_leaks, 1.0)
         variance = max(float(left @ left) / len(left), misfit_variance)
         precisions = np.append(np.zeros(n_leaks), regression.inflation / _oil_deviations() ** 2)
-        for _ in range(MAX_ITERATIONS):  # each is linear about the properties of the iteration before
+        for _ in range(MAX_ITERATIONS):  # of a linear fit of the leaks and of changes of `logs`
             left, design = regression.leaked(logs), np.column_stack([columns, regression.slopes(logs)])
             scale = np.sqrt((design**2).sum(axis=0))
             scale[~(scale > 0.0)] = 1.0
-            scales, prior, means = np.outer(scale, scale), variance * precisions, np.append(np.zeros(n_leaks), -logs)
+            scales = np.outer(scale, scale)
+            prior, means = variance * precisions, np.append(np.zeros(n_leaks), -logs)  # precisions and means
             matrix = (design.T @ design + np.diag(prior)) / scales
             matrix.flat[:: len(scale) + 1] += RIDGE
             inverse = np.linalg.inv(matrix) / scales
@@ -448,23 +446,23 @@ class HeldChambers:
     def fit_piston_leak(self, onset: float, offset: float, exponent: float = 1.0) -> LeakFit:
         """Fit a leak past the piston that begins at `onset` [s] to the times in which shut valves hold the load.
 
-        Its flow is its coefficient times sign(dp) |dp|^`exponent` of dp = p_A - p_B - z. In each hold z is about
-        `offset` [Pa], the sensor offset in the recording. The likelihood includes the prior on the offset.
+        `offset`: sensor offset of p_A - p_B in the recording [Pa]; `exponent`: exponent of the leak's law
+        (`_unit_piston_leak`). The likelihood includes the prior on the offset.
         """
         fit = self._fit_leak(self._unit_piston_leak(offset, exponent), onset)
         return fit._replace(likelihood=fit.likelihood - 0.5 * self._offset_cost(offset))
 
     def _offset_cost(self, offset: float) -> float:
-        """Compute -2 log of the prior density of the sensor offset [Pa] and of each hold's deviation from it."""
+        """Compute -2 log of the prior density of a sensor offset [Pa] and of the deviations of all holds from it."""
         return offset_cost(offset) + sum(hold.own_offset(offset)[1] for hold in self.holds)
 
     def leaks_since(self, onset: float) -> Array | None:
         """Estimate the conductances of three leaks from the holds, each followed by its standard deviation, shape (6,).
 
-        The leaks are past the piston, to the outside from A, and to the outside from B, all in m^3/(s Pa). The
+        The leaks are past the piston, to the outside from A, and to the outside from B, as in `HeldLeaks`. The
         conductance past the piston is that of a leak since `onset` [s], times the probability of this leak
-        (`piston_leak`); its standard deviation is not multiplied by the probability. The leaks to the outside are means
-        over the whole recording. Return None if no hold shows a flow past the piston after the onset.
+        (`piston_leak`), by which its standard deviation is not multiplied. The leaks to the outside are means over the
+        recording. Return None if no hold shows a flow past the piston after the onset.
         """
         fits = self._fits_over_offsets(onset)
         if not fits:
@@ -476,8 +474,7 @@ class HeldChambers:
     def _fits_over_offsets(self, onset: float) -> list[LeakFit]:
         """Fit a leak past the piston since `onset` [s] for each sensor offset of a grid; omit fits without any flow.
 
-        The offset must be varied since it is uncertain at a small pressure difference, or once a leak has equalised
-        the pressures.
+        The offset is varied since at small pressure differences the fitted leak depends strongly on it.
         """
         fits = [self.fit_piston_leak(onset, float(offset)) for offset in (*self._offset_grid, self.piston_fit.offset)]
         return [fit for fit in fits if fit.deviation < UNKNOWN]
@@ -485,19 +482,18 @@ class HeldChambers:
     def _fit_leak(self, leak: UnitLeak, onset: float) -> LeakFit:
         """Fit the coefficient, at least 0, of a leak that begins at `onset` [s] to all holds of the recording.
 
-        `leak`: its flow with a coefficient of 1. The standard deviation of the coefficient is `UNKNOWN` if no oil
-        would flow in the holds after the onset.
+        `leak`: flow of the leak with a coefficient of 1. If no oil would flow in the holds after the onset, the
+        coefficient is 0 with the standard deviation `UNKNOWN`.
         """
         column = self._leak_columns(leak, np.array([onset]))
-        has_flow = column.any()
-        fit = self._fit(column, leak.is_refilled) if has_flow else self._fits_without_leak[leak.is_refilled]
-        value, deviation, by_oil = 0.0, UNKNOWN, 0.0
-        if has_flow:
-            value, deviation = float(fit.coefficients[0]), float(fit.by_noise[0, 0]) ** 0.5
-            by_oil = float(max(fit.by_oil[0, 0], 0.0)) ** 0.5
-        if value < 0.0:  # a leak flows from the higher to the lower pressure only
-            value, fit = 0.0, self._fits_without_leak[leak.is_refilled]
-        return LeakFit(value, deviation, by_oil, -0.5 * self.n_readings * float(np.log(fit.variance)))
+        fit_without_leak = self._fits_without_leak[leak.is_refilled]
+        value, deviation, by_oil, variance = 0.0, UNKNOWN, 0.0, fit_without_leak.variance
+        if column.any():
+            fit = self._fit(column, leak.is_refilled)
+            deviation, by_oil = float(fit.by_noise[0, 0]) ** 0.5, float(max(fit.by_oil[0, 0], 0.0)) ** 0.5
+            if not fit.coefficients[0] < 0.0:  # a leak flows from the higher to the lower pressure only
+                value, variance = float(fit.coefficients[0]), fit.variance
+        return LeakFit(value, deviation, by_oil, likelihood=-0.5 * self.n_readings * float(np.log(variance)))
 
     @cached_property
     def onsets(self) -> Array:
@@ -525,8 +521,8 @@ class HeldChambers:
     def _leak_columns(self, leak: UnitLeak, onsets: Array) -> Array:
         """Compute the volume that a leak with a coefficient of 1 loses since each of o onsets, at r readings, (r, o).
 
-        A reading is a mean over several samples of a hold. The volumes have the sign of the flow in the volume balance
-        of each side, and are relative to their mean over the hold.
+        A reading is a mean of samples. The volumes have the sign of the flow in the volume balance of each side, and
+        are relative to their mean over the hold.
         """
         columns = []
         for hold, flow in zip(self.holds, leak.flows, strict=True):
@@ -541,8 +537,8 @@ class HeldChambers:
     def _onset_posteriors(self, leak: UnitLeak) -> Array:
         """Compute the log posterior probability of each possible onset of a leak (`onsets`), shape (o,).
 
-        `leak`: its flow with a coefficient of 1. The result is log prior - N/2 log(residual sum of squares), for N
-        independent readings and a coefficient >= 0, with the properties of the oil eliminated.
+        The result is log prior - N/2 log(residual sum of squares), up to a constant, for N independent readings and a
+        coefficient >= 0, with the properties of the oil eliminated. `leak`: flow of the leak with a coefficient of 1.
         """
         regression, usual = self._regressions[leak.is_refilled], np.zeros(4)
         left, oil, misfit_variance = regression.leaked(usual), regression.slopes(usual), regression.misfit_variance
@@ -563,8 +559,8 @@ class HeldChambers:
     def _offset_grid(self) -> Array:
         """Candidates of the sensor offset of p_A - p_B [Pa], in ascending order.
 
-        They are a fixed grid, and the recorded p_A - p_B at the end of each hold, i.e. of each time in which shut
-        valves hold the load. If a leak has equalised the pressures by then, this difference is the offset.
+        They are a fixed grid, and the recorded p_A - p_B at the end of each hold. If a leak has equalised the pressures
+        by then, this difference is the offset.
         """
         ends = [hold.mean(hold.p_A - hold.p_B)[-1] for hold in self.holds]
         return np.unique(np.concatenate([np.append(-OFFSET_GRID, OFFSET_GRID) * INFERENCE.zero.pressure, ends]))
@@ -580,7 +576,7 @@ class HeldChambers:
         best = int(np.argmax([self._find_onset(float(offset))[1] for offset in grid]))
         refined = np.linspace(grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)], N_REFINED)
         fits = [(*self._find_onset(float(offset)), float(offset)) for offset in (*refined, grid[best])]
-        onset, _, offset = max(fits, key=lambda fit: fit[1])  # of the highest posterior
+        onset, _, offset = max(fits, key=lambda fit: fit[1])  # with the highest posterior
         return PistonFit(float(self.onsets[onset]), offset)
 
     def _find_onset(self, offset: float) -> tuple[int, float]:
@@ -615,14 +611,13 @@ class HeldChambers:
         ]
 
     def total_leak(self) -> Flow:
-        """Estimate the mean conductance [m^3/(s Pa)] of whatever leaks in the holds, also through valves that are open.
+        """Estimate the mean conductance [m^3/(s Pa)] of all leaks in the holds, even if the valves are open.
 
-        Through open valves the pump leaks into the other chamber, which check valves keep at the charge pressure: only
-        one chamber loses oil, driven by p_A - p_B. The leak is the piston's, one to the outside, or one of this kind;
-        the estimates are weighted by their probabilities. Check valves that refill a chamber would hide what leaves
-        it, so none are assumed.
+        The leak is past the piston, to the outside, or through open valves and the pump (`_unit_pump_leak`); the
+        estimates are weighted by the probabilities of these hypotheses. Check valves that refill a chamber would hide
+        the oil that leaves it, so no refilling is assumed.
         """
-        chambers = replace(self, charge=0.0)
+        chambers = replace(self, charge=0.0)  # without a charge pressure check valves stay closed
         sides = (True, False)
         leaks = [chambers._unit_outside_leak(is_A) for is_A in sides]
         leaks += [chambers._unit_pump_leak(is_A) for is_A in sides]
@@ -634,10 +629,10 @@ class HeldChambers:
 
     @cached_property
     def leaks(self) -> HeldLeaks:
-        """Mean leaks over the recording, past the piston and to the outside from A and from B, from the holds.
+        """Mean leaks over the recording, from the times in which shut valves hold the load.
 
-        A hold is a time in which shut valves hold the load. Each leak is its estimate times the probability of that
-        leak; the standard deviations are not weighted in this way.
+        Each leak is its estimate times the probability of that leak. The standard deviations are not multiplied by the
+        probability, and exclude the uncertainty of the oil's properties.
         """
         values_and_deviations = []
         for leak in self._leak_hypotheses:
@@ -655,10 +650,10 @@ class HeldChambers:
 
     @property
     def probability_after_holds(self) -> float:
-        """Prior probability that a leak begins after the last hold, so that no hold shows it.
+        """Prior probability that a leak begins after the last time that shut valves hold the load, and does not show.
 
-        A hold is a time in which shut valves hold the load. The probability is (1 - `held_oil.from_start`), that of a
-        leak that begins within the recording, times the fraction of the recording's time after the last hold.
+        The probability is (1 - `held_oil.from_start`), the probability of a leak that begins within the recording,
+        times the fraction of the recording's time after that hold.
         """
         time_after, begins_within = self.end - float(self.holds[-1].t[-1]), 1.0 - INFERENCE.held_oil.from_start
         return begins_within * time_after / max(self.end - self.begin, np.finfo(float).tiny)
@@ -672,7 +667,7 @@ class HeldChambers:
         posteriors = self._onset_posteriors(self._unit_piston_leak(self.piston_fit.offset))
         weights = np.exp(posteriors - posteriors.max())
         first, best, last = np.searchsorted(np.cumsum(weights) / weights.sum(), [0.5 * TAIL, 0.5, 1.0 - 0.5 * TAIL])
-        if first < 2:  # the recording's beginning or the first onset within a hold
+        if first < 2:  # it may be the beginning of the recording or the first onset within a hold
             return None
         ends = np.append(self.onsets, self.end)
         return Interval(float(self.onsets[best]), float(ends[first - 1]), float(ends[last + 1]))

@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 def cycle_length(speed: Array, rate: float) -> float | None:
     """Estimate the period of a machine's cycle [s], from its strokes or else from the spectrum of a speed.
 
-    `speed` (n,): speed or flow at the sampling `rate` [Hz]. Without regular strokes it is the period of the strongest
-    spectral line. Return None if the recording has fewer than `MIN_BLOCKS` of those periods.
+    Without regular strokes it is the period of the strongest spectral line, or None if the recording contains fewer
+    than `MIN_BLOCKS` of these periods. `speed` (n,): speed or flow at the sampling `rate` [Hz].
     """
     cycle = estimate_period(speed, rate)
     if cycle is None:
@@ -66,36 +66,39 @@ def oil_loss_tests(signals: Signals, rig: Rig, cycle: float | None, begin: float
     The volume of oil that the accumulator has delivered follows from the pressure of the unloaded side, to which it is
     connected, by the polytropic law of its gas. If the position is recorded, the oil that the rod displaces is
     subtracted. The volume and the pressure of a side are averaged over blocks, and the leak's conductance is tested for
-    a step between them (`step_test`). Blocks are whole multiples of `cycle`, the duration of the machine's cycle [s],
-    so that motion within a cycle averages out; None if there is no cycle, for blocks of any whole number of samples.
+    a step between blocks (`step_test`). `signals`: both pressures and, if recorded, the position; `begin`: time of the
+    first sample [s]; `cycle`: duration of the machine's cycle [s], None if there is no cycle. Blocks are whole
+    multiples of the cycle, so that motion within a cycle averages out; without a cycle they have any length.
 
-    `signals`: both pressures and, if recorded, the position; `begin`: time of the first sample [s]. The result maps
-    "external leak A" and "external leak B" to their tests. It lacks sides that cannot be tested, and is empty without
-    an accumulator (`makeup.check_valves` = "absent") or for fewer than `MIN_BLOCKS` blocks.
+    The result maps "external leak A" and "external leak B" to their tests. A side that cannot be tested is left out.
+    The result is empty without an accumulator (`makeup.check_valves` = "absent") or for fewer than `MIN_BLOCKS` blocks.
     """
     if rig.makeup.check_valves == "absent":
         return {}
-    unit = 1.0 / signals.rate if cycle is None else cycle  # blocks are whole multiples of it
+    unit_s = 1.0 / signals.rate if cycle is None else cycle
     duration = len(signals.time_step) / signals.rate
-    block_s = unit * max(1, round(duration / (INFERENCE.blocks.coarse * unit)))
+    block_s = unit_s * max(1, round(duration / (INFERENCE.blocks.coarse * unit_s)))
     edges = np.round(np.arange(int(duration / block_s) + 1) * block_s * signals.rate).astype(int)
     if len(edges) <= MIN_BLOCKS:
         return {}
-    # volume that the accumulator has delivered, from the pressure of the unloaded side, to which it is connected
     unloaded_pressure = np.where(signals.carried_by_A > 0.0, signals["p_B"], signals["p_A"])
+    # volume that the accumulator has delivered, up to a constant
     volume = -rig.makeup.V_gas / (rig.makeup.n_gas * (rig.fluid.p_charge + P_ATM)) * unloaded_pressure
     if "x" in signals:
         volume = volume - (rig.cylinder.A_A - rig.cylinder.A_B) * signals["x"]
-    volumes, tests = _block_means(volume, edges), {}
+    volumes = _block_means(volume, edges)
+    tests = dict[str, StepTest]()
     for side in "AB":
         pressures = _block_means(signals[f"p_{side}"], edges)
         if np.isfinite(volumes).all() and np.isfinite(pressures).all():
-            tests[f"external leak {side}"] = step_test(_estimate_conductance(volumes, pressures, block_s, begin))
-    return {name: test for name, test in tests.items() if test is not None}
+            test = step_test(_estimate_conductance(volumes, pressures, block_s, begin))
+            if test is not None:
+                tests[f"external leak {side}"] = test
+    return tests
 
 
 def _block_means(values: Array, edges: Array) -> Array:
-    """Average the samples of each of K blocks, without missing ones; NaN for a block without any sample.
+    """Average the known samples of each of K blocks; NaN for a block without known samples.
 
     `edges` (K + 1,): indices in `values` (n,) between which the blocks lie.
     """
@@ -110,9 +113,9 @@ def _block_means(values: Array, edges: Array) -> Array:
 def _estimate_conductance(volume: Array, pressure: Array, block_s: float, begin: float) -> Information:
     """Compute the likelihood of an external leak's conductance [m^3/(s Pa)] in K blocks of `block_s` [s].
 
-    `volume` (K,): mean volume that the accumulator has delivered, in each block [m^3]; `pressure` (K,): mean pressure
-    that drives the leak [Pa]; `begin`: start of the first block [s]. The initial volume and the effect of the gas
-    temperature, linear and quadratic in time, are eliminated.
+    The initial volume and the effect of the gas temperature, linear and quadratic in time, are eliminated. `volume`
+    (K,): mean volume that the accumulator has delivered by each block [m^3]; `pressure` (K,): mean pressure that drives
+    the leak in each block [Pa]; `begin`: start of the first block [s].
     """
     count = len(volume)
     time = (np.arange(count, dtype=float) + 0.5) * block_s
@@ -122,5 +125,7 @@ def _estimate_conductance(volume: Array, pressure: Array, block_s: float, begin:
     temperature = INFERENCE.level.gas * np.column_stack([time, time**2 / time[-1]])
     weight = np.linalg.inv(max(noise, np.finfo(float).tiny) * np.eye(count) + temperature @ temperature.T)
     weight -= np.outer(weight.sum(axis=0), weight.sum(axis=1)) / weight.sum()  # without the initial volume
-    precision, vector, healthy = losses.T @ weight @ losses, losses.T @ weight @ volume, INFERENCE.healthy.outside
-    return Information(begin + time, 0.5 * (precision + precision.T), vector, level=healthy, slope=healthy)
+    precision, vector = losses.T @ weight @ losses, losses.T @ weight @ volume
+    healthy_deviation = INFERENCE.healthy.outside  # of the conductance in a healthy machine
+    precision = 0.5 * (precision + precision.T)
+    return Information(begin + time, precision, vector, level=healthy_deviation, slope=healthy_deviation)

@@ -6,13 +6,14 @@ returns displaces nothing,
 
     integral of phi D dtheta = G integral of phi (p_A - p_B) dt + sum_j c_j integral of phi f_j dg_j,
 
-so the pump delivers just the leakage. If it delivers less than any pump leaks, no loop replaces the leakage, and the
-balance contains no information. While a loop holds the piston at standstill, any test function will do. Rows with a
-missing sample have no weight. Neither have rows of a single rod in which the loaded side changes, since the circuit
-then exchanges oil. Of the mean pressure difference d only the part counts that sensor offsets up to z cannot cause: d
-- z^2/d above z (Breiman's garrote). If no channel gives a flow, shut valves hold the piston, and the leakage of the
-loaded side moves it slowly. While the command moves, the valve may replace the lost oil, and the samples do not
-count.
+so the pump delivers just the leakage. D is the pump's displacement per angle theta, G the leakage conductance, and c_j
+are the coefficients of the other terms f_j dg_j. If the pump delivers less than any pump leaks, no loop replaces the
+leakage, and the balance contains no information. While a loop holds the piston at standstill, any test function will
+do. Rows with a missing sample have no weight. Rows of a single rod in which the loaded side changes have no weight
+either, since the circuit then exchanges oil. Sensor offsets up to z may cause a part of the mean pressure difference d
+of a row; only d - z^2/d counts, or 0 below z (Breiman's garrote). If no channel gives a flow, shut valves hold the
+piston, and the leakage of the loaded side moves it slowly. While the command moves, the valve may replace the lost oil,
+and the samples do not count.
 
 Sources: M. Shinbrot, Trans. ASME 79 (1957) 547; L. Breiman, Technometrics 37 (1995) 373.
 """
@@ -61,20 +62,21 @@ class CycleBalance(NamedTuple):
 def circulations(recording: Recording, rig: Rig) -> list[CycleBalance]:
     """Compute the volume balances that a recording allows without a position, over whole cycles and over holds.
 
-    A hold is a time in which the piston is held at standstill. A recording with a position but without flow gives a
-    balance over holds behind shut valves only. The list is empty if no balance is possible.
+    A hold is a time in which the piston is held at standstill. A recording with a position but without flow gives only
+    a balance over holds behind shut valves. The list is empty if no balance is possible.
     """
     channels, begin = frozenset(recording.channels), float(recording.t[0])
     equation = locked(rig, channels) if "x" in channels else circulation(rig, channels)
     if equation is None:
         return []
-    is_locked, samples = equation.name == LOCKED, samples_without_holes(recording, _READ)
+    is_locked = equation.name == LOCKED  # shut valves hold the piston
+    samples = samples_without_holes(recording, _READ)
     if not is_locked:
         samples = derive_drive_signals(samples, rig, recording.rate, loaded=True)
     signals = Signals(samples, recording.rate)
     # left side as a flow [m^3/s]: delivered by the pump, or displaced by a piston behind shut valves
     flow, dp = equation.left(signals) * recording.rate, signals.pressure_difference
-    # friction dissipates: a negative power means reversed wiring
+    # friction dissipates power, so a negative power means reversed signs of the flow
     if not is_locked and float(np.nansum((dp - np.nanmean(dp)) * flow)) < 0.0:
         recorded_left = equation.left
         equation, flow = equation._replace(left=lambda s: -recorded_left(s)), -flow
@@ -87,7 +89,8 @@ def circulations(recording: Recording, rig: Rig) -> list[CycleBalance]:
     max_creep = _PRIORS.creep * max(rig.cylinder.A_A, rig.cylinder.A_B) if is_locked else 0.0
     is_held = is_known & _find_holds(np.where(may_hold, flow, np.inf), recording.rate, max_creep)
     if is_locked and "u" not in channels and not is_held.all():
-        is_held[: int(np.argmin(is_held))] = False  # before the first motion the machine may be off
+        first_motion = int(np.argmin(is_held))
+        is_held[:first_motion] = False  # before it the machine may be off
     cycle = None if is_locked else cycle_length(np.where(is_known, flow, 0.0), recording.rate)
     balances = []
     for half_width, is_used in ((cycle, is_known), (HOLD_HALF_WIDTH, is_held)):
@@ -103,16 +106,16 @@ def circulations(recording: Recording, rig: Rig) -> list[CycleBalance]:
 def _find_holds(flow: Array, rate: float, min_limit: float = 0.0) -> NDArray[np.bool_]:
     """Flag the samples (n,) in which the piston is held, i.e. the flow has been near zero for the settling time.
 
-    `flow` (n,) [m^3/s] at the sampling `rate` [Hz]; an infinite value means that the piston is not held. The averaged
-    flow must be at most a fraction of its largest value, or at most `min_limit` [m^3/s] if that is larger.
+    The averaged flow is near zero up to a fraction of its largest value, or up to `min_limit` [m^3/s] if that is
+    larger. `flow` (n,): flow [m^3/s] at the sampling `rate` [Hz], infinite where the piston is surely not held.
     """
     window, settling = max(1, round(_PRIORS.averaged * rate)), max(1, round(_PRIORS.settles * rate))  # [samples]
     mean_flow = np.abs(np.convolve(flow, np.full(window, 1.0 / window), "same"))
     is_finite = np.isfinite(mean_flow)
     limit = max(_PRIORS.slow * mean_flow[is_finite].max(initial=0.0), min_limit)
     is_moving = ~is_finite | (mean_flow > limit)
-    # held if nothing moved in the settling time before
-    return np.asarray(np.convolve(is_moving, np.ones(settling))[: flow.size] == 0)
+    n_moving = np.convolve(is_moving, np.ones(settling))[: flow.size]  # of the last `settling` samples
+    return np.asarray(n_moving == 0)
 
 
 def _build_blocks(
@@ -130,17 +133,19 @@ def _build_blocks(
     if one_sided:
         by_A = _integrate_rows([signals.carried_by_A[1:] / rate], is_used, half_width, rate).values[:, 0]
         rows = rows._replace(whole=rows.whole & (np.minimum(by_A, 1.0 - by_A) < _PRIORS.elsewhere))
-    # a block has the rows of one cycle, or of `MAX_BLOCK_TIME`
-    group = 2 if half_width > HOLD_HALF_WIDTH else round(2.0 * MAX_BLOCK_TIME / half_width)
-    n_blocks = len(rows.time) // group
-    is_whole = rows.whole[: n_blocks * group]
-    n_rows = np.count_nonzero(is_whole.reshape(n_blocks, group), axis=1)
+    # rows are half of `half_width` apart; a block has the rows of one cycle (`half_width`), or of `MAX_BLOCK_TIME`
+    rows_per_block = 2 if half_width > HOLD_HALF_WIDTH else round(2.0 * MAX_BLOCK_TIME / half_width)
+    n_blocks = len(rows.time) // rows_per_block
+    n_used = n_blocks * rows_per_block
+    is_whole = rows.whole[:n_used]
+    n_rows = np.count_nonzero(is_whole.reshape(n_blocks, rows_per_block), axis=1)
     if np.count_nonzero(n_rows) < MIN_BLOCKS:
         return None
-    whole_rows = rows.values[: n_blocks * group][is_whole]
+    whole_rows = rows.values[:n_used][is_whole]
     gram = Weighting((ColumnRoles(equation),)).compute_gram_matrices([whole_rows], np.cumsum(n_rows))
-    # windows are half a half-width apart: each stands for a quarter of it on either side of its middle
-    ends = rows.time[: n_blocks * group].reshape(n_blocks, group)[:, [0, -1]] + np.array([-0.25, 0.25]) * half_width
+    # each row stands for a quarter of `half_width` on either side of its middle
+    middles = rows.time[:n_used].reshape(n_blocks, rows_per_block)
+    ends = middles[:, [0, -1]] + np.array([-0.25, 0.25]) * half_width
     samples = [slice(*pair) for pair in np.round(ends * rate).astype(int)]
     flow = np.array([_mean_flow(left[block], rate) for block in samples])
     pressures = np.array([sorted_part_means(dp[block], rate) for block in samples])
@@ -151,9 +156,9 @@ def _build_blocks(
 def _integrate_rows(increments: list[Array], is_used: NDArray[np.bool_], half_width: float, rate: float) -> Rows:
     """Compute rows of a regression: mean rates of c columns over overlapping triangular windows.
 
-    `increments`: arrays (n,) of each column; `is_used` (n,): a row that contains other intervals is flagged as not
-    whole. The windows have a `half_width` [s]; neighbouring ones are half of that apart. The integral over a triangle
-    is computed as the second difference of the twice integrated increments.
+    `increments`: arrays (n,) of each column; `is_used` (n,): flags of the intervals that may be part of a row; a row
+    with other intervals is flagged as not whole. The windows have a `half_width` [s], and their middles are half of it
+    apart. The integral over a triangle is computed as the second difference of the twice integrated increments.
     """
     half_length, n_samples = half_width * rate, len(is_used)
     centres = np.arange(half_length, n_samples - half_length, 0.5 * half_length)
@@ -178,7 +183,7 @@ def _shrink_offset(values: Array, names: list[str]) -> None:
     """Reduce, in place, the columns of the leak in rows (r, c) by the part that sensor offsets may cause.
 
     A row is the volume balance integrated with one test function; `names`: names of the columns. The mean pressure
-    difference d of a row becomes d - z^2/d, or 0 if it is smaller than the largest usual offset z (Breiman's garrote).
+    difference d of a row becomes d - z^2/d, or 0 if |d| is smaller than the largest usual offset z (Breiman's garrote).
     The column of an orifice is scaled by the same factor.
     """
     max_offset = WITHIN_95 * INFERENCE.zero.pressure

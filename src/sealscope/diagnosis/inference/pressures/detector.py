@@ -39,14 +39,14 @@ class PressureResponse:
     def reading(self, recording: Recording) -> ResponseLeak | None:
         """Measure the leakage of a recording by the response of its pressures to the command.
 
-        None if no parameters of the model describe the response.
+        None if the recording does not meet the requirements, or if no parameters of the model describe the response.
         """
         return response.measure_leak(recording, self.rig)
 
     def learn(self, recording: Recording) -> Summary | None:
         """Summarise a healthy recording by the mean conductance past the piston [m^3/(s Pa)], with the key "level".
 
-        Return None if the model of the response does not describe the recording.
+        Return None if the recording is not measured (`reading`).
         """
         leak = self.reading(recording)
         return None if leak is None else {"level": leak.level[0]}

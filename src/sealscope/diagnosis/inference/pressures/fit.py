@@ -5,9 +5,10 @@ some theta_k^0,
 
     y_k(theta_k) = y_k(theta_k^0) + J_k (theta_k - theta_k^0),
 
-and the block stores sums only. The likelihood is Gaussian in all theta_k together (`Joint`). The covariance of one
-parameter over all blocks, with all others eliminated, is therefore a part of the inverse of the joint precision.
-Parameters are counted in units that are fractions of the widths of their priors.
+with the Jacobian J_k. Of each block only products of residual and Jacobian are kept (`Block`). The likelihood is
+Gaussian in all theta_k together (`Joint`). The covariance of one parameter over all blocks, with all other parameters
+eliminated, is therefore a part of the inverse of the joint precision. Parameters are counted in units that are
+fractions of the widths of their priors.
 """
 
 from __future__ import annotations
@@ -42,8 +43,8 @@ class Normal(NamedTuple):
 class Priors(NamedTuple):
     """Prior on p parameters that vary during a recording, (p,) each.
 
-    `centre`, `width`: prior mean and standard deviation of each parameter's average; `wander`: standard deviation
-    that its random walk reaches within `blocks.wander` of `priors.toml`, 90 s.
+    `centre`, `width`: prior mean and standard deviation of each parameter's average over the recording; `wander`:
+    standard deviation that the parameter's random walk reaches within `blocks.wander` of `priors.toml`, 90 s.
     """
 
     centre: Array
@@ -77,8 +78,8 @@ class Linearisation(NamedTuple):
     """Linearisation of the model's output over n samples about p parameters `theta` (p,).
 
     `rows` (1 + p, n): residual [Pa], and derivative of the output by each parameter [Pa per unit]; `gram`
-    (1 + p, 1 + p): products of these rows; `ends`: simulated states at the last sample; `squares`: residual sums of
-    squares [Pa^2] of all simulated parameter sets, that of `theta` first.
+    (1 + p, 1 + p): products of these rows, without the mains hum; `ends`: simulated states at the last sample;
+    `squares`: residual sums of squares [Pa^2] of all simulated parameter sets, `theta` being the first.
     """
 
     theta: Array
@@ -97,11 +98,11 @@ class Linearisation(NamedTuple):
 
 
 class Block(NamedTuple):
-    """Sums of a block of samples, from the linearisation about its parameters `theta` (p,).
+    """Sums over a block of samples, from the linearisation about the block's parameters `theta` (p,).
 
     `gram` (1 + p, 1 + p): products of the residual and the derivatives by each parameter; `samples`: number of known
-    samples; `scores` (s, 1 + p): products of these rows with the derivative by the tested parameter, in each of s
-    pieces of the block. Their scatter shows the autocorrelation of the residual.
+    samples; `scores` (s, 1 + p): products of residual and derivatives with the derivative by the tested parameter, in
+    each of s pieces of the block. The scatter of the scores shows the autocorrelation of the residual.
     """
 
     theta: Array
@@ -130,16 +131,17 @@ class Joint:
     def fit(blocks: Sequence[Block], priors: Priors, block_s: float, parameter: int) -> Joint:
         """Fit the parameters of all blocks, each `block_s` [s] long, together.
 
-        `parameter`: index of the tested parameter. The scatter of its scores, i.e. products of residual and
-        derivative, shows how much the correlation of the noise inflates the variance of the estimates.
+        `parameter`: index of the tested parameter, whose scores (`Block`) show how much the correlation of the noise
+        inflates the variance of the estimates.
         """
         theta = np.array([block.theta for block in blocks])
         prior_precision = _prior_precision(len(blocks), priors, block_s)
         prior_gradient = prior_precision @ ((theta - priors.centre) / priors.unit).ravel()
         gram = block_diag(*(block.gram[1:, 1:] for block in blocks))
         gradient = np.concatenate([block.gram[0, 1:] for block in blocks])
-        variance, inflation = _estimate_noise(blocks, np.zeros(theta.size), parameter)[0], 1.0  # white at first
-        for _ in range(2):  # the noise's variance is one of the unknowns
+        variance, _ = _estimate_noise(blocks, np.zeros(theta.size), parameter)
+        inflation = 1.0  # white noise at first
+        for _ in range(2):  # the fit changes the variance of the noise, which weights the prior
             factor = cho_factor(gram / (variance * inflation) + prior_precision, check_finite=False)
             mean = cho_solve(factor, gradient / (variance * inflation) - prior_gradient, check_finite=False)
             variance, inflation = _estimate_noise(blocks, mean, parameter)
@@ -149,15 +151,15 @@ class Joint:
     def information(self, parameter: int, time: Array, wander: float) -> Information:
         """Compute the likelihood of one parameter in each block, with all other parameters eliminated.
 
-        `parameter`: its index; `time` (K,): middles of the blocks [s]. The prior that the fit used for this parameter
-        is removed. Instead the result has a prior on a slope and on a random walk, with the scale `wander` over all
-        blocks.
+        The prior that the fit used for this parameter is removed. Instead the result has a prior on a linear change and
+        on a random walk, with the scale `wander` over all blocks. `parameter`: index of the parameter; `time` (K,):
+        middles of the blocks [s].
         """
         indices = slice(parameter, None, self.theta.shape[1])
         # precision with the prior, of deviations from theta
         posterior = np.linalg.inv(self.covariance[indices, indices])
         prior, unit = self.prior_precision[indices, indices], self.priors.unit[parameter]
-        # likelihood = posterior - prior, and from deviations to the parameter itself
+        # precision of the likelihood = posterior - prior; then from deviations to the parameter itself
         value, precision = self.theta[:, parameter] / unit, posterior - prior
         prior_gradient = prior @ (value - self.priors.centre[parameter] / unit)
         vector = posterior @ self.mean[indices] + prior_gradient + precision @ value
@@ -168,8 +170,8 @@ class Joint:
 def _prior_precision(n_blocks: int, priors: Priors, block_s: float) -> Array:
     """Compute the joint prior precision of the parameters in K blocks, each `block_s` [s] long, shape (K p, K p).
 
-    The parameters are in units of `priors.unit`. Each is a random walk from block to block, and its mean over the
-    blocks has the prior standard deviation `priors.width`.
+    The parameters are in units of `priors.unit`. Each parameter is a random walk from block to block, and its mean over
+    the blocks has the prior standard deviation `priors.width`.
     """
     steps = np.diff(np.eye(n_blocks), axis=0)
     walks = np.kron(steps.T @ steps, np.diag(1.0 / priors.wander_variance(block_s)))
@@ -178,11 +180,11 @@ def _prior_precision(n_blocks: int, priors: Priors, block_s: float) -> Array:
 
 
 def _estimate_noise(blocks: Sequence[Block], deviations: Array, parameter: int) -> tuple[float, float]:
-    """Compute the variance of the residual [Pa^2], and a factor by which correlation of the noise inflates it.
+    """Compute the variance of the residual [Pa^2], and its inflation by the correlation of the noise.
 
-    `deviations` (K p,): deviations of the parameters from `theta` of each block, in multiples of `Priors.unit`. The
-    factor is the variance of the scores of one `parameter` (an index) relative to that under white noise, at least 1.
-    A score is the product of the residual and its derivative by the parameter.
+    The inflation is the variance of the scores (`Block`) over their variance under white noise, at least 1.
+    `deviations` (K p,): deviations of the parameters from `theta` of each block, in multiples of `Priors.unit`;
+    `parameter`: index of the tested parameter.
     """
     # (1, -deviation) times residual and Jacobian is the residual at these deviations
     directions = [np.append(1.0, -deviation) for deviation in deviations.reshape(len(blocks), -1)]

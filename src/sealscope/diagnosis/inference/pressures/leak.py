@@ -1,4 +1,4 @@
-"""Leakage measured by the response of the pressures: changes of the conductance; its level is too uncertain."""
+"""Leakage measured by the response of the pressures: only changes of the conductance, as its level is uncertain."""
 
 from __future__ import annotations
 
@@ -46,11 +46,12 @@ def states_flow(rig: Rig) -> bool:
 class ResponseLeak:
     """The leakage of a recording as measured by the response of its pressures (`observable.LeakMeasure`).
 
-    `parameters`: likelihood in K blocks of each parameter of the response by its name, with all others eliminated;
-    "G" is the conductance past the piston [m^3/(s Pa)]. `pressure` (K,): mean of abs(p_A - p_B) in each block [Pa];
-    `pump_flow`: mean flow of the pump [m^3/s], over the recording and while it delivers, here equal; `stated`: true
-    if the rig's file states the sizes that convert a conductance to L/min; `healthy`: mean conductance of each
-    healthy recording of the machine [m^3/(s Pa)].
+    - `parameters`: likelihood in K blocks of each parameter of the response, by the parameter's name; "G" is the
+      conductance past the piston [m^3/(s Pa)].
+    - `pressure` (K,): mean of abs(p_A - p_B) in each block [Pa].
+    - `pump_flow`: mean flow of the pump [m^3/s] over the recording, and while the pump delivers; both are equal here.
+    - `stated`: true if the rig's file states the sizes that convert a conductance to L/min.
+    - `healthy`: mean conductance of each healthy recording of the machine [m^3/(s Pa)].
     """
 
     parameters: Mapping[str, Information]
@@ -91,18 +92,18 @@ class ResponseLeak:
     def step_flow(self) -> Flow:
         """Mean flow [m^3/s] of a leak that begins within the recording, at the recording's mean abs(p_A - p_B).
 
-        It is the step of the conductance that `step` has fitted, converted to a flow. The law of the leak is not known:
-        an orifice of the same fitted conductance has `ORIFICE_RATIO` times the flow of a laminar leak. The result is
-        the mean of the two flows, and its standard error includes their difference, as if they were the ends of a 95 %
-        interval. Without a step test it is 0 with an infinite standard error.
+        It is the fitted step of the conductance, converted to a flow. The law of the leak is not known: an orifice of
+        the same fitted conductance has `ORIFICE_RATIO` times the flow of a laminar leak. The result is the mean of the
+        two flows. Its standard error includes their difference, as if the two were the ends of a 95 % interval. Without
+        a step test the flow is 0 with an infinite standard error.
         """
         if self.step is None:
             return Flow(0.0, np.inf)
         size, deviation = self.step.fitted
         mean_ratio, half_range = 0.5 * (ORIFICE_RATIO + 1.0), 0.5 * (ORIFICE_RATIO - 1.0)
-        by_law = half_range * abs(size) / WITHIN_95  # the laws are the ends of a 95 % interval
+        law_deviation = half_range * abs(size) / WITHIN_95
         unit = self.flow_per_conductance
-        return Flow(mean_ratio * size * unit, float(np.hypot(mean_ratio * deviation, by_law)) * unit)
+        return Flow(mean_ratio * size * unit, float(np.hypot(mean_ratio * deviation, law_deviation)) * unit)
 
     @property
     def flow_per_conductance(self) -> float:
@@ -115,19 +116,21 @@ class ResponseLeak:
 
         None if there are no healthy recordings.
         """
-        healthy, count = self.healthy, len(self.healthy)
+        count = len(self.healthy)
         if not count:
             return None
-        total = sum(healthy)
-        # each healthy recording minus the mean of the others, as the judged one is compared with all of them
-        differences = [level - (total - level) / (count - 1) for level in healthy] if count > 1 else [0.0]
-        return student_rise(self.level[0] - total / count, differences, PRESSURE.conductance.level)
+        total = sum(self.healthy)
+        # each healthy recording minus the mean of the others, as the judged recording is compared with a mean
+        differences = [level - (total - level) / (count - 1) for level in self.healthy] if count > 1 else [0.0]
+        judged_level, _ = self.level
+        return student_rise(judged_level - total / count, differences, PRESSURE.conductance.level)
 
     @property
     def bound_flow(self) -> float:
-        """95 % upper bound of the mean flow [m^3/s] of a leak, if it is an orifice; infinite if nothing was tested.
+        """95 % upper bound of the mean flow [m^3/s] of a leak; infinite if nothing was tested.
 
         With healthy recordings it bounds the leakage above theirs, otherwise a leak that begins within the recording.
+        An orifice is assumed, which has the largest flow for a fitted conductance.
         """
         test = self.step if self.rise is None else self.rise
         if test is None:
@@ -139,8 +142,8 @@ class ResponseLeak:
     def step_rise(self) -> LeakRise | None:
         """Leakage above that of healthy recordings, and the evidence that a step within the recording caused it.
 
-        The evidence (`step_log_ratio`) compares the rise of the mean that the step would cause with no rise. None
-        without healthy recordings.
+        The evidence (`step_log_ratio`) is the log likelihood ratio of the rise of the mean that the step would cause to
+        no rise. None without healthy recordings.
         """
         if self.rise is None:
             return None
@@ -163,7 +166,7 @@ class ResponseLeak:
         return 1.0 / LITRE_PER_MINUTE if self.stated else None
 
     def relative(self, flow: Flow) -> RelativeLeak | None:
-        """Return None, since the pump's flow is not measured."""
+        """Return None, since the pump's flow is not measured, only assumed from the command."""
         return None
 
     def total(self, detectable_flow: float | None) -> TotalLeakage:
@@ -173,7 +176,7 @@ class ResponseLeak:
         None if that was not tested. It is stated in L/min and as a fraction of the pump's flow (`findable_lpm`,
         `findable_share`).
         """
-        pump_flow, lpm_per_flow = self.pump_flow[0], self.lpm_per_flow
+        (pump_flow, _), lpm_per_flow = self.pump_flow, self.lpm_per_flow
         return TotalLeakage(
             lpm=None,
             interval_lpm=None,
@@ -185,15 +188,14 @@ class ResponseLeak:
     def history(self, onset_s: float | None) -> LeakCourse | None:
         """Compute the leakage over time [L/min], with its 95 % interval, relative to its mean before the onset.
 
-        `onset_s`: onset of the leak [s], or None. The flow is midway between the flow through a laminar gap and
-        through an orifice. Return None without an onset or a step test, or if the rig's file does not state the
-        machine's sizes.
+        `onset_s`: onset of the leak [s]. The flow is midway between those of a laminar leak and of an orifice. Return
+        None without an onset or a step test, or if the rig's file does not state the machine's sizes.
         """
         if onset_s is None or self.step is None or not self.stated:
             return None
         time = self.information.time
         growth = fit_history(self.information, self.step, with_step=True).relative_to(time < onset_s)
-        unit = self.pressure * 0.5 * (1.0 + ORIFICE_RATIO) / LITRE_PER_MINUTE  # midway between the leak laws
+        unit = self.pressure * 0.5 * (1.0 + ORIFICE_RATIO) / LITRE_PER_MINUTE  # [L/min] per conductance
         value = growth.mean * unit
         half_width = WITHIN_95 * np.sqrt(np.maximum(np.diag(growth.covariance), 0.0)) * unit
         return LeakCourse(time, value, value - half_width, value + half_width)

@@ -1,8 +1,8 @@
 """Model of the rig reduced to the difference p_A - p_B of its chamber pressures, for many parameter sets at once.
 
-Its seven states are the difference p, the piston's speed v and position, the friction, the motor's speed, its current
-and the integral of its speed loop. They follow the laws of `sealscope.physics`. Friction has two alternative laws,
-Stribeck's and LuGre's. A leak of conductance G damps the ringing of a compliance C after each reversal by G/C. It
+Its seven states are the difference p, the piston's speed v and position, the friction, the motor's speed and current,
+and the integral of the speed loop. The states follow the laws of `sealscope.physics`. Friction has two alternative
+laws, Stribeck's and LuGre's. A leak of conductance G damps the ringing of a compliance C after each reversal by G/C. It
 also reduces the ramp, the breakaway and the fall of the pressure while sliding. `response` fits the parameters to
 recorded pressures. Parameter sets are simulated in parallel lanes of the processor (`physics.lanes`).
 """
@@ -31,28 +31,38 @@ from sealscope.recordings.recording import Array
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-#: Parameters of a block: speed per volt [rad/(s V)], constant speed [rad/s], stiffness of the oil [Pa], Coulomb
-#: friction [N], viscous friction [N s/m], breakaway over Coulomb friction [1], its decay [s/m], relative increase of
-#: friction on the way out [1], conductance past the piston [m^3/(s Pa)], compliance of the contact before it slides
-#: [m/N], stiffness of the load [N/m]; then those with derivatives that need no simulation: lead of the command [s],
-#: lag of the transducers [s], scale of p_A - p_B [1] and its offset [Pa].
+#: Parameters that are fitted to a block. The derivatives by the last four need no simulation.
 PARAMETERS = (
-    *("gain", "bias", "K", "F_C", "F_v", "K_brk", "C_c", "side", "G", "give", "spring"),
-    *("lead", "lag", "scale", "offset"),
+    "gain",  # motor speed per volt of the command [rad/(s V)]
+    "bias",  # motor speed without command [rad/s]
+    "K",  # stiffness (bulk modulus) of the oil [Pa]
+    "F_C",  # Coulomb friction [N]
+    "F_v",  # viscous friction [N s/m]
+    "K_brk",  # breakaway over Coulomb friction [1]
+    "C_c",  # decay of the breakaway friction with the speed [s/m]
+    "side",  # relative increase of friction in motion out [1]
+    "G",  # leakage conductance past the piston [m^3/(s Pa)]
+    "give",  # compliance of the contact before it slides [m/N]
+    "spring",  # stiffness of the load [N/m]
+    "lead",  # lead of the command [s]
+    "lag",  # lag of the transducers [s]
+    "scale",  # scale of p_A - p_B [1]
+    "offset",  # sensor offset of p_A - p_B [Pa]
 )
+#: Index of each parameter.
 GAIN, BIAS, K_OIL, F_C, F_V, K_BRK, C_C, SIDE, G, COMPLIANCE, SPRING, LEAD, LAG, SCALE, OFFSET = range(len(PARAMETERS))
 #: Index of the position in a state.
 POSITION = 5
 State = tuple[float, float, float, float, float, float]
 Parameters = tuple[float, float, float, float, float, float, float, float, float, float, float, float, float]
-#: Numbers of the reduced rig, A_A the mean of both areas.
+#: Numbers of the reduced rig, named as in `physics.rig.RigNumbers`; A_A is the mean of both areas.
 Reduced = namedtuple("Reduced", "A_A V M_eq v_th q_b k_p K_i V_max C_m B_M J_M R_c L_c C_e i_max")
 #: Laws of friction: Stribeck's, as in the rig, and LuGre's, whose contact does not creep.
 LAWS = STRIBECK, BRISTLES = "stribeck", "bristles"
 _FRICTION = {STRIBECK: PRESSURE.stribeck, BRISTLES: PRESSURE.bristles}
 _CENTRING_RATE = 1.0 / PRESSURE.follow.centring
-#: Maximum step of the solver [s], with which RK4 is within 100 Pa, far below the noise of transducers; length of
-#: spectra [samples].
+#: Maximum step of the solver [s], with which RK4 is within 100 Pa, far below the noise of transducers; length of the
+#: segments of which spectra are computed [samples].
 _MAX_STEP, _SEGMENT = 1.01e-3, 256
 
 
@@ -69,9 +79,9 @@ def _direction_factor(v: float, theta: Parameters) -> float:
 def _steady_friction(v: float, theta: Parameters, m: Reduced) -> tuple[float, float, float]:
     """Compute the friction of steady sliding at a speed v [m/s] by Stribeck's law.
 
-    `theta`: fitted parameters; `m`: sizes of the rig. Returns the friction force [N], which falls linearly to zero
-    below the creep speed `m.v_th`; its magnitude without this reduction [N]; and the magnitude of the speed, at least
-    the creep speed [m/s].
+    Returns the friction force [N], which falls linearly to zero below the creep speed `m.v_th`; the magnitude of the
+    force without this reduction [N]; and the magnitude of the speed, at least the creep speed [m/s]. `theta`: fitted
+    parameters; `m`: sizes of the rig.
     """
     speed = max(abs(v), m.v_th)
     magnitude = stribeck_force(speed, theta[F_C], theta[K_BRK], theta[C_C]) * _direction_factor(v, theta)
@@ -189,16 +199,16 @@ def simulate_response(
 def response_priors(rig: Rig, law: str = STRIBECK) -> Priors:
     """Compute the priors on the parameters `PARAMETERS` of the pressure response from the parameters of a rig.
 
-    The rig's values scale the numbers `[response]` of `priors.toml`; parameters that it does not have are priors on
-    their own. `law`: law of friction, one of `LAWS`. The Coulomb friction is taken with both chambers at the charge
-    pressure.
+    The table `[response]` of `priors.toml` states the prior of a parameter relative to the rig's value, or absolutely
+    if the rig has no such parameter. `law`: law of friction, one of `LAWS`. The Coulomb friction of the rig is that at
+    the charge pressure in both chambers.
     """
     friction, gain = rig.friction, rig.motor.omega_per_volt
     of_difference = friction.coulomb_pressure == "difference"
     coulomb = coulomb_friction(rig.fluid.p_charge, rig.fluid.p_charge, friction.F_pr, friction.F_cfr, of_difference)
     rig_values = {"gain": gain, "bias": gain, "K": rig.fluid.K_oil, "F_C": coulomb}
     rig_values |= {name: getattr(friction, name) for name in ("F_v", "K_brk", "C_c")}
-    # centre, width and wander of each parameter, relative to the rig's value if it has one
+    # centre, width and wander of each parameter, relative to the rig's value if the rig has the parameter
     relative = {str(name): row for name, row in PRESSURE.response.items()} | {"give": _FRICTION[law].give}
     return Priors(*np.array([rig_values.get(name, 1.0) * np.array(relative[name]) for name in PARAMETERS]).T)
 
@@ -250,13 +260,12 @@ class Machine(NamedTuple):
         """Find the two stiffnesses of the oil [Pa] that correspond to the strongest ringing of p_A - p_B, shape (2,).
 
         The ringing shows in the spectrum of `dp` (n,), i.e. p_A - p_B [Pa], minus the spectrum of `total` (n,), i.e.
-        p_A + p_B [Pa], which has the same noise and hum but does not ring. If no resolved frequency is within the
-        prior, both are the stiffness of the rig's file.
+        p_A + p_B [Pa], which has the same noise and hum but does not ring. If the spectrum has no line within the
+        prior, both results are the centre of the prior.
         """
         relative_width = priors.width[K_OIL] / priors.centre[K_OIL]
-        # bins of the zero-padded spectra: of the ringing at the centre of the prior, and around it
-        n_padded = 4 * _SEGMENT
-        middle = n_padded / self.ringing_period(priors.centre[K_OIL])
+        n_padded = 4 * _SEGMENT  # samples of a segment with zeros, for a finer grid of frequencies
+        middle = n_padded / self.ringing_period(priors.centre[K_OIL])  # bin of the ringing at the centre of the prior
         bins = np.arange(
             math.ceil(middle * math.exp(-2.0 * relative_width)),
             min(n_padded // 2, int(middle * math.exp(relative_width))),
@@ -266,7 +275,9 @@ class Machine(NamedTuple):
         segments = sliding_window_view([dp, total], min(_SEGMENT, dp.size), axis=1)[:, :: _SEGMENT // 2]
         spectra = np.fft.rfft(segments * np.hanning(segments.shape[2] + 1)[:-1], n_padded)
         powers = np.mean(np.abs(spectra) ** 2, axis=1)  # Welch's method
-        excess = np.pad((powers[0] - powers[1])[bins], 1, constant_values=-np.inf)
+        difference_power, total_power = powers
+        excess = np.pad((difference_power - total_power)[bins], 1, constant_values=-np.inf)
         peaks = np.flatnonzero((excess[1:-1] > excess[:-2]) & (excess[1:-1] >= excess[2:]))
-        strongest = np.resize(peaks[np.argsort(-excess[1 + peaks])], 2)
-        return np.asarray(priors.centre[K_OIL] * (bins[strongest] / middle) ** 2)  # frequency grows with its root
+        strongest = np.resize(peaks[np.argsort(-excess[1 + peaks])], 2)  # a single peak is repeated
+        # the frequency grows with the root of the stiffness
+        return np.asarray(priors.centre[K_OIL] * (bins[strongest] / middle) ** 2)

@@ -1,9 +1,10 @@
 """Fit of the response of p_A - p_B to the command in a recording without a position, block by block.
 
-One call of the simulation (`reduced_rig`) gives a whole Jacobian: its lanes simulate the parameters, and the
-parameters with each of them increased in turn. Their states continue from block to block. An iterated Kalman filter
-leads from block to block (`Follower`), both live and over a recording. Over a recording all blocks are then fitted
-together (`fit.Joint`). Of the two laws of friction the one that is more probable at the beginning is used.
+One call of the simulation (`reduced_rig`) gives a whole Jacobian: it simulates in parallel the parameters, and the
+parameters with each of them increased in turn. The simulated states continue from block to block. An iterated Kalman
+filter tracks the parameters from block to block (`Follower`), both live and over a recording. Over a recording all
+blocks are then fitted together (`fit.Joint`). Friction follows Stribeck's law, or LuGre's if Stribeck's does not
+explain the beginning of the recording and LuGre's fits better.
 
 The result is the factor p(pressures | command) of the likelihood. A volume balance of position and angle is conditional
 on p_A and p_B, so the two likelihoods may be multiplied.
@@ -55,11 +56,12 @@ if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
 _FOLLOW = PRESSURE.follow
-#: Parameters that stay positive; minimum compliance of the contact [m/N] and lag [s].
+#: Parameters that stay positive; minimum compliance of the contact [m/N], and minimum lag that is divided by [s].
 _POSITIVE, _MIN = [GAIN, K_OIL, F_C, K_BRK, C_C], 1e-9
-#: Gauss-Newton steps of a fit, fractions of a step that are tried together, and minimum expected decrease of -2 log
-#: posterior for another step.
-_N_STEPS, _FRACTIONS, _MIN_GAIN = 12, np.array([1.0, *np.geomspace(0.5, 0.02, 4)]), 5.0
+#: Maximum number of Gauss-Newton steps of a fit, and minimum expected decrease of -2 log posterior for another step.
+_N_STEPS, _MIN_GAIN = 12, 5.0
+#: Fractions of a Gauss-Newton step that are tried together.
+_FRACTIONS = np.array([1.0, *np.geomspace(0.5, 0.02, 4)])
 
 
 def _geometric_grid(middle: float, factor: float, count: int) -> Array:
@@ -71,11 +73,11 @@ def _geometric_grid(middle: float, factor: float, count: int) -> Array:
 class Segment:
     """Consecutive samples of a recording that are fitted with one set of parameters.
 
-    `machine`: simulator; `priors`: of its parameters; `command` (n + 1,): command [V] at the previous sample and at
-    each sample; `dp` (n,): recorded p_A - p_B [Pa]; `states` (8, 12): simulated states at the previous sample, with
-    the parameters and with each of them increased; `waves` (m, n): waves of the mains hum, which are projected out;
-    `sample_weights` (n,): 1 for a recorded sample, 0 for a missing one; `smooth`: width [samples] of a Gaussian that
-    smooths the residual before it is fitted, 0 for no smoothing.
+    `machine`, `priors`: simulator, and priors of its parameters; `command` (n + 1,): command [V] at the previous sample
+    and at each sample; `dp` (n,): recorded p_A - p_B [Pa]; `states` (8, 12): simulated states at the previous sample,
+    with the parameters, and with each parameter up to `SPRING` increased in turn; `waves` (m, n): waves of the mains
+    hum, which are projected out; `sample_weights` (n,): 0 for samples that are missing or recorded while the drive
+    settles, otherwise 1; `smooth`: width [samples] of a Gaussian that smooths the residual, 0 for no smoothing.
     """
 
     machine: Machine
@@ -89,7 +91,7 @@ class Segment:
 
     @cached_property
     def n_samples(self) -> float:
-        """Number of samples that are not missing."""
+        """Number of samples with a weight."""
         return float(np.count_nonzero(self.sample_weights))
 
     @cached_property
@@ -98,10 +100,10 @@ class Segment:
         return np.asarray(np.linalg.pinv(self.waves @ self.waves.T, hermitian=True))
 
     def _project_on_waves(self, rows: Array) -> tuple[Array, Array, Array]:
-        """Smooth rows (m, n) of samples, set missing samples to zero, and fit k waves of the mains hum to each row.
+        """Smooth rows (m, n) of samples, set samples without a weight to 0, and fit k mains waves to each row.
 
-        Returns the smoothed rows, their products with the waves and the fitted amplitudes of the waves, shape (m, k)
-        each.
+        Returns the smoothed rows (m, n), their products with the waves (m, k), and the fitted amplitudes of the waves
+        (m, k).
         """
         rows = gaussian_filter1d(rows, self.smooth) if self.smooth > 0.0 else rows
         if self.n_samples < rows.shape[1]:
@@ -124,10 +126,11 @@ class Segment:
         """Linearise the residual of the model about the first of up to 5 parameter sets (m, p).
 
         The residual is dp - scale * simulated response - offset. The rows of the result are the residual of the first
-        set, and the derivatives of scale * response + offset by each parameter, in its unit. The result also has the
-        residual sum of squares of each set.
+        set, and the derivatives of scale * response + offset by each parameter, per unit of `priors.unit`. The result
+        also has the residual sum of squares of each set.
         """
-        theta, n_sets, n_slopes = sets[0], len(sets), SPRING + 1
+        theta, n_sets = sets[0], len(sets)
+        n_slopes = SPRING + 1  # number of parameters whose derivatives are simulated
         # simulated together: theta, theta with each parameter up to SPRING increased by a unit, and the other sets
         simulated = np.concatenate([sets[:1], np.tile(theta, (n_slopes, 1)), sets[1:]])
         simulated[range(1, n_slopes + 1), range(n_slopes)] += self.priors.unit[:n_slopes]
@@ -146,10 +149,10 @@ class Segment:
         return Linearisation(theta, gram[:n_rows, :n_rows], rows[:n_rows], ends[:, : n_slopes + 1], squares)
 
     def _analytic_slopes(self, theta: Array, response: Array) -> Array:
-        """Compute the derivatives of the response by three parameters without simulation, (3, n), in their units.
+        """Compute the derivatives of the response by three parameters without simulation, (3, n).
 
-        The parameters are the lead of the command, the lag of the transducers, and the scale of p_A - p_B. `theta`
-        (p,): all parameters; `response` (n,): simulated p_A - p_B [Pa].
+        The parameters are the lead of the command, the lag of the transducers, and the scale of p_A - p_B, in units of
+        `priors.unit`. `theta` (p,): all parameters; `response` (n,): simulated p_A - p_B [Pa].
         """
         change = np.asarray(np.gradient(response))
         change[1:-1] -= np.diff(change, 2) / 6.0  # to fourth order, since the ringing is fast
@@ -177,7 +180,7 @@ class Segment:
                 break
             sets = np.clip(fit.theta + _FRACTIONS[:, None] * step * prior.unit, *self.bounds(fit.theta))
             full_step, deviations = self.linearise(sets), prior.deviations(sets)
-            costs = full_step.squares / variance + np.sum(deviations @ prior.precision * deviations, axis=1)
+            costs = full_step.squares / variance + np.sum(deviations @ prior.precision * deviations, axis=1)  # (5,)
             gains = np.nan_to_num(fit.cost(variance, prior) - costs, nan=-np.inf)
             best = int(np.argmax(gains))
             if not gains[best] > 0.0:
@@ -190,7 +193,8 @@ class Segment:
     def bounds(self, theta: Array) -> tuple[Array, Array]:
         """Return lower and upper limits (p,) of the parameters after one step from `theta` (p,).
 
-        Parameters that must be positive can at most halve or double.
+        Parameters that must be positive can at most halve or double. The lag is at least 0, and the compliance at least
+        `_MIN`. The other parameters are not limited.
         """
         low, high = np.full(theta.size, -np.inf), np.full(theta.size, np.inf)
         low[_POSITIVE], high[_POSITIVE] = 0.5 * theta[_POSITIVE], 2.0 * theta[_POSITIVE]
@@ -207,18 +211,19 @@ class Segment:
         return max(squares, 1.0) / count * max(1.0, 2.0 * math.sqrt(math.pi) * self.smooth)
 
     def is_explained(self, cost: float) -> bool:
-        """Return True if a fit explains the samples: its chi-squared `cost` hardly exceeds their number n.
+        """Return True if a fit explains the n samples: its chi-squared `cost` does not exceed n by much.
 
-        The limit is n + c sqrt(2 n), i.e. c standard deviations above the mean (`follow.unexplained` of `priors.toml`).
+        The limit is n + c sqrt(2 n), i.e. c standard deviations above the mean of the chi-squared distribution, with
+        c = `follow.unexplained` of `priors.toml`.
         """
         return bool(cost <= self.n_samples + _FOLLOW.unexplained * math.sqrt(2.0 * self.n_samples))
 
     def block_sums(self, fit: Linearisation) -> Block:
         """Reduce a linearised fit of these samples to the sums for the joint fit of all blocks (`fit.Joint`).
 
-        With the derivative d_G of the model by the leakage conductance G, the scores of a second are the sums over its
-        samples of d_G times the residual, and of d_G times the derivative by each parameter. Their shape is (s, 1 + p)
-        for s seconds, of which the last may be incomplete, and p parameters. The mains hum is projected out.
+        The scores of a second are the sums over its samples of d_G times the residual, and of d_G times the derivative
+        by each parameter, where d_G is the derivative by the leakage conductance G. They have the shape (s, 1 + p) for
+        s seconds, of which the last may be incomplete. The mains hum is projected out.
         """
         rows = fit.rows - (fit.rows @ self.waves.T) @ self._wave_gram_inverse @ self.waves
         first = np.arange(0, self.dp.size, round(self.machine.rate))
@@ -227,13 +232,12 @@ class Segment:
 
 
 def fit_from_priors(segment: Segment, total: Array, noise: float) -> Linearisation:
-    """Fit the parameters to a first segment of samples, from the priors alone.
+    """Fit the parameters to a first segment of samples, without parameters from an earlier fit.
 
-    `total` (n,): sum p_A + p_B of the pressures [Pa]; `noise`: variance of the noise [Pa^2].
-
-    The ringing causes many local minima. Therefore the slow part of the pressure is fitted first, from the best of
-    several gains. Then all of it is fitted, from several breakaway forces and from stiffnesses at the peaks of the
-    spectrum of p_A - p_B minus that of p_A + p_B, which does not ring.
+    The ringing causes many local minima. Therefore the slow part of p_A - p_B is fitted first, from the best of several
+    gains and stiffnesses of the load. Then the unsmoothed p_A - p_B is fitted from several breakaway forces and several
+    stiffnesses of the oil, two of them by the strongest ringing (`Machine.ringing_stiffnesses`). `total` (n,): sum
+    p_A + p_B of the pressures [Pa]; `noise`: variance of the noise [Pa^2].
     """
     priors = segment.priors
 
@@ -259,16 +263,18 @@ def fit_from_priors(segment: Segment, total: Array, noise: float) -> Linearisati
     stiffnesses = np.append(ringing, priors.centre[K_OIL] * _geometric_grid(*PRESSURE.start["K"], 2))  # (4,)
     breakaways = theta[K_BRK] * _geometric_grid(*PRESSURE.start["K_brk"], 4)
     starts = rank_starts(segment, theta, 4, {K_OIL: np.repeat(stiffnesses, 4), K_BRK: np.tile(breakaways, 4)})
-    fit = fit_from_starts(segment, starts[0], noise, n_best=2)  # the best breakaway force for each stiffness
-    if not segment.is_explained(fit.cost(noise, priors.normal)):  # then the second best
-        fit = fit_from_starts(segment, [fit.theta, *starts[1]], noise, n_best=2)
+    best_starts, second_best_starts, *_ = starts  # breakaway forces, for each stiffness of the oil
+    fit = fit_from_starts(segment, best_starts, noise, n_best=2)
+    if not segment.is_explained(fit.cost(noise, priors.normal)):
+        fit = fit_from_starts(segment, [fit.theta, *second_best_starts], noise, n_best=2)
     return fit
 
 
 def fit_from_starts(segment: Segment, starts: Sequence[Array] | Array, noise: float, n_best: int) -> Linearisation:
     """Fit the parameters from several starts (s, p), and return the best fit.
 
-    All starts make a few steps; the `n_best` of them make more. `noise`: variance of the noise [Pa^2].
+    The fit makes a few steps from all starts, and then more steps from the `n_best` best results. `noise`: variance of
+    the noise [Pa^2].
     """
     fits, prior = [segment.linearise(start[None]) for start in starts], segment.priors.normal
     for n_steps, n_kept in ((_N_STEPS // 6, n_best), (_N_STEPS, 1)):
@@ -282,29 +288,29 @@ class Follower:
     """Iterated Kalman filter that tracks the parameters of the pressure response from block to block.
 
     `machine`: simulator; `priors`: of its parameters; `sense`: 1 if p_A - p_B rises with the command, -1 if it falls.
-    The state of the filter consists of the parameters `theta` (p,), their `covariance` (p, p) in units of
-    `priors.unit`, the `variance` of the noise [Pa^2], the simulated `states` (8, 12), the `last` command [V], and
-    `excess`, the misfit (chi squared - n) / sqrt(2 n) of the last block of n samples.
     """
 
     def __init__(self, machine: Machine, priors: Priors, sense: float) -> None:
         self.machine, self.priors, self.sense = machine, priors, sense
-        self.theta, self.variance, self.last = priors.centre, math.nan, math.nan
-        self.covariance = np.diag(priors.variance)
-        self.states, self.excess = np.zeros((8, SPRING + 2)), 0.0
+        self.theta = priors.centre  # parameters (p,)
+        self.covariance = np.diag(priors.variance)  # of the parameters, in units of `priors.unit`
+        self.variance = math.nan  # of the noise [Pa^2]
+        self.states = np.zeros((8, SPRING + 2))  # simulated states, as in `Segment`
+        self.last = math.nan  # command at the last sample [V], NaN at the start and after a gap
+        self.excess = 0.0  # misfit of the last block of n samples, (chi squared - n) / sqrt(2 n)
 
     @staticmethod
     def fit_start(recording: Recording, rig: Rig) -> Follower:
         """Start a filter with parameters that are fitted to the beginning of a recording.
 
-        The law of friction is Stribeck's, or LuGre's if Stribeck's does not explain the samples and LuGre's fits
+        The law of friction is Stribeck's, or LuGre's if Stribeck's does not explain the beginning and LuGre's fits
         better.
         """
         u, dp = recording["u"], recording["p_A"] - recording["p_B"]
         sense = float(np.sign(np.mean(u * (dp - dp.mean())))) or 1.0
         beginning = recording.samples(slice(0, math.ceil(_FOLLOW.window * recording.rate)))
         total = beginning["p_A"] + beginning["p_B"]
-        # 20: sum of the third difference's squared coefficients
+        # the squared coefficients (1, -3, 3, -1) of a third difference have the sum 20
         noise = max(float(np.var(np.diff(total, 3))) / 20.0, 1.0)
         follower = Follower(Machine.from_rig(rig, recording.rate), response_priors(rig), sense)
         segment = follower.next_segment(beginning)
@@ -313,7 +319,7 @@ class Follower:
         if not segment.is_explained(cost):  # try LuGre's friction in place of Stribeck's
             bristles = Follower(Machine.from_rig(rig, recording.rate, BRISTLES), response_priors(rig, BRISTLES), sense)
             starts = np.array([fit.theta, bristles.priors.centre])
-            # Stribeck's friction has no compliance
+            # the fit with Stribeck's friction says nothing about the compliance
             starts[:, COMPLIANCE] = bristles.priors.centre[COMPLIANCE]
             bristles_fit = fit_from_starts(bristles.next_segment(beginning), starts, noise, n_best=1)
             if bristles_fit.cost(noise, bristles.priors.normal) < cost:
@@ -332,7 +338,7 @@ class Follower:
         self.covariance, self.states, self.last = covariance, states, math.nan
 
     def at_rate(self, rig: Rig, rate: float) -> Follower:
-        """Return a filter in the same state for samples at another rate [Hz]."""
+        """Return a filter with the same parameters for samples at another rate [Hz], which starts as after a gap."""
         follower = Follower(Machine.from_rig(rig, rate, self.machine.law), self.priors, self.sense)
         follower.theta, follower.covariance = self.theta, self.covariance
         follower.variance, follower.states = self.variance, self.states
@@ -341,10 +347,11 @@ class Follower:
     def interrupt(self, gap_s: float) -> None:
         """Increase the uncertainty of the parameters after a gap of `gap_s` [s] without samples.
 
-        At most the prior variance is added.
+        At most the prior variance is added. The next block starts the simulation anew (`next_segment`).
         """
-        added = np.minimum(self.priors.wander_variance(gap_s), self.priors.variance)
-        self.covariance, self.last = self.covariance + np.diag(added), math.nan
+        added_variance = np.minimum(self.priors.wander_variance(gap_s), self.priors.variance)
+        self.covariance = self.covariance + np.diag(added_variance)
+        self.last = math.nan
 
     def next_segment(self, block: Recording) -> Segment:
         """Prepare the samples of the next block for a fit.
@@ -358,7 +365,7 @@ class Follower:
             self.last, self.states = float(u[0]), self.states.copy()
             self.states[POSITION] = self.machine.centred_start(u * self.theta[GAIN])
             sample_weights[: round(_FOLLOW.settling * block.rate)] = 0.0
-        # the frequencies of hum show best in the sum of the pressures, which it adds to
+        # hum has the same sign in both pressures, so that its frequencies show best in their sum
         waves = mains_waves(block["p_A"] + block["p_B"], block.rate) * sample_weights
         dp = self.sense * (block["p_A"] - block["p_B"])
         return Segment(self.machine, self.priors, np.append(self.last, u), dp, self.states, waves, sample_weights)
@@ -366,8 +373,8 @@ class Follower:
     def _prior(self, block_s: float, jumped: int | None = None) -> Normal:
         """Compute the prior on the parameters in the next block, which is `block_s` [s] long.
 
-        `jumped`: index of a parameter that may have jumped; its variance is increased by its prior variance at the
-        start.
+        `jumped`: index of a parameter that may have jumped; to its variance the prior variance before the first block
+        is added. None if no parameter has jumped.
         """
         variance = self.priors.wander_variance(block_s)
         if jumped is not None:
@@ -388,19 +395,21 @@ class Follower:
             fit = segment.descend(segment.linearise(start[None]), prior, _N_STEPS, self.variance)
             return fit.cost(self.variance, prior), fit, prior
 
-        candidates = [fit_candidate(self.theta, self._prior(block_s))]
-        if not segment.is_explained(candidates[0][0]):
+        cost, fit, prior = fit_candidate(self.theta, self._prior(block_s))
+        candidates = [(cost, fit, prior)]
+        if not segment.is_explained(cost):
             for parameter, unit, jump in ((G, 1.0, PRESSURE.jump["G"]), (K_OIL, self.theta[K_OIL], PRESSURE.jump["K"])):
                 sets = np.tile(self.theta, (SINGLE_WIDTH, 1))
                 sets[:, parameter] = unit * _geometric_grid(*jump, SINGLE_WIDTH)
                 best = int(segment.residual_squares(sets).argmin())  # of a grid of values after the jump
                 candidates.append(fit_candidate(sets[best], self._prior(block_s, parameter)))
-        return min(candidates, key=lambda entry: entry[0])[1:]
+        _, fit, prior = min(candidates, key=lambda candidate: candidate[0])
+        return fit, prior
 
     def update(self, block: Recording) -> Block:
         """Fit the next block of samples, and return its sums for a joint fit of all blocks (`fit.Joint`).
 
-        The parameters, their covariance and the simulated states are updated.
+        The parameters, their covariance, the simulated states, the last command and `excess` are updated.
         """
         segment = self.next_segment(block)
         fit, prior = self._fit_block(segment, block.duration)
@@ -425,11 +434,11 @@ def fit_response(recording: Recording, rig: Rig) -> Joint | None:
 
         Returns None if the fit fails or explains too little of the variance of p_A - p_B.
         """
-        edges = block_edges(recording)
+        edges = block_edges(recording).tolist()
         with np.errstate(over="ignore", invalid="ignore"):
             try:
                 follower = Follower.fit_start(recording, rig)
-                blocks = [follower.update(recording.samples(slice(*map(int, pair)))) for pair in pairwise(edges)]
+                blocks = [follower.update(recording.samples(slice(first, end))) for first, end in pairwise(edges)]
                 joint = Joint.fit(blocks, follower.priors, recording.duration / len(blocks), G)
             except np.linalg.LinAlgError:
                 return None
@@ -462,10 +471,11 @@ def parameter_information(joint: Joint, time: Array, seconds: float) -> dict[str
 
     Returns, by the name of the parameter, the Gaussian likelihood of its K values (`Information`), from which all other
     parameters are eliminated. It has priors on a linear change and on a random walk of the parameter, whose standard
-    deviations over a recording grow with the root of its length. Those of the leakage conductance G are of a healthy
-    machine. `joint`: fit of all blocks; `time` (K,): middles of the blocks [s]; `seconds`: length of the recording [s].
+    deviations over a recording grow with the root of its length. The priors of the leakage conductance G are those of a
+    healthy machine. `joint`: fit of all blocks; `time` (K,): middles of the blocks [s]; `seconds`: length of the
+    recording [s].
     """
-    growth = math.sqrt(seconds / PRESSURE.blocks.wander)  # of a random walk since the time that the priors state
+    growth = math.sqrt(seconds / PRESSURE.blocks.wander)  # of a random walk, relative to its change in `blocks.wander`
     wander = growth * joint.priors.wander
-    wander[G] = growth * PRESSURE.conductance.wander  # that of a healthy machine
+    wander[G] = growth * PRESSURE.conductance.wander
     return {name: joint.information(k, time, float(wander[k])) for k, name in enumerate(PARAMETERS)}

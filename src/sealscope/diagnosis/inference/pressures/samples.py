@@ -20,8 +20,9 @@ if TYPE_CHECKING:
 def find_unmet_requirement(recording: Recording, rig: Rig) -> str | None:
     """Find the first requirement of a fit of the pressure response that a recording does not meet.
 
-    The fit needs the command [V] and both pressures [Pa] of a pump that drives a cylinder of two equal areas,
-    recorded for long enough and at a high enough rate. Return the requirement as a text, or None if all are met.
+    The fit needs the command [V] and both pressures [Pa] of a pump that drives a cylinder of two equal areas, recorded
+    for long enough and at a high enough rate, without missing samples. Return the requirement as a text, or None if all
+    requirements are met.
     """
     blocks = PRESSURE.blocks
     if not rig.circuit.pump_feeds_chambers:
@@ -49,7 +50,7 @@ def find_unmet_requirement(recording: Recording, rig: Rig) -> str | None:
 
 
 def block_edges(recording: Recording) -> NDArray[np.int64]:
-    """Divide a recording into K blocks of equal length, and return the indices of samples between them, (K + 1,)."""
+    """Divide a recording into K blocks of equal length; return the indices of the samples that bound them, (K + 1,)."""
     n_blocks = max(1, min(PRESSURE.blocks.most, int(recording.duration / PRESSURE.blocks.shortest)))
     return np.round(np.linspace(0, len(recording), n_blocks + 1)).astype(np.int64)
 
@@ -57,16 +58,18 @@ def block_edges(recording: Recording) -> NDArray[np.int64]:
 def mains_waves(total: Array, rate: float) -> Array:
     """Compute the cosine and sine waves of the mains hum and its harmonics at n samples, shape (2 m, n).
 
-    `total` (n,): sum p_A + p_B of the pressures, in whose spectrum the strongest lines near 50 and 60 Hz give the
-    fundamentals; `rate`: sampling rate [Hz]. The m frequencies are those below half the rate.
+    The fundamentals are the strongest lines near 50 and near 60 Hz in the spectrum of `total` (n,), the sum p_A + p_B
+    of the pressures. `rate`: sampling rate [Hz]. Only the m frequencies below half the rate are used.
     """
     n_padded = 4 * total.size  # zero-padded for a finer grid of frequencies
     spectrum = np.abs(np.fft.rfft((total - total.mean()) * np.hanning(total.size), n_padded))
     frequency = np.fft.rfftfreq(n_padded, 1.0 / rate)
-    mains, lines = PRESSURE.mains, []
+    mains, fundamentals = PRESSURE.mains, list[float]()
     for nominal in mains.lines:
         bins = np.flatnonzero(np.abs(frequency - nominal) <= mains.within * nominal)
-        lines += [frequency[bins[np.argmax(spectrum[bins])]]] if bins.size else []
-    waves = np.exp(2j * np.pi / rate * np.outer(lines, np.arange(total.size)))
-    harmonics = np.concatenate([waves[k * np.array(lines) < 0.5 * rate] ** k for k in range(1, mains.harmonics + 1)])
+        if bins.size:
+            fundamentals.append(frequency[bins[np.argmax(spectrum[bins])]])
+    waves = np.exp(2j * np.pi / rate * np.outer(fundamentals, np.arange(total.size)))
+    orders = range(1, mains.harmonics + 1)
+    harmonics = np.concatenate([waves[k * np.array(fundamentals) < 0.5 * rate] ** k for k in orders])
     return np.concatenate([harmonics.real, harmonics.imag])

@@ -37,11 +37,11 @@ from sealscope.units import LITRE_PER_MINUTE
 
 
 class _HoldLaws(NamedTuple):
-    """Leak past the piston as fitted to the times in which shut valves hold the load, under k laws of flow.
+    """Leak past the piston, fitted to the times in which shut valves hold the load, under k laws of flow.
 
-    The exponents of the laws are `EXPONENTS` (1 laminar, 0.5 orifice). All fields have the shape (k,). `weights`:
-    relative likelihood of each law, with the sum 1; `units`: mean flow [m^3/s] for a coefficient of 1; `flows`: fitted
-    mean flows and their standard `deviations` [m^3/s].
+    The laws have the exponents `EXPONENTS` (1 laminar, 0.5 orifice). All fields have the shape (k,). `weights`:
+    relative likelihood of each law, with the sum 1; `units`: mean flow [m^3/s] for a coefficient of 1; `flows`,
+    `deviations`: fitted mean flows and their standard deviations [m^3/s].
     """
 
     weights: Array
@@ -75,10 +75,10 @@ class BalanceLeak:
     def cause(self) -> Cause:
         """Cause of a leak, such as "piston leak", or "piston or pump leak" if the balance cannot separate them.
 
-        Behind a servo valve it is the piston alone. It also is the piston alone if the leakage is measured while shut
+        It is "internal or external leak" if only the creep of a held load is known, which valves and lines may cause as
+        well. It is "piston leak" behind a servo valve. It is also "piston leak" if the leakage is measured while shut
         valves hold the load, and either valves cut the pump off at rest or the leakage is too high for a healthy
-        machine. If only the creep of a held load is known, it may also be a valve or a line: "internal or external
-        leak".
+        machine.
         """
         if self.balance.is_creep:
             return "internal or external leak"
@@ -121,7 +121,7 @@ class BalanceLeak:
 
     @cached_property
     def rise(self) -> Rise | None:
-        """Amount by which the mean leakage [m^3/(s Pa)] exceeds that of healthy recordings; None if there are none.
+        """Amount by which the mean leakage [m^3/(s Pa)] exceeds that of healthy recordings; None without these.
 
         It is measured while shut valves hold the load if that is precise enough or shows a leak, else over the whole
         recording.
@@ -130,7 +130,7 @@ class BalanceLeak:
 
     @cached_property
     def _motion_rise(self) -> Rise | None:
-        """Rise [m^3/(s Pa)] of the leakage in the whole recording over healthy recordings; None if there are none."""
+        """Rise [m^3/(s Pa)] of the leakage in the whole recording over healthy recordings; None without these."""
         if not self.healthy:
             return None
         return rise(self.balance.recording_sums, self.healthy, self.balance.columns)
@@ -148,7 +148,7 @@ class BalanceLeak:
         hold_rise = held_rise(self.balance.recording_sums, self.healthy)
         if hold_rise is None:
             return None
-        # more precise than the rise from the whole recording, or precise enough to show it
+        # error smaller than the error of the rise from the whole recording, or than that rise itself
         is_precise = hold_rise.deviation < max(motion_rise.deviation, motion_rise.value)
         return hold_rise if is_precise or hold_rise.chance < INFERENCE.held_oil.rare else None
 
@@ -184,28 +184,30 @@ class BalanceLeak:
         hold_rise, prior = self._hold_rise, INFERENCE.held_oil
         if hold_rise is None or not hold_rise.chance < prior.rare:
             return flow
-        flows = flow, self._hold_flow(hold_rise)
-        return mixture_flow(np.array([1.0 - prior.right, prior.right]), *np.array(flows).T)
+        flows, deviations = np.array([flow, self._hold_flow(hold_rise)]).T
+        return mixture_flow(np.array([1.0 - prior.right, prior.right]), flows, deviations)
 
     @property
     def rise_onset(self) -> Interval | None:
         """Onset [s] of the leakage above that of healthy recordings, from the times in which shut valves hold the load.
 
-        None if these times (holds) do not clearly show the leakage, or if it may have been there from the start.
+        None if these times (holds) do not clearly show the leakage, or if the leak may have begun before them.
         """
         hold_rise, chambers = self._hold_rise, self.balance.chambers
         if hold_rise is None or chambers is None or not hold_rise.chance < INFERENCE.held_oil.rare:
             return None
         return chambers.piston_onset
 
-    def _hold_flow(self, rise: Rise) -> Flow:
+    def _hold_flow(self, hold_rise: Rise) -> Flow:
         """Estimate the mean flow of the leak that shows while shut valves hold the load.
 
-        It is averaged over the laws of the leak, weighted by their likelihoods. `rise`: rise of the leakage over
-        healthy recordings in these times, whose variance is added to the variance of the fits.
+        The flow is averaged over the laws of the leak, weighted by their likelihoods. `hold_rise`: rise of the leakage
+        over healthy recordings in these times, whose variance is added to the variance of the fits.
         """
-        laws, (low, high) = self._hold_laws(), rise.interval()
-        rise_flow_deviation = (high - low) / (2.0 * WITHIN_95) * laws.units[0]
+        laws = self._hold_laws()
+        low, high = hold_rise.interval()
+        laminar_unit = laws.units[0]  # the rise is that of a laminar leak
+        rise_flow_deviation = (high - low) / (2.0 * WITHIN_95) * laminar_unit
         return mixture_flow(laws.weights, laws.flows, np.hypot(rise_flow_deviation, laws.deviations))
 
     def _hold_laws(self) -> _HoldLaws:
@@ -230,10 +232,11 @@ class BalanceLeak:
         Returns for each law its mean flow if the leak's coefficient rises by 1, and its log weight. A law with an
         exponent e of `EXPONENTS` lies the fraction f = 2 (1 - e) of the way from laminar to orifice flow:
 
-            flow = laminar^(1 - f) orifice^f,    log weight = log prior + f N (log likelihood ratio of one residual),
+            flow = laminar^(1 - f) orifice^f,    log weight = log prior + f N L,
 
-        with the ratio of orifice to laminar leak, and N = `size.readings` (`priors.toml`) independent residuals in a
-        recording. If the laws cannot be compared, each has the laminar flow and the log weight 0.
+        where L is the log likelihood ratio of an orifice to a laminar leak for one residual, and N = `size.readings`
+        (`priors.toml`) the number of independent residuals in a recording. If the laws cannot be compared, each has the
+        laminar flow and the log weight 0.
         """
         balance = self.balance
         laminar_flow = balance.mean_pressure()
@@ -243,9 +246,10 @@ class BalanceLeak:
         # the orifice coefficient that fits like a unit laminar rise is 1 / regression
         orifice_flow = balance.mean_of_blocks(balance.blocks.mean_root()) / fit.regression
         log_ratio = INFERENCE.size.readings * fit.log_ratio
+        fractions = 2.0 * (1.0 - np.array(EXPONENTS))
         return [
             LawWeight(laminar_flow ** (1.0 - f) * orifice_flow**f, float(log_prior) + f * log_ratio)
-            for f, log_prior in zip(2.0 * (1.0 - np.array(EXPONENTS)), np.log(law_priors()), strict=True)
+            for f, log_prior in zip(fractions, np.log(law_priors()), strict=True)
         ]
 
     @property
@@ -269,10 +273,10 @@ class BalanceLeak:
     def bound_flow(self) -> float:
         """95 % upper bound of the leak's mean flow over the recording [m^3/s]; infinite if nothing was tested.
 
-        With healthy recordings it bounds the leakage above theirs. A hold is a time in which shut valves hold the load.
-        If holds replace the rise from the whole recording (`rise`), `_hold_bound` computes the bound from both. Without
-        healthy recordings it bounds a leak that begins within the recording. It is widened by the uncertainty of the
-        scale of the flows (displacement, area or flow meter) and of the leak's law (laminar or orifice).
+        With healthy recordings it bounds the leakage above theirs; without them, a leak that begins within the
+        recording. If the times in which shut valves hold the load show the rise (`rise`), `_hold_bound` computes the
+        bound. The bound is widened by the uncertainty of the scale of the flows (displacement, area or flow meter) and
+        of the leak's law (laminar or orifice).
         """
         test = self.step if self._motion_rise is None else self._motion_rise
         if test is None:
@@ -284,8 +288,8 @@ class BalanceLeak:
         """Compute the 95 % upper bound of a leak's mean flow [m^3/s] from holds and from the whole recording.
 
         A hold is a time in which shut valves hold the load. The bound is a quantile of a mixture of three hypotheses:
-        the holds say nothing about the leak, and the whole recording counts; they show a leak past the piston; or the
-        leak that they show goes to the outside.
+        the holds contain no information about the leak, so that the whole recording counts; the holds show a leak past
+        the piston; the holds show a leak to the outside.
         """
         motion_rise, hold_rise, chambers = self._motion_rise, self._hold_rise, self.balance.chambers
         assert motion_rise is not None and hold_rise is not None and chambers is not None
@@ -324,23 +328,27 @@ class BalanceLeak:
 
         The evidence (`step_log_ratio`) is the log likelihood ratio of the rise that the step would cause to no rise.
         Holds after the step's onset, in which shut valves hold the load, show the whole step. Without such holds, the
-        mean over the recording shows a part of it. None without healthy recordings.
+        mean over the recording shows a part of it. Without a step test there is no such evidence. None without healthy
+        recordings.
         """
-        step, rise, motion_rise = self.step, self.rise, self._motion_rise
-        if rise is None or motion_rise is None or step is None:
-            return None if rise is None else LeakRise(rise)
+        step, total_rise, motion_rise = self.step, self.rise, self._motion_rise
+        if total_rise is None:
+            return None
+        if step is None or motion_rise is None:
+            return LeakRise(total_rise)
         rise_after = self._hold_rise_since(step.onset().value)
         if rise_after is None:
             mean_rise = step.fitted.size * self._fraction_after(step)
-            return LeakRise(rise, motion_rise.log_ratio_within(mean_rise, INFERENCE.scatter.tail))
+            return LeakRise(total_rise, motion_rise.log_ratio_within(mean_rise, INFERENCE.scatter.tail))
         agrees: float = INFERENCE.held_oil.agrees
-        return LeakRise(rise, rise_after._replace(may_be_partial=False).log_ratio(step.fitted.size, agrees))
+        return LeakRise(total_rise, rise_after._replace(may_be_partial=False).log_ratio(step.fitted.size, agrees))
 
     def _hold_rise_since(self, onset: float) -> Rise | None:
         """Estimate the rise of the leakage [m^3/(s Pa)] over healthy recordings in the holds after an onset [s].
 
-        In a hold shut valves hold the load. Return None without such holds, or if too few healthy recordings have holds
-        to compare with.
+        In a hold shut valves hold the load. Return None if holds do not replace the rise from the whole recording
+        (`_hold_rise`), if no hold shows a flow past the piston after the onset, or if too few healthy recordings have
+        holds.
         """
         chambers = self.balance.chambers
         leaks = None if self._hold_rise is None or chambers is None else chambers.leaks_since(onset)
@@ -398,14 +406,14 @@ class BalanceLeak:
         """Return the total leakage of pump and piston, with its interval and the limit for a healthy machine.
 
         `detectable_flow`: flow [m^3/s] of the smallest leak that would be detected if it began within the recording,
-        None if that was not tested. It does not change the total; it is only stated beside it, in L/min and as a
-        fraction of the pump's flow (`findable_lpm`, `findable_share`).
+        None if that was not tested. The result only repeats it, in L/min and as a fraction of the pump's flow
+        (`findable_lpm`, `findable_share`).
         """
         balance = self.balance
         size, pressure, pump_flow = balance.size, balance.mean_pressure(), balance.mean_flow
         value, low, high = balance.conductance
         limit, lpm_per_flow = healthy_leakage(balance.rig), size.scale / LITRE_PER_MINUTE
-        is_single = len(balance.columns) == 1  # a valve's edges leak as well, by an unknown amount
+        is_single = len(balance.columns) == 1  # else a servo valve's edges leak as well, by an unknown amount
         is_stated, size_factor = size.stated and is_single, 1.0 + WITHIN_95 * size.deviation
         # the uncertainty of the size widens the interval at both ends
         low = low * pressure * lpm_per_flow * (1.0 / size_factor if low > 0.0 else size_factor)
@@ -447,7 +455,7 @@ class BalanceLeak:
         remarks = list[Remark]()
         if size.ratio is not None and size.disagrees:
             remarks.append(Remark("sizes disagree", {"ratio": size.ratio.value}))
-        if abs(offset) > 2.0 * WITHIN_95 * INFERENCE.zero.pressure:  # twice the largest usual one
+        if abs(offset) > 2.0 * WITHIN_95 * INFERENCE.zero.pressure:  # twice the 95 % limit of usual sensors
             remarks.append(Remark("zero too high" if offset > 0.0 else "zero too low", {"bar": abs(offset) / 1e5}))
         # a delay of one sample is usual
         if delay is not None and abs(delay.value) > 1.0 / balance.recording.rate + WITHIN_95 * delay.deviation:
@@ -469,10 +477,10 @@ class BalanceLeak:
 def _flow_mixture(rise: Rise, value: float, *, unit: float, weight: float, oil_deviation: float = 0.0) -> Mixture:
     """Compute the distribution of a leak's mean flow [m^3/s] from the rise of its coefficient, scaled by a weight.
 
-    The result is normal distributions whose weights sum to `weight`, as parts of a larger mixture. `rise`: rise over
-    healthy recordings, whose errors are used; `value`: the rise itself, where a negative one counts as 0; `unit`: mean
-    flow [m^3/s] for a coefficient of 1; `oil_deviation`: additional standard deviation of the coefficient due to the
-    uncertain properties of the oil.
+    The result consists of normal distributions whose weights sum to `weight`, as a part of a larger mixture. `rise`:
+    rise over healthy recordings, of which only the distribution of the error is used; `value`: estimate of the rise, a
+    negative one counting as 0; `unit`: mean flow [m^3/s] for a coefficient of 1; `oil_deviation`: additional standard
+    deviation of the coefficient due to the uncertain properties of the oil.
     """
     # the true rise is `value` minus an error that is distributed as a healthy recording's rise
     weights, deviations, centres = rise.mixture or Mixture(np.ones(1), np.array([rise.deviation]), np.zeros(1))

@@ -52,13 +52,13 @@ from sealscope.recordings.recording import Recording, compute_once
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-#: Reason for having no balance, by whether the position is recorded.
+#: Reason for having no balance; the key is True if the position is recorded.
 _NO_BALANCE = {
     True: "too short for a balance, or the piston is not held: {:.3g} s",
     False: "no loop brings the piston back or holds it under a pressure difference, for long enough in {:.3g} s, so "
     "that what leaks moves it: record its position x",
 }
-#: Reason for having no balance for lack of a channel, where a held load may still creep.
+#: Reason for having no balance if a channel is missing and the healthy recordings show no creep of a held load.
 _NO_CREEP = "needs {}; without them it judges a held load that creeps in the healthy recordings"
 _MAX_AGE_S = 1e11  # longer than any machine is recorded [s]
 #: Minimum number of healthy recordings whose scatter shows whether valves cut the pump off at rest.
@@ -70,21 +70,23 @@ MIN_STRIDE = 2
 def compensates_leakage(balance: RecordedBalance) -> bool:
     """Return True if the pump replaces the oil that leaks, so that the volume balance shows the leakage.
 
-    Every pump leaks at least a fraction of its mean flow (`held.share` in `priors.toml`). The lower end of the
-    leakage's 95 % interval must exceed it. A smaller leakage means that no control loop returns or holds the piston.
+    Every pump leaks at least a fraction of its mean flow (`held.share` in `priors.toml`), which the lower end of the
+    leakage's 95 % interval must exceed. Otherwise no control loop returns or holds the piston.
     """
     min_fraction: float = INFERENCE.held.share
     return balance.conductance.low * balance.mean_pressure() > min_fraction * balance.mean_flow
 
 
 class VolumeBalance:
-    """Leak detector by a volume balance: the pump's flow that the piston's motion does not account for leaks.
+    """Leak detector by a volume balance: flow of the pump that the piston's motion does not explain is leakage.
 
-    It needs both chamber pressures, and the pump's angle, its speed, a flow meter or the command; the piston's
-    position, or a loop that brings the piston back or holds it (`without_position`). Behind a servo valve it needs
-    position, command, both chamber pressures and the pressures of supply and return. Without supply and return it
-    measures leaks while shut valves hold the load. A recorded position without any flow or command is enough if the
-    held load creeps in the healthy recordings.
+    It needs both chamber pressures, and one of these sets of channels:
+
+    - the position, and the pump's angle, its speed, a flow meter or the command;
+    - one of these channels without the position, if a loop brings the piston back or holds it (`without_position`);
+    - behind a servo valve: position, command, and the pressures of supply and return; without supply and return, leaks
+      are measured only while shut valves hold the load;
+    - only the position, if the held load creeps in the healthy recordings.
     """
 
     name = VOLUME_BALANCE
@@ -116,22 +118,22 @@ class VolumeBalance:
         """Set up the volume balance of a recording; None if its channels or its length allow none.
 
         `odds`: log odds, from healthy recordings, that valves cut the pump off from the cylinder while the pump rests;
-        `is_locked`: true if they certainly do, whatever this recording shows.
+        `is_locked`: true if valves certainly cut it off, whatever this recording shows.
         """
         if not equations(self.rig, frozenset(recording.channels)):
             return self._balance_without_position(recording)
-        recorded = self._recorded(recording)
+        recorded = self._compute_blocks(recording)
         if recorded is None:
             return None
         max_odds: float = INFERENCE.rest.alone
         odds = np.inf if is_locked else odds + float(np.clip(recorded.odds, -max_odds, max_odds))
-        return self._balance(recording, recorded.regime(odds))
+        return self._build_balance(recording, recorded.regime(odds))
 
     def _balance_without_position(self, recording: Recording) -> RecordedBalance | None:
         """Choose among the volume balances that need no position the one with the smallest upper bound of a leak.
 
-        A balance of holds behind shut valves is always usable, any other only if the pump compensates the leakage
-        (`compensates_leakage`). Return None if none is usable.
+        A balance of holds behind shut valves is always usable, any other balance only if the pump compensates the
+        leakage (`compensates_leakage`). Return None if no balance is usable.
         """
         cycle_balances = compute_once(
             recording, (self.name, self.rig), lambda samples: circulations(samples, self.rig), READ
@@ -143,11 +145,11 @@ class VolumeBalance:
         usable = (candidate for candidate in candidates if candidate.is_creep or compensates_leakage(candidate))
         return min(usable, key=lambda candidate: BalanceLeak(self.name, candidate).bound_flow, default=None)
 
-    def _recorded(self, recording: Recording) -> RecordedBlocks | None:
-        """Return the blocks of a recording for a volume balance with a position, computed once; None if it has none."""
+    def _compute_blocks(self, recording: Recording) -> RecordedBlocks | None:
+        """Compute, only once, the blocks of a recording for a volume balance with a position; None without these."""
         return compute_once(recording, (self.name, self.rig), lambda samples: recorded_blocks(samples, self.rig), READ)
 
-    def _balance(self, recording: Recording, regime: RegimeBlocks) -> RecordedBalance:
+    def _build_balance(self, recording: Recording, regime: RegimeBlocks) -> RecordedBalance:
         """Build the volume balance of a recording from its blocks.
 
         `regime`: the blocks for one assumption on the valves while the pump rests, open or shut.
@@ -156,42 +158,46 @@ class VolumeBalance:
         oil_loss = compute_once(
             recording, ("lost oil", self.rig), lambda samples: recorded_oil_loss_tests(samples, self.rig, offset), READ
         )
-        blocks, plain, balances, columns, shut = regime
         return RecordedBalance(
-            blocks, balances, columns, self.rig, recording, oil_loss, plain=plain, shut=shut, locked=shut
-        )
+            regime.blocks, regime.equations, regime.columns, self.rig, recording, oil_loss,
+            plain=regime.plain, shut=regime.shut, locked=regime.shut,
+        )  # fmt: skip
 
     def learn(self, recording: Recording) -> Summary | None:
         """Summarise a healthy recording for later comparisons; None if it allows no volume balance.
 
-        The summary contains the fields of `scatter.RecordingSums` that are known, the names of the balance's `terms`,
-        and `scale`, the factor from computed to true flows, 0 if no flow can be stated in L/min (`Size`). If the
-        machine rests, it also contains `shut_sums`, the Gram matrices for a pump that valves cut off at rest, and
-        `shut_odds`, the log odds that they do, from the leakage at rest. If it holds a load at rest: `held`, the leaks
-        while shut valves hold the load, and `held_odds`, the same log odds from these leaks. If no pump's flow is
-        recorded (`is_creep`): `creep_odds`, the log odds that the load creeps by leakage.
+        The summary contains the fields of `scatter.RecordingSums` that are known, and
+
+        - `terms`: names of the balance's terms;
+        - `scale`: factor from computed to true flows, 0 if no flow can be stated in L/min (`Size`);
+        - if the machine rests, `shut_sums`: Gram matrices for a pump that valves cut off at rest, and `shut_odds`: log
+          odds that valves cut it off, from the leakage at rest;
+        - if it holds a load at rest, `held`: leaks while shut valves hold the load, and `held_odds`: the same log odds,
+          from these leaks;
+        - if no pump's flow is recorded (`is_creep`), `creep_odds`: log odds that the load creeps by leakage.
         """
-        recorded = self._recorded(recording) if equations(self.rig, frozenset(recording.channels)) else None
-        balance = self.balance(recording) if recorded is None else self._balance(recording, recorded.open)
+        has_position_balance = bool(equations(self.rig, frozenset(recording.channels)))
+        recorded = self._compute_blocks(recording) if has_position_balance else None
+        balance = self.balance(recording) if recorded is None else self._build_balance(recording, recorded.open)
         if balance is None:
             return None
         scale = balance.size.scale if balance.size.stated else 0.0
         summary = {name: value for name, value in balance.recording_sums._asdict().items() if value is not None}
         if recorded is not None and recorded.shut is not None:
-            shut = self._balance(recording, recorded.shut)
-            summary |= {"shut_sums": shut.recording_sums.sums, "shut_odds": recorded.odds}
-            held, odds = shut.recording_sums.held, replace(balance, locked=True).locked_odds()
-            summary |= {} if held is None or odds is None else {"held": held, "held_odds": odds}
+            shut_sums = self._build_balance(recording, recorded.shut).recording_sums
+            summary |= {"shut_sums": shut_sums.sums, "shut_odds": recorded.odds}
+            hold_odds = replace(balance, locked=True).locked_odds()
+            if shut_sums.held is not None and hold_odds is not None:
+                summary |= {"held": shut_sums.held, "held_odds": hold_odds}
         if balance.is_creep:
             summary["creep_odds"] = balance.creep_log_odds()
         return {"terms": list(balance.columns[0].names), "scale": scale, **summary}
 
     def predict_rise(self, summaries: Sequence[Summary], channels: frozenset[str], repeated: int = 1) -> Rise:
-        """Predict the rise that a healthy recording of a later day will show, and its uncertainty.
+        """Predict the rise [m^3/(s Pa)] that a healthy recording of a later day will show, and its uncertainty.
 
         The rise is the leakage above that of the healthy recordings with the given `summaries` (`learn`). `channels`:
         names of their channels; `repeated`: number of times that these recordings count, each time as further sessions.
-        The rise is in m^3/(s Pa).
         """
         shut = _are_valves_shut(summaries, "shut_odds") or self._shut_log_odds(summaries, channels) > 0.0
         healthy = [_sums_from_summary(summary, shut) for summary in summaries]
@@ -205,10 +211,9 @@ class VolumeBalance:
     def _shut_log_odds(self, summaries: Sequence[Summary], channels: frozenset[str]) -> float:
         """Compute the log odds that valves cut the pump off at rest, from summaries of healthy recordings (`learn`).
 
-        If the pump is cut off, the leakage scatters less between recordings if it is estimated for a pump that is cut
-        off than for a connected one. With at least `MIN_FOR_SCATTER` recordings the log odds are therefore (n - 1)
-        log(scatter if connected / scatter if cut off). With fewer recordings they are the sum of the limited log odds
-        of each.
+        The right assumption on the valves makes the estimated leakage scatter less between recordings. For n recordings
+        with rests, at least `MIN_FOR_SCATTER`, the log odds are therefore (n - 1) log(scatter if connected / scatter if
+        cut off). For fewer recordings they are the sum of the log odds of each, which are limited to +-`rest.alone`.
         """
         with_rests = [summary for summary in summaries if "shut_sums" in summary]
         if len(with_rests) < MIN_FOR_SCATTER:
@@ -224,11 +229,10 @@ class VolumeBalance:
         return (len(with_rests) - 1) * float(np.log(scatter[0] / scatter[1]))
 
     def _is_held_by_valves(self, balance: RecordedBalance, summaries: Sequence[Summary]) -> bool:
-        """Return True if valves, not a control loop, hold the load in a volume balance without a pump (`terms.locked`).
+        """Return True unless a control loop may hold the load in a volume balance without a pump (`terms.locked`).
 
-        Any other balance counts as True. With a recorded command valves hold the load. Without one the load must creep
-        in the healthy recordings, by the sum of the log odds in their `summaries`: a control loop would replace what
-        leaks, and slow motions are no creep.
+        In such a balance valves hold the load if the command is recorded. Otherwise the load must creep in the healthy
+        recordings, by the sum of the log odds in their `summaries`, since a control loop would replace the leakage.
         """
         if not balance.is_creep or flow_source(balance.recording.channels) is not None:
             return True
@@ -242,8 +246,9 @@ class VolumeBalance:
         `channels`: names of the recorded channels, which determine the balances; `shut`: True if valves cut the pump
         off at rest.
         """
-        held = None if equations(self.rig, channels) else locked(self.rig, channels)
-        balances = equations(self.rig, channels) if held is None else (held,)
+        balances = equations(self.rig, channels)
+        if not balances and (hold_balance := locked(self.rig, channels)) is not None:
+            balances = (hold_balance,)
         return [ColumnRoles(shut_at_rest(equation) if shut else equation) for equation in balances]
 
     def observe(self, recording: Recording, baseline: Sequence[Healthy] = ()) -> Observed:
@@ -262,42 +267,38 @@ class VolumeBalance:
             return Observed(self.name, lack=_NO_CREEP.format(self.rig.circuit.needed_channels))
         balance = replace(balance, locked=is_locked or _are_valves_shut(summaries, "held_odds"))
         names = [name for name in balance.columns[0].names if name not in (TURNING, HOLDING)]
-        return self._report(
-            balance,
-            [
-                _sums_from_summary(summary, balance.shut, balance.locked)
-                for summary in summaries
-                if summary["terms"] == names
-            ],
-        )
+        comparable = [summary for summary in summaries if summary["terms"] == names]
+        healthy = [_sums_from_summary(summary, balance.shut, balance.locked) for summary in comparable]
+        return self._report(balance, healthy)
 
     def observe_regimes(self, recording: Recording) -> Mapping[bool, Observed]:
         """Report on a recording without healthy ones, under both assumptions on the valves while the pump rests.
 
-        The report with the key False is for a pump that stays connected to the cylinder. The one with the key True is
-        for valves that cut it off; it exists only if the recording has rests.
+        The report with the key False is for a pump that stays connected to the cylinder. The report with the key True
+        is for valves that cut the pump off, and exists only if the recording has rests.
         """
         has_position_balance = bool(equations(self.rig, frozenset(recording.channels)))
-        blocks = self._recorded(recording) if has_position_balance else None
-        if blocks is None:
+        recorded = self._compute_blocks(recording) if has_position_balance else None
+        if recorded is None:
             balances = [self.balance(recording)]
         else:
-            regimes = [regime for regime in (blocks.open, blocks.shut) if regime is not None]
-            balances = [self._balance(recording, regime) for regime in regimes]
+            regimes = [regime for regime in (recorded.open, recorded.shut) if regime is not None]
+            balances = [self._build_balance(recording, regime) for regime in regimes]
         return {balance.shut: self._report(balance, ()) for balance in balances if balance is not None}
 
     def _report(self, balance: RecordedBalance, healthy: Sequence[RecordingSums]) -> Observed:
         """Make the report of a volume balance: tests, leakage, and how much of the recording is judged.
 
-        `healthy`: summaries of the healthy recordings, empty without any. `Observed.share` is the fraction of the
-        samples that count, `Observed.judged_until` the fraction of the time after which none does. The report contains
-        only a reason if the leakage can be tested neither for a step nor against healthy recordings.
+        `healthy`: summaries of the healthy recordings, which may be empty. `Observed.share` is the fraction of the
+        samples that were used, `Observed.judged_until` the end of the last block with used samples, as a fraction of
+        the recording. The report contains only a reason if the leakage can be tested neither for a step nor against
+        healthy recordings.
         """
         leak, rows = BalanceLeak(self.name, balance, healthy), balance.blocks.rows
         if leak.step is None and leak.rise is None:
             lack = "p_A and p_B hardly differ, or too few samples are whole: no leak would show"
             return Observed(self.name, lack=lack)
-        # without a position, rows are fewer also where the piston is not held: they do not show missing samples
+        # the rows of a block show missing samples, but not without a position, where they also depend on the motion
         has_position = balance.equations[0].name == CYLINDER or len(balance.columns) > 1
         share = float(rows.mean() / max(rows.max(), 1.0)) if has_position else 1.0
         judged_until = (np.flatnonzero(rows > 0.0)[-1] + 1.0) / len(rows) if has_position and rows.any() else 1.0
@@ -315,10 +316,10 @@ def compare_motion(
 ) -> Iterator[Observable]:
     """Test whether the piston's motion takes more or less flow for the same speed than in healthy recordings.
 
-    Yields one observable, or none if there are too few healthy recordings. A change means another machine or another
+    Yields one observable, or nothing if there are too few healthy recordings. A change means another machine or another
     scale of a sensor. Load and speed outside of the range of the healthy recordings make the comparison less certain.
-    `judged_sums`, `healthy`: summaries of the recording and of the healthy ones; `roles`: indices of the columns of the
-    volume balance by role (leak, motion, left side).
+    `judged_sums`, `healthy`: summaries of the judged and of the healthy recordings; `roles`: indices of the columns of
+    the volume balance by role (leak, motion, left side).
     """
     prior, healthy_sums = INFERENCE.repeats, np.sum([recording.sums[0] for recording in healthy], axis=0)
 
@@ -335,25 +336,26 @@ def compare_motion(
         PriorScatter(prior.scatter, prior.recordings, prior.inflation),
         further_deviation=INFERENCE.conditions.motion * excess,
     )
-    yield from () if observable is None else (observable,)
+    if observable is not None:
+        yield observable
 
 
 def _are_valves_shut(summaries: Sequence[Summary], odds_key: str) -> bool:
     """Return True if the healthy recordings show that valves cut the pump off at rest.
 
-    Their mean log odds must exceed `rest.locked` of `priors.toml`. `odds_key`: entry of the summaries with these odds,
-    "shut_odds" (from all rests) or "held_odds" (only from rests in which a load is held). The result is False if no
-    summary has it.
+    The mean log odds in their summaries must exceed `rest.locked` of `priors.toml`. `odds_key`: entry of the summaries
+    with these odds, "shut_odds" (from all rests) or "held_odds" (only from rests in which a load is held). The result
+    is False if no summary has this entry.
     """
     log_odds = [summary[odds_key] for summary in summaries if odds_key in summary]
     return bool(log_odds) and float(np.mean(log_odds)) > INFERENCE.rest.locked
 
 
 def _shift_start(recorded: RecordingSums, n_ages: int) -> float | None:
-    """Return the start of a recording [s since 1970], later by `n_ages` times the longest life of a machine.
+    """Return the start of a recording [s since 1970], postponed by `n_ages` times the longest life of a machine.
 
-    Recordings that are moved by different multiples belong to different sessions, so that repeated copies count as
-    further sessions. Return None if the recording is undated.
+    Copies of a recording that are postponed by different multiples count as different sessions. Return None if the
+    recording is undated.
     """
     return None if recorded.start_s is None else recorded.start_s + n_ages * _MAX_AGE_S
 
@@ -370,4 +372,4 @@ def _sums_from_summary(summary: Summary, shut: bool = False, locked: bool = Fals
     held = np.asarray(summary["held"], dtype=float) if locked and "held" in summary else None
     drop = np.asarray(summary["viscous_drop"], dtype=float) if "viscous_drop" in summary else None
     start_s, oil_degC = summary.get("start_s"), summary.get("oil_degC")
-    return RecordingSums(sums, summary["flow"], summary["pressure"], start_s, oil_degC, held, drop)
+    return RecordingSums(sums, summary["flow"], summary["pressure"], start_s, oil_degC, held=held, viscous_drop=drop)

@@ -65,7 +65,7 @@ from sealscope.units import P_ATM
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-#: Quantile of the position that counts as an end of the stroke, and of the load that counts as the largest.
+#: Fraction of the samples beyond each end of the stroke, and beyond the largest load.
 END_QUANTILE = 0.02
 
 
@@ -73,11 +73,15 @@ class Size(NamedTuple):
     """Factor from flows computed with the machine's assumed sizes to its true flows.
 
     The sizes are the pump's displacement, or the piston's areas behind a servo valve and for a load that shut valves
-    hold; a recorded flow meter needs none. `scale`: that factor, with its relative standard `deviation`; `stated`: true
-    if flows can be stated in L/min, since a flow meter is recorded or the rig's file states the size, and the pressures
-    have units; `ratio`: measured over assumed ratio of displacement to area, None if it is not measured; `area`: area
-    of the piston's loaded side as measured with the assumed displacement or the flow meter [m^2], None if unknown;
-    `disagrees`: true if stated displacement and stated area contradict each other.
+    hold. With a flow meter no size is needed.
+
+    - `scale`, `deviation`: the factor, and its relative standard deviation.
+    - `stated`: true if flows can be stated in L/min. The pressures must have units, and a flow meter must be recorded
+      or the rig's file must state the size.
+    - `ratio`: measured over assumed ratio of displacement to area, None if it is not measured.
+    - `area`: area of the piston's loaded side as measured with the assumed displacement or the flow meter [m^2], None
+      if unknown.
+    - `disagrees`: true if stated displacement and stated area contradict each other.
     """
 
     scale: float
@@ -92,12 +96,14 @@ class Size(NamedTuple):
 class RecordedBalance:
     """Volume balance of a recording, and the estimates that follow from it.
 
-    `blocks`: blocks of the recording with the Gram matrices of the balance; `equations`: the volume balances, one for
-    each chamber behind a servo valve; `columns`: for each equation the indices of its columns by role (leak, motion,
-    left side); `rig`: sizes of the machine; `oil_loss`: tests for external leaks by the volume of the accumulator, by
-    the name of the term; `plain`: the blocks without the correction of the pressure offset, if they differ; `shut`:
-    true if valves cut the pump off at rest, so that the piston alone leaks (`regimes`); `locked`: true if the times in
-    which shut valves hold the load measure the leaks (`chambers`).
+    - `blocks`: blocks of the recording with the Gram matrices of the balance.
+    - `equations`: the volume balances, behind a servo valve one for each chamber, otherwise a single one.
+    - `columns`: for each equation the indices of its columns by role (leak, motion, left side).
+    - `rig`: sizes of the machine.
+    - `oil_loss`: tests for external leaks by the volume of the accumulator, by the name of the term.
+    - `plain`: the blocks without the correction of the pressure offset, None if there is no such correction.
+    - `shut`: true if valves cut the pump off at rest, so that only the piston leaks then (`regimes`).
+    - `locked`: true if shut valves hold the load at rest, so that these times measure the leaks (`chambers`).
     """
 
     blocks: Blocks
@@ -122,7 +128,7 @@ class RecordedBalance:
 
     @cached_property
     def _first_motion(self) -> int:
-        """Index of the first block in which the machine moves; 0 if too few blocks follow for a step test."""
+        """Index of the first block in which the machine moves; 0 if too few blocks remain for a step test."""
         first = int(np.argmax(self.blocks.is_moving))
         return first if len(self.blocks) - first >= MIN_BLOCKS else 0
 
@@ -144,8 +150,8 @@ class RecordedBalance:
     def compared_leak(self) -> Information:
         """Likelihood of the leak's conductance in each of `running_blocks`, as it is compared between recordings.
 
-        If the volume balance has a separate term for the leakage of a pump that holds the load, that term is left out.
-        All rests then have one common leakage, unlike in `leak`.
+        If the volume balance has a separate term for the leakage of a pump that holds the load, that term is left out,
+        unlike in `leak`. All rests then have one common leakage.
         """
         roles = self.columns[0]
         return information(self.running_blocks, self.columns, roles.leak, roles.hold_leak)
@@ -159,9 +165,10 @@ class RecordedBalance:
     def observables(self) -> tuple[Observable, ...]:
         """Tests of the balance's coefficients for a step within the recording, the highest score first."""
         plain = self.running_blocks if self.plain is None else self.plain[self._first_motion :]
+        charge = estimate_charge_trend(self.recording) if self.size.stated else None
         return volume_observables(
-            self.running_blocks, plain, self.equations, self.columns, self.oil_loss, self.volume_ratio,
-            estimate_charge_trend(self.recording) if self.size.stated else None, self.size.scale,
+            self.running_blocks, plain, self.equations, self.columns, self.oil_loss,
+            volume_ratio=self.volume_ratio, charge=charge, flow_scale=self.size.scale,
         )  # fmt: skip
 
     @property
@@ -178,13 +185,14 @@ class RecordedBalance:
         """Summary of the recording (Gram matrices, mean flow and pressure) for comparison with other recordings."""
         start_s, oil_degC = start_seconds(self.recording), oil_temperature(self.recording)
         sums = RecordingSums.from_blocks(self.blocks, self.columns, start_s, oil_degC)
-        held = None if self.chambers is None else np.array(self.chambers.leaks)
-        sums = sums._replace(flow=self.mean_flow) if self.is_creep else sums
-        return sums._replace(held=held, viscous_drop=estimate_viscous_drop(self.recording))
+        if self.is_creep:
+            sums = sums._replace(flow=self.mean_flow)
+        hold_leaks = None if self.chambers is None else np.array(self.chambers.leaks)
+        return sums._replace(held=hold_leaks, viscous_drop=estimate_viscous_drop(self.recording))
 
     @cached_property
     def chambers(self) -> HeldChambers | None:
-        """Estimator of the chambers' leaks in holds, i.e. while shut valves cut them off from the resting pump.
+        """Estimator of the chambers' leaks in holds, i.e. while shut valves cut the chambers off from the resting pump.
 
         None if valves do not hold the load (`locked`), if no hold is long enough or loaded, if the pressures have no
         unit, or if the piston's areas are unknown.
@@ -198,7 +206,7 @@ class RecordedBalance:
         rests = find_rests(pumped, recording.rate, max_rest_rate(pumped, recording.rate))
         lower_pressure = np.minimum(pressures["p_A"], pressures["p_B"])
         charge = find_charge_pressure(lower_pressure, rests, recording.rate)
-        # from gauge to absolute pressure; larger if sensor offsets would make the least pressure too low
+        # absolute minus gauge pressure; larger if sensor offsets would make the least pressure too low
         to_absolute = max(P_ATM, MIN_ABSOLUTE_PRESSURE - float(np.nanmin(lower_pressure)))
         channels = (recording.t, *(values + to_absolute for values in pressures.values()), recording["x"])
         holds = [
@@ -210,10 +218,10 @@ class RecordedBalance:
         return HeldChambers(holds, sides, begin, end, charge + to_absolute) if holds else None
 
     def _is_pump_off(self, hold: LockedHold, pumped: Array) -> bool:
-        """Return True if the pump probably rests in a hold, rather than holding the load by replacing what leaks.
+        """Return True if the pump probably rests in a hold, and does not hold the load by replacing the leakage.
 
-        `pumped` (n - 1,): volumes that the pump delivers between the samples of the recording [m^3]. The mean flow is
-        compared with zero and with the typical flow of a pump that holds a load.
+        The mean flow is compared with zero and with the typical flow of a pump that holds a load. `pumped` (n - 1,):
+        volumes that the pump delivers between the samples of the recording [m^3].
         """
         recording = self.recording
         begin, end = np.searchsorted(recording.t, hold.t[[0, -1]])
@@ -226,17 +234,16 @@ class RecordedBalance:
     def _is_loaded(self, hold: LockedHold) -> bool:
         """Return True if p_A - p_B in a hold almost certainly is a load, not the sensors' offset at equal pressures.
 
-        p_A - p_B is taken from the time at which the pump stops, since a large leak equalises p_A and p_B while the
-        valves still shut. Nothing flows through a leak at equal pressures, so a hold that has them throughout would not
-        show it. In the comparison all loads up to the largest pressure difference of the recording are equally
-        probable.
+        At equal pressures a leak has no flow, so that the hold would not show it. The largest p_A - p_B counts, in the
+        hold or just before it, since a large leak equalises the pressures while the valves are still shutting. In the
+        comparison all loads up to the largest pressure difference of the recording are equally probable.
         """
         prior, oil, t = INFERENCE.zero, INFERENCE.held_oil, self.recording.t
         difference = np.abs(self.recording["p_A"] - self.recording["p_B"])
-        stopped, shut = np.searchsorted(t, hold.t[0] - np.array([oil.equalises + oil.settles, 0.0]))
-        pressure = float(
-            np.nanmax([np.abs(hold.mean(hold.p_A - hold.p_B)).max(), np.nanmedian(difference[stopped : shut + 1])])
-        )
+        # just before the hold the pump stops and the valves shut
+        first, last = np.searchsorted(t, hold.t[0] - np.array([oil.equalises + oil.settles, 0.0]))
+        difference_before = np.nanmedian(difference[first : last + 1])
+        pressure = float(np.nanmax([np.abs(hold.mean(hold.p_A - hold.p_B)).max(), difference_before]))
         log_offset_density = -0.5 * offset_cost(pressure) - float(np.log(prior.pressure * np.sqrt(2.0 * np.pi)))
         max_load = float(np.nanquantile(difference, 1.0 - END_QUANTILE))
         log_load_density = -float(np.log(max(max_load, np.finfo(float).tiny)))
@@ -247,15 +254,15 @@ class RecordedBalance:
 
         A hold is a time in which shut valves are supposed to hold the load. The leaks in holds are compared with the
         total leakage of pump and piston, which holds would show if the valves were open. Positive log odds mean that
-        the valves are shut. They are limited to +-`rest.most` of `priors.toml`.
+        the valves are shut. The log odds are limited to +-`rest.most` of `priors.toml`.
         """
         if self.chambers is None:
             return None
-        held, total_leak = self.chambers.total_leak(), self.conductance
-        variance = held.deviation**2
+        hold_leak, total_leak = self.chambers.total_leak(), self.conductance
+        variance = hold_leak.deviation**2
         total_variance = ((total_leak.high - total_leak.low) / (2.0 * WITHIN_95)) ** 2
         max_odds: float = INFERENCE.rest.most
-        odds = rest_log_odds(held.value, variance, total_leak.value, variance + total_variance)
+        odds = rest_log_odds(hold_leak.value, variance, total_leak.value, variance + total_variance)
         return float(np.clip(odds, -max_odds, max_odds))
 
     def _cylinder_sides(self) -> CylinderSides | None:
@@ -277,29 +284,28 @@ class RecordedBalance:
         """Estimate the piston areas of A and B [m^2], as measured with the assumed displacement of the pump.
 
         They are negative if the position x is reversed. The area of a side is the mean of its coefficients of motion in
-        the volume balance, weighted by the sums of squares of their columns. If the rig's file states the areas, they
+        the volume balance, weighted by the sums of squares of their columns. If the rig's file states the areas, these
         are used instead, scaled to the flows of the volume balance. A side that never carries the load takes the area
-        of the other side. Both are zero if nothing moves.
+        of the other side, as does the side with less motion if the signs differ. Both areas are zero if nothing moves.
         """
         roles, total = self.columns[0], self.blocks.gram[:, 0].sum(axis=0)
         nuisance = list(roles.nuisance)
-        coefficients = dict(
-            zip(nuisance, solve(total[np.ix_(nuisance, nuisance)], total[nuisance, roles.left]), strict=True)
-        )
-        areas, energies = [], []
+        fitted = solve(total[np.ix_(nuisance, nuisance)], total[nuisance, roles.left])
+        coefficients = dict(zip(nuisance, fitted, strict=True))
+        areas, energies = [], []  # an energy is the sum of squares of all columns of motion of a side
         for side in "AB":
             motion = [k for k in roles.motion if roles.names[k].endswith(f"{side} carries")]
-            energy = np.diag(total)[motion]
-            energies.append(float(energy.sum()))
-            areas.append(float(energy @ [coefficients[k] for k in motion]) / max(energies[-1], np.finfo(float).tiny))
+            squares = np.diag(total)[motion]
+            energies.append(float(squares.sum()))
+            areas.append(float(squares @ [coefficients[k] for k in motion]) / max(energies[-1], np.finfo(float).tiny))
         main = int(np.argmax(energies))
         if self.rig.states("cylinder.A_A", "cylinder.A_B") and self.size.stated:
-            # the stated areas, in the scale of the balance's flows
             sign = np.sign(areas[main])
             areas = [sign * area / self.size.scale for area in (self.rig.cylinder.A_A, self.rig.cylinder.A_B)]
-        if areas[0] * areas[1] <= 0.0:
-            areas[1 - main] = areas[main]
-        return areas[0], areas[1]
+        area_A, area_B = areas
+        if area_A * area_B <= 0.0:
+            return areas[main], areas[main]
+        return area_A, area_B
 
     @cached_property
     def pressure_offset(self) -> float:
@@ -352,12 +358,13 @@ class RecordedBalance:
     def mean_of_blocks(self, values: Array, since: float = -np.inf) -> float:
         """Average `values` (K,) of K blocks over those from the time `since` [s] on, weighted by their numbers of rows.
 
-        A block counts if its middle is at `since` or later. If there is none, the last block counts.
+        A block counts if its middle is at `since` or later. If no block is that late, the last block counts.
         """
         is_after = self.blocks.time >= since
         if not is_after.any():
             is_after[-1] = True
-        return float(np.average(values[is_after], weights=np.maximum(self.blocks.rows[is_after], 1e-9)))
+        min_weight = 1e-9  # so that the sum of the weights is not zero
+        return float(np.average(values[is_after], weights=np.maximum(self.blocks.rows[is_after], min_weight)))
 
     @cached_property
     def size(self) -> Size:
@@ -377,9 +384,9 @@ class RecordedBalance:
     def creep_log_odds(self) -> float:
         """Compute the log odds that a held load creeps by leakage, rather than that a control loop holds it.
 
-        A loop replaces what leaks, so that the piston hardly moves. A flow in holds near zero therefore speaks against
-        creep, and one near the flow by which a pump holds a load (a fraction of the flow in motion) speaks for it. The
-        log odds are limited to +-`rest.most` of `priors.toml`.
+        A loop replaces the leakage, so that the piston hardly moves. A flow near zero in holds therefore speaks against
+        creep. A flow near the typical leakage of a machine that holds a load (a fraction of its mean flow) speaks for
+        creep. The log odds are limited to +-`rest.most` of `priors.toml`.
         """
         holding_flow, pressure = INFERENCE.rest.holding * self.mean_flow, self.mean_pressure()
         flow, low, high = (value * pressure for value in self.conductance)
@@ -391,7 +398,7 @@ class RecordedBalance:
     def total_history(self) -> History:
         """Total leakage of pump and piston in each block, as a conductance [m^3/(s Pa)] with its covariance.
 
-        It includes a step of the leakage if a test finds one with a p-value below `RAREST`.
+        It includes a step of the leakage if a test finds a step with a p-value below `RAREST`.
         """
         roles = self.columns[0]
         pump = roles.names.index(PUMP) if PUMP in roles.names else None
@@ -410,20 +417,18 @@ class RecordedBalance:
 def _flow_scale(balance: RecordedBalance) -> Size:
     """Determine the factor from computed to true flows (`Size`) and its uncertainty, from the sizes in the rig's file.
 
-    The flow of a flow meter needs no factor. Otherwise the volume balance measures the ratio of displacement to area. A
-    stated displacement gives the factor directly, a stated area through that ratio. If both are stated and disagree,
-    their difference is the uncertainty. Behind a servo valve, and for a load that shut valves hold, the areas give the
-    flow.
+    - Behind a servo valve, and for a load that shut valves hold, the areas give the flow, and the factor is 1.
+    - The flow of a flow meter needs no factor either.
+    - A stated displacement gives the factor 1. If a stated area disagrees, the difference is the uncertainty.
+    - If only the area is stated, the factor follows from the ratio of displacement to area, which the balance measures.
     """
     roles, rig, is_meter = balance.columns[0], balance.rig, measures_flow(balance.recording.units)
-    prior = INFERENCE.size
-    source = flow_source(balance.recording.channels)  # the unit of a meter follows from the area
-    has_flow_unit = source == "q_pump" or (source, COUNTS) not in balance.units
+    prior, source = INFERENCE.size, flow_source(balance.recording.channels)
+    has_flow_unit = source == "q_pump" or (source, COUNTS) not in balance.units  # the area scales a meter without unit
     has_pressure_unit = not {("p_A", COUNTS), ("p_B", COUNTS)} & balance.units
     states_displacement = rig.states("pump.q_b") and has_flow_unit
     states_areas = rig.states("cylinder.A_A", "cylinder.A_B")
-    # behind a valve, or of a load that valves hold, the area sizes the flow
-    if len(balance.columns) > 1 or balance.is_creep:
+    if len(balance.columns) > 1 or balance.is_creep:  # behind a servo valve, or of a load that shut valves hold
         return Size(1.0, prior.area, stated=states_areas and has_pressure_unit)
     motion = [k for k in roles.motion if roles.names[k].startswith("motion")]
     area = _loaded_area(balance, motion) if motion and ("x", "m") in balance.units else None
@@ -435,19 +440,20 @@ def _flow_scale(balance: RecordedBalance) -> Size:
     ratio = Interval(*(area.assumed / end for end in (area.measured, area.high, max(area.low, 1e-12))))
     disagreement = abs(1.0 / ratio.value - 1.0)
     both_deviation = float(np.hypot(prior.displacement, prior.area))
+    size = Size(1.0, both_deviation, stated=False, ratio=ratio, area=area.measured)
     if states_displacement:
         disagrees = states_areas and disagreement > WITHIN_95 * both_deviation
         deviation = disagreement if disagrees else prior.displacement
-        return Size(1.0, deviation, has_pressure_unit, ratio, area=area.measured, disagrees=disagrees)
+        return size._replace(deviation=deviation, stated=has_pressure_unit, disagrees=disagrees)
     if states_areas:
-        return Size(ratio.value, prior.area, has_pressure_unit, ratio, area=area.measured)
-    return Size(1.0, both_deviation, stated=False, ratio=ratio, area=area.measured)
+        return size._replace(scale=ratio.value, deviation=prior.area, stated=has_pressure_unit)
+    return size
 
 
 class _Area(NamedTuple):
     """Piston area of the loaded side [m^2]: as `measured` by the volume balance, and as `assumed`.
 
-    It is measured with the assumed displacement or a flow meter. `low`, `high`: 95 % interval of the measured area;
+    The measurement uses the assumed displacement or a flow meter. `low`, `high`: 95 % interval of the measured area;
     `assumed`: the area in the rig's file.
     """
 
@@ -461,11 +467,11 @@ def _loaded_area(balance: RecordedBalance, motion: list[int]) -> _Area:
     """Estimate the piston area of the loaded side, as a weighted mean over directions of motion and loaded sides.
 
     `motion`: indices of the columns of the piston's motion, one for each direction and loaded side. The weight of a
-    column is its sum of squares, so that each side counts by the motion under its load.
+    column is its sum of squares, so that a side counts by its motion under load.
     """
     roles, cylinder = balance.columns[0], balance.rig.cylinder
-    energy = np.einsum("kii->i", balance.blocks.gram[:, 0])[motion]
-    weights = energy / max(float(energy.sum()), np.finfo(float).tiny)
+    squares = np.einsum("kii->i", balance.blocks.gram[:, 0])[motion]  # sums over all blocks
+    weights = squares / max(float(squares.sum()), np.finfo(float).tiny)
     value, deviation = estimate_weighted_mean(balance.blocks, roles, dict(zip(motion, weights, strict=True)))
     value, half_width = abs(value), WITHIN_95 * deviation
     assumed = [cylinder.A_A if roles.names[k].endswith("A carries") else cylinder.A_B for k in motion]

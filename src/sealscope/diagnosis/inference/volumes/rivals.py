@@ -1,9 +1,9 @@
 """Rivals of a leak: other faults that may explain a change of the flow since the healthy recordings.
 
-Such faults are an external leak, wear of the pump, and free air. Each has a term in the volume balance, whose
-coefficient is fitted to the residual of a recording under the healthy coefficients, with priors on the differences of
-all other coefficients, including the leak's (`priors.toml`). The scatter of this difference among the healthy
-recordings shows which difference is normal (`differences`). A leak to the outside and one past the piston look nearly
+Such faults are an external leak, wear of the pump, and free air. Each has a term in the volume balance. The change of
+its coefficient is fitted to the residual of a recording under the healthy coefficients, with priors on the changes of
+all other coefficients, including the leak's (`priors.toml`). The scatter of the coefficient among the healthy
+recordings shows which change is normal (`differences`). A leak to the outside and a leak past the piston look nearly
 alike. The likelihood ratio of the two is therefore stated with the observable.
 """
 
@@ -37,7 +37,7 @@ def rival_rises(
     """Test for faults other than a leak past the piston that explain a change since the healthy recordings.
 
     These rivals of the leak are external leaks, leakage of the turning pump, and free air. External leaks are compared
-    while shut valves hold the load, if possible (`held_rivals`).
+    only while shut valves hold the load, if `held_rivals` can compare them.
 
     Parameters
     ----------
@@ -58,8 +58,10 @@ def rival_rises(
     tuple of Observable
         One for each rival that can be compared.
     """
-    names, hold_rivals = columns[0].names, held_rivals(judged, healthy, unit_flows)
-    turning = (TURNING,) if SPEED_LOSS in names else ()  # a flow meter is downstream of the pump
+    names = columns[0].names
+    hold_rivals = held_rivals(judged, healthy, unit_flows)
+    # a flow meter, with which the balance has no speed loss, is downstream of the pump and does not show its leakage
+    turning = (TURNING,) if SPEED_LOSS in names else ()
     columns_to_test = [k for k, name in enumerate(names) if name in (AIR, *turning) or name.startswith("external leak")]
     if hold_rivals is not None:
         columns_to_test = [k for k in columns_to_test if not names[k].startswith("external leak")]
@@ -67,7 +69,7 @@ def rival_rises(
     observables = list[Observable]()
     for k in columns_to_test:
         change, error = _estimate_change(judged.sums, healthy_gram, columns, k)
-        # of each healthy recording from the others
+        # change of each healthy recording relative to the other healthy ones
         changes = [_estimate_change(recording.sums, healthy_gram - recording.sums, columns, k) for recording in healthy]
         is_air = names[k] == AIR
         observable = compare_with_healthy(
@@ -86,8 +88,8 @@ def rival_rises(
             # a rise that warmer oil explains does not count
             observable = replace(observable, chance=max(observable.chance, pump_rise.chance))
         elif not is_air:
-            fit = compare_with_leak(judged, healthy, columns, names[k])
-            log_ratio_to_leak = None if fit is None else INFERENCE.size.readings * fit
+            log_ratio = compare_with_leak(judged, healthy, columns, names[k])  # for one independent residual
+            log_ratio_to_leak = None if log_ratio is None else INFERENCE.size.readings * log_ratio
             observable = _penalise_size(observable, judged, unit_flows)
             observable = replace(observable, log_ratio_to_leak=log_ratio_to_leak)
         observables.append(observable)
@@ -97,51 +99,53 @@ def rival_rises(
 def held_rivals(
     judged: RecordingSums, healthy: Sequence[RecordingSums], unit_flows: Mapping[str, float] | None = None
 ) -> tuple[Observable, ...] | None:
-    """Test for external leaks of chambers A and B, while shut valves hold the load, above those of healthy recordings.
+    """Test for external leaks of chambers A and B, measured in holds, above those of healthy recordings.
 
-    Such a time is a hold. Return one observable for each chamber that can be compared, or None if the recording
-    `judged` has no holds or fewer than `MIN_WITH_HOLDS` healthy recordings have any. `unit_flows`: mean flow [m^3/s]
-    of an external leak with a conductance of 1 m^3/(s Pa), by its name, as in `rival_rises`.
+    In a hold shut valves hold the load. Return one observable for each chamber that can be compared, or None if the
+    recording `judged` has no holds, or if fewer than `MIN_WITH_HOLDS` healthy recordings have holds. `unit_flows`: mean
+    flow [m^3/s] of an external leak with a conductance of 1 m^3/(s Pa), by its name, as in `rival_rises`.
     """
-    healthy_leaks = [recording.held for recording in healthy if recording.held is not None]
+    healthy_leaks = [HeldLeaks(*recording.held) for recording in healthy if recording.held is not None]
     if judged.held is None or len(healthy_leaks) < MIN_WITH_HOLDS:
         return None
-    conductance_of_flow = judged.flow / judged.pressure if judged.pressure > 0.0 else 0.0
-    min_error, observables = INFERENCE.scatter.finest * conductance_of_flow, list[Observable]()
+    judged_leaks = HeldLeaks(*judged.held)
+    # conductance of a leak as large as the pump's mean flow
+    max_conductance = judged.flow / judged.pressure if judged.pressure > 0.0 else 0.0
+    min_error = INFERENCE.scatter.finest * max_conductance
+    observables = list[Observable]()
     for side in "AB":
-        leak, deviation = (HeldLeaks._fields.index(f"{name}_{side}") for name in ("outside", "deviation"))
-        coefficients = [float(leaks[leak]) for leaks in healthy_leaks]
-        error = max(float(np.median([leaks[deviation] for leaks in (judged.held, *healthy_leaks)])), min_error)
-        observable = compare_with_healthy(
-            f"external leak {side}", RISE, float(judged.held[leak]), coefficients, error, above=True
-        )
-        observables += [] if observable is None else [_penalise_size(observable, judged, unit_flows)]
+        value, *healthy_values = (float(getattr(leaks, f"outside_{side}")) for leaks in (judged_leaks, *healthy_leaks))
+        errors = [getattr(leaks, f"deviation_{side}") for leaks in (judged_leaks, *healthy_leaks)]
+        error = max(float(np.median(errors)), min_error)
+        observable = compare_with_healthy(f"external leak {side}", RISE, value, healthy_values, error, above=True)
+        if observable is not None:
+            observables.append(_penalise_size(observable, judged, unit_flows))
     return tuple(observables)
 
 
 def _penalise_size(observable: Observable, judged: RecordingSums, unit_flows: Mapping[str, float] | None) -> Observable:
-    """Return the observable of an external leak with its `advantage` set by the prior on the size of such leaks.
+    """Return the observable of an external leak with the `advantage` that the prior on the size of such leaks gives it.
 
-    The advantage is what counts for this explanation besides the score (`Observable.advantage`). A large external leak
-    is improbable, since oil outside is seen: the advantage is 2 log(prior density / largest prior density) of the flow,
-    and 0 for flows below the centre of the prior (`outside` in `priors.toml`).
+    A large external leak is improbable, since oil outside is seen: the advantage is 2 log(prior density / largest prior
+    density) of the flow, and 0 for flows below the centre of the prior (`outside` in `priors.toml`).
 
-    The flow [m^3/s] is the size of the observable, a conductance, times the flow for a conductance of 1 m^3/(s Pa).
-    `unit_flows` states the latter by the name of the observable, "external leak A" or "external leak B". Without an
-    entry it is the mean of abs(p_A - p_B) in the recording `judged`.
+    `unit_flows`: flow [m^3/s] for a conductance of 1 m^3/(s Pa), by the name of the observable. Without an entry it is
+    the mean of abs(p_A - p_B) in the recording `judged`.
     """
     flow = observable.size * (unit_flows or {}).get(observable.name, judged.pressure)
     return replace(observable, advantage=-size_penalty(INFERENCE.outside, flow, above=True))
 
 
 def _estimate_change(gram: Array, reference: Array, columns: Sequence[ColumnRoles], tested: int) -> tuple[float, float]:
-    """Estimate by how much a coefficient of a recording differs from healthy recordings, and the standard error.
+    """Estimate by how much a coefficient of a recording differs from healthy recordings, with the standard error.
 
-    `gram`, `reference` (E, m, m): Gram matrices of the recording and of the sum of the healthy ones, for each equation;
-    `columns`: indices of its columns by role (leak, motion, left side); `tested`: index of the coefficient's column,
-    whose coefficient counts as 0 in the healthy ones. The other coefficients differ by a normal prior and are
-    eliminated (Schur complement): change = moment / precision, both summed over the equations. Without information the
-    change is 0 and the error infinite.
+    - `gram`, `reference` (E, m, m): Gram matrices of the recording, and sums of those of the healthy recordings, for
+      each equation.
+    - `columns`: for each equation the indices of its columns by role (leak, motion, left side).
+    - `tested`: index of the column whose coefficient is tested; in the healthy recordings it counts as 0.
+
+    The other coefficients differ from the healthy ones by a normal prior and are eliminated (Schur complement). Without
+    information the change is 0 and the error infinite.
     """
     precision, moment = 0.0, 0.0
     leak_deviation: float = INFERENCE.between.pump
@@ -154,6 +158,7 @@ def _estimate_change(gram: Array, reference: Array, columns: Sequence[ColumnRole
         with np.errstate(divide="ignore", over="ignore"):
             prior = 1.0 / (np.abs(coefficients) * deviations[free]) ** 2
         matrix, cross = gram[e][np.ix_(free, free)], gram[e][free, tested]
+        # a coefficient of about 0 has a nearly infinite precision, which is limited
         regularised = matrix + np.diag(np.minimum(prior, 1e9 * np.diag(matrix)))
         solution = solve(regularised, np.column_stack([cross, residual[free]]))
         precision += float(gram[e][tested, tested] - cross @ solution[:, 0])
