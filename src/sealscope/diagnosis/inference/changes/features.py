@@ -138,7 +138,8 @@ def sensor_features(blocks: Mapping[str, Array], rate: float) -> Iterator[tuple[
     """Yield the name and the values (K,) of each feature of the pressures that only a change of a sensor shifts.
 
     The features are the sign of p_A - p_B relative to the flow, the noise of both pressures, the difference of their
-    noise, and the hum at the frequencies of the mains. `blocks`: samples (K, length) by channel name, including p_A and
+    noise, and the hum at the frequencies of the mains. The first word of a name is the kind of data that events list
+    (`Observable.data`), such as "noise". `blocks`: samples (K, length) by channel name, including p_A and
     p_B, NaN where missing; `rate`: sampling rate [Hz].
     """
     p_A, p_B = blocks["p_A"], blocks["p_B"]

@@ -86,12 +86,11 @@ def duty_observables(tests: Sequence[StepTest]) -> Iterator[Observable]:
 def sensor_observables(tests: Iterable[tuple[str, StepTest]]) -> Iterator[Observable]:
     """Convert step tests of sensor features, such as noise and hum, to observables.
 
-    `tests`: pairs of a feature's name and its test (`sensor_tests`). Each test is the better of a rise and a fall, so
-    its p-value is doubled.
+    `tests`: pairs of a feature's name, whose first word is the kind of data, and its test (`sensor_tests`). Each test is
+    the better of a rise and a fall, so its p-value is doubled.
     """
     for name, test in tests:
-        data = name.split()[0]  # "noise of the pressures", "hum of 50 Hz" or "sense of p_A - p_B"
-        yield Observable.from_test(name, data if data in ("noise", "hum") else "sense", test, n_tests=2.0)
+        yield Observable.from_test(name, name.split()[0], test, n_tests=2.0)
 
 
 #: Largest exponent whose exponential fits into a float.
