@@ -86,8 +86,8 @@ def duty_observables(tests: Sequence[StepTest]) -> Iterator[Observable]:
 def sensor_observables(tests: Iterable[tuple[str, StepTest]]) -> Iterator[Observable]:
     """Convert step tests of sensor features, such as noise and hum, to observables.
 
-    `tests`: pairs of a feature's name, whose first word is the kind of data, and its test (`sensor_tests`). Each test is
-    the better of a rise and a fall, so its p-value is doubled.
+    `tests`: pairs of a feature's name and its test (`sensor_tests`). The first word of the name is the kind of data.
+    Each test is the better of a rise and a fall, so its p-value is doubled.
     """
     for name, test in tests:
         yield Observable.from_test(name, name.split()[0], test, n_tests=2.0)
