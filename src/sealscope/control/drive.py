@@ -225,8 +225,7 @@ class ValveDrive(_Invertible):
     def steady_voltage(self, flow: float) -> float:
         """Compute the voltage [V] at which the servo valve delivers a constant `flow` [m^3/s] without load."""
         voltage_for = self.inverse(rate=1.0)  # any rate: a valve's model has no filter
-        no_pressure_difference = 0.0
-        return voltage_for(flow, no_pressure_difference)
+        return voltage_for(flow, 0.0)  # p_A - p_B = 0
 
     def unloaded_flow(self, u: float) -> float:
         """Compute the servo valve's flow [m^3/s] at a constant voltage `u` [V] without load."""

@@ -120,11 +120,9 @@ def block_bounds(effects: Sequence[Effect], n_out: int, rate: float) -> np.ndarr
         change = np.abs(effect.change(stops / rate - inset) - effect.change(starts / rate + inset))
         max_parts = np.maximum(1, (stops - starts) // max(1, round(effect.min_block * rate)))
         n_parts = np.maximum(n_parts, np.minimum(np.ceil(change / effect.max_change - 1e-9), max_parts))
-    divided_blocks = [
-        np.linspace(start, stop, int(parts), endpoint=False)
-        for start, stop, parts in zip(starts, stops, n_parts, strict=True)
-    ]
-    return np.unique(np.rint(np.concatenate([*divided_blocks, [n_out]])).astype(np.int64))
+    blocks = zip(starts, stops, n_parts, strict=True)
+    parts = [np.linspace(start, stop, int(n), endpoint=False) for start, stop, n in blocks]
+    return np.unique(np.rint(np.concatenate([*parts, [n_out]])).astype(np.int64))
 
 
 def step_limiting_parameters(effects: Sequence[Effect], base: RigNumbers) -> tuple[RigNumbers, ...]:

@@ -150,10 +150,7 @@ class Polyline:
         return self.value_at(t)
 
     def breakpoints(self) -> tuple[float, ...]:
-        """Return the times [s] at which the slope changes or the value jumps; () for 1000 points or more.
-
-        A run is divided at its breakpoints; so many would slow it down.
-        """
+        """Return the times [s] at which the slope changes or the value jumps; () for 1000 points or more."""
         return tuple(map(float, np.unique(self.t))) if self.t.size < _MAX_BREAKPOINTS else ()
 
     def onset(self) -> float:
@@ -183,7 +180,7 @@ class Polyline:
         return self.words
 
 
-#: Points from which on a polyline does not list its breakpoints.
+#: Points from which on a polyline does not list its breakpoints: a run is divided there, and too many would slow it.
 _MAX_BREAKPOINTS = 1000
 
 

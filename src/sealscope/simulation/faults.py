@@ -210,8 +210,7 @@ class Fault:
         """Return the time span over which a stuck sensor repeats its reading, in a tuple; () for any other fault."""
         if self.name != "sensor stuck":
             return ()
-        never_ends = self.opening.y[-1] > 0
-        stop = math.inf if never_ends else float(self.opening.t[-1])
+        stop = math.inf if self.opening.y[-1] > 0 else float(self.opening.t[-1])  # infinite if the fault never ends
         return (Hold(self.at, self.onset(), stop),)
 
     def change_command(self, command: Command) -> Command:

@@ -178,7 +178,6 @@ def simulate_experiment(experiment: Experiment, progress: Progress | None = None
         """Build the function that reports the progress of `task`, called with the simulated time reached [s]."""
 
         def report(time: float) -> None:
-            """Report the completed fraction of the task at the simulated `time` [s]."""
             if progress is not None:
                 progress(task, min(1.0, time / experiment.duration))
 
@@ -262,9 +261,7 @@ def powers(outputs: Mapping[str, Array], rig: Rig) -> dict[str, Array]:
 
 
 def compare_trajectories(experiment: Experiment, coarse: Trajectory, fine: Trajectory) -> tuple[Difference, ...]:
-    """Compute the differences between two runs of an experiment, `coarse` at a solver step and `fine` at a shorter one.
-
-    Compared are:
+    """Compare two runs of an experiment, `coarse` at a solver step and `fine` at a shorter one.
 
     - speed, angle, position and velocity, by their rms difference, without a tolerance;
     - the four pressures, by their rms difference;

@@ -411,9 +411,9 @@ class SetRun:
     def _prepare_filters(self, rate: float) -> None:
         """Set `taps` to the coefficients of each run's anti-alias filter, which includes the delays of its transducers.
 
-        The filter computes a sample of the recording from the solver's outputs, which are `oversampling` times as many.
-        For a sample at output n, coefficient k multiplies output n + k - `taps_before`. `rate` [Hz]: rate of the
-        outputs.
+        The filter computes a sample of the recording from the solver's outputs, which are `oversampling` times as many:
+        for a sample at output n, from `taps_before` outputs before n to `taps_after` outputs after n, which are set,
+        too. `rate` [Hz]: rate of the outputs.
         """
         sensors = [member.experiment.rig.sensors for member in self.experiment_set.members]
         delays = np.array([[getattr(group, name).delay * rate for name in CHAMBERS] for group in sensors])

@@ -81,8 +81,7 @@ def centred_start(rig: Rig, command: Command | Position | str, duration: float) 
     motor, cylinder = rig.motor, rig.cylinder
     half_stroke = 0.5 * cylinder.L
     if isinstance(command, Position):
-        first_value = command.value_at(np.zeros(()))
-        return float(np.clip(first_value, -half_stroke, half_stroke))
+        return float(np.clip(command.value_at(np.zeros(())), -half_stroke, half_stroke))  # the target at t = 0
     dt = _PATH_STEP
     volts = command.volts(np.arange(0.0, duration + dt, dt))
     area = 0.5 * (cylinder.A_A + cylinder.A_B)
