@@ -16,9 +16,9 @@ from sealscope.recordings.recording import Array
 class Measured(NamedTuple):
     """The inputs of a controller at one of its samples: time, target and measurements.
 
-    `t` [s]: time; `target` [m]: target of the piston's position; `target_speed` [m/s]: mean speed of the target while
-    the computed voltage will act; `x` [m]: measured position from mid-stroke; `p_A`, `p_B` [Pa]: measured pressures
-    of the two chambers; `theta` [rad]: measured angle of the motor.
+    `t` [s]: time; `target` [m]: target of the piston's position; `target_speed` [m/s]: mean speed of the target during
+    the time in which the computed voltage will act; `x` [m]: measured position from mid-stroke; `p_A`, `p_B` [Pa]:
+    measured pressures of the two chambers; `theta` [rad]: measured angle of the motor.
     """
 
     t: float
@@ -30,7 +30,7 @@ class Measured(NamedTuple):
     theta: float = 0.0
 
 
-#: The compiled function that reads a `Measured` at an address, the argument of a compiled law.
+#: Compiled function that reads a `Measured` at the address that a compiled control law receives.
 measured_at = record_view(record_dtype(*Measured._fields))
 
 
@@ -40,7 +40,8 @@ class CompiledLaw(NamedTuple):
     `address`: address of a function ``double law(double *memory, double *measured)``, from numba.cfunc or a C compiler,
     that returns the voltage [V] for the numbers of a `Measured`. `memory` (n,): the parameters and the state of the
     control law, which each call updates; memory[0] is the leakage flow [m^3/s] that the controller compensates, or NaN
-    if it reports none. `kept`: an object that must not be freed while the law is in use, or None.
+    if it does not report this flow. `kept`: an object that must not be freed while the law is in use, such as the
+    `CompiledLaw` that this law calls, or None.
     """
 
     address: int
@@ -59,8 +60,8 @@ class Started:
     def __call__(self, measured: Measured) -> float:
         """Compute the controller's voltage [V] from the measurements of its next sample.
 
-        Each call advances the controller's state, so it must be called exactly once a sample. If the controller is
-        written in Python and raises an exception, this call raises the exception.
+        Each call advances the controller's state: call the law exactly once a sample. An exception that a controller
+        written in Python raises is passed on.
         """
         self._measured[:] = measured
         volts = float(self._call(*self._addresses))
@@ -99,8 +100,8 @@ class _PythonLaw:
         """Call the Python controller, and return the voltage [V] that it sets.
 
         `measured` is the address of the measured values, in the order of the fields of `Measured`. The leakage flow
-        that the controller compensates is stored in `self._memory[0]`, NaN if it reports none. If the controller
-        raises an exception, this is stored in `self.raised`, and the result is NaN.
+        that the controller compensates is stored in `self._memory[0]`, NaN if the controller does not report this
+        flow. If the controller raises an exception, this is stored in `self.raised`, and the result is NaN.
         """
         try:
             numbers = (ctypes.c_double * len(Measured._fields)).from_address(measured)
@@ -126,10 +127,10 @@ def start_law(controller: Controller) -> CompiledLaw:
 def reraise_python_error(law: CompiledLaw) -> None:
     """Raise the exception of a Python controller that failed when compiled code called `law`; else do nothing.
 
-    A law may call the law of an inner controller, which is searched for the exception too.
+    A law may call the law of an inner controller, which may be the one written in Python.
     """
     innermost: Any = law
-    while isinstance(innermost, CompiledLaw):  # a law that calls another has it in `kept`
+    while isinstance(innermost, CompiledLaw):  # `kept` is the inner law, or the Python controller
         innermost = innermost.kept
     if isinstance(innermost, _PythonLaw) and innermost.raised is not None:
         raise innermost.raised
@@ -139,10 +140,9 @@ class Controller(Protocol):
     """A sampled controller of the piston's position: the interface that a controller of your own must have.
 
     `rate` [Hz]: sampling rate, a whole multiple or a whole fraction of the rig's; `delay`: number of whole samples
-    from a measurement to the voltage computed from it. A run calls `start` once, and then the function that it
-    returned once a sample. All state must be in that function: then a run can be repeated. The voltage is constant
-    between samples, and limited to the converter's range. Make the controller a frozen dataclass: its fields identify
-    the run.
+    from a measurement to the voltage computed from it. A run calls `start` once, and then calls the returned function
+    once a sample. All state must be in this function: then a run can be repeated. The voltage is constant between
+    samples, and limited to the converter's range. Make the controller a frozen dataclass: its fields identify the run.
 
     The function may have an attribute `compensated`, the leakage flow [m^3/s] that it compensated at its last sample.
     The recording then has it as channel `q_comp`; without it, control would hide the wear.

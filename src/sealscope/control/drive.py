@@ -1,4 +1,4 @@
-"""A controller's model of the drive: it computes the voltage for a flow, for a pump's motor or a servo valve."""
+"""A controller's model of the drive, from which the voltage for a flow is computed: pump and motor, or servo valve."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
 
-#: Smallest pressure drop across a valve that a controller assumes, as a fraction of the supply pressure: against a
-#: higher load the piston could not be moved.
+#: Smallest pressure drop across a valve that a controller assumes, as a fraction of the supply pressure. It keeps the
+#: voltage finite under loads that the valve cannot move.
 _MIN_VALVE_FRACTION = 0.1
 #: Gain by which a small voltage is increased until the overlap of the valve's edges is passed.
 _OVERLAP_GAIN = 4.0
-#: Parameters and state of `drive_voltage`: those of a `Drive`, or of a `ValveDrive`, which has Q_N > 0.
+#: Parameters and filter state of `drive_voltage`: those of a pump's drive, then those of a servo valve (Q_N > 0).
 DRIVE = record_dtype(
     *("displacement", "omega_per_volt", "shortfall", "decay", "droop", "high_passed", "previous_speed"),
     *("Q_N", "dp_N", "u_N", "p_s", "dead_volts"),
@@ -37,15 +37,15 @@ def drive_voltage(m: Any, flow: float, dp: float) -> float:
 
     `m`: a record `DRIVE`, the parameters and the filter state of the drive.
 
-    A servo valve (Q_N > 0) needs u = u_N flow/(Q_N sqrt((p_s - sign(flow) dp)/(2 dp_N))), with at least 10 % of p_s
-    for the pressure drop. To pass the overlap of the edges, abs(u) is then increased to five times, by at most
-    `dead_volts`.
+    A servo valve (Q_N > 0) needs u = u_N flow/(Q_N sqrt((p_s - sign(flow) dp)/(2 dp_N))); the pressure drop p_s -
+    sign(flow) dp is taken as at least 10 % of p_s. To pass the overlap of the edges, 4 u is then added to u, at most
+    +-`dead_volts`.
 
     A pump needs u = (omega + shortfall H(omega + droop dp))/omega_per_volt, with omega = flow/displacement. H is the
     high-pass filter s/(s + corner), which each call advances by one sample; `m.decay` is exp(-corner/rate).
     """
     if m.Q_N > 0.0:  # a servo valve
-        valve_drop = max(m.p_s - math.copysign(dp, dp * flow), _MIN_VALVE_FRACTION * m.p_s)  # p_s - sign(Q) dp
+        valve_drop = max(m.p_s - math.copysign(dp, dp * flow), _MIN_VALVE_FRACTION * m.p_s)  # p_s - sign(flow) dp
         u = m.u_N * flow / (m.Q_N * math.sqrt(0.5 * valve_drop / m.dp_N))
         return u + min(max(_OVERLAP_GAIN * u, -m.dead_volts), m.dead_volts)  # type: ignore[no-any-return]
     omega = flow / m.displacement
@@ -57,7 +57,7 @@ def drive_voltage(m: Any, flow: float, dp: float) -> float:
 
 @kernel
 def filter_lag(values: np.ndarray, decay: float, state: float, out: np.ndarray) -> None:
-    """Filter `values` (n,) by a first-order lag, one sample late, and write the result to `out` (n,).
+    """Filter `values` (n,), which are constant between samples, by a first-order lag; write the result to `out` (n,).
 
     out[0] = `state`, and out[k] = decay out[k-1] + (1 - decay) values[k-1]. `decay`: exp(-T/tau), with the sample
     interval T and the lag's time constant tau.
@@ -70,8 +70,8 @@ def filter_lag(values: np.ndarray, decay: float, state: float, out: np.ndarray) 
 def check_numbers(what: str, source: object, positive: Sequence[str], not_negative: Sequence[str] = ()) -> None:
     """Check that attributes of an object are finite numbers in their range; raise InputError otherwise.
 
-    `source`: the object; `positive`: names of the attributes that must be > 0; `not_negative`: names of those that
-    must be >= 0; `what`: name of the object in the error message.
+    `source`: the object; `positive`: names of the attributes that must be > 0; `not_negative`: names of the attributes
+    that must be >= 0; `what`: name of the object in the error message.
     """
     for name in (*positive, *not_negative):
         value = getattr(source, name)
@@ -80,7 +80,7 @@ def check_numbers(what: str, source: object, positive: Sequence[str], not_negati
 
 
 class _Invertible(ABC):
-    """A model of a drive from which the voltage for a flow can be computed."""
+    """A model of a drive from which the voltage for a flow can be computed (`drive_voltage`)."""
 
     @abstractmethod
     def coefficients(self, rate: float, dead_volts: float = 0.0) -> Any:
@@ -91,9 +91,9 @@ class _Invertible(ABC):
         """
 
     def inverse(self, rate: float) -> Callable[[float, float], float]:
-        """Build a function of flow [m^3/s] and p_A - p_B [Pa] that computes the voltage [V] for that flow.
+        """Build a function of flow [m^3/s] and p_A - p_B [Pa] that computes the voltage [V] for the flow.
 
-        The function filters its input, so it must be called once a sample, at the sampling rate `rate` [Hz].
+        For a pump, the function filters its inputs and must be called once a sample, at the sampling rate `rate` [Hz].
         """
         (coefficients,) = self.coefficients(rate)
         return lambda flow, dp: float(drive_voltage(coefficients, flow, dp))
@@ -101,12 +101,12 @@ class _Invertible(ABC):
 
 @dataclass(frozen=True)
 class Drive(_Invertible):
-    """A controller's model of a pump and of the motor, under speed control, that turns it.
+    """A controller's model of a pump and of the motor that drives it under speed control.
 
     Without the winding's inductance, the thesis's eqs. (4.3) and (4.4) are k_p (omega_d - omega) + K_i integral of
-    (omega_d - omega) dt = C_e omega + R_c i, with the commanded speed omega_d, the speed omega and the current i = D
-    dp/C_m, whose torque balances the pressure difference dp = p_A - p_B. Solved for the command: omega_d = omega +
-    (C_e/k_p) s/(s + K_i/k_p) (omega + R_c D dp/(C_m C_e)).
+    (omega_d - omega) dt = C_e omega + R_c i. Here omega_d is the commanded speed, omega the speed, and i = D dp/C_m the
+    current, whose torque balances the pressure difference dp = p_A - p_B. Solved for the commanded speed: omega_d =
+    omega + (C_e/k_p) s/(s + K_i/k_p) (omega + R_c D dp/(C_m C_e)).
 
     `displacement` [m^3/rad]: D; `omega_per_volt` [rad/(s V)]: commanded speed over voltage; `shortfall`: C_e/k_p;
     `corner` [1/s]: K_i/k_p; `droop` [rad/(s Pa)]: R_c D/(C_m C_e).
@@ -127,14 +127,16 @@ class Drive(_Invertible):
         check_circuit_property(
             "a pump's drive (of a servo valve: ValveDrive)", rig.name, rig.circuit, "pump_feeds_chambers"
         )
-        motor, displacement = rig.motor, rig.pump.q_b / (2.0 * math.pi)  # for the class's equation
-        shortfall, corner = (motor.C_e / motor.k_p, motor.K_i / motor.k_p) if motor.k_p > 0 else (0.0, 0.0)
+        motor, displacement = rig.motor, rig.pump.q_b / (2.0 * math.pi)
+        shortfall = corner = 0.0  # without a proportional gain the speed is taken as the commanded one
+        if motor.k_p > 0:
+            shortfall, corner = motor.C_e / motor.k_p, motor.K_i / motor.k_p
         droop = motor.R_c * displacement / (motor.C_m * motor.C_e)
         return cls(displacement, motor.omega_per_volt, shortfall, corner, droop)
 
     @property
     def lag(self) -> float:
-        """Time constant [s] of the motor's speed loop, (1 + shortfall)/corner; infinite if it has no integral term."""
+        """Time constant [s] of the motor's speed loop, (1 + shortfall)/corner; infinite if `corner` is 0."""
         return (1.0 + self.shortfall) / self.corner if self.corner > 0.0 else math.inf
 
     @staticmethod
@@ -146,14 +148,16 @@ class Drive(_Invertible):
         """Compute the pump's flow (n,) [m^3/s] for voltages (n,) [V] at `rate` [Hz] against p_A - p_B (n,) [Pa].
 
         The motor's speed is omega = (omega_d + shortfall (y - droop dp))/(1 + shortfall), with the commanded speed
-        omega_d. y is omega_d + droop dp after a first-order lag with the time constant `lag`; y of a sample depends on
-        the samples before it. With `settling` = 0 the run begins at standstill under the first dp. Otherwise u and dp
-        are taken as periodic with a period of `settling` samples, and y begins with its steady periodic value.
+        omega_d. The signal y is omega_d + droop dp after a first-order lag with the time constant `lag` (`filter_lag`).
+        With `settling` = 0 the run begins at standstill under the first dp. Otherwise u and dp are taken as periodic
+        with a period of `settling` samples, and y begins with the value that it has in the steady state.
         """
         omega_d, droop_speed = self.omega_per_volt * u, self.droop * dp
         lag_input, y = omega_d + droop_speed, np.empty_like(omega_d)
-        exponent, y_0 = -1.0 / (self.lag * rate), float(droop_speed[0])
-        if settling and exponent < 0.0:  # from 0 the lag reaches y_0 less the part of y_0 that has decayed
+        exponent = -1.0 / (self.lag * rate)
+        y_0 = float(droop_speed[0])
+        if settling and exponent < 0.0:
+            # from 0, the lag reaches y_0 - y_0 exp(settling exponent) within a period; y_0 is its periodic value
             filter_lag(lag_input[: settling + 1], math.exp(exponent), 0.0, y[: settling + 1])
             y_0 = float(y[settling]) / -math.expm1(settling * exponent)
         filter_lag(lag_input, math.exp(exponent), y_0, y)
@@ -171,7 +175,7 @@ class Drive(_Invertible):
     def steady_voltage(self, flow: float) -> float:
         """Compute the voltage [V] at which the pump delivers a constant `flow` [m^3/s].
 
-        The motor is assumed to turn at its commanded speed, whatever the load.
+        The motor is assumed to turn at its commanded speed, under any load.
         """
         return flow / self.displacement / self.omega_per_volt
 
@@ -207,8 +211,8 @@ class ValveDrive(_Invertible):
         return cls(valve.Q_N, valve.dp_N, valve.u_N, supply.p_set + pump_flow / supply.G_set)
 
     def mean_pressure(self, rig: Rig) -> float:
-        """Compute the mean pressure [Pa] of a rig's chambers at standstill: halfway from supply to return."""
-        return 0.5 * (self.p_s + 2.0 * rig.supply.p_return)
+        """Compute the mean pressure [Pa] of a rig's chambers at standstill: the mean of supply and return."""
+        return 0.5 * (self.p_s + 2.0 * rig.supply.p_return)  # p_s is the supply's pressure above the return's
 
     def coefficients(self, rate: float, dead_volts: float = 0.0) -> Any:
         """Make the parameters of the servo valve, as `drive_voltage` takes them; `rate` is ignored.
@@ -220,11 +224,12 @@ class ValveDrive(_Invertible):
 
     def steady_voltage(self, flow: float) -> float:
         """Compute the voltage [V] at which the servo valve delivers a constant `flow` [m^3/s] without load."""
-        return self.inverse(1.0)(flow, 0.0)
+        voltage_for = self.inverse(rate=1.0)  # any rate: a valve's model has no filter
+        return voltage_for(flow, 0.0)  # p_A - p_B = 0
 
     def unloaded_flow(self, u: float) -> float:
-        """Compute the servo valve's flow [m^3/s] at a constant voltage `u` [V], with p_A = p_B."""
-        return u / self.steady_voltage(1.0)
+        """Compute the servo valve's flow [m^3/s] at a constant voltage `u` [V] without load."""
+        return u / self.steady_voltage(flow=1.0)  # the flow is proportional to the voltage
 
 
 def drive_of(rig: Rig) -> Drive | ValveDrive:

@@ -1,4 +1,4 @@
-"""Fault-tolerant control: the leakage across the piston is estimated, and the pump delivers it in addition."""
+"""Fault-tolerant control: the leakage across the piston is estimated, and the pump delivers this flow in addition."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ if TYPE_CHECKING:
 
 #: Time constant [s] of the average of the pressures that drive the leak.
 _PRESSURE_LAG = 0.005
-#: Time constant [s] with which a change of the estimate enters the control law: slow, for the inner controller's
-#: integral must follow it.
+#: Time constant [s] with which a change of the estimate enters the control law. It is long because the inner
+#: controller's integral must follow.
 _BLEND = 0.5
-#: A leak is compensated once its estimate exceeds this many standard errors, until it is below half of that.
+#: A leak is compensated once its estimate exceeds this many standard errors, until the estimate is below half of them.
 _SIGNIFICANT_SDS = 4.0
-#: The leak must also move the piston by this many encoder counts a second: less cannot be measured.
+#: The leak must also move the piston by this many encoder counts a second: a slower motion cannot be measured.
 _RESOLVED_COUNTS = 0.5
 #: Number of blocks that the observer must have used before a leak is compensated.
 _MIN_BLOCKS = 4
 #: Conductance [m^3/(s Pa)] below which a former leak counts as 0: the voltages are the inner controller's again.
 _NEGLIGIBLE_G = 1e-18
-#: State and parameters of the law; law and memory of the inner controller as addresses.
+#: State and parameters of the control law. `inner`, `inner_memory`: addresses of the inner controller's law and memory.
 _MEMORY = record_dtype(
     *("compensated", "inner", "inner_memory", "u_max", "G_assumed", "is_known", "pressure_gain", "blend_gain"),
     *("mean_A", "mean_B", "G", "is_significant"),
@@ -46,9 +46,9 @@ _memory_at = record_view(_MEMORY)
 def _tolerant_law(memory: Any, sample: Any) -> Any:
     """Compute the voltage [V] of a sample: the inner controller's, plus the one at which the pump feeds the leak.
 
-    The leak's flow is G times the averaged p_A - p_B, where G is the conductance that the observer estimates above
-    the assumed one. While G is not 0, the sum is limited to +-u_max. It is called as machine code. `memory`, `sample`:
-    addresses of a record `_MEMORY`, which is updated, and of the numbers of a `Measured`.
+    The leak's flow is G times the averaged p_A - p_B. G is the conductance that the observer estimates, minus the
+    assumed conductance; it stays 0 until it is significant, and changes slowly. While G is not 0, the sum is limited to
+    +-u_max. `memory`, `sample`: addresses of a record `_MEMORY`, which is updated, and of the numbers of a `Measured`.
     """
     m, measured = _memory_at(memory), measured_at(sample)
     u = call_at(int(m.inner), int(m.inner_memory), address_of(sample))
@@ -66,7 +66,7 @@ def _tolerant_law(memory: Any, sample: Any) -> Any:
         if n_blocks >= _MIN_BLOCKS:
             unresolved_flow = _RESOLVED_COUNTS * observer.x_step * min(observer.area_A, observer.area_B)
             unresolved_G = unresolved_flow / max(abs(mean_dp), 1.0)
-            # half the threshold for a leak that is compensated already
+            # a leak that is compensated already has half the threshold
             threshold_G = (0.5 if m.is_significant > 0.0 else 1.0) * max(_SIGNIFICANT_SDS * sd, unresolved_G)
             m.is_significant = 1.0 if excess_G > threshold_G else 0.0
             target_G = excess_G if excess_G > threshold_G else 0.0
@@ -84,15 +84,15 @@ def _tolerant_law(memory: Any, sample: Any) -> Any:
 class FaultTolerant:
     """A controller that compensates the leakage across the piston, in addition to another controller.
 
-    The voltage is that of the controller `inner`, plus the voltage at which the `drive` delivers the leakage flow G
-    dp, where dp is p_A - p_B averaged over some milliseconds. A Kalman filter (`update_observer`, with the model
-    `balance`) estimates the conductance between the chambers from the measurements; G [m^3/(s Pa)] is this estimate
-    minus `G_assumed`, the assumed leakage conductance of the pump. G stays 0 until it exceeds 4 standard errors and
-    would move the piston by half an encoder count a second, so without a leak the voltages are exactly those of
-    `inner`. The voltage is limited to +-`u_max` [V] while a leak is compensated.
+    The voltage is that of the controller `inner`, plus the voltage at which the `drive` delivers the leakage flow G dp.
+    Here dp is p_A - p_B averaged over some milliseconds. A Kalman filter (`update_observer`, with the model `balance`)
+    estimates the conductance between the chambers from the measurements. G [m^3/(s Pa)] is this estimate minus
+    `G_assumed`, the assumed leakage conductance of the pump. G stays 0 until it exceeds 4 standard errors and would
+    move the piston by half an encoder count a second: without a leak the voltages are exactly those of `inner`. The
+    voltage is limited to +-`u_max` [V] while a leak is compensated.
 
-    `known` >= 0 [m^3/(s Pa)], if not None, takes the place of the estimated G: an ideal controller that knows the
-    leak. The compensated flow [m^3/s] is reported as `compensated`.
+    `known` >= 0 [m^3/(s Pa)], if not None, replaces the estimated G: the ideal controller, which knows the leak. The
+    compensated flow [m^3/s] is reported as `compensated`.
     """
 
     inner: Controller

@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 
 #: Time constant [s] of the average of the load.
 _LOAD_LAG = 0.1
-#: Largest change of the target's speed within a sample, relative to `v_max`; a larger one is a jump, no acceleration.
+#: Change of the target's speed within a sample, relative to `v_max`, from which on it is a jump and no acceleration.
 _MAX_SPEED_CHANGE = 0.1
-#: State and parameters of the law.
+#: State and parameters of the control law.
 _MEMORY = record_dtype(
     *("compensated", "v_max", "M", "F_C", "v_th", "F_v", "G", "C", "T", "load_gain", "is_first", "v", "dp", "load"),
     drive=DRIVE,
@@ -34,9 +34,9 @@ _memory_at = record_view(_MEMORY)
 def _flatness_law(memory: Any, sample: Any) -> Any:
     """Compute the voltage [V] of a sample: feedback plus feed-forward by the equations of `Flatness`, within +-u_max.
 
-    The feed-forward is the voltage at which the drive delivers the flow G dp + C d(dp)/dt against dp, the pressure
-    difference that the load and the target's speed and acceleration require. It is called as machine code. `memory`,
-    `sample`: addresses of a record `_MEMORY`, which is updated, and of the numbers of a `Measured`.
+    The feed-forward is the voltage at which the drive delivers the flow G dp + C d(dp)/dt against dp. Here dp is the
+    pressure difference that the load and the target's speed and acceleration require. `memory`, `sample`: addresses of
+    a record `_MEMORY`, which is updated, and of the numbers of a `Measured`.
     """
     m, measured = _memory_at(memory), measured_at(sample)
     feedback, is_first = m.feedback, m.is_first > 0.0
@@ -59,15 +59,18 @@ def _flatness_law(memory: Any, sample: Any) -> Any:
 class Flatness:
     """A position controller that feeds forward the flow the target requires, and corrects errors by PI control.
 
-    The position is a flat output of the machine: the target and its derivatives, the speed v and the acceleration a,
-    determine the force on the piston, F = M a + F_f(v) + F_load, the pressure difference dp = F/A, the flow Q = A v +
-    G dp + C dp/dt, and from Q and dp the voltage, by the model `drive`. The PI controller `feedback` provides the
-    voltage for A v and for the correction of the error. The feed-forward adds the pump's leakage G dp, the
-    compression C dp/dt of the oil, and the speed that the drive loses under the torque of dp.
+    The position is a flat output of the machine: the target, its speed v and its acceleration a determine
+
+    - the force on the piston, F = M a + F_f(v) + F_load;
+    - the pressure difference dp = F/A and the flow Q = A v + G dp + C d(dp)/dt;
+    - the voltage for this flow against dp, by the model `drive`.
+
+    The PI controller `feedback` provides the voltage for A v and for the correction of the error. The feed-forward adds
+    the pump's leakage G dp, the compression C d(dp)/dt of the oil, and the speed that the drive loses under dp.
 
     The friction is F_f(v) = F_C tanh(v/v_th) + F_v v. F_load is the force of the measured pressures minus (M a +
     F_f), averaged over time. The controller assumes `M` [kg], `F_C` [N], `F_v` [N s/m], `v_th` [m/s], `G` [m^3/(s
-    Pa)] and `C` = V/(2 K) [m^3/Pa]. A jump of the target has no derivative: a target's speed above `v_max` [m/s] is
+    Pa)] and `C` = V/(2 K) [m^3/Pa]. A speed of the target above `v_max` [m/s] is taken as a jump of the target, and is
     not fed forward.
 
     Source: J. Levine, Analysis and Control of Nonlinear Systems: A Flatness-based Approach, Springer 2009, chapter 6.

@@ -1,4 +1,4 @@
-"""The leakage between the chambers, estimated on line from a controller's measurements by a Kalman filter."""
+"""Estimate the leakage between the chambers on line from a controller's measurements, by a Kalman filter."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ _MEAN_NOISE = 0.1
 #: Standard deviation of the conductance's random walk in a block: absolute [m^3/(s Pa)], and relative to the
 #: estimate.
 _WALK, _RELATIVE_WALK = 1e-15, 0.03
-#: A block with an innovation above this many standard deviations is left out as an outlier; a second one in
-#: succession with the same sign is a leak that opened suddenly.
+#: A block with an innovation above this many standard deviations is left out as an outlier. If the next block is an
+#: outlier with the same sign, a leak has opened suddenly.
 _OUTLIER_SDS = 4.0
 #: Time constant [s] of the average of all four signals.
 _LAG = 0.01
 #: Parameters (`Balance`) and state of the observer. `length`: samples in a block; `turned_forward`, `turned_back`:
-#: rotation within the block in either direction [rad]; `means`: averages of angle, position and both pressures at
-#: present, `begin`: those when the block began; `state`: conductance, relative errors of 1/K and of the area, with
-#: their covariance `P`.
+#: rotation within the block in either direction [rad]; `outlier_G`: change of conductance that the last tested block
+#: implies if it is an outlier, else 0; `means`: averages of angle, position, p_A and p_B up to now; `begin`: these
+#: averages when the block began; `state`: conductance, relative errors of 1/K and of the area; `P`: its covariance.
 OBSERVER = record_dtype(
     *("D", "area_A", "area_B", "V_A", "V_B", "K", "x_step", "noise", "shut", "rate", "length", "lag_gain"),
     *("count", "sum_dp", "min_dp", "max_dp", "turned_forward", "turned_back", "outlier_G", "n_blocks"),
@@ -52,11 +52,11 @@ def update_observer(m: Any, theta: float, x: float, p_A: float, p_B: float) -> N
     `p_B` [Pa]: pressures.
 
     A Kalman filter estimates the conductance G between the chambers from the volume balance of each block of
-    `BLOCK` seconds. The balance is that of the chamber with the higher pressure, because a check valve may feed the
-    other one. For chamber A, D dtheta - A dx - (V(x)/K) dp_A - (|p_A - p_B|/K) D dtheta_in = G integral of (p_A -
-    p_B) dt; for B the signs are opposite. Here dtheta and dx are the rotation and the travel in the block, and
-    dtheta_in is the rotation that pumps oil into that chamber, which compresses it from the other chamber's
-    pressure. The filter also estimates the relative errors of 1/K and of the area. Friction and load do not enter.
+    `BLOCK` seconds. The chamber with the higher pressure is balanced, because a check valve may feed the other chamber.
+    For chamber A, D dtheta - A dx - (V(x)/K) dp_A - (|p_A - p_B|/K) D dtheta_in = G integral of (p_A - p_B) dt; for B
+    the signs are opposite. Here dtheta and dx are the rotation and the travel in the block. dtheta_in is the rotation
+    that pumps oil into the balanced chamber, which compresses this oil from the other chamber's pressure. The filter
+    also estimates the relative errors of 1/K and of the area. Friction and load do not enter.
     """
     sample, means = (theta, x, p_A, p_B), m.means
     if m.count == 0.0:
@@ -86,10 +86,13 @@ def _update_with_block(m: Any, dp_sum: float) -> None:
     `OBSERVER`, the memory of the filter; `dp_sum`: sum of p_A - p_B [Pa] over the block's samples, the two at its
     ends by half.
 
-    The block is left out if the mean of p_A - p_B is smaller in size than `MIN_DP`, or if p_A - p_B changes its sign
-    or is too small to shut a check valve. It is also left out if its innovation exceeds `_OUTLIER_SDS` standard
-    deviations, unless that of the block before did with the same sign: then a leak may have opened, and the variance of
-    the conductance is increased.
+    The block is left out if
+
+    - the mean of p_A - p_B is within +-`MIN_DP`;
+    - p_A - p_B changes its sign, or is too small to shut a check valve;
+    - its innovation (measured minus predicted leakage) exceeds `_OUTLIER_SDS` standard deviations. If the block before
+      was such an outlier with the same sign, the block is used: a leak may have opened, and the variance of the
+      conductance is increased.
     """
     dp_integral = dp_sum / m.rate
     if abs(dp_integral) < MIN_DP * m.length / m.rate or m.min_dp * m.max_dp <= 0.0:
@@ -111,7 +114,7 @@ def _update_with_block(m: Any, dp_sum: float) -> None:
     # uniform error of one encoder count (1/12) at both ends, noise of the averaged pressures, errors of the model
     noise = (side_area * m.x_step) ** 2 / 6.0 + _MEAN_NOISE * (V / m.K * m.noise) ** 2
     variance = noise + (_COMPRESSION_ERROR * compressed) ** 2 + (_SWEPT_ERROR * swept) ** 2
-    row = (dp_integral, compressed, swept)  # leaked = row . state
+    row = (dp_integral, compressed, swept)  # the model is leaked = row . state
     innovation = leaked - (row[0] * state[0] + row[1] * state[1] + row[2] * state[2])
     walk = (_WALK + _RELATIVE_WALK * abs(state[0])) ** 2
     innovation_variance = row[0] * row[0] * walk + variance
@@ -123,7 +126,7 @@ def _update_with_block(m: Any, dp_sum: float) -> None:
         m.outlier_G = innovation / dp_integral
         if previous_outlier_G * m.outlier_G <= 0.0:
             return
-        jump_variance = m.outlier_G**2  # a leak that opened suddenly: G may have changed by as much
+        jump_variance = m.outlier_G**2  # G may have changed by this outlier_G
         walk, innovation_variance = walk + jump_variance, innovation_variance + row[0] * row[0] * jump_variance
     else:
         m.outlier_G = 0.0
@@ -155,7 +158,7 @@ class Balance:
     `D` [m^3/rad]: displacement of the pump; `area_A`, `area_B` [m^2]: piston areas; `V_A`, `V_B` [m^3]: volumes of
     the chambers at mid-stroke; `K` [Pa]: bulk modulus of the oil; `x_step` [m]: position change of one encoder count;
     `noise` [Pa]: standard deviation of a pressure sample; `shut` [Pa]: pressure difference |p_A - p_B| above which
-    the check valve of the chamber with the higher pressure is shut.
+    the check valve of the chamber with the higher pressure is shut, 0 for a rig without such valves.
     """
 
     D: float

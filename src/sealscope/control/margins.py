@@ -1,4 +1,4 @@
-"""Stability margins of a rig's control loop: the additional gain, phase and delay that it tolerates."""
+"""Stability margins of a rig's control loop: the additional gain, phase and delay that the loop tolerates."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 #: Duration [s] of a controller's impulse response.
 _RESPONSE_DURATION = 60.0
-#: Sizes of the impulses: position [m], above any dead band, pressures [Pa], angle [rad].
+#: Sizes of the impulses of position [m] (above any dead band), pressure [Pa] and angle [rad].
 _IMPULSE_X, _IMPULSE_P, _IMPULSE_THETA = 1e-3, 1e4, 1.0
 #: Time [s] in which a moving piston settles before the rig is linearised.
 _SETTLING = 0.5
 _N_FREQUENCIES = 4000
 #: Samples of an impulse response that are summed at once.
 _BLOCK = 64
-#: Steps of the voltage [V] and of each state (SI) for the finite differences.
+#: Steps of the voltage [V], and of each state [SI] in the order of `STATES`, for the finite differences.
 _VOLTAGE_STEP = 1e-3
 _STATE_STEPS = (1e-3, 1e-3, 1e-2, 1e-3, 1e-6, 1e-6, 1e2, 1e2, 1e2, 1e2, 1e-9, 1e-9, 1e-7, 1e-4)
 
@@ -38,8 +38,8 @@ class Margins:
     `speed` [m/s]: speed of the piston; `gain`: factor by which the loop's gain may grow, inf if unlimited; `phase`
     [rad]: smallest distance of arg L from -pi where |L| = 1; `crossover` [Hz]: highest frequency at which |L| = 1;
     `delay` [s]: smallest additional delay at which the loop becomes unstable; `peak`: largest sensitivity 1/|1 + L|;
-    `damped`: True if the rig without controller is stable. It may be unstable in slow strokes, where friction falls
-    with speed; the margins then do not prove that the loop is stable.
+    `damped`: True if the rig without controller is stable. The rig may be unstable in slow strokes, where friction
+    falls with speed; the margins then do not prove that the loop is stable.
     """
 
     speed: float
@@ -54,12 +54,13 @@ class Margins:
 def margins(rig: Rig, controller: Controller, speed: float = 0.0, load: float = 0.0) -> Margins:
     """Compute the stability margins of the control loop of a rig and a controller, opened at the voltage.
 
+    The piston moves at `speed` [m/s] (0: standstill) under a force `load` [N] in addition to the rig's own load. Raises
+    InputError for a speed that the drive cannot reach.
+
     The rig is linearised over one sample of the controller, y(k+1) = A y(k) + B u(k), by finite differences of the
-    solver's steps. The result has the largest factor of the loop's gain, the phase margin [rad] and others (`Margins`).
-    The piston moves at `speed` [m/s] (0: standstill) under a force `load` [N] in addition to the rig's own load. The
-    controller's transfer functions C_j(z) are computed from its impulse responses to each measurement j = x, p_A, p_B,
-    theta. The open loop is L(z) = -z^-delay sum_j C_j(z) c_j (z I - A)^-1 B, where the row c_j picks measurement j from
-    the state. Raises InputError for a speed that the drive cannot reach.
+    solver's steps. The controller's transfer functions C_j(z) are computed from its responses to an impulse of each
+    measurement j = x, p_A, p_B, theta. The open loop is L(z) = -z^-delay sum_j C_j(z) c_j (z I - A)^-1 B, where the row
+    c_j picks measurement j from the state.
 
     Examples
     --------
@@ -81,9 +82,9 @@ def open_loop(
     """Compute the open-loop response L (n,) of a rig and its controller at frequencies `f` (n,) [Hz].
 
     L = -z^-delay sum_j C_j(z) P_j(z) with z = exp(2 pi i f/rate). C_j is the controller's transfer function from
-    measurement j (x, p_A, p_B or theta) to the voltage, P_j that of the rig from the voltage to measurement j. The
-    rig is linearised while its piston moves at `speed` [m/s] (0: standstill), under a force `load` [N] in addition to
-    the rig's own. The second result is True if the linearised rig is stable without the controller.
+    measurement j (x, p_A, p_B or theta) to the voltage, P_j the rig's transfer function from the voltage to measurement
+    j. The rig is linearised while its piston moves at `speed` [m/s] (0: standstill), under a force `load` [N] in
+    addition to the rig's own. The second result is True if the linearised rig is stable without the controller.
     """
     A, B, state = _linearise(rig, controller.rate, speed, load)
     z = np.exp(2j * math.pi * f / controller.rate)
@@ -94,8 +95,9 @@ def open_loop(
     for measured_state, response in _impulse_responses(controller, state):
         plant = (eigenvectors[measured_state] * modal_inputs / (z[:, None] - eigenvalues)).sum(axis=1)
         L -= _frequency_response(response, z) * plant
-    # 1e-6: the integrators position and angle have eigenvalues of 1, up to the error of the finite differences
-    return L * z**-controller.delay, bool(np.abs(eigenvalues).max() < 1.0 + 1e-6)
+    # 1e-6: position and angle are integrals, with eigenvalues of 1 up to the error of the finite differences
+    damped = bool(np.abs(eigenvalues).max() < 1.0 + 1e-6)
+    return L * z**-controller.delay, damped
 
 
 def _linearise(rig: Rig, rate: float, speed: float, load: float) -> tuple[Array, Array, Array]:
@@ -112,8 +114,10 @@ def _linearise(rig: Rig, rate: float, speed: float, load: float) -> tuple[Array,
     from sealscope.physics.state import OUTPUTS, POSITION, VELOCITY
 
     p = rig_numbers(rig) if load == 0.0 else rig_numbers(rig)._replace(pushed=(True,))
-    steps = max(2, math.ceil(1.2 / (rate * min(1e-3, longest_step(p)))))  # a sample; with 20 % in reserve
-    h, implicit, euler = 1.0 / (rate * steps), IMPLICIT if p.throttled else EXPLICIT, rig.motor.integrator == "euler"
+    steps = max(2, math.ceil(1.2 / (rate * min(1e-3, longest_step(p)))))  # per sample; with 20 % in reserve
+    h = 1.0 / (rate * steps)
+    implicit = IMPLICIT if p.throttled else EXPLICIT
+    euler = rig.motor.integrator == "euler"
     nodes = step_nodes(implicit, h).size
 
     def advance_state(y: Array, u: float, samples: int = 1) -> Array:
@@ -138,12 +142,14 @@ def _linearise(rig: Rig, rate: float, speed: float, load: float) -> tuple[Array,
             last_state = advance_state(first_state, u, samples)
             return last_state, float(last_state[POSITION] - first_state[POSITION]) * rate / samples
 
-        _, speed_at_rest = find_moving_state(0.0)  # the load may move a piston whose drive gives way
-        for _ in range(5):  # adjust the voltage until the piston has the speed: the drive falls short of its command
+        _, drift_speed = find_moving_state(0.0)  # the load may move the piston at 0 V
+        for _ in range(5):  # adjust the voltage to the stated speed: the drive falls short of its command
             state, mean_speed = find_moving_state(min(max(u, -limit), limit))
-            speed_gain = mean_speed - speed_at_rest
-            # in proportion to the speed, by at most a factor of 5; by 1.5 if the piston does not follow
-            u *= min(max((speed - speed_at_rest) / speed_gain, 0.2), 5.0) if speed_gain * speed > 0.0 else 1.5
+            speed_gain = mean_speed - drift_speed
+            if speed_gain * speed > 0.0:
+                u *= min(max((speed - drift_speed) / speed_gain, 0.2), 5.0)
+            else:  # the piston does not follow
+                u *= 1.5
         if not abs(mean_speed - speed) < 0.2 * abs(speed):
             raise InputError(f"speed must be one that the drive can give, got {speed:g} m/s")
         y = state
@@ -166,13 +172,14 @@ def _impulse_responses(controller: Controller, state: Array) -> list[tuple[int, 
     """
     from sealscope.physics.state import P_A, P_B, POSITION, THETA
 
-    standstill = Measured(0.0, 0.0, 0.0, 0.0, float(state[P_A]), float(state[P_B]), 0.0)
+    p_A, p_B = float(state[P_A]), float(state[P_B])
+    standstill = Measured(t=0.0, target=0.0, target_speed=0.0, x=0.0, p_A=p_A, p_B=p_B, theta=0.0)
     n = round(_RESPONSE_DURATION * controller.rate)
 
     def respond(impulse: Measured) -> Array:
-        """Compute the controller's voltages (n,) [V] from a sample with the measurements `impulse` on.
+        """Compute the controller's voltages (n,) [V], the first at a sample with the measurements `impulse`.
 
-        All samples before and after that one have the measurements at standstill.
+        All samples before and after the first have the measurements at standstill.
         """
         voltage = controller.start()
         for _ in range(round(controller.rate)):  # settle for a second
@@ -193,8 +200,8 @@ def _impulse_responses(controller: Controller, state: Array) -> list[tuple[int, 
 def _frequency_response(response: Array, z: NDArray[np.complex128]) -> NDArray[np.complex128]:
     """Compute the frequency response (m,) of a controller from its impulse response, by the z-transform.
 
-    The z-transform is sum_k a_k z^-k. `response` (n,): the first values a_k; the rest are equal to the last of them,
-    as for an integrator. `z` (m,): complex numbers at which it is computed.
+    The z-transform is sum_k a_k z^-k. `response` (n,): the first n values a_k; all later values are taken as equal to
+    the last of these, as for an integrator. `z` (m,): complex numbers at which the transform is computed.
     """
     last_value = response[-1]
     transient = response - last_value
@@ -206,7 +213,7 @@ def _frequency_response(response: Array, z: NDArray[np.complex128]) -> NDArray[n
     total = np.zeros(z.size, dtype=complex)
     for k in range(len(blocks) - 1, -1, -1):  # Horner's scheme, a block at a time
         total = total * z**-_BLOCK + block_sums[:, k]
-    return np.asarray(total + last_value / (1.0 - 1.0 / z))  # geometric series
+    return np.asarray(total + last_value / (1.0 - 1.0 / z))  # a constant is a geometric series
 
 
 def compute_margins(f: Array, L: NDArray[np.complex128], speed: float = 0.0, damped: bool = True) -> Margins:
@@ -215,9 +222,10 @@ def compute_margins(f: Array, L: NDArray[np.complex128], speed: float = 0.0, dam
     Between the frequencies, L is interpolated linearly. `speed`, `damped`: copied to the result.
     """
     indices = np.arange(f.size)
-    unit_gain, real_axis = _crossings(np.abs(L) - 1.0), _crossings(L.imag)
-    crossover, phase_margin = np.interp(unit_gain, indices, f), np.angle(-np.interp(unit_gain, indices, L))
-    real = np.interp(real_axis, indices, L.real)
+    unit_gain = _crossings(np.abs(L) - 1.0)  # fractional indices at which |L| = 1
+    crossover = np.interp(unit_gain, indices, f)
+    phase_margin = np.angle(-np.interp(unit_gain, indices, L))  # arg L + pi
+    real = np.interp(_crossings(L.imag), indices, L.real)  # L where it crosses the real axis
     gain = float(np.min(-1.0 / real[(real < 0.0) & (real > -1.0)], initial=math.inf))  # a larger gain moves these to -1
     phase = float(np.min(np.abs(phase_margin), initial=math.inf))
     delay = float(np.min(np.mod(phase_margin, 2.0 * math.pi) / (2.0 * math.pi * crossover), initial=math.inf))
@@ -226,9 +234,6 @@ def compute_margins(f: Array, L: NDArray[np.complex128], speed: float = 0.0, dam
 
 
 def _crossings(values: Array) -> Array:
-    """Find the places where `values` (n,) change their sign, as fractional indices (m,).
-
-    Between two values, the place is interpolated linearly.
-    """
+    """Find where `values` (n,) change their sign, as fractional indices (m,) by linear interpolation."""
     k = np.flatnonzero(np.diff(values > 0.0))
     return k + values[k] / (values[k] - values[k + 1])

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 #: Time constant [s] of the average of p_A - p_B, whose sign tells which side carries the load.
 _PRESSURE_LAG = 0.02
-#: State and parameters of the law.
+#: State and parameters of the control law.
 FOLLOWING = record_dtype(
     *("compensated", "area_A", "area_B", "k_v", "k_i_T", "dead_band", "u_max", "pressure_gain", "integral", "dp"),
     drive=DRIVE,
@@ -30,10 +30,9 @@ _memory_at = record_view(FOLLOWING)
 def following_voltage(m: Any, measured: Any) -> float:
     """Compute the voltage [V] of a sample by PI control with velocity feed-forward (`PositionPI`), within +-u_max.
 
-    It is the voltage at which the drive delivers the flow A v_c, with the piston area A of the chamber with the
-    higher pressure and the commanded velocity v_c = v_target + k_v e + k_i integral of e dt, e = target - x.
-    `m`: a record `FOLLOWING` of the law's parameters and state; the integral and the averaged p_A - p_B in it are
-    updated. `measured`: a `Measured`.
+    The drive delivers the flow A v_c at this voltage. A is the piston area of the chamber with the higher pressure, and
+    v_c = v_target + k_v e + k_i integral of e dt the commanded velocity, with the error e = target - x. `m`: a record
+    `FOLLOWING`, whose integral and averaged p_A - p_B are updated; `measured`: a `Measured`.
     """
     m.dp += m.pressure_gain * (measured.p_A - measured.p_B - m.dp)
     error = measured.target - measured.x
@@ -57,14 +56,15 @@ def _position_law(memory: Any, measured: Any) -> Any:
 
 @dataclass(frozen=True)
 class PositionPI:
-    """A PI controller of the piston's position with velocity feed-forward; its fields are what it assumes of the rig.
+    """A PI controller of the piston's position with velocity feed-forward; its fields are assumptions about the rig.
 
     The commanded velocity is v_c = v_target + k_v e + k_i integral of e dt, with the error e = target - x. The
     voltage is the one at which the `drive` delivers the flow v_c A; A is the piston area of the chamber with the
     higher pressure, which carries the load. For a pump the load is neglected: the commanded speed of the motor is
-    omega_d = omega_c + (C_e/k_p) s/(s + K_i/k_p) omega_c, the inverse of its speed loop omega/omega_d = (k_p s +
-    K_i)/((k_p + C_e) s + K_i), eqs. (4.2)-(4.4) of the thesis. For a servo valve the voltage depends on the measured
-    pressure difference. Small voltages are increased by up to `dead_volts` [V] to pass the overlap of its edges.
+    omega_d = omega_c + (C_e/k_p) s/(s + K_i/k_p) omega_c, where omega_c is the speed for the flow. This inverts the
+    speed loop omega/omega_d = (k_p s + K_i)/((k_p + C_e) s + K_i), eqs. (4.2)-(4.4) of the thesis. For a servo valve
+    the voltage depends on the measured pressure difference. Small voltages are increased by up to `dead_volts` [V] to
+    pass the overlap of the valve's edges.
 
     The integral is frozen within `dead_band` [m] of the target, where it would oscillate against static friction or
     between two encoder counts, and while the voltage is at its limit `u_max` [V].
@@ -95,11 +95,11 @@ class PositionPI:
         `gains`: values of other fields, such as `k_v`, `k_i` or `rate`, which replace the defaults.
         """
         valve, drive = rig.valve, drive_of(rig)
-        gains.setdefault("dead_band", 1.5 * rig.sensors.x.resolution)
+        gains.setdefault("dead_band", 1.5 * rig.sensors.x.resolution)  # one and a half encoder counts
         if isinstance(drive, Drive):
-            drive = replace(drive, droop=0.0)  # inverted without load
+            drive = replace(drive, droop=0.0)  # neglects the load
         else:
-            # each direction opens two edges, of which the one with less overlap opens first
+            # each direction opens two edges; the edge with less overlap opens first
             overlap = max(0.0, 0.5 * (min(valve.o_PA, valve.o_BT) + min(valve.o_PB, valve.o_AT)))
             gains.setdefault("dead_volts", valve.u_N * overlap / valve.x_max)
         return cls(rig.cylinder.A_A, rig.cylinder.A_B, drive, rig.daq.u_max, **gains)  # type: ignore[arg-type]

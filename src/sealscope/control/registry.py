@@ -35,6 +35,7 @@ CONTROLLERS: Mapping[str, Callable[[Rig], Controller]] = {
 }
 
 
+#: Group of the entry points by which distributions install controllers.
 GROUP = "sealscope.controllers"
 
 
@@ -55,8 +56,8 @@ def check_controller_name(name: str) -> None:
     A user's controller is written ``MODULE:NAME`` or ``FILE.py:NAME``. It is not imported, so it may not exist.
     Raises InputError for any other name.
     """
-    place, colon, attribute = name.rpartition(":")
-    if not is_installed(name) and not (colon and place and attribute):
+    module_or_file, _, attribute = name.rpartition(":")
+    if not is_installed(name) and not (module_or_file and attribute):
         names = (*CONTROLLERS, *_installed())
         raise InputError(
             f"controller must be one of {', '.join(names)}, or MODULE:NAME or FILE.py:NAME of your own, got {name!r}"
@@ -68,9 +69,9 @@ def controller_named(name: str, rig: Rig) -> Controller:
     """Make the controller called `name` for a rig.
 
     `name`: the name of a built-in or installed controller, or ``MODULE:NAME`` or ``FILE.py:NAME`` of a class or
-    function. Its method `from_rig` is called with the rig, or the class or function itself if it has no such method.
-    Raises InputError for an unknown name, for code that fails, and for a controller without `rate`, `delay` or
-    `start`.
+    function. The controller is made by its method `from_rig` from the rig, or without such a method by calling the
+    class or function with the rig. Raises InputError for an unknown name, for code that fails, and for a controller
+    without `rate`, `delay` or `start`.
 
     Examples
     --------
@@ -82,10 +83,13 @@ def controller_named(name: str, rig: Rig) -> Controller:
     if name in CONTROLLERS:
         return CONTROLLERS[name](rig)
     check_controller_name(name)
-    place, _, attribute = name.rpartition(":")
+    module_or_file, _, attribute = name.rpartition(":")
     try:
-        make: Any = _installed()[name].load() if name in _installed() else getattr(_load_module(place), attribute)
-        build = getattr(make, "from_rig", None) or getattr(make, "of", make)  # `of`: the former name
+        if name in _installed():
+            factory: Any = _installed()[name].load()
+        else:
+            factory = getattr(_load_module(module_or_file), attribute)
+        build = getattr(factory, "from_rig", None) or getattr(factory, "of", factory)  # `of`: former name of `from_rig`
         controller = build(rig)
     except InputError:
         raise
@@ -104,10 +108,11 @@ def find_controller_source(name: str) -> Path | None:
     """
     if name in CONTROLLERS:
         return None
-    place = _installed()[name].module if name in _installed() else name.rpartition(":")[0]
-    path = Path(place) if place.endswith(".py") else _find_module_file(place)
+    stated_module_or_file, _, _ = name.rpartition(":")
+    module_or_file = _installed()[name].module if name in _installed() else stated_module_or_file
+    path = Path(module_or_file) if module_or_file.endswith(".py") else _find_module_file(module_or_file)
     if path is None or not path.is_file():
-        raise InputError(f"a controller's file must exist, got {place}")
+        raise InputError(f"a controller's file must exist, got {module_or_file}")
     return path
 
 
@@ -116,7 +121,8 @@ def _find_module_file(module: str) -> Path | None:
 
     `module`: dotted name, such as "my_package.control".
     """
-    parts, folders = module.split("."), None  # `folders`: those of the package that contains the module
+    parts = module.split(".")
+    folders = None  # of the package that contains the module, None for a top-level module
     for depth in range(1, len(parts) + 1):
         name = ".".join(parts[:depth])
         specs = (finder.find_spec(name, folders) for finder in sys.meta_path)
@@ -127,16 +133,16 @@ def _find_module_file(module: str) -> Path | None:
     return Path(spec.origin) if spec is not None and spec.origin else None
 
 
-def _load_module(place: str) -> Any:
+def _load_module(module_or_file: str) -> Any:
     """Import a module by its name, or from the path of a Python file; raise InputError if the file does not exist.
 
     A file is imported once, under a name that contains the hash of its text.
     """
-    if not place.endswith(".py"):
-        return importlib.import_module(place)
-    path = Path(place)
+    if not module_or_file.endswith(".py"):
+        return importlib.import_module(module_or_file)
+    path = Path(module_or_file)
     if not path.is_file():
-        raise InputError(f"a controller's file must exist, got {place}")
+        raise InputError(f"a controller's file must exist, got {module_or_file}")
     name = f"sealscope_controller_{sha256(path.read_bytes()).hexdigest()[:16]}"
     if name in sys.modules:
         return sys.modules[name]
@@ -144,7 +150,7 @@ def _load_module(place: str) -> Any:
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module  # dataclasses look their module up
+    sys.modules[name] = module  # before it is executed: `dataclass` looks up the module of its class
     try:
         spec.loader.exec_module(module)
     except BaseException:

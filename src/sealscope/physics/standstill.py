@@ -48,8 +48,9 @@ def pressures_at_standstill(force: float, p: RigNumbers) -> tuple[float, float]:
     if len(p.throttled) > 0:
         V_A, V_B = V_A + p.V_1, V_B + p.V_2
     missing_force = force - p.p_charge * (p.A_A - p.A_B)  # [N], not carried by the charge pressure
-    displaced_oil = missing_force / (p.A_A / V_A + p.A_B / V_B)
-    return p.p_charge + displaced_oil / V_A, p.p_charge - displaced_oil / V_B
+    # [Pa m^3]: bulk modulus times the oil volume displaced from side B to A; over a side's volume: its pressure change
+    modulus_times_volume = missing_force / (p.A_A / V_A + p.A_B / V_B)
+    return p.p_charge + modulus_times_volume / V_A, p.p_charge - modulus_times_volume / V_B
 
 
 @law
@@ -89,22 +90,25 @@ def pressures_behind_valve(force: float, A_A: float, A_B: float, p_1: float, p_2
 def supply_at_standstill(force: float, x: float, p: RigNumbers) -> tuple[float, float, float]:
     """Compute p_1, p_A, p_B [Pa] of a rig with its servo valve centred and its piston at rest at `x` [m].
 
-    `force` [N]: load against +x. The supply pressure p_1 is the one that stays constant: the root of dp_1/dt, which
-    falls as p_1 rises, is found by bisection.
+    `force` [N]: load against +x. The supply pressure p_1 is constant at standstill, dp_1/dt = 0. As dp_1/dt falls with
+    rising p_1, this pressure is found by bisection.
     """
     y = np.zeros(len(STATES))
     y[POSITION], y[P_2] = x, p.p_return
     low = p.p_return
-    high = low + p.p_set + p.q_b * p.omega_P / p.G_set  # the relief valve alone takes more
+    high = low + p.p_set + p.q_b * p.omega_P / p.G_set  # here the relief valve takes more than the pump delivers
     p_A, p_B = low, low
-    for _ in range(200):  # halvings, beyond the resolution of doubles
+    for _ in range(200):  # more halvings than doubles resolve
         middle = 0.5 * (low + high)
         p_A, p_B = pressures_behind_valve(force, p.A_A, p.A_B, middle, p.p_return)
         y[P_A], y[P_B], y[P_1] = p_A, p_B, middle
         dp = middle - p.p_return
         Q_1 = pump_flow(p.omega_P, dp, p.q_b, p.G_pump) - turbulent_slip(dp, p.c_slip, p.dp_0)
-        rises = valve_rates(state_of(y), Q_1, p)[2] > 0.0
-        low, high = (middle, high) if rises else (low, middle)
+        _, _, p_1_rate, _ = valve_rates(state_of(y), Q_1, p)
+        if p_1_rate > 0.0:
+            low = middle
+        else:
+            high = middle
     return low, p_A, p_B
 
 

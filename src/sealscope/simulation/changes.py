@@ -1,8 +1,8 @@
 """Changes of machine and instruments within a run.
 
 An `Effect` changes one parameter of the compiled model or of an instrument over time; a `Hold` makes a sensor repeat
-a reading. Drifts (in this module) and faults (in `faults`) are lists of effects. The solver takes the machine's
-parameters as constant within short blocks of time.
+a reading. Drifts (in this module) and faults (in `faults`) cause effects. The solver takes the machine's parameters
+as constant within short blocks of time.
 """
 
 from __future__ import annotations
@@ -23,14 +23,15 @@ if TYPE_CHECKING:
     from sealscope.physics.rig import RigNumbers
 
 T = TypeVar("T", float, Array)
-#: Longest and shortest block [s] within which changing numbers are constant (jumps may make one shorter).
+#: Longest and shortest block [s] within which changing parameters are constant (jumps may cut a shorter one).
 LONGEST_BLOCK, SHORTEST_BLOCK = 0.5, 0.05
 #: Largest relative change of a drifting parameter from one block to the next.
 MAX_RELATIVE_CHANGE = 5e-4
 #: Parameters that drift together, by the name of the group.
 PARAMETER_GROUPS = {"friction": ("friction.F_pr", "friction.F_cfr", "friction.F_v")}
+#: Flow coefficients of the throttles in the lines to chambers A and B, by flow direction.
 THROTTLES = ("c_A_in", "c_A_out", "c_B_in", "c_B_out")
-#: Rig parameters that the compiled model takes only through derived ones: (model parameter, its power of the rig's).
+#: Model parameters that are proportional to a power of a rig parameter of another name, as (name, exponent).
 _POWERS = {
     "line.C_d": tuple((field, 1.0) for field in THROTTLES),
     "line.d_line": tuple((field, 2.0) for field in THROTTLES),
@@ -39,11 +40,11 @@ _POWERS = {
     "pump.C_st": (("c_slip", 1.0),),
     "pump.C_h": (("k_h", 1.0),),
 }
-#: Parameters that `ParameterDrift` refuses, being geometry or conditions at the start. Rows of `faults.toml` are not
-#: checked against them.
+#: Parameters that `ParameterDrift` refuses: geometry, and conditions at the start. Faults are not checked against them.
 _CANNOT_DRIFT = {"cylinder.L", "cylinder.V", "fluid.p_charge", "makeup.V_gas"}
 #: Points at which the range of a drift's path is computed.
 _N_PATH_POINTS = 1001
+#: Symbols (last parts of dotted names) of the instruments' parameters that can change.
 _INSTRUMENT_SYMBOLS = {"noise", "hum", "offset", "gain_error", "scale_error", "common_noise"}
 
 
@@ -75,7 +76,8 @@ def apply_effects(rig_value: T, effects: Sequence[Effect], field: str, t: Array)
     """Compute one parameter at times t [s] as (value in the rig + sum of addends) x product of factors.
 
     `rig_value`: value of the parameter in the rig, without effects; `field`: name of the parameter; `effects`: changes
-    of parameters over time, of which only those of this parameter are applied. Without any, `rig_value` is returned.
+    of any parameters over time, from which those of this parameter are applied. If there are none of this parameter,
+    `rig_value` is returned.
     """
     value: T | Array = rig_value
     for effect in sorted(effects, key=lambda effect: not effect.additive):  # sums before products
@@ -109,7 +111,7 @@ def block_bounds(effects: Sequence[Effect], n_out: int, rate: float) -> np.ndarr
         return np.array([0, n_out], dtype=np.int64)
     breakpoints = np.array([t for effect in effects for t in effect.breakpoints if math.isfinite(t)], dtype=np.float64)
     grid = np.arange(0, n_out, max(1, round(LONGEST_BLOCK * rate)))
-    break_outputs = np.ceil(breakpoints * rate * (1.0 - 1e-12))  # less rounding: a break on an output stays there
+    break_outputs = np.ceil(breakpoints * rate * (1.0 - 1e-12))  # 1e-12: a break on an output stays there
     bounds = np.unique(np.clip(np.r_[grid, n_out, break_outputs], 0, n_out))
     starts, stops = bounds[:-1], bounds[1:]
     inset = 1e-6 / rate  # excludes a jump at a block's bound from the change within the block
@@ -118,8 +120,9 @@ def block_bounds(effects: Sequence[Effect], n_out: int, rate: float) -> np.ndarr
         change = np.abs(effect.change(stops / rate - inset) - effect.change(starts / rate + inset))
         max_parts = np.maximum(1, (stops - starts) // max(1, round(effect.min_block * rate)))
         n_parts = np.maximum(n_parts, np.minimum(np.ceil(change / effect.max_change - 1e-9), max_parts))
-    cuts = [np.linspace(a, b, int(n), endpoint=False) for a, b, n in zip(starts, stops, n_parts, strict=True)]
-    return np.unique(np.rint(np.concatenate([*cuts, [n_out]])).astype(np.int64))
+    blocks = zip(starts, stops, n_parts, strict=True)
+    parts = [np.linspace(start, stop, int(n), endpoint=False) for start, stop, n in blocks]
+    return np.unique(np.rint(np.concatenate([*parts, [n_out]])).astype(np.int64))
 
 
 def step_limiting_parameters(effects: Sequence[Effect], base: RigNumbers) -> tuple[RigNumbers, ...]:
@@ -134,8 +137,10 @@ def step_limiting_parameters(effects: Sequence[Effect], base: RigNumbers) -> tup
     times = np.array(sorted({t for effect in fast_effects for t in effect.breakpoints if math.isfinite(t)}))
     before_and_after = np.concatenate([times - 1e-9, times + 1e-9])  # a nanosecond from each switch
     values = changing_values(fast_effects, base, before_and_after) if times.size else {}
-    rows = np.unique(np.array(list(values.values())).T, axis=0) if values else ()
-    return base, *(base._replace(**dict(zip(values, row.tolist(), strict=True))) for row in rows)
+    if not values:
+        return (base,)
+    distinct_rows = np.unique(np.array(list(values.values())).T, axis=0)  # a row has the changing parameters at a time
+    return base, *(base._replace(**dict(zip(values, row.tolist(), strict=True))) for row in distinct_rows)
 
 
 class Schedule:
@@ -158,16 +163,16 @@ class Schedule:
             return
         middles: Array = np.asarray(0.5 * (self.bounds[:-1] + self.bounds[1:]) / rate, dtype=np.float64)
         values = changing_values(effects, base, middles)
-        table = np.array(list(values.values()))
-        differs = np.r_[True, np.any(table[:, 1:] != table[:, :-1], axis=0)]
+        table = np.array(list(values.values()))  # (parameters, blocks)
+        differs = np.r_[True, np.any(table[:, 1:] != table[:, :-1], axis=0)]  # from the block before
         self.bounds = np.r_[self.bounds[:-1][differs], n_out]
-        # the laws in force are compiled in, so they are the same in all blocks
-        laws: dict[str, Any] = {}
+        # optional parts of the model are compiled in, so that all blocks have those that any of them needs
+        options: dict[str, Any] = {}
         if any(name.startswith("G_ext") and np.any(series > 0) for name, series in values.items()):
-            laws["open_circuit"] = (True,)
+            options["open_circuit"] = (True,)
         if "air" in values and np.any(values["air"] > 0):
-            laws["aerated"] = (True,)
-        numbers = base._replace(**laws)
+            options["aerated"] = (True,)
+        numbers = base._replace(**options)
         rows = table[:, differs].T.tolist()
         self.numbers = [numbers._replace(**dict(zip(values, row, strict=True))) for row in rows]
 
@@ -202,12 +207,12 @@ class Readings:
     def value(self, parameter: str, rig_value: float, t: Array) -> Array | float:
         """Compute a parameter of an instrument at times t [s], with the changes within the run.
 
-        `parameter`: its dotted name, such as "sensors.p_A.noise"; `rig_value`: its value without changes.
+        `parameter`: dotted name, such as "sensors.p_A.noise"; `rig_value`: value without changes.
         """
         return apply_effects(rig_value, self.effects, parameter, t)
 
     def hold_readings(self, channel: str, values: Array, t: Array) -> Array:
-        """Return the readings of a channel in which each span of a stuck sensor repeats its first reading.
+        """Repeat the first reading of each time span in which a channel is stuck; return all readings of the channel.
 
         `values` (n,): readings of the channel at times `t` (n,) [s] as if it were never stuck.
         """
@@ -223,11 +228,7 @@ class Shape(Protocol):
     """The course of a drift: the change of a parameter since the start of the run, relative or in its SI unit."""
 
     def value_at(self, t: Array) -> Array:
-        """Compute the drift at times t [s], for an array t of any shape.
-
-        The drift is the change of the parameter since the start of the run, where it is 0. It is a fraction of the
-        parameter's value, or in the parameter's SI unit.
-        """
+        """Compute the drift at times t [s], for an array t of any shape; 0 at the start of the run."""
         ...
 
     def breakpoints(self) -> tuple[float, ...]:
@@ -256,12 +257,13 @@ class Wander:
         """Compute the random walk, which is the change of a drifting parameter, at times t [s]; 0 before t = 0."""
         phase = np.pi / self.duration * np.maximum(t, 0.0)
         change = np.asarray(self.slope / np.pi * phase)
-        if self.weights:  # next term by sin(a + phase) = 2 cos(phase) sin(a) - sin(a - phase)
-            term, twice_cosine = np.sin(0.5 * phase), 2.0 * np.cos(phase)
-            previous = -term
+        if self.weights:
+            sine, twice_cosine = np.sin(0.5 * phase), 2.0 * np.cos(phase)  # sin((k - 1/2) phase) for k = 1
+            previous_sine = -sine  # k = 0
             for weight in self.weights:
-                change = change + weight * term
-                previous, term = term, twice_cosine * term - previous
+                change = change + weight * sine
+                # sin(a + phase) = 2 cos(phase) sin(a) - sin(a - phase), with a = (k - 1/2) phase
+                previous_sine, sine = sine, twice_cosine * sine - previous_sine
         return change
 
     def breakpoints(self) -> tuple[float, ...]:
@@ -269,7 +271,7 @@ class Wander:
         return ()
 
     def scale_to_range(self, size: float) -> Wander:
-        """Scale the walk to a range (maximum minus minimum over its duration) of `size`; leave a constant one as is."""
+        """Scale the walk so that its maximum minus minimum over its duration is `size`; keep a constant walk."""
         path = self.value_at(np.linspace(0.0, self.duration, _N_PATH_POINTS))
         path_range = float(np.ptp(path))
         return self.times(size / path_range) if path_range > 0 else self
@@ -289,7 +291,7 @@ def linear_path(size: float, duration: float) -> Wander:
     return Wander((), duration, size)
 
 
-#: Largest change from one block to the next of numbers that drift in their own unit; unlimited for all others.
+#: Largest change from one block to the next of parameters that drift in their own unit; others have no limit.
 _ABSOLUTE_MAX_CHANGES = {"F_l": 0.2}
 
 
@@ -306,10 +308,14 @@ def is_absolute_drift(parameter: str) -> bool:
 class ParameterDrift:
     """A parameter that drifts: value(t) = value (1 + shape(t)), or value + shape(t) in its SI unit if `absolute`.
 
-    "value" is the parameter's value in the rig. `parameter`: bare or dotted name of a parameter of motor, pump, lines,
-    cylinder, friction, oil or make-up; of a sensor's noise, hum, offset, gain or scale error; or `friction` for all
-    friction forces together. `absolute` must be True for offsets, gain and scale errors and the load `F_l`, False for
-    all others. Raises InputError for any other parameter.
+    Here value is the parameter's value in the rig. `parameter` is the bare or dotted name of
+
+    - a parameter of motor, pump, lines, cylinder, friction, oil or make-up;
+    - noise, hum, offset, gain or scale error of a sensor;
+    - or `friction`, for all friction forces together.
+
+    `absolute` must be True for offsets, gain and scale errors and the load `F_l`, else False. Raises InputError for a
+    parameter that cannot drift.
     """
 
     parameter: str
@@ -341,42 +347,40 @@ class ParameterDrift:
             raise InputError(f"a relative drift must stay above -100 %, got {100 * lowest:.4g} % ({self.parameter})")
 
     def effects(self) -> tuple[Effect, ...]:
-        """Build the changes over time by which the drift acts on the compiled model or on an instrument.
+        """Build the changes over time that the drift causes, one for each parameter of instrument or model.
 
-        Each effect changes one parameter. For a drift of an instrument there is one effect, on the instrument's
-        parameter. For a drift of a machine's parameter there is one for each parameter of the model that is derived
-        from it and is proportional to a power of it. An absolute drift is added to these parameters, a relative one
-        is a factor on them.
+        A drift of an instrument changes that parameter of the instrument. A drift of the machine changes every
+        parameter of the compiled model that is proportional to a power of the drifting parameter
+        (`model_parameters_derived_from`).
         """
         breakpoints = self.shape.breakpoints()
 
-        def build_effect(field: str, power: float) -> Effect:
-            """Build the change of the model parameter `field`: factor (1 + drift)^power, or the drift as an addend.
-
-            It is an addend if the drift is absolute.
-            """
+        def build_effect(name: str, power: float) -> Effect:
+            """Build the change of one parameter: the drift is added if absolute, else (1 + drift)^power is a factor."""
             if self.absolute:
-                max_change = _ABSOLUTE_MAX_CHANGES.get(field, math.inf)
-                return Effect(field, self.shape.value_at, max_change, additive=True, breakpoints=breakpoints)
+                max_change = _ABSOLUTE_MAX_CHANGES.get(name, math.inf)
+                return Effect(name, self.shape.value_at, max_change, additive=True, breakpoints=breakpoints)
             return Effect(
-                field, lambda t: (1.0 + self.shape.value_at(t)) ** power, MAX_RELATIVE_CHANGE, breakpoints=breakpoints
+                name, lambda t: (1.0 + self.shape.value_at(t)) ** power, MAX_RELATIVE_CHANGE, breakpoints=breakpoints
             )
 
-        fields = ((self.parameter, 1.0),) if self._is_instrument() else model_parameters_derived_from(self.parameter)
-        return tuple(build_effect(field, power) for field, power in fields)
+        if self._is_instrument():
+            return (build_effect(self.parameter, 1.0),)
+        return tuple(build_effect(name, power) for name, power in model_parameters_derived_from(self.parameter))
 
 
 @cache
 def model_parameters_derived_from(parameter: str) -> tuple[tuple[str, float], ...]:
     """List the model parameters that are proportional to a power of a rig parameter, as (name, exponent).
 
-    `parameter`: dotted name, or a group such as `friction`. Returns () if no model parameter depends on it, or if it
-    cannot drift.
+    `parameter`: dotted name, or a group such as `friction`. Returns () if no model parameter is proportional to a power
+    of the parameter, or if the parameter cannot drift.
     """
     from sealscope.physics.rig import NUMBERS
 
     if parameter in PARAMETER_GROUPS:
-        return tuple(field for name in PARAMETER_GROUPS[parameter] for field in model_parameters_derived_from(name))
+        names = PARAMETER_GROUPS[parameter]
+        return tuple(derived for name in names for derived in model_parameters_derived_from(name))
     if parameter in _POWERS:
         return _POWERS[parameter]
     group, _, symbol = parameter.rpartition(".")

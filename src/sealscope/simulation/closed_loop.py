@@ -1,4 +1,4 @@
-"""A controller around the rig: it samples measurements, and its voltage is constant from one sample to the next."""
+"""A controller in feedback with the rig: it samples measurements, and holds its voltage until its next sample."""
 
 from __future__ import annotations
 
@@ -58,14 +58,14 @@ class Feedback:
         # the voltage of a sample acts from `delay` to `delay + 1` samples later
         target_ahead = target.value_at(t + controller.delay / controller.rate)
         inputs[:-1, 2] = np.diff(np.broadcast_to(target_ahead, t.shape)) * controller.rate
-        random = np.random.default_rng([seed, 2])  # 2: a random stream apart from those of the instruments
+        random = np.random.default_rng([seed, 2])  # 2: not the random numbers of the instruments
         sensors = rig.sensors
         inputs[:-1, 3:] = random.standard_normal((samples, 2)) * (sensors.p_A.noise, sensors.p_B.noise)
         self._inputs = inputs
         min_pressure = rig.fluid.p_vap - P_ATM if rig.fluid.p_vap > 0 else -math.inf
-        theta_count, last_voltage = 2.0 * math.pi / sensors.theta.counts, 0.0
-        # `Loop.numbers`
-        self._loop_numbers = sensors.x.resolution, theta_count, min_pressure, rig.daq.u_max, last_voltage
+        theta_count = 2.0 * math.pi / sensors.theta.counts  # [rad]
+        # `Loop.numbers`; the last is the controller's last voltage, 0 at the start
+        self._loop_numbers = sensors.x.resolution, theta_count, min_pressure, rig.daq.u_max, 0.0
         self.loop: Loop
         self.restart()
 
@@ -83,14 +83,14 @@ class Feedback:
             memory=memory,
             addresses=np.array([self._law.address, memory.ctypes.data, measured.ctypes.data]),
             numbers=np.array(self._loop_numbers),
-            counters=np.array([self._spacing, controller.delay, 0, 0]),  # nothing sampled, nothing reported
+            counters=np.array([self._spacing, controller.delay, 0, 0]),  # 0 samples taken, 0: no flow reported
         )
 
     def raise_failure(self) -> None:
-        """Raise the exception that stopped the controller.
+        """Raise the exception that stopped the run at a sample of the controller.
 
-        It is the controller's own exception if it is written in Python, else SimulationFailed for a voltage that is
-        not finite.
+        If the controller is written in Python and raised an exception, this exception is raised again. Otherwise
+        SimulationFailed states that the voltage is not finite.
         """
         reraise_python_error(self._law)
         t = self._inputs[self.loop.counters[SAMPLED], 0]

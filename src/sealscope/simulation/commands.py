@@ -44,11 +44,13 @@ class Sine:
         return self.offset + self.amplitude * np.sin(self.omega * t + self.phase)
 
     def __str__(self) -> str:
-        phase, offset = (
-            f" {'-' if value < 0 else '+'} {format_number(abs(value))}" if value else ""
-            for value in (self.phase, self.offset)
-        )
+        phase, offset = _format_addend(self.phase), _format_addend(self.offset)
         return f"{format_number(self.amplitude)} sin({format_number(self.omega)}t{phase}){offset}"
+
+
+def _format_addend(value: float) -> str:
+    """Format a number that follows another one in a sum, such as " + 2" or " - 0.5"; return "" for 0."""
+    return f" {'-' if value < 0 else '+'} {format_number(abs(value))}" if value else ""
 
 
 @dataclass(frozen=True)
@@ -113,14 +115,14 @@ class Alternating:
                 raise InputError(f"a duty in turn must be of periods >= 1 of sines from zero, got {periods} of {sine}")
 
     def volts(self, t: Array) -> Array:
-        """Compute the voltage u [V] at times t [s], that of the sine which is active at each time; 0 before t = 0."""
-        lengths = np.array([2.0 * np.pi * periods / sine.omega for periods, sine in self.parts])  # of the parts [s]
-        ends = np.cumsum(lengths)
+        """Compute the voltage u [V] of the sine that is active at each of the times t [s]; 0 before t = 0."""
+        durations = np.array([2.0 * np.pi * periods / sine.omega for periods, sine in self.parts])  # of the parts [s]
+        ends = np.cumsum(durations)
         time_in_cycle = np.mod(t, ends[-1])
         part = np.minimum(np.searchsorted(ends, time_in_cycle, side="right"), ends.size - 1)
         amplitude = np.array([sine.amplitude for _, sine in self.parts])
         omega = np.array([sine.omega for _, sine in self.parts])
-        u = amplitude[part] * np.sin(omega[part] * (time_in_cycle - (ends - lengths)[part]))
+        u = amplitude[part] * np.sin(omega[part] * (time_in_cycle - (ends - durations)[part]))
         return np.asarray(np.where(t >= 0, u, 0.0))
 
     def __str__(self) -> str:
@@ -148,14 +150,11 @@ class Polyline:
         return self.value_at(t)
 
     def breakpoints(self) -> tuple[float, ...]:
-        """Return the times [s] at which the slope changes or the value jumps.
-
-        A table of 1000 points or more has too many of them, and returns ().
-        """
+        """Return the times [s] at which the slope changes or the value jumps; () for 1000 points or more."""
         return tuple(map(float, np.unique(self.t))) if self.t.size < _MAX_BREAKPOINTS else ()
 
     def onset(self) -> float:
-        """Find the time [s] of the last point before the first positive value, where the signal begins to rise above 0.
+        """Find the time [s] at which the signal begins to rise above 0: the last point before the first positive value.
 
         It is 0 if the first value is positive, and infinity if no value is positive.
         """
@@ -166,7 +165,7 @@ class Polyline:
 
     @property
     def rise(self) -> tuple[float, float] | None:
-        """Begin and end [s] of the rise if the signal is one linear rise or jump from 0 to 1, else None."""
+        """Start and stop [s] of the rise if the signal is one linear rise or jump from 0 to 1, else None."""
         return (float(self.t[0]), float(self.t[1])) if self.y.tolist() == [0.0, 1.0] else None
 
     def __eq__(self, other: object) -> bool:
@@ -181,14 +180,12 @@ class Polyline:
         return self.words
 
 
+#: Points from which on a polyline does not list its breakpoints: a run is divided there, and too many would slow it.
 _MAX_BREAKPOINTS = 1000
 
 
 def polyline(points: Sequence[tuple[float, float]], words: str) -> Polyline:
-    """Make the signal that is linear between the points (t [s], y).
-
-    `words`: text of the signal, such as "step 5 at 1 s".
-    """
+    """Make the signal that is linear between the points (t [s], y); `words`: its text, such as "step 5 at 1 s"."""
     t, y = np.array(points, dtype=np.float64).T
     return Polyline(t, y, words)
 
@@ -215,8 +212,8 @@ def ramp(level: float, start: float, stop: float) -> Polyline:
     """Make the command that rises linearly from 0 at `start` [s] to `level` [V] at `stop` [s] and stays there."""
     if not stop > start:
         raise InputError(f"a ramp must stop after it starts, got {start:g} s to {stop:g} s")
-    words = f"ramp {format_number(level)} from {format_number(start)} s to {format_number(stop)} s"
-    return polyline([(start, 0.0), (stop, level)], words)
+    text = f"ramp {format_number(level)} from {format_number(start)} s to {format_number(stop)} s"
+    return polyline([(start, 0.0), (stop, level)], text)
 
 
 @dataclass(frozen=True)
@@ -254,8 +251,8 @@ GOLDEN, MIX, LAST_SHIFT = 0x9E3779B97F4A7C15, ((30, 0xBF58476D1CE4E5B9), (27, 0x
 class PseudoRandom:
     """A pseudo-random binary command: +amplitude or -amplitude [V], drawn anew every `hold` [s] from `seed`.
 
-    The sign in the k-th interval is a bit of SplitMix64 at its k-th state (Steele, Lea, Flood, OOPSLA 2014), which is
-    computed directly, without the earlier states.
+    The sign in the k-th interval is a bit of the generator SplitMix64 (Steele, Lea, Flood, OOPSLA 2014) at its k-th
+    state. This state is computed directly, without the earlier ones.
     """
 
     amplitude: float
@@ -268,13 +265,13 @@ class PseudoRandom:
 
     def volts(self, t: Array) -> Array:
         """Compute the voltage u [V] of the pseudo-random command at times t [s]; 0 before t = 0."""
-        slot = np.clip(np.floor(t / self.hold), 0.0, 2.0**63).astype(np.uint64)
-        start = np.random.SeedSequence(self.seed).generate_state(1, np.uint64)
-        state = start + (slot + np.uint64(1)) * np.uint64(GOLDEN)
+        interval = np.clip(np.floor(t / self.hold), 0.0, 2.0**63).astype(np.uint64)
+        first_state = np.random.SeedSequence(self.seed).generate_state(1, np.uint64)
+        state = first_state + (interval + np.uint64(1)) * np.uint64(GOLDEN)
         for shift, factor in MIX:
             state = (state ^ (state >> np.uint64(shift))) * np.uint64(factor)
         random_bits = state ^ (state >> np.uint64(LAST_SHIFT))
-        signs = np.where(random_bits >> np.uint64(63), 1.0, -1.0)
+        signs = np.where(random_bits >> np.uint64(63), 1.0, -1.0)  # by the highest bit
         return np.where(t >= 0, self.amplitude * signs, 0.0)
 
     def __str__(self) -> str:
@@ -311,13 +308,13 @@ def check_command(command: Command, t: Array, limit: float) -> None:
     beyond the limit.
     """
     for start in range(0, t.size, _CHECK_CHUNK):
-        part = t[start : start + _CHECK_CHUNK]
-        u = command.volts(part)
+        times = t[start : start + _CHECK_CHUNK]
+        u = command.volts(times)
         is_beyond = ~(np.abs(u) <= limit * (1 + 1e-12))  # True for NaN
         if is_beyond.any():
             k = int(np.argmax(is_beyond))
             raise InputError(
-                f"command must stay within +-{limit:g} V, got {u[k]:.4g} V at t = {part[k]:.4g} s ({command})"
+                f"command must stay within +-{limit:g} V, got {u[k]:.4g} V at t = {times[k]:.4g} s ({command})"
             )
 
 
@@ -328,25 +325,26 @@ NUMBER = rf"[-+]?{UNSIGNED}"
 TIME = rf"{UNSIGNED}\s*(?:\[\s*\w+\s*\]|(?:s|ms|min|h)\b)?"
 _N, _T = NUMBER, rf"[-+]?{TIME}"
 _SIGNED = rf"[-+]\s*{UNSIGNED}"
-_FORMS: tuple[tuple[str, Callable[[list[str | None]], Command]], ...] = (
+#: Pattern of each form of a command but sines, and the function that makes the command from the pattern's groups.
+_FORMS: tuple[tuple[str, Callable[..., Command]], ...] = (
     (
         rf"trapezoid\s+({_N})\s*v?\s+within\s+({_T})\s+every\s+({_T})",
-        lambda g: Trapezoid(_parse_number(g[0], 0.0), parse_seconds(g[1]), parse_seconds(g[2])),
+        lambda level, rise, period: Trapezoid(_parse_number(level), parse_seconds(rise), parse_seconds(period)),
     ),
-    (rf"step\s+({_N})\s*v?(?:\s+at\s+({_T}))?", lambda g: step(_parse_number(g[0], 0.0), parse_seconds(g[1]))),
+    (rf"step\s+({_N})\s*v?(?:\s+at\s+({_T}))?", lambda level, start: step(_parse_number(level), parse_seconds(start))),
     (
         rf"ramp\s+({_N})\s*v?\s+(?:from\s+({_T})\s+)?(?:to|over)\s+({_T})",
-        lambda g: ramp(_parse_number(g[0], 0.0), parse_seconds(g[1]), parse_seconds(g[2])),
+        lambda level, start, stop: ramp(_parse_number(level), parse_seconds(start), parse_seconds(stop)),
     ),
     (
         rf"chirp\s+({_N})\s*v?\s+from\s+({_N})\s*(?:hz)?\s+to\s+({_N})\s*(?:hz)?\s+over\s+({_T})",
-        lambda g: Chirp(
-            _parse_number(g[0], 0.0), _parse_number(g[1], 0.0), _parse_number(g[2], 0.0), parse_seconds(g[3])
+        lambda level, f_0, f_1, duration: Chirp(
+            _parse_number(level), _parse_number(f_0), _parse_number(f_1), parse_seconds(duration)
         ),
     ),
     (
         rf"prbs\s+({_N})\s*v?\s+every\s+({_T})(?:\s+seed\s+(\d+))?",
-        lambda g: PseudoRandom(_parse_number(g[0], 0.0), parse_seconds(g[1]), int(g[2] or 0)),
+        lambda level, hold, seed: PseudoRandom(_parse_number(level), parse_seconds(hold), int(seed or 0)),
     ),
 )
 
@@ -356,7 +354,7 @@ def parse_seconds(text: str | None) -> float:
     return 0.0 if text is None else parse_quantity(text.lower(), "s", name="a time")
 
 
-def _parse_number(text: str | None, default: float) -> float:
+def _parse_number(text: str | None, default: float = 0.0) -> float:
     """Parse a number in the text of a command; return `default` for None.
 
     Raises InputError if the number is not finite.
@@ -388,7 +386,7 @@ _SINES = re.compile(rf"\s*([-+])?\s*({_N})?\s*\*?\s*sin\(\s*({_N})?\s*\*?\s*t\s*
 
 
 def _parse_sines(text: str) -> Sine | MultiSine | None:
-    """Parse a sine such as "3 sin(4t)", or a sum of sines; an offset may follow the last.
+    """Parse a sine such as "3 sin(4t)", or a sum of sines, with or without an offset at its end.
 
     Returns None for any other text.
     """
@@ -397,25 +395,25 @@ def _parse_sines(text: str) -> Sine | MultiSine | None:
     while (match := _SINES.match(text, end)) is not None and (match[1] or not parts):
         sign, amplitude, omega, phase = match.groups()
         factor = -1.0 if sign == "-" else 1.0
-        parts.append(Sine(factor * _parse_number(amplitude, 1.0), _parse_number(omega, 1.0), _parse_number(phase, 0.0)))
+        parts.append(Sine(factor * _parse_number(amplitude, 1.0), _parse_number(omega, 1.0), _parse_number(phase)))
         end = match.end()
-    rest = re.fullmatch(rf"\s*({_SIGNED})?\s*v?", text[end:], re.IGNORECASE)
-    if rest is None or not parts:
+    offset = re.fullmatch(rf"\s*({_SIGNED})?\s*v?", text[end:], re.IGNORECASE)
+    if offset is None or not parts:
         return None
-    parts[-1] = replace(parts[-1], offset=_parse_number(rest[1], 0.0))
+    parts[-1] = replace(parts[-1], offset=_parse_number(offset[1]))
     return parts[0] if len(parts) == 1 else MultiSine(tuple(parts))
 
 
 def parse_command(text: str) -> Command:
     """Parse the text of a command, such as "3 sin(4t)", "step 5 at 1 s" or "file LOG" (channel u of a recording).
 
-    Raises InputError, which lists all forms, if the text has none of them.
+    Raises InputError, which lists all forms, if the text has another form.
     """
     stripped = text.strip()
     if stripped.lower().startswith("file "):
         from sealscope.recordings import read
 
-        path = stripped[5:].strip()
+        path = stripped[len("file ") :].strip()
         return recorded_command(read(path), path)
     stripped = normalize_blanks(text, "command")
     if "period" in stripped.lower():
@@ -429,7 +427,7 @@ def parse_command(text: str) -> Command:
     for pattern, make in _FORMS:
         match = re.fullmatch(pattern, stripped, re.IGNORECASE)
         if match:
-            return make(list(match.groups()))
+            return make(*match.groups())
     raise InputError(
         "command must be like '3 sin(4t)', '3 sin(4t) + 1 sin(9t)', '6 periods of 5 sin(2t), 10 periods of 3 sin(4t)' "
         "(in turn, again and again), 'step 5 at 1 s', 'ramp 5 from 1 s to 3 s', 'trapezoid 3 within 1 s every 8 s', "

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 #: Most samples of a recording (about 1.4 GB of channels), so that a wrong unit cannot fill the memory.
 MAX_SAMPLES = 20_000_000
-#: Most steps of the solver in a run: an hour at 3.6 us.
+#: Most steps of the solver in a run, such as an hour at a step of 3.6 us.
 MAX_STEPS = 1_000_000_000
 #: Times at which a drift is checked.
 _N_DRIFT_CHECKS = 2001
@@ -40,10 +40,10 @@ _Kind = TypeVar("_Kind", Leak, Fault)
 
 
 def choose_method(rig: Rig, method: Method) -> Literal["rk4", "imex"]:
-    """Choose the integration method of a rig: the stated one, or for `auto` the one that suits the rig.
+    """Choose the integration method of a rig: `method` as stated, or for `auto` the method that suits the rig.
 
-    That is the implicit-explicit method (imex) for a rig with throttles, else the explicit one (rk4). Raises
-    InputError for a method that does not suit the rig.
+    The implicit-explicit method (imex) suits a rig with throttles, the explicit method (rk4) a rig without. Raises
+    InputError for imex without throttles, for imex with motor.integrator = euler, and for an unknown method.
     """
     if method not in ("auto", "rk4", "imex"):
         raise InputError(f"method must be auto, rk4 or imex, got {method!r}")
@@ -76,8 +76,8 @@ def check_target(target: Position, t: Array, half_stroke: float) -> None:
 def check_circuit(rig: Rig) -> None:
     """Check that a single-rod cylinder in a closed circuit has pilot-operated check valves or a relief valve.
 
-    Its two chambers take up unequal volumes of oil; the difference must leave and enter the circuit through these
-    valves. Raises InputError otherwise.
+    The two chambers of such a cylinder take up unequal volumes of oil; the difference must leave and enter the circuit
+    through these valves. Raises InputError if there are none.
     """
     cylinder, makeup = rig.cylinder, rig.makeup
     if not rig.circuit.pump_feeds_chambers:
@@ -195,10 +195,10 @@ class Experiment:
         quantities: dict[str, Any] = {}  # in SI units, by argument
         for declared in fields(arguments):
             value, unit = getattr(arguments, declared.name), declared.metadata["unit"]
-            if unit and value is not declared.default:
-                value = parse_quantity(value, unit, name=declared.name, finite=False)
-            if unit:
+            if unit and value is declared.default:  # may be None
                 quantities[declared.name] = value
+            elif unit:
+                quantities[declared.name] = parse_quantity(value, unit, name=declared.name, finite=False)
         rate = quantities.pop("rate")
         if not isinstance(arguments.set, Mapping | None):
             raise InputError(f"set must map names of parameters to values, got {arguments.set!r}")
@@ -275,10 +275,7 @@ class Experiment:
         return self.controller or PositionPI.from_rig(self.rig)
 
     def effects(self) -> tuple[Effect, ...]:
-        """Collect the changes of the machine's parameters over time by drifts and faults.
-
-        Those of the instruments are in `readings`.
-        """
+        """Collect the changes over time of the machine's parameters (not the instruments') by drifts and faults."""
         return tuple(effect for effect in self._all_effects() if not effect.changes_instrument)
 
     def _all_effects(self) -> tuple[Effect, ...]:
@@ -287,11 +284,10 @@ class Experiment:
         return (*drift_effects, *(effect for fault in self.faults for effect in fault.effects(self.rig)))
 
     def scale_with_viscosity(self, leaks: tuple[Leak, ...]) -> tuple[Leak, ...]:
-        """Return leaks that open further as the oil gets thinner: warmer oil leaks more through a laminar gap.
+        """Let laminar leaks grow as a fault warms the oil: divide their openings by the oil's viscosity over time.
 
-        The openings of laminar leaks are divided by the oil's relative viscosity over time. The leaks' coefficients
-        hold at the viscosity of the rig's oil temperature. Without a fault of the oil's temperature the leaks are
-        returned unchanged.
+        The viscosity is relative to that at the rig's oil temperature, for which the leaks' coefficients hold. Returns
+        all leaks; they are unchanged if there is no fault of the oil's temperature.
         """
         for fault in self.faults:
             if (viscosity := fault.viscosity_ratio(self.rig)) is not None:
@@ -330,12 +326,12 @@ class Experiment:
 
     def onset(self) -> float | None:
         """Compute the time [s] at which the first leak opens; None if no leak opens within the run."""
-        onsets = [leak.opening.onset() for leak in self.leaks if (leak.mean or leak.coefficient or 0.0) > 0]
-        onsets = [onset for onset in onsets if onset < self.duration]
+        sized_leaks = [leak for leak in self.leaks if (leak.mean or leak.coefficient or 0.0) > 0]
+        onsets = [onset for leak in sized_leaks if (onset := leak.opening.onset()) < self.duration]
         return max(0.0, min(onsets)) if onsets else None
 
     def describe(self) -> dict[str, Any]:
-        """Describe the experiment by a dict of plain values, which the recording keeps as its provenance.
+        """Describe the experiment by plain values, which the recording keeps in its provenance.
 
         Leaks, faults and drifts are left out, because a diagnosis must find them by itself.
         """
@@ -367,13 +363,14 @@ class Experiment:
 def identity_values(value: Any) -> Any:
     """Convert a command, leak or other object to plain values that are equal only for equal objects.
 
-    An array becomes a hash of its bytes, a dataclass a list of its name and its fields' values, any other object its
-    `repr`.
+    - An array becomes a hash of its bytes.
+    - A dataclass becomes a list of its name and its fields' values, converted in the same way.
+    - Any other object becomes its `repr`.
     """
     if isinstance(value, np.ndarray):
         return hashlib.sha256(np.ascontiguousarray(value, dtype=np.float64).tobytes()).hexdigest()
     if is_dataclass(value):
-        return [type(value).__name__, *(identity_values(getattr(value, part.name)) for part in fields(value))]
+        return [type(value).__name__, *(identity_values(getattr(value, declared.name)) for declared in fields(value))]
     return repr(value)
 
 
@@ -382,10 +379,13 @@ def _parse_several(
 ) -> tuple[_Kind, ...]:
     """Parse an argument that states one or several leaks or faults.
 
-    The argument is a text, an object of the class `kind`, or an iterable of these; None gives an empty tuple. `parse`
-    parses one text, `name` is the argument's name in messages. Raises InputError for anything else.
+    `argument`: a text, an object of the class `kind`, or an iterable of these; None gives an empty tuple. `parse`:
+    function that parses one text, and returns None for a text such as ``none``, which is left out; `name`: name of the
+    argument in messages. Raises InputError for any other argument.
     """
-    items = [] if argument is None else [argument] if isinstance(argument, (str, kind)) else argument
+    if argument is None:
+        return ()
+    items = [argument] if isinstance(argument, (str, kind)) else argument
     if not isinstance(items, Iterable):
         raise InputError(f"{name} must be a text, a {kind.__name__} or several of them, got {argument!r}")
     result = []

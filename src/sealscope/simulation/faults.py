@@ -63,9 +63,9 @@ def _parse_number(text: str | None) -> float:
 
 @dataclass(frozen=True)
 class FaultRow:
-    """One kind of fault as an entry of `faults.toml` describes it: the pattern of its text, and its effects.
+    """An entry of `faults.toml`, which describes a kind of fault: the pattern of its text, and its effects.
 
-    The comment at the head of that file explains the fields.
+    The comment at the head of `faults.toml` explains the fields.
     """
 
     name: str
@@ -100,14 +100,14 @@ class FaultRow:
         channel_or_side = groups.get("at") or ""
         if not self.is_sensor_fault:
             channel_or_side = channel_or_side.upper()  # side A or B
-        frequency_factor = _parse_number(groups.get("pace") or "1")
+        frequency_factor = _parse_number(groups.get("pace") or "1")  # only a fault of the duty states one
         return Fault(self.name, self._parse_value(groups), channel_or_side, parse_opening(groups), frequency_factor)
 
     def _parse_value(self, groups: Groups) -> float:
         """Read the size of a fault from the named groups of its matched text.
 
-        A number with a unit is converted to SI units. "x3" and "+20 %" are factors, 3 and 1.2; "1 %" of a gain or of
-        air is a fraction, 0.01. Without a number the result is 1 for a fault stated by a factor, else 0.
+        A number with a unit is converted to SI units. "x3" gives the factor 3, "+20 %" the factor 1.2, and "1 %" of a
+        gain or of air the fraction 0.01. Without a number the result is 1 for a fault stated by a factor, else 0.
         """
         if groups.get("size") is not None:
             unit = CHANNEL_UNITS.get(groups["at"] or "", "Pa") if self.is_sensor_fault else self.unit
@@ -115,7 +115,7 @@ class FaultRow:
         if groups.get("percent") is not None:
             return 1.0 + _parse_number(groups["percent"]) / 100.0
         if groups.get("share") is not None:
-            return _parse_number(groups["share"]) / (100.0 if groups["sign"] else 1.0)  # in % or a fraction
+            return _parse_number(groups["share"]) / (100.0 if groups["sign"] else 1.0)  # `sign`: a % after the number
         return _parse_number(groups.get("times") or groups.get("value") or ("1" if self.factor else "0"))
 
 
@@ -123,10 +123,10 @@ class FaultRow:
 class Fault:
     """A fault of machine, sensor or duty (the commanded motion) other than a leak across the piston.
 
-    `name`: name of its kind, a key of `FAULTS`; `value`: a factor on the faulty parameter, or an addend in SI units;
-    `at`: side (A or B) or channel that is faulty, "" if there is nothing to choose; `opening`: extent of the fault over
-    time, 0 (healthy) to 1 (full size); `frequency_factor`: factor on the frequency of the command. `str` gives the text
-    that `parse_fault` reads.
+    `name`: its key in `FAULTS`; `value`: a factor on the faulty parameter, or an addend in SI units; `at`: side (A or
+    B) or channel that is faulty, "" for faults with neither; `opening`: extent of the fault over time, 0 (healthy) to 1
+    (full size); `frequency_factor`: factor on the frequency of the command. `str` gives the text that `parse_fault`
+    reads.
     """
 
     name: str
@@ -136,14 +136,11 @@ class Fault:
     frequency_factor: float = 1.0
 
     def __post_init__(self) -> None:
-        """Check side or channel, value, frequency factor and opening against the rules for this kind of fault.
-
-        Raises InputError if one of them breaks a rule.
-        """
+        """Raise InputError if side, channel, value, frequency factor or opening break a rule of this kind of fault."""
         row = self.row
         if row.is_sensor_fault and self.at not in GAIN_PARAMETERS:
             raise InputError(f"a faulty sensor must be one of {', '.join(GAIN_PARAMETERS)}, got {self.at!r}")
-        has_side = not row.is_sensor_fault and "{at}" in row.words  # its text names the side
+        has_side = not row.is_sensor_fault and "{at}" in row.words  # the text of such a fault names the side
         if has_side and self.at not in ("A", "B"):
             raise InputError(f"a {self.name} must be A or B, got {self.at!r}")
         if not (math.isfinite(self.value) and row.least <= self.value <= row.most):
@@ -170,7 +167,9 @@ class Fault:
     def effects(self, rig: Rig) -> tuple[Effect, ...]:
         """Build the changes of the machine's or a sensor's parameters over time that the fault causes.
 
-        Raises InputError if this rig cannot have the fault, because a part is absent or a needed parameter is 0.
+        The fault multiplies each of `row.parameters` or adds to it, in proportion to its opening; without parameters,
+        as for the duty, the result is (). Shut-off valves and the oil's temperature have functions of their own
+        (`_EFFECTS`). Raises InputError if this rig cannot have the fault: a part is absent, or a needed parameter is 0.
         """
         row = self.row
         if row.needs is not None:
@@ -180,12 +179,11 @@ class Fault:
         if self.name in _EFFECTS:
             return _EFFECTS[self.name](self, rig)
         if row.factor:
-            size = self.value - 1.0
+            healthy, size = 1.0, self.value - 1.0
             max_change = FAULT_MAX_CHANGE * max(abs(size), 1e-3)  # above 0 for a factor of 1
         else:
-            size = float(rig[row.adds]) if row.adds else self.value / (float(rig[row.over]) if row.over else 1.0)
+            healthy, size = 0.0, self._addend(rig)
             max_change = FAULT_MAX_CHANGE * size or math.inf
-        healthy = 1.0 if row.factor else 0.0
         return tuple(
             Effect(
                 name.format(at=self.at, gain=GAIN_PARAMETERS.get(self.at)),
@@ -198,23 +196,33 @@ class Fault:
             for name in row.parameters
         )
 
+    def _addend(self, rig: Rig) -> float:
+        """Compute the number that the fault at full size adds to its parameters.
+
+        It is the rig's parameter `row.adds`, or else the fault's value, divided by the rig's parameter `row.over` if
+        the row states one.
+        """
+        if self.row.adds:
+            return float(rig[self.row.adds])
+        return self.value / float(rig[self.row.over]) if self.row.over else self.value
+
     def holds(self) -> tuple[Hold, ...]:
-        """List the time spans over which a stuck sensor repeats its reading; empty for any other fault."""
+        """Return the time span over which a stuck sensor repeats its reading, in a tuple; () for any other fault."""
         if self.name != "sensor stuck":
             return ()
-        stop = math.inf if self.opening.y[-1] > 0 else float(self.opening.t[-1])
+        stop = math.inf if self.opening.y[-1] > 0 else float(self.opening.t[-1])  # infinite if the fault never ends
         return (Hold(self.at, self.onset(), stop),)
 
     def change_command(self, command: Command) -> Command:
-        """Return the command with the changes of amplitude and frequency over time by this fault.
+        """Apply the fault to a command, and return the result.
 
-        Only a fault of the duty (the commanded motion) changes the command; for any other fault it is returned
-        unchanged.
+        A fault of the duty (the commanded motion) changes the command's amplitude and frequency over time. For any
+        other fault the command is returned unchanged.
         """
         return ChangedDuty(command, self) if self.name == "duty" else command
 
     def viscosity_ratio(self, rig: Rig) -> Callable[[Array], Array] | None:
-        """Build a function of times [s] that computes the oil's dynamic viscosity relative to the rig's.
+        """Build a function of times [s] that computes the oil's dynamic viscosity over that at the rig's temperature.
 
         Returns None unless this is a fault of the oil's temperature.
         """
@@ -242,16 +250,16 @@ class Fault:
 
     def __str__(self) -> str:
         """Format the fault as the text that `parse_fault` reads."""
-        words = self.row.words
+        template = self.row.words
         if self.name == "duty":
             changes_frequency = self.frequency_factor != 1.0
-            words = "duty amplitude x{value}" if self.value != 1.0 or not changes_frequency else "duty"
-            words += f" frequency x{format_number(self.frequency_factor)}" if changes_frequency else ""
-        value, lpm = format_number(self.value), self.value / LITRE_PER_MINUTE
-        percent, signed = format_number(100.0 * self.value), f"{self.value:+.12g}"
+            template = "duty amplitude x{value}" if self.value != 1.0 or not changes_frequency else "duty"
+            template += f" frequency x{format_number(self.frequency_factor)}" if changes_frequency else ""
+        value, percent = format_number(self.value), format_number(100.0 * self.value)
+        signed, lpm = f"{self.value:+.12g}", self.value / LITRE_PER_MINUTE
         unit = CHANNEL_UNITS.get(self.at)
-        words = words.format(at=self.at, value=value, lpm=lpm, unit=unit, percent=percent, signed=signed)
-        return f"{words} {self.opening}"
+        text = template.format(at=self.at, value=value, lpm=lpm, unit=unit, percent=percent, signed=signed)
+        return f"{text} {self.opening}"
 
 
 @dataclass(frozen=True)
@@ -265,12 +273,12 @@ class ChangedDuty:
     change: Fault
 
     def original_time(self, t: Array) -> Array:
-        """Compute the times [s] at which to evaluate the original command for a changed frequency.
+        """Compute the times [s] at which to evaluate the original command, so that its frequency changes smoothly.
 
-        They are t + (factor - 1) times the integral of the fault's opening up to t. The factor is the one on the
-        frequency, and the opening is the extent of the fault over time, 0 to 1.
+        They are t + (frequency_factor - 1) times the integral of the fault's opening up to t. The opening is the extent
+        of the fault over time, 0 to 1.
         """
-        start, stop = self.change.opening.rise or (math.inf, math.inf)
+        start, stop = self.change.opening.rise or (math.inf, math.inf)  # a fault of the duty always has a rise
         opening_integral = np.maximum(t - start, 0.0)
         if stop > start:
             ramp_time = np.minimum(opening_integral, stop - start)
@@ -289,8 +297,8 @@ class ChangedDuty:
 def _shut_off_effects(fault: Fault, rig: Rig) -> tuple[Effect, ...]:
     """Build the effects of opening or closing a shut-off valve within a run.
 
-    The effects change the two flow coefficients of the throttle in the valve's line. Raises InputError for a rig
-    without throttles in its lines.
+    The line has one flow coefficient for each flow direction, and each effect changes one of them. Raises InputError
+    for a rig without throttles in its lines.
     """
     from sealscope.physics.restrictors import orifice_coefficient, series_coefficient
     from sealscope.physics.rig import throttle_coefficients
@@ -298,7 +306,7 @@ def _shut_off_effects(fault: Fault, rig: Rig) -> tuple[Effect, ...]:
     line = rig.line
     if line.orifices == "absent":
         raise InputError(f"a shut-off valve must be in a line (line.orifices = present), got absent ({fault})")
-    c_line = orifice_coefficient(line.C_d, math.pi / 4.0 * line.d_line**2, rig.fluid.rho)
+    c_line = orifice_coefficient(line.C_d, math.pi / 4.0 * line.d_line**2, rig.fluid.rho)  # of the full cross-section
     open_coefficients = throttle_coefficients(rig.with_overrides({"line.open_A": 1.0, "line.open_B": 1.0}))
     initial_opening = line.open_A if fault.at == "A" else line.open_B
 
@@ -314,7 +322,7 @@ def _shut_off_effects(fault: Fault, rig: Rig) -> tuple[Effect, ...]:
             opening = initial_opening + (fault.value - initial_opening) * fault.opening.value_at(t)
             return np.asarray(np.where(opening >= 1.0, c_open, series_coefficient(c_open, c_line, opening)) - c_initial)
 
-        max_change = 1e-6 * c_open  # a block for each output while the valve moves
+        max_change = 1e-6 * c_open  # so small that each solver output is a block while the valve moves
         return Effect(
             name, change, max_change, additive=True, breakpoints=fault.opening.breakpoints(), min_block=_VALVE_BLOCK
         )
@@ -326,9 +334,10 @@ def _shut_off_effects(fault: Fault, rig: Rig) -> tuple[Effect, ...]:
 def _oil_temperature_effects(fault: Fault, rig: Rig) -> tuple[Effect, ...]:
     """Build the changes of the model's parameters over time that a fault of the oil's temperature causes.
 
-    Viscous friction and filter resistances are proportional to the oil's viscosity, the conductances of the leaks of
-    pump and rod seals to 1/viscosity. Bulk modulus and density depend on the temperature, and parameters that contain
-    the density change with it.
+    - Viscous friction and filter resistances are proportional to the oil's viscosity.
+    - The conductances of the leaks of pump and rod seals are proportional to 1/viscosity.
+    - The bulk modulus depends on the temperature.
+    - Parameters that contain the oil's density are proportional to a power of it.
     """
     from sealscope.physics.fluid import thermal_density_ratio, thermal_stiffness_ratio
 
@@ -354,7 +363,7 @@ def _oil_temperature_effects(fault: Fault, rig: Rig) -> tuple[Effect, ...]:
     )
 
 
-#: Faults whose effects do not follow from the parameters in their row.
+#: Functions that build the effects of faults that do not simply multiply or add to the parameters in their row.
 _EFFECTS = {"shut-off": _shut_off_effects, "oil": _oil_temperature_effects}
 #: The kinds of faults, by name.
 FAULTS: Mapping[str, FaultRow] = {
@@ -366,8 +375,8 @@ FAULTS: Mapping[str, FaultRow] = {
 def parse_fault(text: str) -> Fault | None:
     """Parse the text of a fault, such as "pump leak x3 from 90 s"; return None for ``none``.
 
-    The flow stated for a leaking rod seal is that at the charge pressure. Operations of the rig, such as
-    `circulation`, are stated in the same way. Raises InputError, which lists the forms, if the text has none of them.
+    The flow stated for a leaking rod seal is the one at the charge pressure. Operations of the rig, such as
+    `circulation`, are stated in the same way. Raises InputError, which lists the forms, if the text has another form.
     """
     stripped = normalize_blanks(text, "fault")
     if stripped.lower() in ("none", "no fault"):

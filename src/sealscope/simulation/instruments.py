@@ -44,7 +44,8 @@ def anti_alias_taps(factor: int, delay: float = 0.0) -> Array:
     reach = FILTER_REACH * factor
     offsets = np.arange(-reach, reach + 1) + delay
     window = np.i0(_KAISER_BETA * np.sqrt(np.maximum(0.0, 1.0 - (offsets / reach) ** 2))) / np.i0(_KAISER_BETA)
-    taps = np.sinc((_CUTOFF_FRACTION / factor if factor > 1 else 1.0) * offsets) * window
+    cutoff = _CUTOFF_FRACTION / factor if factor > 1 else 1.0  # relative to the signal's Nyquist frequency
+    taps = np.sinc(cutoff * offsets) * window
     return np.asarray(taps / taps.sum())
 
 
@@ -60,7 +61,7 @@ def decimate(values: Array, factor: int, n: int, delay: float = 0.0) -> Array:
     reach = FILTER_REACH * factor
     whole_delay = math.floor(delay)
     taps = anti_alias_taps(factor, delay - whole_delay)
-    if taps.size == 1:  # unfiltered, delayed by whole samples
+    if taps.size == 1:  # not filtered, only delayed by whole samples: the same filter with the usual length
         taps = np.r_[np.zeros(reach), 1.0, np.zeros(reach)]
     padded = np.concatenate([np.full(reach + whole_delay, values[0]), values])
     windows = np.lib.stride_tricks.sliding_window_view(padded, taps.size)[::factor]
@@ -94,8 +95,8 @@ def sample_with_jitter(sample: Callable[[Array], Array], values: Array, lateness
     center = sample(values)
     if lateness is None:
         return center
-    before, after = sample(np.r_[values[:1], values[:-1]]), sample(np.r_[values[1:], values[-1:]])
-    return np.asarray(center + 0.5 * lateness * (after - before) + 0.5 * lateness**2 * (after - 2.0 * center + before))
+    left, right = sample(np.r_[values[:1], values[:-1]]), sample(np.r_[values[1:], values[-1:]])  # one value off
+    return np.asarray(center + 0.5 * lateness * (right - left) + 0.5 * lateness**2 * (right - 2.0 * center + left))
 
 
 def volts_per_pascal(sensor: PressureTransducer, daq: Daq) -> float:
@@ -108,7 +109,8 @@ def digitize(pressure: Array, sensor: PressureTransducer, daq: Daq) -> Array:
 
     The transducer saturates at the ends of its range.
     """
-    sensitivity, saturated = volts_per_pascal(sensor, daq), np.clip(pressure, sensor.range_lo, sensor.range_hi)
+    sensitivity = volts_per_pascal(sensor, daq)
+    saturated = np.clip(pressure, sensor.range_lo, sensor.range_hi)
     volts = daq.sensor_volts_lo + (saturated - sensor.range_lo) * sensitivity
     n_positive_codes = 2 ** (daq.bits - 1)
     codes = np.clip(np.rint(volts / daq.step), -n_positive_codes, n_positive_codes - 1)
@@ -126,9 +128,15 @@ def read_pressure(
 ) -> Array:
     """Compute the readings [Pa] of one pressure channel from the filtered `pressure` [Pa] at `rate` [Hz].
 
-    Applied in this order: gain; offset, drift, hum, noise of the channel and `common_noise` [Pa], added; saturation;
-    conversion to digits; stuck samples, which repeat a reading; and lost samples, which are NaN. `parameter(symbol,
-    value)` returns a parameter of the sensor over time, which may change within the run, from its `value` in the rig.
+    These errors are applied in turn:
+
+    1. gain;
+    2. offset, drift, mains hum, noise of the channel, and noise of all channels (`common_noise` [Pa]), all added;
+    3. saturation and conversion to digits (`digitize`);
+    4. stuck samples, which repeat a reading, and lost samples, which are NaN.
+
+    `parameter(symbol, value)` computes a parameter of the sensor over time from its `value` in the rig; it may change
+    within the run.
     """
     n = pressure.size
     t = np.arange(n) / rate
@@ -137,7 +145,8 @@ def read_pressure(
     noise = parameter("noise", sensor.noise) * random.standard_normal(n)
     if sensor.hum_harmonics > 0:
         hum = hum + parameter("hum", sensor.hum) * _hum_harmonics(sensor, t, random)
-    gain, offset = 1.0 + parameter("gain_error", sensor.gain_error), parameter("offset", sensor.offset)
+    gain = 1.0 + parameter("gain_error", sensor.gain_error)
+    offset = parameter("offset", sensor.offset)
     readings = digitize(gain * pressure + offset + drift + hum + noise + common_noise, sensor, daq)
     if sensor.stuck_rate > 0:  # a reading is stuck for a second on average
         for start in np.flatnonzero(random.random(n) < sensor.stuck_rate / rate):
@@ -149,8 +158,8 @@ def read_pressure(
 def _hum_harmonics(sensor: PressureTransducer, t: Array, random: np.random.Generator) -> Array:
     """Compute the sum of the harmonics 2 to `HUM_HARMONICS` of a mains hum at times t [s].
 
-    It is relative to the amplitude of the fundamental, harmonic 1. Each harmonic has a random phase and
-    `sensor.hum_harmonics` times the amplitude of the one before.
+    The sum is relative to the amplitude of the fundamental, which is harmonic 1. Each harmonic has a random phase and
+    `sensor.hum_harmonics` times the amplitude of the harmonic before it.
     """
     orders = np.arange(2, HUM_HARMONICS + 1)
     phases = random.random(orders.size)
@@ -169,11 +178,12 @@ def record(
     """Record a simulated run with the rig's instruments.
 
     `trajectory` has `factor` outputs per sample and continues for FILTER_REACH samples after the end of the
-    recording; `u` (n,): command [V] at the samples; `readings`: changes of the instruments within the run. The analog
-    channels (pressures, flow meter) pass the anti-alias filter; the encoders are read at the instant. The clock of
-    all channels but the command may jitter. Each channel has its own random numbers, drawn from `seed`, so that its
-    noise does not depend on the settings of other channels. The motor of a valve-controlled rig, which drives the
-    supply, has no encoder: its angle and speed are not recorded.
+    recording; `u` (n,): command [V] at the samples; `readings`: changes of the instruments within the run.
+
+    The analog channels (pressures, flow meter) pass the anti-alias filter; the encoders are read without a filter. The
+    clock of all channels but the command may jitter. Each channel has its own random numbers, drawn from `seed`, so
+    that its noise does not depend on the settings of other channels. In a valve-controlled rig the motor drives the
+    supply and has no encoder: its angle and speed are not recorded.
     """
     n = u.size
     rate = rig.daq.sample_rate

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from sealscope.parameters import Rig
     from sealscope.physics.rig import RigNumbers
 
+#: Called with the simulated time reached [s].
 Progress = Callable[[float], None]
 #: Step [s] that suits the thesis's rig: error in p_A under 10 Pa rms (docs/decisions/0004-solvers.md).
 DEFAULT_STEP = {"rk4": 5e-4, "imex": 1e-3}
@@ -47,8 +48,11 @@ SAFETY = 1.2
 #: Lengths [s] of the first window and of the later ones, and the starts of these as fractions of the run.
 FIRST_WINDOW, LATER_WINDOW = 2.0, 1.0
 LATER_STARTS = (0.5, 0.9)
+#: Levels of the wavelet details that are compared.
 LEVELS = 4
+#: Most solver steps for which the inputs are computed at once, which bounds the memory.
 _BLOCK_STEPS = 4096
+#: Solver outputs per recorded sample that suffice for the anti-alias filter.
 _OVERSAMPLING = 4
 
 
@@ -58,8 +62,8 @@ class Trajectory:
 
     `OUTPUTS` are the names in `physics.state`, by which `trajectory[name]` gives one output (n,). `method`: rk4 or
     imex; `step` [s]: the solver's step; `error`: estimated rms error [Pa] of the pressures, NaN if it was not
-    checked. Under a controller, `volts` (n,) are its voltages [V] and `compensated` (n,) is the leakage flow [m^3/s]
-    that it compensates, None if it reports none; without a controller both are None.
+    checked. `volts` (n,): voltages [V] of the controller, None without a controller; `compensated` (n,): leakage flow
+    [m^3/s] that the controller compensates, None without a controller or if the controller does not report this flow.
     """
 
     t: Array
@@ -89,16 +93,16 @@ class RunInputs:
         `leaks` replace those of the experiment; their leakage coefficients must be known.
         """
         self._leaks = experiment.scale_with_viscosity(leaks)
-        # under a target the voltage is that of the controller (`Feedback`), and this command is not used
-        self._command = experiment.voltage_command if experiment.target is None else Sine(0.0, 0.0)
+        # under a target the controller sets the voltage (`Feedback`), and this command is not used
+        self._command = experiment.voltage_command if experiment.target is None else Sine(amplitude=0.0, omega=0.0)
         self._duration, self._limit = experiment.duration, experiment.rig.daq.u_max
 
     def at_nodes(self, start: Array, offsets: Array) -> tuple[Array, Array, Array]:
-        """Compute the voltage command and the leakage coefficients at all times that some steps of the solver need.
+        """Compute the voltage command and the leakage coefficients at the nodes of some solver steps.
 
-        Returns the command [V], G [m^3/(s Pa)] and C [m^3/(s Pa^0.5)], each (steps, nodes), at the times start[:,
-        None] + offsets [s]. `start` (steps,): beginnings of the steps; `offsets` (nodes,): times within a step.
-        Raises InputError for a command beyond its limit.
+        The nodes are the times `offsets` (nodes,) [s] after the beginning of a step at which the solver needs its
+        inputs. `start` (steps,): beginnings of the steps [s]. Returns the command [V], G [m^3/(s Pa)] and C [m^3/(s
+        Pa^0.5)], each (steps, nodes). Raises InputError for a command beyond the converter's limit.
         """
         t = start[:, None] + offsets
         return self._check_and_clip(self._command.volts(t), t), *self._leakage(t)
@@ -119,18 +123,21 @@ class RunInputs:
         t.
         """
         G, C = np.zeros(t.shape), np.zeros(t.shape)
+        latest = t.max(initial=-math.inf)
         for leak in self._leaks:
-            if not leak.coefficient or t.max(initial=-math.inf) < leak.opening.onset():
-                continue
-            coefficient = leak.coefficient * leak.opening.value_at(t)
-            G, C = (G + coefficient, C) if leak.law == "laminar" else (G, C + coefficient)
+            if leak.coefficient and latest >= leak.opening.onset():  # else the leak is shut at all these times
+                coefficient = leak.coefficient * leak.opening.value_at(t)
+                if leak.law == "laminar":
+                    G = G + coefficient
+                else:
+                    C = C + coefficient
         return G, C
 
     def _check_and_clip(self, u: Array, t: Array) -> Array:
-        """Check that the command `u` [V] at the times `t` [s] stays within its limit, and return it clipped.
+        """Clip the command `u` [V] at the times `t` [s] to the limit of the converter.
 
-        Raises InputError if the command exceeds the limit within the run. Values after the end of the run are only
-        clipped: the solver continues beyond the end because the anti-alias filter looks ahead.
+        Raises InputError for a value beyond the limit within the duration of the run. Only later values are clipped:
+        the solver continues after the end because the anti-alias filter looks ahead.
         """
         if np.abs(u).max(initial=0.0) <= self._limit:
             return u
@@ -161,7 +168,7 @@ def oversampling_of(rate: float, step: float) -> int:
 
 def steps_per_output(rate: float, step: float) -> int:
     """Compute the fewest solver steps between two outputs at `rate` [Hz] for which none is longer than `step` [s]."""
-    return max(1, math.ceil(1.0 / (rate * step) * (1.0 - 1e-9)))
+    return max(1, math.ceil(1.0 / (rate * step) * (1.0 - 1e-9)))  # 1e-9: a quotient just above a whole number is whole
 
 
 def integrate_run(
@@ -175,13 +182,19 @@ def integrate_run(
 ) -> Trajectory:
     """Integrate an experiment from standstill, with outputs at the rate that its instruments need.
 
-    `leaks`, all with coefficients, replace those of the experiment. `step` [s], `error` [Pa] and `duration` [s]
-    replace the experiment's unless None; the error of a `step` stated here is not checked. The default duration is
-    that of the recording plus the reach of the anti-alias filter. `progress` is called with the time reached [s].
+    `leaks`, all with coefficients, replace those of the experiment. `step` [s] and `error` [Pa] replace those of the
+    experiment unless None; with a `step` stated here the error is not checked. `duration` [s]: length of the run, by
+    default that of the recording plus the reach of the anti-alias filter. `progress` is called with the time reached
+    [s].
     """
     if duration is None:
         duration = (round(experiment.duration * experiment.rate) + FILTER_REACH) / experiment.rate
-    rate, feedback = experiment.rate * oversampling(experiment), None
+    if step is not None:
+        error = None  # not checked
+    elif error is None:
+        error = experiment.error_allowed
+    rate = experiment.rate * oversampling(experiment)
+    feedback = None
     target, controller = experiment.target, experiment.active_controller
     if target is not None and controller is not None:
         feedback = Feedback(experiment.rig, target, controller, duration=duration, rate=rate, seed=experiment.seed)
@@ -195,26 +208,24 @@ def integrate_run(
         x_0=experiment.x_0,
         method=experiment.method,
         step=step or experiment.step,
-        error=(experiment.error_allowed if error is None else error) if step is None else None,
+        error=error,
         allow_unresolved=experiment.allow_unresolved,
         progress=progress,
         effects=experiment.effects(),
     )
 
 
-def _without_mean_leaks(leaks: Sequence[Leak]) -> tuple[Leak, ...]:
-    """Replace the leaks of which a mean flow is stated by leaks with the coefficient 0; return all leaks.
-
-    The search for their coefficients starts at 0.
-    """
+def _start_of_search(leaks: Sequence[Leak]) -> tuple[Leak, ...]:
+    """Return the leaks with the coefficient 0, where the search for it starts, in place of each stated mean flow."""
     return tuple(leak if leak.mean is None else replace(leak, mean=None, coefficient=0.0) for leak in leaks)
 
 
 def solve_leak_coefficients(experiment: Experiment) -> tuple[Leak, ...]:
     """Find the leakage coefficients that give the stated mean flows; return the leaks of the experiment with them."""
     if not any(leak.mean for leak in experiment.leaks):
-        return _without_mean_leaks(experiment.leaks)
-    return run_with_sized_leaks(experiment)[0]
+        return _start_of_search(experiment.leaks)
+    leaks, _ = run_with_sized_leaks(experiment)
+    return leaks
 
 
 def run_with_sized_leaks(
@@ -232,7 +243,7 @@ def run_with_sized_leaks(
     SimulationFailed if the search does not converge.
     """
     leaks, dp_0 = experiment.leaks, experiment.rig.line.dp_0
-    initial_leaks = _without_mean_leaks(leaks)
+    initial_leaks = _start_of_search(leaks)
     if not any(leak.mean for leak in leaks):
         return initial_leaks, integrate_run(experiment, initial_leaks, progress=report_time)
     is_first_run = True
@@ -240,8 +251,8 @@ def run_with_sized_leaks(
     def measure(coefficients: Array) -> tuple[Array, tuple[tuple[Leak, ...], Trajectory]]:
         """Simulate the n leaks with `coefficients` (n,), and compute each leak's mean flow per unit of coefficient.
 
-        Returns the mean flows [m^3/s] (n,) that leaks with the coefficient 1 would have under the pressures of this
-        run, 0 for leaks without a stated mean flow. Also returns the pair of leaks with `coefficients` and trajectory.
+        Returns the mean flows (n,) [m^3/s] that leaks with the coefficient 1 would have under the pressures of this
+        run, 0 for leaks without a stated mean flow; and the simulated leaks with their trajectory.
         """
         nonlocal is_first_run
         pairs = zip(initial_leaks, coefficients, strict=True)
@@ -266,7 +277,8 @@ def run_with_sized_leaks(
         return unit_flows, (sized_leaks, run)
 
     coefficients = np.array([leak.coefficient or 0.0 for leak in initial_leaks])
-    return size_leaks(leaks, coefficients, measure, progress)[1]
+    _, leaks_and_run = size_leaks(leaks, coefficients, measure, progress)
+    return leaks_and_run
 
 
 def integrate(
@@ -288,22 +300,26 @@ def integrate(
     """Integrate a rig from standstill over `duration` [s], with outputs at `rate` [Hz].
 
     `inputs`: command and leakage; `x_0` [m]: position at the start; `load`: in addition to the rig's own; `feedback`:
-    a controller whose voltage replaces the command; `effects`: changes of the rig's numbers within the run
+    a controller whose voltage replaces the command; `effects`: changes of the model's parameters within the run
     (`Schedule`); `progress` is called with the time reached [s].
 
-    A stated `step` [s] is rounded down to a divisor of the output interval. If it is None, ever shorter steps are
-    tried, from the longest one that resolves the rig, at most `LONGEST_STEP`, down to `LONGEST_STEP` /
-    `MAX_STEP_REFINEMENT`. The first step that passes a check is taken, or the shortest even if it fails. The check
-    integrates short windows of the run (`comparison_windows`) at half the step as well: no pressure may change by more
-    than `error` [Pa rms], and the RMS of no wavelet detail by more than 0.1 % (`StepErrorCheck`). `error` None omits
-    the check of a stated step.
+    A stated `step` [s] is rounded down to a divisor of the output interval. Without one, ever shorter steps are tried
+    until one passes a check, from the longest that resolves the rig, at most `LONGEST_STEP`, to `LONGEST_STEP` /
+    `MAX_STEP_REFINEMENT`. This shortest step is taken even if it fails. The check integrates short windows of the run
+    (`comparison_windows`) at half the step as well: no pressure may change by more than `error` [Pa rms], and the RMS
+    of no wavelet detail by more than 0.1 % (`StepErrorCheck`). A stated step is not checked if `error` is None.
 
-    Raises InputError for a step or an error that is not positive; SimulationFailed if the step cannot resolve the
-    rig, the leak or an end stop that was hit, if a stated step fails the check, if a pressure falls below vacuum, or
-    if a state is not finite. `allow_unresolved` permits all of these but the last.
+    Raises InputError for a step or an error that is not positive. Raises SimulationFailed if
+
+    - a state is not finite;
+    - a pressure falls below vacuum;
+    - the step cannot resolve the rig, the leak or an end stop that was hit;
+    - a stated step fails the check.
+
+    `allow_unresolved` permits all of these but a state that is not finite.
     """
     from sealscope.physics.solvers.limits import longest_step
-    from sealscope.physics.state import OUTPUTS, P_2, P_A, STATES
+    from sealscope.physics.state import OUTPUTS
 
     base = loaded_rig_numbers(rig, load)
     start_state = loaded_standstill_state(rig, load, x_0)
@@ -324,45 +340,43 @@ def integrate(
         load=load,
         feedback=feedback,
     )
-    checks = [] if error is None else comparison_windows(n_out, rate)
+    windows = [] if error is None else comparison_windows(n_out, rate)
     bounds = {0, n_out}
     max_steps = steps_per_output(rate, LONGEST_STEP / MAX_STEP_REFINEMENT)  # per output, as `n_steps`
     if step is None:  # the run stops at the end of each window, so that a step that fails is abandoned at once
-        bounds |= {bound for window in checks for bound in window}
+        bounds |= {bound for window in windows for bound in window}
         max_G, max_C = inputs.max_leakage(np.arange(n_out) / rate)
         first_step = min(LONGEST_STEP, *(longest_step(p, max_G, max_C) for p in schedule.numbers))
         n_steps = steps_per_output(rate, max(first_step, LONGEST_STEP / MAX_STEP_REFINEMENT))
     else:
         n_steps = steps_per_output(rate, step)
-    pressures = slice(P_A, P_2 + 1)
     while True:
         run.refuse_unresolved(n_steps)
         check = StepErrorCheck(rig, rate, error or PRESSURE_TOLERANCE)
         excess = 0.0  # largest ratio of an error to its tolerance
-        rows, y = np.empty((n_out, len(OUTPUTS))), start_state.copy()
+        rows = np.empty((n_out, len(OUTPUTS)))
+        y = start_state.copy()
         if feedback is not None:
             feedback.restart()
         for start, stop in itertools.pairwise(sorted(bounds)):
             run.advance(y, start, stop, n_steps, rows)
-            for first, end in checks:
+            for first, end in windows:
                 if start <= first and end <= stop:
-                    y_window, fine = rows[first, : len(STATES)].copy(), np.empty((end - first, len(OUTPUTS)))
-                    run.advance(y_window, first, end, 2 * n_steps, fine, origin=first)
-                    excess = max(excess, check.add_window(rows[first:end, pressures], fine[:, pressures]))
+                    excess = max(excess, run.compare_with_half_step(rows, first, end, n_steps, check))
             if excess > 1.0 and n_steps < max_steps and step is None:
                 break
         h = 1.0 / (rate * n_steps)
         if excess <= 1.0 or n_steps >= max_steps or (step is not None and allow_unresolved):
             volts = None if feedback is None else feedback.volts(n_out)
             compensated = None if feedback is None else feedback.compensated_flow(n_out)
-            found_error = check.pressure_error if checks else math.nan
+            found_error = check.pressure_error if windows else math.nan
             return Trajectory(np.arange(n_out) / rate, rows, run.method, h, found_error, volts, compensated)
         if step is not None:
             raise SimulationFailed(
                 f"the run is under-resolved: halving the step of {h:.3g} s ({run.method}) moves "
                 f"{check.describe_worst()}; take a smaller step, or state an error instead of a step"
             )
-        # the error goes with h^4; at most half the step, because the estimate for a step far too long is unreliable
+        # the error goes with h^4; at most twice the steps, because the estimate for a step far too long is unreliable
         refinement = min(2.0, (1.1 * excess) ** 0.25) if math.isfinite(excess) else 2.0
         n_steps = min(max(n_steps + 1, math.ceil(n_steps * refinement)), max_steps)
 
@@ -390,9 +404,9 @@ class _Integration:
     def refuse_unresolved(self, n_steps: int) -> None:
         """Raise SimulationFailed if `n_steps` solver steps per output are too few to resolve the rig without its leaks.
 
-        The step, 1/(rate n_steps), is checked with the rig's parameters at all times of the run, as these may change
-        (function `refuse_unresolved`). Leaks and end stops are checked during the run (`advance`). Nothing is checked
-        if the experiment allows unresolved runs.
+        The step, 1/(rate n_steps), is checked with the parameters of every block of the run (function
+        `refuse_unresolved`). Leaks and end stops are checked during the run (`advance`). Nothing is checked if the
+        experiment allows unresolved runs.
         """
         if not self.allow_unresolved:
             for p in self.schedule.numbers:
@@ -414,9 +428,8 @@ class _Integration:
         implicit = IMPLICIT if self.method == "imex" else EXPLICIT
         nodes = step_nodes(implicit, h)
         max_outputs = max(1, _BLOCK_STEPS // n_steps)
-        last = start
-        while last < stop:
-            first, last = last, min(last + max_outputs, stop)
+        for first in range(start, stop, max_outputs):
+            last = min(first + max_outputs, stop)
             step_numbers = np.arange(first * n_steps, last * n_steps, dtype=np.float64)
             u, G, C = map(np.ascontiguousarray, self.inputs.at_nodes(step_numbers * h, nodes))
             F = unloaded
@@ -426,25 +439,40 @@ class _Integration:
             for k, end, p in self.schedule.blocks_between(first, last):
                 if not self.allow_unresolved and max(max_G, max_C) > 0.0:
                     refuse_long(h, longest_step(p, max_G, max_C), "the leak")
-                part = slice((k - first) * n_steps, (end - first) * n_steps)
-                out, n_outputs = rows[k - origin : end - origin], end - k
-                arguments = G[part], C[part], F[part], pack_numbers(p), self.euler, n_steps
+                steps = slice((k - first) * n_steps, (end - first) * n_steps)
+                out = rows[k - origin : end - origin]
+                arguments = G[steps], C[steps], F[steps], pack_numbers(p), self.euler, n_steps
                 if self.feedback is None:
-                    advance(implicit, y, h, u[part], *arguments, out)
-                else:
-                    n_outputs = advance_closed(implicit, y, h, *arguments, k, out, self.feedback.loop)
-                self._check_rows(p, h, out[:n_outputs], k)
-                if self.feedback is not None and n_outputs < end - k:
+                    advance(implicit, y, h, u[steps], *arguments, out)
+                    self._check_rows(p, h, out, k)
+                    continue
+                n_completed = advance_closed(implicit, y, h, *arguments, k, out, self.feedback.loop)
+                self._check_rows(p, h, out[:n_completed], k)
+                if n_completed < end - k:  # the controller failed
                     self.feedback.raise_failure()
             if self.progress is not None and last / self.rate > self.reached:
                 self.reached = last / self.rate
                 self.progress(self.reached)
 
+    def compare_with_half_step(self, rows: Array, first: int, end: int, n_steps: int, check: StepErrorCheck) -> float:
+        """Integrate a window of the run again at half the step; return the largest ratio of an error to its tolerance.
+
+        `rows`: outputs of the run with `n_steps` steps per output; the window is first <= k < end. The errors are added
+        to `check`.
+        """
+        from sealscope.physics.state import OUTPUTS, P_2, P_A, STATES
+
+        y = rows[first, : len(STATES)].copy()  # the first outputs are the state
+        fine = np.empty((end - first, len(OUTPUTS)))
+        self.advance(y, first, end, 2 * n_steps, fine, origin=first)
+        pressures = slice(P_A, P_2 + 1)
+        return check.add_window(rows[first:end, pressures], fine[:, pressures])
+
     def _check_rows(self, p: RigNumbers, h: float, rows: Array, first: int) -> None:
         """Check outputs that were integrated with steps of h [s].
 
         `rows` (n, 21): the outputs, of which the first has the index `first` in the run. Raises SimulationFailed if
-        one is not finite. Unless the experiment allows unresolved runs, it is also raised if a pressure is below
+        an output is not finite. Unless the experiment allows unresolved runs, also raises it if a pressure is below
         vacuum or if the step is too long for an end stop that was hit.
         """
         from sealscope.physics.solvers.limits import longest_step_on_stop
@@ -482,16 +510,18 @@ def refuse_long(h: float, limit: float, what: str) -> None:
 def refuse_unresolved(p: RigNumbers, h: float, method: str) -> None:
     """Raise SimulationFailed if solver steps of h [s] are too long to resolve a rig without its leaks.
 
-    There are two limits. `longest_step` is that of all parts except leaks, throttles and end stops: an oscillation may
-    advance by one radian per step, and a decay must be stable. If the rig has throttles and the `method` is "rk4", not
-    "imex", h must also be at most 2.785/lambda, with the decay rate lambda [1/s] of the pressures across a throttle
-    (`stiffest_rate`). `p`: the rig's parameters.
+    `p`: parameters of the rig; `method`: "rk4" or "imex". There are two limits:
+
+    - `longest_step`, for all parts but leaks, throttles and end stops: an oscillation may advance by one radian per
+      step, and a decay must be stable.
+    - 2.785/lambda for "rk4" with throttles, with the decay rate lambda [1/s] of the pressures across a throttle
+      (`stiffest_rate`).
     """
     from sealscope.physics.solvers.limits import DECAY_LIMIT, longest_step, stiffest_rate
 
-    refuse_long(
-        h, longest_step(p), "speed loop, oil columns and friction of this rig" + " under its load" * (len(p.pushed) > 1)
-    )
+    has_load_tables = len(p.pushed) > 1  # a load over position or velocity acts as a spring or damper
+    parts = "speed loop, oil columns and friction of this rig"
+    refuse_long(h, longest_step(p), f"{parts} under its load" if has_load_tables else parts)
     rate = stiffest_rate(p)
     if method == "rk4" and p.throttled and h * rate > DECAY_LIMIT:
         raise SimulationFailed(
@@ -529,10 +559,12 @@ class StepErrorCheck:
         difference of a pressure.
         """
         self._tolerance = tolerance
-        self._every = max(1, round(rate / rig.daq.sample_rate))
+        self._outputs_per_sample = max(1, round(rate / rig.daq.sample_rate))
         sensors = [getattr(rig.sensors, name) for name in CHAMBERS]
-        self._noise = np.repeat([sensor.noise**2 + rig.sensors.common_noise**2 for sensor in sensors], 2)
-        self._squares, self._samples = np.zeros((LEVELS, 4)), 0  # of p_A at both steps, then of p_B
+        # four columns: p_A at the step and at half of it, then p_B
+        self._noise_variances = np.repeat([sensor.noise**2 + rig.sensors.common_noise**2 for sensor in sensors], 2)
+        self._squares = np.zeros((LEVELS, 4))
+        self._samples = 0
         self.pressure_error = self.detail_error = 0.0
 
     def add_window(self, coarse: Array, fine: Array) -> float:
@@ -541,9 +573,9 @@ class StepErrorCheck:
         Returns the largest ratio of an error to its tolerance; the step is short enough if it is at most 1.
 
         `coarse`, `fine` (n, 4): p_A, p_B, p_1, p_2 [Pa] at the step and at half of it. The error of a pressure is the
-        rms difference within the window, times `SAFETY`. The RMS of the db8 wavelet details d_1 .. d_4 of p_A and p_B
-        are compared over all windows so far, at the recording's rate and with its noise added. They are not compared
-        if the error of a pressure exceeds its tolerance.
+        rms difference within the window, times `SAFETY`. If it is within its tolerance, the RMS of the db8 wavelet
+        details d_1 .. d_4 of p_A and p_B are compared, too: over all windows so far that are long enough for the
+        wavelet, at the recording's rate and with its noise added.
         """
         pressure_error = SAFETY * float(np.sqrt(np.mean(np.square(coarse - fine), axis=0)).max(initial=0.0))
         self.pressure_error = max(self.pressure_error, pressure_error)
@@ -552,17 +584,14 @@ class StepErrorCheck:
         self._add_detail_squares(coarse, fine)
         if self._samples == 0:
             return pressure_error / self._tolerance
-        recorded_rms = np.sqrt(self._squares / self._samples + self._noise)
+        recorded_rms = np.sqrt(self._squares / self._samples + self._noise_variances)
         coarse_rms, fine_rms = recorded_rms[:, ::2], recorded_rms[:, 1::2]
         detail_error = float(np.max(np.abs(coarse_rms - fine_rms) / np.where(fine_rms > 0, fine_rms, 1.0)))
         self.detail_error = max(self.detail_error, detail_error)
         return max(pressure_error / self._tolerance, detail_error / DETAIL_TOLERANCE)
 
     def describe_worst(self) -> str:
-        """Describe in words the difference between the two runs that is largest relative to its tolerance.
-
-        It is the difference of a pressure or of the RMS of a wavelet detail, and is stated with its tolerance.
-        """
+        """Describe the larger of two differences relative to its tolerance: of a pressure, or of a detail's RMS."""
         if self.pressure_error / self._tolerance >= self.detail_error / DETAIL_TOLERANCE:
             return f"a pressure by {self.pressure_error:.4g} Pa rms, which must be <= {self._tolerance:.4g} Pa"
         error, tolerance = 100 * self.detail_error, 100 * DETAIL_TOLERANCE
@@ -572,7 +601,7 @@ class StepErrorCheck:
         """Add the squared wavelet details of p_A and p_B of both runs in a window to the sums over all windows.
 
         `coarse`, `fine` (n, 4): the pressures, as in `add_window`. Samples near the ends of the window, where the
-        wavelet's filters reach beyond it, are left out.
+        wavelet's filters reach beyond it, are left out. A window without any other samples changes nothing.
         """
         import pywt
 
@@ -580,7 +609,7 @@ class StepErrorCheck:
 
         before, after = reach("db8", LEVELS)[-1]
         # both runs' p_A, then both runs' p_B
-        runs = np.array([run[:: self._every, column] for column in range(2) for run in (coarse, fine)])
+        runs = np.array([run[:: self._outputs_per_sample, column] for column in range(2) for run in (coarse, fine)])
         n = runs.shape[1] // 2**LEVELS * 2**LEVELS  # the stationary transform needs a multiple
         if n <= before + after:
             return

@@ -26,7 +26,7 @@ from sealscope.units import LITRE_PER_MINUTE, parse_quantity
 
 #: Named groups of a match, as texts.
 Groups = dict[str, str | None]
-#: When, in texts of leaks and faults: `from 90 s`, `growing from 1 min to 120 s`.
+#: Pattern of the times in texts of leaks and faults: `from 90 s`, `growing from 1 min to 120 s`.
 WHEN = rf"(?:\s+(?:from\s+(?P<since>{TIME})|growing\s+from\s+(?P<start>{TIME})\s+to\s+(?P<stop>{TIME})))?"
 _MEAN = rf"(?P<mean>{UNSIGNED}\s*(?:\[[^\]]+\]|[a-zA-Z][a-zA-Z^0-9]*/[a-zA-Z]+))"
 _LEAK = rf"(?:{_MEAN}|(?P<letter>[GC])\s*=\s*(?P<coefficient>{UNSIGNED}))(?:\s+(?P<law>laminar|orifice))?{WHEN}"
@@ -35,19 +35,21 @@ _LEAK = rf"(?:{_MEAN}|(?P<letter>[GC])\s*=\s*(?P<coefficient>{UNSIGNED}))(?:\s+(
 def opening_from(start: float = 0.0, stop: float = math.inf, ramp: float = 0.0) -> Polyline:
     """Make the opening of a leak or fault, 0 (shut) to 1 (full), that begins at `start` and ends at `stop` [s].
 
-    It rises from 0 to 1 within `ramp` [s] from `start` on, and falls back to 0 within `ramp` from `stop` on. Raises
-    InputError if the times do not fit together.
+    It rises from 0 to 1 within `ramp` [s] from `start` on, and falls back to 0 within `ramp` from `stop` on; an
+    infinite `stop` means that it stays at 1. Raises InputError if the times do not fit together.
     """
     if not (math.isfinite(ramp) and ramp >= 0.0):
         raise InputError(f"a ramp must be >= 0 s and finite, got {ramp:g} s")
     if not stop >= start + ramp:
         raise InputError(f"what begins at {start:g} s and takes {ramp:g} s must end later than that, got {stop:g} s")
-    words = f"from {format_number(start)} s"
+    text = f"from {format_number(start)} s"
     points = [(start, 0.0), (start + ramp, 1.0)]
     if math.isfinite(stop):
-        words += f" to {format_number(stop)} s"
+        text += f" to {format_number(stop)} s"
         points += [(stop, 1.0), (stop + ramp, 0.0)]
-    return polyline(points, words + (f" within {format_number(ramp)} s" if ramp else ""))
+    if ramp:
+        text += f" within {format_number(ramp)} s"
+    return polyline(points, text)
 
 
 def growing_opening(start: float, stop: float) -> Polyline:
@@ -57,15 +59,16 @@ def growing_opening(start: float, stop: float) -> Polyline:
     """
     if not stop > start:
         raise InputError(f"a growing leak must stop growing after it starts, got {start:g} s to {stop:g} s")
-    words = f"growing from {format_number(start)} s to {format_number(stop)} s"
-    return polyline([(start, 0.0), (stop, 1.0)], words)
+    text = f"growing from {format_number(start)} s to {format_number(stop)} s"
+    return polyline([(start, 0.0), (stop, 1.0)], text)
 
 
 @dataclass(frozen=True, eq=False)
 class Thinned:
     """The opening of a laminar leak in oil of changing viscosity: `opening` divided by the oil's relative viscosity.
 
-    `viscosity(t)`: the oil's viscosity at times t [s], relative to the one that the leak's coefficient assumes.
+    `viscosity(t)`: the oil's viscosity at times t [s], relative to the one that the leak's coefficient assumes;
+    `rise`: None, because the result is not a single linear rise (`Polyline.rise`).
     """
 
     opening: Opening
@@ -93,9 +96,9 @@ class Leak:
     """A leak across the piston, from chamber A to B.
 
     `law`: "laminar", Q = G dp with G [m^3/(s Pa)] (worn seal), or "orifice", Q = C sign(dp) sqrt|dp| with C
-    [m^3/(s Pa^0.5)] (needle valve). The size at full opening is stated either as `coefficient` (G or C) or as `mean`
-    [m^3/s], the mean magnitude of Q while the leak is open (`sizing.mean_while_open`), for which `sizing` then finds
-    the coefficient. `opening` states how far the leak is open over time, 0 to 1.
+    [m^3/(s Pa^0.5)] (needle valve); `opening`: how far the leak is open over time, 0 to 1. The size at full opening is
+    stated by one of `coefficient`, which is G or C, and `mean` [m^3/s], which is the mean of |Q| while the leak is open
+    (`sizing.mean_while_open`). For a stated mean, `sizing.size_leaks` finds the coefficient.
     """
 
     law: Literal["laminar", "orifice"] = "laminar"
@@ -141,7 +144,7 @@ def parse_leak(text: str) -> Leak | None:
 
     ``table FILE`` names a file with the columns `t [s]` and `q_leak [L/min]`. The leak is then laminar: the largest
     `q_leak` is its mean flow at full opening, and `q_leak` over this maximum is its opening, linear between the times.
-    Raises InputError, which lists all forms, if the text has none of them.
+    Raises InputError, which lists all forms, if the text has another form.
     """
     stripped = text.strip()
     if stripped.lower() in ("none", "0", "no leak"):
@@ -149,11 +152,12 @@ def parse_leak(text: str) -> Leak | None:
     if stripped.lower().startswith("table "):
         from sealscope.recordings import read
 
-        table = read(stripped[6:].strip())
+        path = stripped[len("table ") :].strip()
+        table = read(path)
         flow = table["q_leak"]
         max_flow = float(np.max(flow, initial=0.0))
         if not (np.all(np.isfinite(flow)) and max_flow > 0 and flow.min() >= 0):
-            raise InputError(f"q_leak of a leak table must be finite, >= 0 and somewhere > 0 ({stripped[6:].strip()})")
+            raise InputError(f"q_leak of a leak table must be finite, >= 0 and somewhere > 0 ({path})")
         return Leak("laminar", mean=max_flow, opening=polyline_from_table(table.t, flow / max_flow))
     match = re.fullmatch(_LEAK, normalize_blanks(text, "leak"), re.IGNORECASE)
     if not match:
@@ -161,7 +165,8 @@ def parse_leak(text: str) -> Leak | None:
             "leak must be like '0.0042 L/min from 90 s', '0.01 L/min orifice growing from 60 s to 120 s', "
             f"'G = 6.1e-13 from 90 s', 'C = 2e-10', 'table LEAK.csv' or 'none', got {text!r}"
         )
-    groups, stated_law = match.groupdict(), (match["law"] or "").lower()
+    groups = match.groupdict()
+    stated_law = (match["law"] or "").lower()
     if letter := (groups["letter"] or "").upper():
         law: Literal["laminar", "orifice"] = "laminar" if letter == "G" else "orifice"
         if stated_law not in ("", law):

@@ -115,8 +115,8 @@ class Proof:
 
         Quantities without a tolerance are left out.
         """
-        limited_rows = [row for row in self.differences if row.tolerance]
-        return max(limited_rows, key=lambda row: row.difference / (row.tolerance or math.inf))
+        limited = [row for row in self.differences if row.tolerance]
+        return max(limited, key=lambda row: row.difference / (row.tolerance or math.inf))  # `or`: for the type checker
 
 
 @dataclass(frozen=True)
@@ -160,8 +160,8 @@ def simulate_experiment(experiment: Experiment, progress: Progress | None = None
     Returns
     -------
     Run
-        `recording`; `truth`: leaks with their coefficients, onset, mean leak and every state without noise; `proof`,
-        None unless `prove`.
+        `recording`; `truth`: leaks with their coefficients, onset, mean leak and outputs without noise; `proof`: None
+        unless `prove`.
 
     Raises
     ------
@@ -178,7 +178,6 @@ def simulate_experiment(experiment: Experiment, progress: Progress | None = None
         """Build the function that reports the progress of `task`, called with the simulated time reached [s]."""
 
         def report(time: float) -> None:
-            """Report the completed fraction of the task at the simulated `time` [s]."""
             if progress is not None:
                 progress(task, min(1.0, time / experiment.duration))
 
@@ -196,10 +195,21 @@ def simulate_experiment(experiment: Experiment, progress: Progress | None = None
                 f"by {worst.difference:.4g} {worst.unit}, which must be <= {worst.tolerance:.4g} {worst.unit}; take a "
                 "smaller step"
             )
-    n, factor = round(experiment.duration * experiment.rate), oversampling(experiment)
-    at_samples, times = slice(0, n * factor, factor), experiment.sample_times()
+    return Run(_record_run(experiment, run), _collect_truth(experiment, leaks, run), proof)
+
+
+def _sample_outputs(experiment: Experiment) -> slice:
+    """Select the solver outputs at the times of the recording's samples: one in `oversampling` outputs."""
+    factor = oversampling(experiment)
+    return slice(0, round(experiment.duration * experiment.rate) * factor, factor)
+
+
+def _record_run(experiment: Experiment, run: Trajectory) -> Recording:
+    """Record an integrated run with the rig's instruments, and state its origin in the recording's provenance."""
+    at_samples = _sample_outputs(experiment)
+    times = experiment.sample_times()
     volts = experiment.voltage_command.volts(times) if run.volts is None else run.volts[at_samples]
-    readings = record(experiment.rig, run, volts, factor, experiment.seed, experiment.readings())
+    readings = record(experiment.rig, run, volts, at_samples.step, experiment.seed, experiment.readings())
     solver = {"method": run.method, "step_s": run.step, "allow_unresolved": experiment.allow_unresolved}
     if experiment.step is None:
         solver["error_pa"] = experiment.error_allowed
@@ -214,25 +224,29 @@ def simulate_experiment(experiment: Experiment, progress: Progress | None = None
     if run.compensated is not None:
         channels["q_comp"] = run.compensated[at_samples]
     units = {name: CHANNEL_UNITS[name] for name in channels}
-    recording = replace(readings, channels=channels, units=units, provenance=provenance, history=history)
+    return replace(readings, channels=channels, units=units, provenance=provenance, history=history)
+
+
+def _collect_truth(experiment: Experiment, leaks: tuple[Leak, ...], run: Trajectory) -> Truth:
+    """Collect the truth about an integrated run; `leaks` are those of the experiment with their coefficients."""
+    at_samples, times = _sample_outputs(experiment), experiment.sample_times()
     outputs = {name: run[name][at_samples] for name in TRUE_OUTPUTS}
     if experiment.rig.line.k_clog_A > 0 or experiment.rig.line.k_clog_B > 0:
-        # a rig with clogging filters has no servo valve: the spool's states are the oil that passed the filters
-        outputs |= {"passed_A": run["x_s"][at_samples], "passed_B": run["v_s"][at_samples], "x_s": np.zeros(n)}
+        # a rig with clogging filters has no servo valve: the spool's states hold the oil that passed the filters
+        outputs |= {"passed_A": run["x_s"][at_samples], "passed_B": run["v_s"][at_samples], "x_s": np.zeros(times.size)}
     outputs |= powers(outputs, experiment.rig)
     dp, dp_0 = run["p_A"] - run["p_B"], experiment.rig.line.dp_0
     flows = (leak_flow(leak, run.t, dp, dp_0) for leak in experiment.scale_with_viscosity(leaks))
     mean_leak = sum(mean_while_open(leak, run.t, flow) for leak, flow in zip(leaks, flows, strict=True))
     mean_leak_lpm = mean_leak / LITRE_PER_MINUTE
-    truth = Truth(leaks, experiment.onset(), mean_leak_lpm, times, outputs, experiment.faults, experiment.drifts)
-    return Run(recording, truth, proof)
+    return Truth(leaks, experiment.onset(), mean_leak_lpm, times, outputs, experiment.faults, experiment.drifts)
 
 
 def powers(outputs: Mapping[str, Array], rig: Rig) -> dict[str, Array]:
     """Compute the powers [W] of a run: electrical into the motor, hydraulic from the pump, mechanical on the piston.
 
     `outputs`: outputs of the run by name (`TRUE_OUTPUTS`). Returns arrays by the names P_electric, P_hydraulic and
-    P_mechanical. In a rig with a servo valve the first two are those of the motor and pump that feed the supply.
+    P_mechanical. In a rig with a servo valve, P_electric and P_hydraulic belong to the motor and pump of the supply.
     """
     from sealscope.physics.cylinder import mechanical_power
     from sealscope.physics.motor import electric_power
@@ -247,10 +261,11 @@ def powers(outputs: Mapping[str, Array], rig: Rig) -> dict[str, Array]:
 
 
 def compare_trajectories(experiment: Experiment, coarse: Trajectory, fine: Trajectory) -> tuple[Difference, ...]:
-    """Compute the differences between two runs of an experiment, one at a solver step and one at a shorter step.
+    """Compare two runs of an experiment, `coarse` at a solver step and `fine` at a shorter one.
 
-    They are the rms differences of speed, angle, position and velocity (without a tolerance) and of the four pressures;
-    and the changes of the RMS of the wavelet details d1 to d4 of p_A and p_B, noise included.
+    - speed, angle, position and velocity, by their rms difference, without a tolerance;
+    - the four pressures, by their rms difference;
+    - the wavelet details d1 to d4 of p_A and p_B, by the change of their RMS, which includes the sensors' noise.
     """
     from sealscope.signals.details import QUANTITIES, details, mean_squares
     from sealscope.signals.windows import rms
@@ -262,12 +277,15 @@ def compare_trajectories(experiment: Experiment, coarse: Trajectory, fine: Traje
         difference = rms(coarse[name][: n * factor] - fine[name][: n * factor])
         differences.append(Difference(name, difference, unit, PRESSURE_TOLERANCE if unit == "Pa" else None))
     for name in CHAMBERS:
-        noise = getattr(experiment.rig.sensors, name).noise ** 2 + experiment.rig.sensors.common_noise**2
-        both_details = [details(decimate(run[name], factor, n)) for run in (coarse, fine)]
-        inside = both_details[0].inside()
-        both_rms = [np.sqrt(mean_squares(levels, [inside.start, inside.stop])[0] + noise) for levels in both_details]
-        for quantity, coarse_rms, fine_rms in zip(QUANTITIES[:4], *both_rms, strict=False):  # d1 to d4, not d3d4
-            change, tolerance = float(abs(coarse_rms - fine_rms)), float(DETAIL_TOLERANCE * fine_rms)
+        noise_variance = getattr(experiment.rig.sensors, name).noise ** 2 + experiment.rig.sensors.common_noise**2
+        coarse_details, fine_details = (details(decimate(run[name], factor, n)) for run in (coarse, fine))
+        inside = coarse_details.inside()
+        limits = [inside.start, inside.stop]  # of one segment, the [0] below
+        coarse_rms = np.sqrt(mean_squares(coarse_details, limits)[0] + noise_variance)
+        fine_rms = np.sqrt(mean_squares(fine_details, limits)[0] + noise_variance)
+        for level, quantity in enumerate(QUANTITIES[:4]):  # d1 to d4, not d3d4
+            change = float(abs(coarse_rms[level] - fine_rms[level]))
+            tolerance = float(DETAIL_TOLERANCE * fine_rms[level])
             differences.append(Difference(f"RMS of {quantity} of {name}", change, "Pa", tolerance))
     return tuple(differences)
 
@@ -286,12 +304,12 @@ def prove(experiment: Experiment, progress: Progress | None = None) -> Proof:
     Returns
     -------
     Proof
-        The difference and the tolerance of each channel and of each detail's RMS.
+        The change of each compared quantity with its tolerance: states, pressures, and RMS of wavelet details.
 
     Raises
     ------
     SimulationFailed
-        The run is under-resolved, unless the experiment allows it; the message states the largest difference.
+        The run diverged, or it is under-resolved or falls below vacuum and the experiment does not allow it.
 
     Examples
     --------
@@ -307,9 +325,11 @@ def prove(experiment: Experiment, progress: Progress | None = None) -> Proof:
 def write_truth(truth: Truth, path: str | os.PathLike[str]) -> None:
     """Write the truth about a run as JSON, without its outputs.
 
-    The file contains the leaks with their coefficients, the onset [s], the mean leak while open [L/min], the other
-    faults with their onsets [s], and for each drift its range and its change from start to end, in per cent or in the
-    SI unit.
+    The file contains:
+
+    - the leaks with their coefficients, the onset [s], and the mean leak while open [L/min];
+    - the other faults with their onsets [s], null for a fault that never begins;
+    - the range of each drift and its change from start to end, in per cent or in the SI unit.
     """
     tree: dict[str, Any] = {
         "onset_s": truth.onset_s,
@@ -319,9 +339,9 @@ def write_truth(truth: Truth, path: str | os.PathLike[str]) -> None:
         ],
     }
     if truth.faults:
-        onsets = [onset if math.isfinite(onset := fault.onset()) else None for fault in truth.faults]
+        onsets = [fault.onset() for fault in truth.faults]
         tree["faults"] = [
-            {"kind": fault.kind, "words": str(fault), "onset_s": onset}
+            {"kind": fault.kind, "words": str(fault), "onset_s": onset if math.isfinite(onset) else None}
             for fault, onset in zip(truth.faults, onsets, strict=True)
         ]
     if truth.drifts:
@@ -333,8 +353,7 @@ def write_truth(truth: Truth, path: str | os.PathLike[str]) -> None:
 def _describe_drift(drift: ParameterDrift, t: Array) -> dict[str, Any]:
     """Describe a drift over the times t [s] by its range (maximum minus minimum) and its change from start to end.
 
-    Relative drifts are in per cent, absolute ones in the parameter's SI unit. Returns plain values for JSON by
-    name.
+    Returns a dict for JSON. A relative drift is in per cent, an absolute one in the parameter's SI unit.
     """
     change = drift.shape.value_at(t)
     span, net_change = float(np.ptp(change)), float(change[-1] - change[0])
@@ -347,8 +366,8 @@ def _describe_drift(drift: ParameterDrift, t: Array) -> dict[str, Any]:
 def simulate(arguments: Arguments) -> Recording:
     """Simulate a rig under a command, and record it with its instruments.
 
-    A quantity is a number in SI, in the unit stated with the argument (a field of `Arguments`), or a text with a unit
-    ("3 min", "20[Pa]"), as on the command line.
+    A quantity is a number in the SI unit that the argument states, or a text with a unit ("3 min", "20[Pa]"), as on the
+    command line.
 
     Returns
     -------
@@ -379,7 +398,7 @@ def simulate_with_truth(arguments: Arguments) -> Run:
     Returns
     -------
     Run
-        `recording`; `truth`: leaks with their coefficients, onset, mean leak and every state without noise.
+        `recording`; `truth`: leaks with their coefficients, onset, mean leak and outputs without noise.
 
     Raises
     ------

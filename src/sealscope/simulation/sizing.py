@@ -12,9 +12,11 @@ from sealscope.errors import SimulationFailed
 from sealscope.recordings.recording import Array
 from sealscope.simulation.leaks import Leak
 
-#: Relative error of a mean flow at which the search ends, and up to which the best run is accepted after the last one:
-#: where friction sticks under a sampled controller, nearly equal leaks give flows that scatter by more than the first.
-TOLERANCE, SCATTER_TOLERANCE = 1e-3, 1e-2
+#: Relative error of a mean flow at which the search ends.
+TOLERANCE = 1e-3
+#: Relative error up to which the best run is accepted if the search has not ended after `MAX_RUNS`. Where friction
+#: sticks under a sampled controller, the flows of nearly equal leaks scatter by more than `TOLERANCE`.
+SCATTER_TOLERANCE = 1e-2
 MAX_RUNS = 20
 T = TypeVar("T")
 #: Smallest slope of log flow over log coefficient that a leak has.
@@ -22,10 +24,10 @@ _MIN_SLOPE = 0.1
 
 
 def leak_flow(leak: Leak, t: Array, dp: Array, dp_0: float) -> Array:
-    """Compute the flow |Q_L| [m^3/s] of a leak at times t [s] under `dp` = p_A - p_B [Pa].
+    """Compute the flow |Q_L| (n,) [m^3/s] of a leak at times `t` (n,) [s] under `dp` (n,) = p_A - p_B [Pa].
 
-    `t`, `dp` (n,). The flow is a G |dp| for a laminar leak and a C sqrt|dp| for an orifice, where a is the leak's
-    opening at t, 0 to 1. The flow of an orifice is linear in dp for |dp| below about `dp_0` [Pa].
+    The flow is a G |dp| for a laminar leak and a C sqrt|dp| for an orifice, with the leak's opening a at t, 0 to 1, and
+    its coefficient G or C. The flow of an orifice is linear in dp for |dp| below about `dp_0` [Pa].
     """
     from sealscope.physics.leakage import laminar_leakage, leakage_series
 
@@ -51,14 +53,16 @@ def mean_while_open(leak: Leak, t: Array, flow: Array) -> float:
 def next_coefficient(mean: float, previous: tuple[float, float], latest: tuple[float, float]) -> float:
     """Compute the next leakage coefficient to try in the search for a stated mean flow.
 
-    `mean` [m^3/s]: the mean flow to reach; `previous`, `latest`: (coefficient, mean flow) of the last two runs. For
-    a run with the coefficient 0, the flow is the one that a coefficient of 1 would have under the pressures of this
-    run.
+    `mean` [m^3/s]: the mean flow to reach; `previous`, `latest`: (coefficient, mean flow) of the last two runs, (0, 0)
+    for no run. For a `latest` coefficient of 0, the flow is the one that a coefficient of 1 would have under the
+    pressures of this run.
 
     The next coefficient is on the straight line through both runs on logarithmic scales. The slope of this line is
-    limited to 0.1 .. 1, the range that leaks have, and taken as 1 if the two coefficients are too close.
+    limited to 0.1 .. 1, the range that leaks have. It is taken as 1 without a previous run with a leak, and for two
+    coefficients that are too close.
     """
-    (c_0, q_0), (c_1, q_1) = previous, latest
+    c_0, q_0 = previous
+    c_1, q_1 = latest
     if c_1 == 0.0:
         return mean / q_1
     slope = 1.0
@@ -75,10 +79,10 @@ def size_leaks(
 ) -> tuple[Array, T]:
     """Find the leakage coefficients (n,) that give the leaks' stated mean flows, by repeated simulation.
 
-    A coefficient has the unit m^3/(s Pa) for a laminar leak, m^3/(s Pa^0.5) for an orifice. `coefficients`: values to
-    start from; they stay for leaks without a stated mean. `measure(coefficients)` simulates the rig and returns each
-    leak's mean flow [m^3/s] for a coefficient of 1 (n,), and any other result of the run. Returns the coefficients, and
-    this other result for them.
+    A coefficient has the unit m^3/(s Pa) for a laminar leak, m^3/(s Pa^0.5) for an orifice. `coefficients`: start
+    values, which are kept for leaks without a stated mean. `measure(coefficients)` simulates the rig; it returns the
+    mean flow [m^3/s] of each leak divided by its coefficient (n,), and the run in any form. Returns the coefficients
+    found, and the run with them. `progress` is called with the task and its completed fraction.
 
     A small leak's flow is proportional to its coefficient, because friction sets the pressure difference. A large
     leak's flow grows less, and its coefficient is found step by step (`next_coefficient`). Raises SimulationFailed
@@ -86,26 +90,28 @@ def size_leaks(
     """
     means = np.array([leak.mean or 0.0 for leak in leaks])
     indices = np.flatnonzero(means > 0.0)
-    previous = np.zeros((2, coefficients.size))  # coefficients and mean flows of the previous run
+    previous_coefficients = previous_flows = np.zeros(coefficients.size)
     best: tuple[Array, T] | None = None
     best_error = SCATTER_TOLERANCE
     for attempt in range(MAX_RUNS):
         if progress is not None:
             progress("sizing the leak", 1.0 - 0.5**attempt)
-        unit_flows, measurement = measure(coefficients)
+        unit_flows, run = measure(coefficients)
         flows = unit_flows * coefficients
         error = float(np.abs(flows[indices] / means[indices] - 1.0).max(initial=0.0))
         if error < best_error:
-            best, best_error = (coefficients, measurement), error
+            best, best_error = (coefficients, run), error
         if best and (error <= TOLERANCE or attempt == MAX_RUNS - 1):
             if progress is not None:
                 progress("sizing the leak", 1.0)
             return best
         next_coefficients = coefficients.copy()
         for k in indices:
+            previous = previous_coefficients[k], previous_flows[k]
             latest = coefficients[k], flows[k] if coefficients[k] > 0.0 else unit_flows[k]
-            next_coefficients[k] = next_coefficient(means[k], (previous[0, k], previous[1, k]), latest)
-        previous, coefficients = np.stack([coefficients, flows]), next_coefficients
+            next_coefficients[k] = next_coefficient(means[k], previous, latest)
+        previous_coefficients, previous_flows = coefficients, flows
+        coefficients = next_coefficients
     raise SimulationFailed(
         f"no leakage coefficient gives the mean asked for within {TOLERANCE:g}: {', '.join(map(str, leaks))} is more "
         "than this rig's pressures can drive; ask for a smaller leak"

@@ -34,7 +34,8 @@ _STIFFNESSES = {"N/mm": 1e3, "kN/mm": 1e6, "N/m": 1.0, "kN/m": 1e3}
 _DAMPINGS = {"N s/mm": 1e3, "kN s/mm": 1e6, "N s/m": 1.0, "kN s/m": 1e3}
 #: Most rows of a table of force over position or velocity: every stage of every step evaluates them all.
 MAX_LOAD_ROWS = 200
-#: A piecewise linear force a + b s + sum of c_k max(s - s_k, 0): (a, b), then (s_k, c_k).
+_NO_FORCE = Sine(amplitude=0.0, omega=0.0)
+#: A force F(s) = a + b s + sum of c_k max(s - s_k, 0) over position or velocity s: (a, b), then each (s_k, c_k).
 Breakpoints = tuple[tuple[float, float], ...]
 
 
@@ -42,7 +43,7 @@ Breakpoints = tuple[tuple[float, float], ...]
 class Position:
     """A target for the piston's position over time, which a controller follows.
 
-    x = signal(t) [m], from mid-stroke; `words`: text of the signal.
+    `signal`: the position [m] from mid-stroke, as a command whose method `volts` computes metres; `words`: its text.
     """
 
     signal: Command
@@ -50,7 +51,7 @@ class Position:
 
     def value_at(self, t: Array) -> Array:
         """Compute the target position [m] at times t [s]."""
-        return self.signal.volts(t)
+        return self.signal.volts(t)  # the value of the signal, here in metres
 
     def __str__(self) -> str:
         return f"position {self.words}"
@@ -60,9 +61,9 @@ class Position:
 class Force:
     """An additional load on the piston against +x: F = signal(t) + f(x) + g(v) [N].
 
-    `words`: text of the load; `over_x`, `over_v`: the piecewise linear functions f of the piston's position x [m] and
-    g of its velocity v [m/s]; () for none. The pairs (a, b), (s_1, c_1), (s_2, c_2) .. mean a + b s + sum of c_k
-    max(s - s_k, 0), where s is x or v.
+    `signal`: the force over time, as a command whose method `volts` computes newtons; `words`: text of the load;
+    `over_x`, `over_v`: the piecewise linear functions f of the piston's position x [m] and g of its velocity v [m/s]
+    as `Breakpoints`, () for none.
     """
 
     signal: Command
@@ -71,20 +72,20 @@ class Force:
     over_v: Breakpoints = ()
 
     def value_at(self, t: Array) -> Array:
-        """Compute the part of the load [N] that depends on time alone, at times t [s]."""
-        return self.signal.volts(t)
+        """Compute the part of the load [N] that depends on time only, at times t [s]."""
+        return self.signal.volts(t)  # the value of the signal, here in newtons
 
     def tables(self) -> tuple[Array, Array] | None:
         """Build the tables of the load over position and over velocity that the compiled model takes.
 
-        Returns two arrays (rows, 2) with the pairs of `over_x` and `over_v`, for `piecewise_linear_force`. If only one
-        of them states a load, the other array has the single row (0, 0). Returns None if the load depends on time
-        alone.
+        Returns two arrays (rows, 2) with the pairs of `over_x` and `over_v`, for `piecewise_linear_force`. An empty
+        `over_x` or `over_v` gives the single row (0, 0), which is no load. Returns None if the load depends on time
+        only.
         """
         if not (self.over_x or self.over_v):
             return None
-        x, v = (np.array(breakpoints or ((0.0, 0.0),), dtype=np.float64) for breakpoints in (self.over_x, self.over_v))
-        return x, v
+        no_load: Breakpoints = ((0.0, 0.0),)
+        return np.array(self.over_x or no_load, dtype=np.float64), np.array(self.over_v or no_load, dtype=np.float64)
 
     def __str__(self) -> str:
         return f"load {self.words}"
@@ -93,13 +94,12 @@ class Force:
 def loaded_rig_numbers(rig: Rig, load: Force | None) -> RigNumbers:
     """Build the parameters of a rig for the compiled model, including a load in addition to the rig's own.
 
-    `load`: the additional load, None for none. Its part over position and velocity is among the parameters; of its
-    part over time they only state that it exists.
+    `load`: the additional load, None for none. Its functions of position and velocity become the parameter `pushed`.
+    A load that depends on time only is an input of the solver, and `pushed` states only that there is one.
     """
     from sealscope.physics.rig import rig_numbers
 
     numbers = rig_numbers(rig)
-    # a load over time alone has no tables: one entry in `pushed` compiles its force in
     return numbers if load is None else numbers._replace(pushed=load.tables() or (True,))
 
 
@@ -111,8 +111,10 @@ def loaded_standstill_state(rig: Rig, load: Force | None, x: float) -> Array:
     from sealscope.physics.cylinder import piecewise_linear_force
     from sealscope.physics.standstill import initial_state
 
-    force, tables = (0.0, None) if load is None else (float(load.value_at(np.zeros(()))), load.tables())
-    if tables is not None:
+    if load is None:
+        return initial_state(rig, x)
+    force = float(load.value_at(np.zeros(())))  # at t = 0
+    if (tables := load.tables()) is not None:
         over_x, over_v = tables
         force = float(force + piecewise_linear_force(x, over_x) + piecewise_linear_force(0.0, over_v))
     return initial_state(rig, x, force)
@@ -122,10 +124,9 @@ def breakpoints_through(s: Array, F: Array) -> Breakpoints:
     """Convert points (s, F) of a load to breakpoints (s_k, c_k) of F_0 + sum of c_k max(s - s_k, 0).
 
     `s` (n,), rising: positions [m] or velocities [m/s]; `F` (n,) [N]. The force is linear between the points and
-    constant beyond the outer ones. The first returned pair is (F_0, 0): the force and the slope before the first point.
-    The others are the pairs (s_k, change of the slope at s_k), for `piecewise_linear_force`.
+    constant beyond the outer points. The first returned pair is (F_0, 0): the force and the slope before the first
+    point. The next pairs are (s_k, c_k), where c_k is the change of the slope at s_k (`piecewise_linear_force`).
     """
-    # the coefficient c_k of a breakpoint is the change of slope there
     slopes = np.concatenate([[0.0], np.diff(F) / np.diff(s), [0.0]])
     return (float(F[0]), 0.0), *zip(s.tolist(), np.diff(slopes).tolist(), strict=True)
 
@@ -143,7 +144,7 @@ def _parse_signal(text: str, units: Mapping[str, float], what: str) -> Command:
         raise InputError(f"{what} must have its unit ({', '.join(units)}), such as '{example}', got {text!r}")
     in_si = number_with_unit.sub(lambda match: repr(float(match[1]) * units[match[2]]), text)
     if re.fullmatch(NUMBER, in_si.strip()):
-        return Sine(0.0, 0.0, 0.0, float(in_si))
+        return Sine(amplitude=0.0, omega=0.0, offset=float(in_si))  # a constant
     try:
         return parse_command(in_si)
     except InputError as error:
@@ -158,19 +159,19 @@ def parse_position(text: str) -> Position | None:
     The signal is written as in `parse_command`, with lengths in mm, cm or m; ``position file LOG`` takes the channel
     x of a recording. Returns None if the text does not begin with ``position``.
     """
-    words = normalize_blanks(text, "command")
-    if not words.lower().startswith("position "):
+    normalized = normalize_blanks(text, "command")
+    if not normalized.lower().startswith("position "):
         return None
-    words = words[len("position ") :]
-    if words.lower().startswith("file "):
+    signal = normalized[len("position ") :]
+    if signal.lower().startswith("file "):
         from sealscope.recordings import read
 
-        path = words[5:].strip()
+        path = signal[len("file ") :].strip()
         recording = read(path)
         if "x" not in recording or recording.units["x"] != "m":
             raise InputError(f"a recorded position must have the channel x with a unit of length, got {path} without")
-        return Position(sampled_signal(recording.t - recording.t[0], recording["x"], path), words)
-    return Position(_parse_signal(words, _LENGTHS, "position"), words)
+        return Position(sampled_signal(recording.t - recording.t[0], recording["x"], path), signal)
+    return Position(_parse_signal(signal, _LENGTHS, "position"), signal)
 
 
 def command_or_target(text: str) -> Command | Position:
@@ -179,7 +180,7 @@ def command_or_target(text: str) -> Command | Position:
 
 
 class _Column(NamedTuple):
-    """A column of a table: its index in the row, and its unit as the heading states it."""
+    """A column of a table: its index in a row, from 0, and its unit as the heading states it."""
 
     position: int
     unit: str
@@ -188,15 +189,15 @@ class _Column(NamedTuple):
 def _read_force(path: str, words: str) -> Force:
     """Read a load from a CSV file with the column ``F [N]`` and one of ``t [s]``, ``x [m]`` and ``v [m/s]``.
 
-    Other units are converted; `words`: text of the load. The load is linear between the rows and constant beyond
-    them. If there is a column of times, columns of x and v are ignored, and the first time becomes t = 0. Raises
-    InputError for any other table.
+    `words`: text of the load. Other units are converted. The load is linear between the rows and constant beyond them.
+    If there is a column of times, columns of x and v are ignored, and the first time becomes t = 0. Raises InputError
+    for any other table.
     """
     with open_regular(path, "a recorded load") as file:
         head = file.readline(4096).decode("utf-8-sig", "replace")
         headings = [re.fullmatch(r"\s*(\w+)\s*\[([^\]]+)\]\s*", cell) for cell in head.split(",")]
         columns = {match[1]: _Column(k, match[2]) for k, match in enumerate(headings) if match}
-        arguments = [name for name in ("t", "x", "v") if name in columns]
+        arguments = [name for name in ("t", "x", "v") if name in columns]  # of the function F
         if "F" not in columns or not arguments or arguments == ["x", "v"]:
             raise InputError(
                 "a recorded load must have the columns t [s] and F [N], or F [N] with one of x [m] and v [m/s], got "
@@ -224,24 +225,12 @@ def _read_force(path: str, words: str) -> Force:
     return Force(_NO_FORCE, words, **{f"over_{argument}": breakpoints_through(s, F)})
 
 
-_NO_FORCE = Sine(0.0, 0.0)
-
-
 def _unit_pattern(units: Mapping[str, float]) -> str:
     """Build the regular expression that matches any of the units; blanks within a unit may be left out."""
     return "|".join(re.escape(unit).replace("\\ ", r"\s*") for unit in sorted(units, key=len, reverse=True))
 
 
-def _term_pattern(letter: str, slopes: Mapping[str, float], places: Mapping[str, float]) -> re.Pattern[str]:
-    """Compile the regular expression of one term of a load, such as ``- 5 kN/mm over x from 50 mm``.
-
-    `letter`: x or v, the argument of the load; `slopes`, `places`: allowed units of slope and start. The groups of
-    a match are sign, slope, its unit, start, and its unit.
-    """
-    start = rf"(?:\s+from\s+([-+]?{UNSIGNED})\s*\[?({_unit_pattern(places)})\b\]?)?"
-    return re.compile(rf"(?:^|([-+]))\s*({UNSIGNED})\s*\[?({_unit_pattern(slopes)})\b\]?\s+over\s+{letter}\b{start}\s*")
-
-
+#: Units of the slope and of the start of a load over x or v.
 _TERM_UNITS = {"x": (_STIFFNESSES, _LENGTHS), "v": (_DAMPINGS, _SPEEDS)}
 
 
@@ -252,24 +241,39 @@ def parse_force(text: str) -> Force:
     ``200 N/mm over x``, ``5 kN/mm over x from 50 mm`` (0 below 50 mm), ``2 kN s/m over v``. ``file LOAD.csv`` is a
     table of ``F [N]`` over ``t [s]``, ``x [m]`` or ``v [m/s]``.
     """
-    words = normalize_blanks(text, "load")
-    if words.lower().startswith("file "):
-        return _read_force(words[5:].strip(), words)
-    rest, terms = words, {}
-    for letter, (slopes, places) in _TERM_UNITS.items():
-        pattern, constant_slope, breakpoints = _term_pattern(letter, slopes, places), 0.0, []
-        for sign, number, unit, place, place_unit in pattern.findall(rest):
-            slope = float(f"{sign}{number}") * slopes[_match_unit(unit, slopes)]
-            if place:
-                breakpoints.append((float(place) * places[place_unit], slope))
-            else:
-                constant_slope += slope
-        if pattern.search(rest):
-            terms[f"over_{letter}"] = ((0.0, constant_slope), *breakpoints)
-        rest = pattern.sub("", rest)
-    if terms:
-        rest = re.sub(r"^\s*\+|[+]\s*$", "", rest).strip()
-    return Force(_NO_FORCE if terms and not rest else _parse_signal(rest, _FORCES, "load"), words, **terms)
+    normalized = normalize_blanks(text, "load")
+    if normalized.lower().startswith("file "):
+        return _read_force(normalized[len("file ") :].strip(), normalized)
+    over_x, signal = _extract_terms(normalized, "x")
+    over_v, signal = _extract_terms(signal, "v")
+    if over_x or over_v:
+        signal = re.sub(r"^\s*\+|[+]\s*$", "", signal).strip()  # a sign that joined the signal to a term
+        if not signal:
+            return Force(_NO_FORCE, normalized, over_x, over_v)
+    return Force(_parse_signal(signal, _FORCES, "load"), normalized, over_x, over_v)
+
+
+def _extract_terms(text: str, letter: str) -> tuple[Breakpoints, str]:
+    """Parse the terms over x or v (`letter`) in the text of a load, such as ``- 5 kN/mm over x from 50 mm``.
+
+    Returns their sum as a piecewise linear function, () if there are no such terms, and the text without them.
+    """
+    slope_units, start_units = _TERM_UNITS[letter]
+    number = rf"({UNSIGNED})\s*\[?({_unit_pattern(slope_units)})\b\]?"
+    start_and_unit = rf"(?:\s+from\s+([-+]?{UNSIGNED})\s*\[?({_unit_pattern(start_units)})\b\]?)?"
+    pattern = re.compile(rf"(?:^|([-+]))\s*{number}\s+over\s+{letter}\b{start_and_unit}\s*")
+    terms = pattern.findall(text)
+    if not terms:
+        return (), text
+    common_slope = 0.0  # of the terms without a start
+    breakpoints = []
+    for sign, magnitude, unit, start, start_unit in terms:
+        slope = float(f"{sign}{magnitude}") * slope_units[_match_unit(unit, slope_units)]
+        if start:
+            breakpoints.append((float(start) * start_units[start_unit], slope))
+        else:
+            common_slope += slope
+    return ((0.0, common_slope), *breakpoints), pattern.sub("", text)
 
 
 def _match_unit(unit: str, units: Mapping[str, float]) -> str:

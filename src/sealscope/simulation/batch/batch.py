@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 #: Called with the completed fraction of the batch.
 Progress = Callable[[float], None]
-#: Members of a set on which its step is chosen, and how long [s] each of them is run for that.
+#: Runs of a set that are simulated to choose its step, and their duration [s].
 _N_SAMPLE_RUNS, _SAMPLE_DURATION = 4, 2.0 * FIRST_WINDOW
 
 
@@ -62,8 +62,9 @@ class Batch:
 
         `channel`: p_A or p_B; `detail`: d1, d2, d3, d4 [Pa] or d3d4 [Pa^2].
         """
-        i, k = _index_of(channel, CHAMBERS, "channel"), _index_of(detail, QUANTITIES, "detail")
-        return np.asarray(self.rms[:, i, :, k])
+        channel_index = _index_of(channel, CHAMBERS, "channel")
+        detail_index = _index_of(detail, QUANTITIES, "detail")
+        return np.asarray(self.rms[:, channel_index, :, detail_index])
 
     @checked_call
     def changes(self, channel: str, detail: str, *, before: int = 0, after: int = -1) -> Array:
@@ -109,10 +110,7 @@ class Batch:
 
 
 def _index_of(name: str, names: tuple[str, ...], what: str) -> int:
-    """Return the index of `name` in `names`.
-
-    Raises InputError, which calls the name `what`, if it is none of them.
-    """
+    """Return the index of `name` in `names`; raise InputError, which calls the name `what`, if it is absent."""
     if name not in names:
         raise InputError(f"{what} must be one of {', '.join(names)}, got {name!r}")
     return names.index(name)
@@ -129,11 +127,14 @@ def simulate_batch(
 ) -> Batch:
     """Simulate many experiments at once, and compute the RMS of the db8 details of p_A and p_B as recorded.
 
-    All runs must have the same duration and sampling rate. Rigs, leaks (at most one per run, opening abruptly or
-    linearly), drifts, faults of the machine and loads may differ. The solver's step of a run is its own `step` if
-    stated; otherwise one step is chosen for all runs with the same laws (choices of the rig, such as the law of
-    friction), command, load and error (their own, or `error`). Results do not depend on the runs' order or number, nor
-    on `threads`. The noise differs from that of `simulate`.
+    All runs must have the same duration and sampling rate. Rigs, drifts, faults of the machine and loads may differ. A
+    run may have one leak, which opens abruptly or linearly.
+
+    Runs are integrated together if they have the same choices of the rig (such as the friction law), command waveform,
+    load, method, step and error. Unless they state a step, one is chosen for all of them by their error, or else by
+    `error`. A run's results do not depend on `threads`. They depend on the other runs only through what is chosen for
+    all of them: the step, the blocks of time in which changing parameters are constant, and the end of the search for
+    leakage coefficients. The noise differs from that of `simulate`.
 
     Parameters
     ----------
@@ -179,17 +180,19 @@ def simulate_batch(
     is_rising = edges.ndim == 1 and edges.size >= 2 and np.all(np.isfinite(edges)) and np.all(np.diff(edges) > 0)
     if not (is_rising and edges[0] >= 0 and edges[-1] <= first.duration):
         raise InputError(f"bounds must rise within 0 .. {first.duration:g} s, got {edges.tolist()}")
-    n, segments = len(experiments), edges.size - 1
-    batch = Batch(np.empty((n, len(CHAMBERS), segments, len(QUANTITIES))), edges, *(np.empty(n) for _ in range(3)))
+    n = len(experiments)
+    rms = np.empty((n, len(CHAMBERS), edges.size - 1, len(QUANTITIES)))
+    # filled set by set
+    batch = Batch(rms, edges, mean_leak_lpm=np.empty(n), coefficients=np.empty(n), steps=np.empty(n))
     completed = 0.0
     for experiment_set in sets:
         set_fraction = len(experiment_set.members) / n
 
         def report(fraction: float, before: float = completed, set_fraction: float = set_fraction) -> None:
-            """Report the completed fraction of the batch from the completed `fraction` of the current set.
+            """Report the completed fraction of the batch, from the completed `fraction` of the current set.
 
-            `before`: fraction of the batch that was complete when the set began; `set_fraction`: the set's fraction
-            of the batch.
+            `before`: fraction of the batch completed before this set; `set_fraction`: fraction of the batch in this
+            set. Both are defaults so that they keep the values of this pass of the loop.
             """
             if progress is not None:
                 progress(min(1.0, before + fraction * set_fraction))
@@ -255,8 +258,8 @@ def longest_allowed_step(experiment_set: ExperimentSet, coefficients: Array) -> 
 def _size_leaks(experiment_set: ExperimentSet, step: float, coefficients: Array, threads: int) -> Array:
     """Find the leakage coefficients (runs,) that give the stated mean flows of a set's leaks.
 
-    The search starts from `coefficients`; those of leaks without a stated mean flow stay. `step` [s]: longest step of
-    the solver if the set states none.
+    The search starts from `coefficients`, which are kept for leaks without a stated mean flow. `step` [s]: longest
+    step of the solver if the set does not state one.
     """
     members, stated_step = experiment_set.members, experiment_set.experiment.step
     mean_flows = np.array([member.leak.mean or 0.0 for member in members])
@@ -264,10 +267,10 @@ def _size_leaks(experiment_set: ExperimentSet, step: float, coefficients: Array,
     def measure_unit_flows(coefficients: Array) -> tuple[Array, None]:
         """Simulate the set; return each leak's mean flow [m^3/s] per unit coefficient (runs,), and None.
 
-        `coefficients` (runs,): leakage coefficients; a leak with the coefficient 0 is measured as if it were 1
-        under the pressures of the run. The None stands for the further results that `size_leaks` passes on.
+        `coefficients` (runs,): leakage coefficients. For a coefficient of 0, the flow that a leak of coefficient 1
+        would have under the pressures of the run is returned. None stands for the run, which is not needed.
         """
-        flow_coefficients = np.where(coefficients > 0, coefficients, 1.0)  # a unit leak where none acts yet
+        flow_coefficients = np.where(coefficients > 0, coefficients, 1.0)
         run_step = stated_step or min(step, longest_allowed_step(experiment_set, coefficients))
         run = SetRun(experiment_set, run_step, coefficients, flow_coefficients=flow_coefficients, bounds=None)
         run.run_all(threads, None)
@@ -277,4 +280,5 @@ def _size_leaks(experiment_set: ExperimentSet, step: float, coefficients: Array,
             raise InputError(f"a leak with a mean flow must be open within the run (run {members[never_open[0]].row})")
         return unit_flows, None
 
-    return size_leaks([member.leak for member in members], coefficients, measure_unit_flows)[0]
+    sized_coefficients, _ = size_leaks([member.leak for member in members], coefficients, measure_unit_flows)
+    return sized_coefficients

@@ -1,8 +1,9 @@
-"""White noise for runs on lanes: normal random numbers from a counter and a key for each lane, that is each run.
+"""White noise for many runs at once: normal random numbers from a counter and a key for each run.
 
-The generator is SplitMix64, evaluated directly at any position of its sequence (Steele, Lea, Flood, Fast splittable
-pseudorandom number generators, OOPSLA 2014): a sample's number depends only on the run's key and the sample's
-position, never on lane, group or block. The stream differs from that of a single run (`instruments.record`).
+A vector register holds a number of each run in one of its lanes. The generator is SplitMix64, evaluated directly at any
+position of its sequence (Steele, Lea, Flood, Fast splittable pseudorandom number generators, OOPSLA 2014). The random
+number of a sample therefore depends only on the run's key and the sample's position, not on how runs are grouped. It
+differs from that of a single run (`instruments.record`).
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ _SQRT_2, _LN_2 = math.sqrt(2.0), math.log(2.0)
 
 
 def _integer_constant(value: int) -> Any:
-    """Make the LLVM constant of a vector that contains a 64-bit integer in every place."""
+    """Make the LLVM constant of a vector whose elements all are the 64-bit integer `value`."""
     return ir.Constant(_INTEGERS, [value] * WIDTH)
 
 
@@ -49,19 +50,20 @@ def uniform(key: Any, position: int) -> Any:
 def _lower_uniform(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
     """Build the LLVM instructions of `uniform`, which evaluate SplitMix64 (`commands.PseudoRandom`).
 
-    The state at position k is key + (k + 1) GOLDEN; its mixed bits become the mantissa of a number in (0, 1].
+    The generator's state at position k is key + (k + 1) GOLDEN. The bits of the state, mixed by shifts and products,
+    become the mantissa of a number in (0, 1].
     """
     key, position = values
-    word = ir.IntType(64)
+    int64 = ir.IntType(64)
     k = context.cast(builder, position, arg_types[1], types.int64)
-    increment = builder.mul(builder.add(k, ir.Constant(word, 1)), ir.Constant(word, GOLDEN))
+    increment = builder.mul(builder.add(k, ir.Constant(int64, 1)), ir.Constant(int64, GOLDEN))
     first_lane = builder.insert_element(ir.Constant(_INTEGERS, ir.Undefined), increment, ir.Constant(ir.IntType(32), 0))
     to_all_lanes = ir.Constant(ir.VectorType(ir.IntType(32), WIDTH), [0] * WIDTH)
     z = builder.add(builder.bitcast(key, _INTEGERS), builder.shuffle_vector(first_lane, first_lane, to_all_lanes))
     for shift, factor in MIX:
         z = builder.mul(builder.xor(z, builder.lshr(z, _integer_constant(shift))), _integer_constant(factor))
     z = builder.xor(z, builder.lshr(z, _integer_constant(LAST_SHIFT)))
-    # a random mantissa under the exponent of 1: a number in [1, 2)
+    # a random mantissa with the exponent of 1 is a number in [1, 2); 2 minus this number is in (0, 1]
     bits = builder.or_(builder.lshr(z, _integer_constant(64 - _MANTISSA_BITS)), _integer_constant(_ONE_BITS))
     return builder.fsub(ir.Constant(_DOUBLES, [2.0] * WIDTH), builder.bitcast(bits, _DOUBLES))
 
@@ -127,11 +129,10 @@ def half_turn_sine(v: Any) -> Any:
 def normals(key: Any, pair: int) -> tuple[Any, Any]:
     """Draw two independent standard normal random numbers for each of a vector of runs, in compiled code.
 
-    They are computed from the uniform numbers at positions 2 `pair` and 2 `pair` + 1 of the sequences that `key`
-    selects (`uniform`). Source: Box and Muller, Annals of Mathematical Statistics 29 (1958) 610-611; cos 2a = 1 - 2
-    sin^2 a.
+    They are computed by the method of Box and Muller (Annals of Mathematical Statistics 29 (1958) 610-611) from the
+    uniform numbers at positions 2 `pair` and 2 `pair` + 1 of the sequences that `key` selects (`uniform`).
     """
     radius = math.sqrt(-2.0 * logarithm(uniform(key, 2 * pair)))
     s = half_turn_sine(uniform(key, 2 * pair + 1) - 0.5)
     c = math.sqrt(max(1.0 - s * s, 0.0))
-    return radius * (2.0 * s * c), radius * (1.0 - 2.0 * s * s)
+    return radius * (2.0 * s * c), radius * (1.0 - 2.0 * s * s)  # sine and cosine of twice the angle of s and c

@@ -1,4 +1,4 @@
-"""Sets of experiments that can run on the lanes of one vector register, and the simulation of such a set."""
+"""Sets of experiments that can be integrated together, each in a lane of a vector register, and their simulation."""
 
 from __future__ import annotations
 
@@ -36,8 +36,9 @@ ABRUPT = 1e15
 class Member:
     """One experiment of a set of experiments that are integrated together.
 
-    `row`: its index in the batch; `numbers`: the model's parameters; `effects`: changes of them within the run. Its
-    command is `gain` times the waveform that the set shares (`ExperimentSet.shape`), plus `offset` [V].
+    `row`: index of the experiment in the batch; `numbers`: parameters of the model; `effects`: changes of parameters
+    within the run. The command is `gain` times the waveform that the set shares (`ExperimentSet.shape`), plus `offset`
+    [V].
     """
 
     row: int
@@ -57,18 +58,18 @@ class Member:
     def step_limiting_parameters(self) -> tuple[RigNumbers, ...]:
         """The sets of model parameters in the run that limit the length of the solver's step.
 
-        The parameters change during the run. A step that is short enough for each of these sets is short enough for
-        the whole run. They are the parameters without any change, and those just before and just after each fast
-        change, such as the switching of a valve.
+        A step that is short enough for each of these sets is short enough for the whole run. The first set has the
+        parameters without any change. The others have the parameters just before and just after each fast change, such
+        as the switching of a valve.
         """
         return step_limiting_parameters(self.effects, self.numbers)
 
 
 @dataclass(frozen=True)
 class ExperimentSet:
-    """Experiments that are integrated together: their laws, command waveform (`shape`), load and solver are equal.
+    """Experiments that are integrated together: command waveform (`shape`), load and solver settings are equal.
 
-    Equal laws are equal choices of the rig, such as the law of friction; parameters may differ.
+    The rigs are equal in their choices, such as the friction law; their parameters may differ.
     """
 
     members: tuple[Member, ...]
@@ -81,12 +82,15 @@ class ExperimentSet:
 
 
 def refuse_unbatchable(experiment: Experiment, row: int) -> None:
-    """Raise InputError for an experiment that cannot be part of a batch, with the rule that it breaks.
+    """Raise InputError for an experiment that cannot be part of a batch, with the first rule that it breaks.
 
-    It must have a voltage command, at most one leak that opens abruptly or linearly, no fault of a sensor, no leak
-    while the oil's temperature changes, the integrator "state" of the motor, and no clock jitter. Its chamber pressure
-    sensors must have no lag, no harmonics of the hum, and no stuck or lost samples. `row`: its index in the batch, for
-    the message.
+    `row`: index of the experiment in the batch, for the message. These rules hold:
+
+    - a voltage command;
+    - at most one leak, which opens abruptly or linearly, and no leak while the oil's temperature changes;
+    - the integrator "state" of the motor;
+    - no fault of a sensor, and no clock jitter;
+    - chamber pressure sensors without lag, harmonics of the hum, and stuck or lost samples.
     """
     rig, leaks = experiment.rig, experiment.leaks
     violated_rules = []
@@ -102,7 +106,7 @@ def refuse_unbatchable(experiment: Experiment, row: int) -> None:
         violated_rules.append(f"no fault of a sensor, got {', '.join(map(str, experiment.faults))}")
     if leaks and experiment.changes_viscosity:
         violated_rules.append("no leak while the oil's temperature changes")
-    not_modelled = ["daq.jitter"]  # by the instruments on lanes
+    not_modelled = ["daq.jitter"]  # by the instruments of a batch (`batch.signals`)
     not_modelled += [
         f"sensors.{name}.{symbol}"
         for name in CHAMBERS
@@ -134,10 +138,11 @@ def _split_command(command: Command) -> _ScaledCommand:
 
 
 def group_experiments(experiments: Sequence[Experiment]) -> list[ExperimentSet]:
-    """Group experiments into sets that can be integrated together: equal laws, waveform, load, solver settings.
+    """Group experiments into sets that can be integrated together.
 
-    Laws are the choices of a rig, such as the law of friction; the waveform is the command without gain and offset.
-    Raises InputError if an experiment cannot be in a batch, or if they differ in duration or sampling rate.
+    The experiments of a set have equal choices of the rig (such as the friction law), command waveforms, loads, and
+    solver settings. The waveform is the command without gain and offset. Raises InputError if an experiment cannot be
+    in a batch, or if experiments differ in duration or sampling rate.
     """
     from sealscope.physics.rig import CHOICES
 
@@ -158,13 +163,13 @@ def group_experiments(experiments: Sequence[Experiment]) -> list[ExperimentSet]:
             numbers_by_rig[id(experiment.rig), load] = loaded_rig_numbers(experiment.rig, experiment.load)
         numbers = numbers_by_rig[id(experiment.rig), load]
         effects = experiment.effects()
-        # laws that these effects need are compiled in
+        # optional parts of the model that these effects need are compiled in
         if any(effect.field.startswith("G_ext") for effect in effects):
             numbers = numbers._replace(open_circuit=(True,))
         if any(effect.field == "air" for effect in effects):
             numbers = numbers._replace(aerated=(True,))
         scaled_command = _split_command(experiment.voltage_command)
-        choices = tuple(getattr(numbers, name) for name in CHOICES if name != "pushed")  # that follows from the load
+        choices = tuple(getattr(numbers, name) for name in CHOICES if name != "pushed")  # the load, which `load` states
         method = choose_method(experiment.rig, experiment.method)
         kind = (scaled_command.key, load, choices, method, experiment.step, experiment.error)
         shapes[kind] = scaled_command.shape
@@ -192,10 +197,14 @@ def unpack_lanes(lanes: Array, runs: int) -> Array:
 def build_leak_rows(members: Sequence[Member], coefficients: Array, flow_coefficients: Array) -> Array:
     """Build the table (runs, LEAK_ROWS) of the leaks' parameters that the compiled model takes.
 
-    The columns are: the coefficients G and C of the leak that acts in the run; start [s] and slope [1/s] of its
-    opening; G and C of the leak whose mean flow is computed. `coefficients` (runs,) give the first two,
-    `flow_coefficients` (runs,) the last two. They differ only while coefficients are searched for: a run in which
-    no leak acts yet then computes the flow that a leak of coefficient 1 would have under its pressures.
+    The columns are:
+
+    - G and C of the leak that acts in the run, from `coefficients` (runs,): one of them is 0;
+    - start [s] and slope [1/s] of the leak's opening;
+    - G and C of the leak whose mean flow is computed, from `flow_coefficients` (runs,).
+
+    Both arguments differ only in the search for a coefficient that gives a stated mean flow. It starts with a run
+    without a leak, which computes the flow that a leak of coefficient 1 would have under the pressures of this run.
     """
     rows = []
     for member, coefficient, flow_coefficient in zip(members, coefficients, flow_coefficients, strict=True):
@@ -213,9 +222,10 @@ def build_leak_rows(members: Sequence[Member], coefficients: Array, flow_coeffic
 class Cells:
     """Model parameters of the runs of a set over time, constant within cells.
 
-    A cell is a span of outputs, i.e. of times at which the solver writes its results, the same for all runs. `bounds`
-    (cells + 1,): outputs at which the cells begin, and the end; `base` (runs, parameters): parameters without changes;
-    `changing`: indices of the parameters that change, with their `values` (runs, changing, cells).
+    A cell is a span of outputs, which are the times at which the solver writes its results. All runs have the same
+    cells. `bounds` (cells + 1,): outputs at which the cells begin, and the end of the last; `base` (runs, parameters):
+    parameters without changes; `changing`: indices of the parameters that change; `values` (runs, changing, cells):
+    values of the changing parameters.
     """
 
     bounds: np.ndarray
@@ -226,8 +236,7 @@ class Cells:
     def table(self, first: int, last: int, width: int) -> Array:
         """Build the table of the model's parameters in the cells first <= cell < last, for compiled code.
 
-        A cell is a span of time within which the parameters are constant. Returns (groups, cells, parameters,
-        width), with `width` runs in a group.
+        Returns an array (groups, cells, parameters, width), with `width` runs in a group.
         """
         table = np.repeat(self.base[:, None, :], last - first, axis=1)
         for k, parameter in enumerate(self.changing):
@@ -239,13 +248,14 @@ def build_cells(members: Sequence[Member], n_out: int, rate: float) -> Cells:
     """Compute the model's parameters over time for a set of runs.
 
     Time is divided into cells in which the parameters are constant, so short that they change little from one cell
-    to the next (`block_bounds`). All runs have the same cells. `n_out`: number of outputs of a run, that is of times at
-    which the solver writes its results, at `rate` [Hz].
+    to the next (`block_bounds`). All runs have the same cells. A run has `n_out` outputs at `rate` [Hz], the times at
+    which the solver writes its results.
     """
     from sealscope.physics.rig import NUMBERS
 
-    numbers_by_id = {id(member.numbers): member.numbers for member in members}  # most members share their parameters
-    rows = {key: [float(getattr(numbers, name)) for name in NUMBERS] for key, numbers in numbers_by_id.items()}
+    # most members share their parameters: convert each distinct object once
+    distinct_numbers = {id(member.numbers): member.numbers for member in members}
+    rows = {key: [float(getattr(numbers, name)) for name in NUMBERS] for key, numbers in distinct_numbers.items()}
     base = np.array([rows[id(member.numbers)] for member in members])
     effects = [effect for member in members for effect in member.effects]
     bounds = block_bounds(effects, n_out, rate)
@@ -269,12 +279,12 @@ def with_leak_coefficient(experiment: Experiment, coefficient: float) -> Experim
 
 
 def build_instrument_rows(members: Sequence[Member], first: int, last: int) -> Array:
-    """Build the table of the parameters of the instruments of p_A and p_B, for a span of samples.
+    """Build the table of the parameters of the instruments of p_A and p_B for the samples first <= sample < last.
 
-    The span has the samples first <= sample < last. Returns (runs, 2, INSTRUMENT_ROWS) for compiled code; the last axis
-    has the quantities whose indices are constants of `signals` (`GAIN` to `MAX_CODE`). Gain, offset and noises may
-    change within a run. They are stored as the value at sample `first` (such as `GAIN`) and the change per sample
-    (`GAIN_RISE`), so that they are linear and reach their true value again at sample `last`.
+    Returns an array (runs, 2, INSTRUMENT_ROWS) for compiled code; the last axis has the quantities whose indices are
+    constants of `batch.signals` (`GAIN` to `MAX_CODE`). Gain, offset and noises may change within a run; they are
+    stored as the value at sample `first` (such as `GAIN`) and the mean change per sample until sample `last` (such as
+    `GAIN_RISE`).
     """
     from sealscope.simulation.batch.signals import HUM, HUM_PHASE
 
@@ -283,7 +293,7 @@ def build_instrument_rows(members: Sequence[Member], first: int, last: int) -> A
     samples = last - first
     rows = np.array([_pressure_instruments(run.rig, run.readings(), ends, samples) for run in experiments])
     for row, experiment in zip(rows, experiments, strict=True):
-        if row[:, HUM].any():  # 1: a random stream apart from that of the noise
+        if row[:, HUM].any():  # 1: not the random numbers of the noise
             row[:, HUM_PHASE] = np.random.default_rng([experiment.seed, 1]).random(len(CHAMBERS))
     return rows
 
@@ -291,9 +301,10 @@ def build_instrument_rows(members: Sequence[Member], first: int, last: int) -> A
 def _pressure_instruments(rig: Rig, readings: Readings, ends: Array, samples: int) -> Array:
     """Build the parameters (2, INSTRUMENT_ROWS) of one run's pressure instruments for a span of time.
 
-    `ends` (2,): begin and end of the span [s]; `samples`: number of samples in it; `readings`: changes of the
-    instruments. The first axis is p_A and p_B; the second has the quantities whose indices are constants of `signals`
-    (`GAIN` to `MAX_CODE`). A parameter that changes is stored as its value at the begin and its mean change per sample.
+    `ends` (2,): start and end of the span [s]; `samples`: number of samples in the span; `readings`: changes of the
+    instruments. The first axis is p_A and p_B; the second has the quantities whose indices are constants of
+    `batch.signals` (`GAIN` to `MAX_CODE`). Gain, offset and noises are stored as the value at the start and the mean
+    change per sample.
     """
     from sealscope.simulation.batch import signals
 
@@ -336,9 +347,7 @@ MAX_CHUNK_STEPS = 4096
 class SetRun:
     """The simulation of all runs of an `ExperimentSet`, on several threads.
 
-    `coefficients` (runs,): leakage coefficients that act; `flow_coefficients` (runs,): those whose mean flow is
-    computed (`build_leak_rows`); `bounds` [s]: limits of the segments over which the RMS of the wavelet details is
-    computed, None to compute mean flows only.
+    `run_all` simulates the runs; `rms` and `mean_flow` then compute the results.
     """
 
     #: Runs of a group.
@@ -355,15 +364,17 @@ class SetRun:
     ) -> None:
         """Prepare the runs of a set at standstill, to be integrated with a step of at most `step` [s].
 
-        `coefficients` (runs,): leakage coefficients that act in the runs; `flow_coefficients` (runs,): those whose
-        mean flow is computed; `bounds` [s]: limits of the segments of the statistics, None to compute mean flows
-        only. Raises SimulationFailed if the step cannot resolve one of the runs.
+        `coefficients` (runs,): leakage coefficients that act in the runs; `flow_coefficients` (runs,): coefficients of
+        the leaks whose mean flow is computed (`build_leak_rows`); `bounds` [s]: limits of the segments over which the
+        RMS of the wavelet details is computed, None to compute mean flows only. Raises SimulationFailed if the step
+        cannot resolve one of the runs.
         """
         from sealscope.physics.solvers.advance import EXPLICIT, IMPLICIT, step_nodes
         from sealscope.physics.solvers.limits import longest_step
         from sealscope.physics.vector.runs import CHANNELS, MIN_PRESSURE, N_TOTALS
 
-        members, common = experiment_set.members, experiment_set.experiment  # `common`: for the settings all share
+        members = experiment_set.members
+        common = experiment_set.experiment  # for the settings that all members share
         self.experiment_set, self.n_runs, self.channels = experiment_set, len(members), CHANNELS
         self.method = choose_method(common.rig, common.method)
         self.oversampling = oversampling_of(common.rate, step)
@@ -400,8 +411,9 @@ class SetRun:
     def _prepare_filters(self, rate: float) -> None:
         """Set `taps` to the coefficients of each run's anti-alias filter, which includes the delays of its transducers.
 
-        The filter computes a sample of the recording from the solver's outputs, which are `oversampling` times as many.
-        Coefficient k multiplies the output k - `taps_before` steps after the sample. `rate` [Hz]: rate of the outputs.
+        The filter computes a sample of the recording from the solver's outputs, which are `oversampling` times as many:
+        for a sample at output n, from `taps_before` outputs before n to `taps_after` outputs after n, which are set,
+        too. `rate` [Hz]: rate of the outputs.
         """
         sensors = [member.experiment.rig.sensors for member in self.experiment_set.members]
         delays = np.array([[getattr(group, name).delay * rate for name in CHAMBERS] for group in sensors])
@@ -438,14 +450,12 @@ class SetRun:
         `progress` is called with the completed fraction of the set. The threads run in parallel because compiled
         code releases Python's lock.
         """
-        cuts = np.unique(np.linspace(0, self.n_groups, min(threads, self.n_groups) + 1).round().astype(int)).tolist()
+        # groups at which the share of a thread begins, and the end
+        bounds = np.unique(np.linspace(0, self.n_groups, min(threads, self.n_groups) + 1).round().astype(int)).tolist()
         lock, completed = threading.Lock(), 0.0
 
         def add_progress(fraction: float) -> None:
-            """Add `fraction` to the completed fraction of the set of runs, and report the sum.
-
-            It is called by all threads.
-            """
+            """Add `fraction` to the completed fraction of the set of runs, and report the sum; for all threads."""
             nonlocal completed
             if progress is not None:
                 with lock:
@@ -453,24 +463,27 @@ class SetRun:
                     progress(completed)
 
         with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(lambda groups: self._run_groups(groups, add_progress), itertools.pairwise(cuts)))
+            list(pool.map(lambda groups: self._run_groups(groups, add_progress), itertools.pairwise(bounds)))
 
     def _chunks(self) -> list[_Chunk]:
         """Divide the run into chunks, spans of time that are integrated by one call of compiled code.
 
-        A chunk covers several whole cells, which are spans of constant parameters, or a part of one long cell.
+        A chunk covers as many whole cells (spans of constant parameters) as `MAX_CHUNK_STEPS` allows, or a part of one
+        longer cell.
         """
         max_outputs = max(1, MAX_CHUNK_STEPS // self.steps_per_output)
         edges = self.cells.bounds
+        n_cells = edges.size - 1
         chunks = []
         first = 0
-        while first < edges.size - 1:
-            last = first + 1
-            while last < edges.size - 1 and edges[last + 1] - edges[first] <= max_outputs:
-                last += 1
-            start, stop = int(edges[first]), int(edges[last])
-            chunks += [_Chunk(first, last, a, min(a + max_outputs, stop)) for a in range(start, stop, max_outputs)]
-            first = last
+        while first < n_cells:
+            end = first + 1
+            while end < n_cells and edges[end + 1] - edges[first] <= max_outputs:
+                end += 1
+            stop = int(edges[end])
+            starts = range(int(edges[first]), stop, max_outputs)
+            chunks += [_Chunk(first, end, start, min(start + max_outputs, stop)) for start in starts]
+            first = end
         return chunks
 
     def _readable_samples(self, stop: int) -> int:
@@ -483,30 +496,31 @@ class SetRun:
         return min(max(0, (stop - self.taps_after - 1) // self.oversampling + 1), self.n_samples)
 
     def _run_groups(self, groups: tuple[int, int], add_progress: Callable[[float], None]) -> None:
-        """Simulate some groups of runs, chunk by chunk from standstill to the end.
+        """Simulate the groups of runs groups[0] <= g < groups[1], chunk by chunk from standstill to the end.
 
-        The groups, each of which fills a vector register, are groups[0] <= g < groups[1]. The squared wavelet
-        details of each chunk's readings are added to the sums. `add_progress` is called with the fraction that each
-        chunk completes.
+        A group of runs fills a vector register. If there are segments, the squared wavelet details of the readings are
+        added to the sums after each chunk. `add_progress` is called with the fraction of the set that each chunk
+        completes.
         """
         from sealscope.physics.vector.runs import advance_lanes_imex, advance_lanes_rk4
         from sealscope.signals.streams import DetailStream
         from sealscope.simulation.batch.signals import sense_lanes
 
         advance = advance_lanes_imex if self.method == "imex" else advance_lanes_rk4
-        a, b = groups
+        a, b = groups  # first group, and the end
         local_groups = (0, b - a)  # indices within the slices [a:b] of the arrays
         state, leaks, totals = self.state[a:b], self.leaks[a:b], self.totals[a:b]
         table, cells = np.empty((0, 0, 0, 0)), (-1, -1)
         chunks = self._chunks()
-        history = self.taps_before + self.taps_after + self.oversampling  # outputs that later samples still need
+        history = self.taps_before + self.taps_after + self.oversampling  # earlier outputs that later samples need
         longest = max(chunk.stop - chunk.start for chunk in chunks)
+        # (groups, outputs of history and chunk, channels, width)
         pressures = np.zeros((b - a, history + longest, self.channels, self.width))
         offset_drifts = np.zeros((b - a, self.channels, self.width))
         wavelet = DetailStream((self.channels, (b - a) * self.width))
         n_read = 0  # samples read so far
         every = self.steps_per_output
-        for first, last, start, stop in chunks:
+        for first, last, start, stop in chunks:  # cells first <= cell < last, outputs start <= output < stop
             if cells != (first, last):
                 table, cells = self.cells.table(first, last, self.width)[a:b], (first, last)
             cell_bounds = (np.clip(self.cells.bounds[first : last + 1], start, stop) - start) * every  # in steps
@@ -517,7 +531,7 @@ class SetRun:
             self._check_groups(groups, stop)
             if self.bounds is not None:
                 if start == 0:
-                    pressures[:, :history] = pressures[:, history : history + 1]  # at standstill before the beginning
+                    pressures[:, :history] = pressures[:, history : history + 1]  # constant before the beginning
                 end_sample = self._readable_samples(stop)
                 if end_sample > n_read:
                     first_tap = n_read * self.oversampling - self.taps_before - (start - history)
@@ -531,25 +545,24 @@ class SetRun:
             add_progress((stop - start) / self.n_outputs * (b - a) / self.n_groups)
 
     def _inputs_at_nodes(self, start: int, stop: int) -> Array:
-        """Compute the command [V] and the load [N] at all times that the solver's steps in a chunk need.
+        """Compute the command waveform and the load [N] at the nodes of the solver's steps in a chunk.
 
-        The command is the one that all runs share, before the gain and offset of each. The chunk has the outputs
-        start <= output < stop; `nodes` are the times within a step at which its inputs are needed. Returns
-        (steps, nodes), or (steps, 2 nodes) with the load in the last columns if there is one.
+        The nodes are the times within a step at which the solver needs its inputs. All runs share the waveform; a run's
+        command is gain times waveform plus offset. The chunk has the outputs start <= output < stop. Returns an array
+        (steps, nodes), or (steps, 2 nodes) with the load in the last columns if there is a load.
         """
         t = np.arange(start * self.steps_per_output, stop * self.steps_per_output, dtype=np.float64) * self.step
-        times, load = t[:, None] + self.nodes, self.experiment_set.experiment.load
-        volts = self.experiment_set.shape.volts(times)
-        return np.ascontiguousarray(
-            volts if load is None else np.hstack([volts, np.broadcast_to(load.value_at(times), times.shape)])
-        )
+        times = t[:, None] + self.nodes
+        waveform, load = self.experiment_set.shape.volts(times), self.experiment_set.experiment.load
+        if load is None:
+            return np.ascontiguousarray(waveform)
+        return np.ascontiguousarray(np.hstack([waveform, np.broadcast_to(load.value_at(times), times.shape)]))
 
     def _sensors(self, groups: tuple[int, int], first: int, last: int) -> Array:
-        """Build the parameters of the pressure instruments for some groups of runs and a span of samples.
+        """Build the parameters of the pressure instruments for the samples first <= sample < last of some groups.
 
-        The span has the samples first <= sample < last. Returns (groups, 2, INSTRUMENT_ROWS, width) for the groups
-        groups[0] <= g < groups[1] of `width` runs; the second axis is p_A and p_B, the third has the quantities of
-        `build_instrument_rows`.
+        The groups are groups[0] <= g < groups[1], of `width` runs each. Returns an array (groups, 2, INSTRUMENT_ROWS,
+        width); the second axis is p_A and p_B, the third has the quantities of `build_instrument_rows`.
         """
         if self._constant_sensors is not None:
             return self._constant_sensors[groups[0] : groups[1]]
@@ -569,8 +582,8 @@ class SetRun:
     def _check_groups(self, groups: tuple[int, int], stop: int) -> None:
         """Raise SimulationFailed if a run of the groups groups[0] <= g < groups[1] has diverged before output `stop`.
 
-        Also raises it if a run fell below vacuum or hit an end stop that its step cannot resolve, unless the
-        experiment allows unresolved runs.
+        Unless the experiment allows unresolved runs, also raises SimulationFailed if a run fell below vacuum, or if it
+        hit an end stop that the step cannot resolve.
         """
         from sealscope.physics.solvers.limits import longest_step_on_stop
         from sealscope.physics.vector.runs import DIVERGED, MAX_TRAVEL, MIN_PRESSURE
@@ -585,7 +598,7 @@ class SetRun:
         extremes = totals_by_run[:, [MAX_TRAVEL, MIN_PRESSURE, DIVERGED]]
         for k, (max_travel, min_pressure, diverged) in enumerate(extremes):
             index = groups[0] * self.width + k
-            if index >= self.n_runs:  # a spare lane
+            if index >= self.n_runs:  # the lanes from here on have copies of the last run
                 break
             member = self.experiment_set.members[index]
             if not diverged == 0.0:  # NaN once a state was not finite
@@ -616,9 +629,9 @@ class SetRun:
     def mean_flow(self) -> Array:
         """Compute the mean flow |Q_L| (runs,) [m^3/s] of each run's leak while it is open.
 
-        It is the sum of |Q_L| over the output times of the run, divided by the sum of the leak's opening (0 to 1) over
-        the same times. An output time at which the leak is half open thus counts as half a time. The leaks have the
-        coefficients `flow_coefficients`. The flow is 0 for a leak that never opens.
+        The mean is the sum of |Q_L| over the output times of the run, divided by the sum of the leak's opening (0 to 1)
+        over the same times: a time at which the leak is half open counts half. The leaks have the coefficients
+        `flow_coefficients`. The result is 0 for a leak that never opens.
         """
         from sealscope.physics.vector.runs import FLOW, OPENING
 

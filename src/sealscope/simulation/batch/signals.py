@@ -1,6 +1,7 @@
-"""Instruments and wavelet details of runs on lanes: from simulated pressures to sums of squared details.
+"""Instruments and wavelet details of many runs at once: from simulated pressures to sums of squared details.
 
-The instruments and the wavelet transform are those of `instruments.record` and `signals.details`.
+A group of runs fills a vector register, one run in each lane. The instruments and the wavelet transform are those of
+`instruments.record` and `signals.details`.
 """
 
 from __future__ import annotations
@@ -18,11 +19,12 @@ from sealscope.simulation.batch.noise import half_turn_sine, normals
 LEVELS = 4
 #: Number of quantities with summed squares: d1, d2, d3, d4 and the product d3 d4.
 QUANTITIES = LEVELS + 1
-#: Rows that describe a channel's instrument: gain, offset, noise of the channel, common noise, and the change of each
-#: per sample; drift per sample; hum's amplitude, cycles per sample and phase in cycles; range of pressure; converter's
-#: volts at the lower end of the range, volts per pascal, volts per code, largest code.
+#: Rows that describe a channel's instrument. First gain, offset, noise of the channel and noise of all channels, and
+#: the changes of these four per sample.
 GAIN, OFFSET, NOISE, COMMON, GAIN_RISE, OFFSET_RISE, NOISE_RISE, COMMON_RISE = range(8)
+#: Standard deviation of the drift per sample; amplitude of the hum, its cycles per sample, and its phase in cycles.
 DRIFT_STEP, HUM, HUM_CYCLES, HUM_PHASE = range(8, 12)
+#: Range of pressure [Pa]; volts of the converter at its lower end, per pascal and per code; largest code plus 1.
 RANGE_MIN, RANGE_MAX, VOLTS_AT_MIN, VOLTS_PER_PASCAL, VOLTS_PER_CODE, MAX_CODE = range(12, 18)
 INSTRUMENT_ROWS = 18
 
@@ -48,8 +50,8 @@ def convert_lanes(pressure: Any, sensor: np.ndarray, row: int) -> Any:
 def _mains_hum(sensor: np.ndarray, row: int, sample: int) -> Any:
     """Compute the mains hum [Pa] of a pressure channel at the sample number `sample`, for a group of runs at once.
 
-    It is a sine, computed as 2 sin a cos a from half its phase a. `sensor`: table of the parameters of the
-    instruments; `row`: index of the first of this channel's `INSTRUMENT_ROWS` rows in it.
+    The hum is a sine, computed as 2 sin a cos a, where a is half its phase. `sensor`: table of the parameters of the
+    instruments; `row`: index in this table of the first of the `INSTRUMENT_ROWS` rows for this channel.
     """
     cycles = load(sensor, row + HUM_PHASE) + load(sensor, row + HUM_CYCLES) * sample
     cycles = cycles - nearest_integer(cycles)  # -1/2 .. 1/2
@@ -71,10 +73,10 @@ def _read_pressure(
 ) -> Any:
     """Compute the readings [Pa] of a pressure channel in a group of runs from the filtered `pressure` [Pa].
 
-    `sensor`: table of the parameters of the instruments; `row`: index of the first of this channel's
-    `INSTRUMENT_ROWS` rows in it; `channel_noise`, `common_noise`: standard normal numbers; `drift` [Pa]: drift of the
-    offset so far; `sample`: number of the sample; `samples_since`: number of samples since the one for which `sensor`
-    was built.
+    `sensor`: table of the parameters of the instruments; `row`: index in this table of the first of the
+    `INSTRUMENT_ROWS` rows for this channel; `channel_noise`, `common_noise`: standard normal numbers; `drift` [Pa]:
+    drift of the offset so far; `sample`: number of the sample; `samples_since`: number of samples since the sample for
+    which the table was built.
     """
     gain = load(sensor, row + GAIN) + samples_since * load(sensor, row + GAIN_RISE)
     offset = load(sensor, row + OFFSET) + samples_since * load(sensor, row + OFFSET_RISE)
@@ -91,8 +93,8 @@ def _add_squares(details: np.ndarray, first: int, n: int, bounds: np.ndarray, su
     """Add the squared wavelet details of n samples, and the squares of d3 d4, to the sums of their segments.
 
     `details` (LEVELS, CHUNK, WIDTH): details of the samples from `first` on; `bounds` (segments + 1,): samples at
-    which the segments begin, and the end. The sums of segment k are QUANTITIES rows of `sums`, the first of which
-    is `sums_row` + k QUANTITIES.
+    which the segments begin, and the end of the last. The sums of segment k are QUANTITIES rows of `sums`, beginning
+    with row `sums_row` + k QUANTITIES.
     """
     for segment in range(bounds.size - 1):
         row = sums_row + segment * QUANTITIES
@@ -127,13 +129,13 @@ def add_reading_squares(
 
     `pressures` (groups, outputs, CHANNELS, WIDTH): simulated pressures, `factor` outputs per sample. The anti-alias
     filter of sample `first` begins at output `first_output`.
-    `taps` (groups, CHANNELS, taps, WIDTH): coefficients of that filter.
+    `taps` (groups, CHANNELS, taps, WIDTH): coefficients of the anti-alias filter.
     `sensors` (groups, CHANNELS, INSTRUMENT_ROWS, WIDTH): parameters of the instruments at sample `first`.
     `keys` (groups, WIDTH): keys of the runs' noise.
     `drifts` (groups, CHANNELS, WIDTH): drift of the offset so far [Pa], updated.
     `wavelet`: coefficients (taps, WIDTH) of the low-pass and of the high-pass filter.
     `buffers` (groups, CHANNELS, LEVELS, history + CHUNK, WIDTH): inputs of the wavelet's levels, updated.
-    `bounds` (segments + 1,): samples at which the segments of the sums begin, and the end.
+    `bounds` (segments + 1,): samples at which the segments of the sums begin, and the end of the last.
     `sums` (groups, CHANNELS, segments, QUANTITIES, WIDTH): sums of the squared details, updated.
     """
     n_taps, stride, sum_rows = taps.shape[2], factor * CHANNELS, (bounds.size - 1) * QUANTITIES
@@ -143,7 +145,7 @@ def add_reading_squares(
     details = np.empty((LEVELS, CHUNK, WIDTH))
     for g in range(groups[0], groups[1]):
         key = load(keys, g)
-        A, B = CHANNELS * g, CHANNELS * g + 1  # both channels; rows of lanes in all arrays are counted through
+        A, B = CHANNELS * g, CHANNELS * g + 1  # numbers of both channels; rows are counted over all axes but the lanes
         drift_A, drift_B = load(drifts, A), load(drifts, B)
         sensor_A, sensor_B = A * INSTRUMENT_ROWS, B * INSTRUMENT_ROWS
         start_A, start_B = A * LEVELS * capacity, B * LEVELS * capacity
@@ -175,8 +177,5 @@ def add_reading_squares(
 
 @kernel
 def sense_lanes(*run: Any) -> None:
-    """Read some groups of runs with their instruments, and add the squared wavelet details of the readings to sums.
-
-    This is `add_reading_squares` in compiled code, with the same arguments.
-    """
+    """Call `add_reading_squares` from Python as compiled code; `run`: its arguments."""
     add_reading_squares(*run)

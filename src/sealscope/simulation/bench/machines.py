@@ -1,4 +1,4 @@
-"""The bench: healthy machines drawn at random from a profile, each with parameters and slow drifts of its own."""
+"""The bench: healthy machines drawn at random from a profile, with different parameters and slow drifts."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
 T = TypeVar("T")
-#: Terms of a wandering drift.
+#: Number of sines in a wandering drift (`Wander.weights`).
 WANDER_TERMS = 6
 #: Time step [s] at which the piston's path is estimated for `centred_start`.
 _PATH_STEP = 0.05
@@ -32,10 +32,10 @@ _PATH_STEP = 0.05
 class BenchMachine:
     """One healthy machine in one recording: how it deviates from the designed rig, its drifts, its command and load.
 
-    `overrides`: the machine's parameters by dotted name, in SI units; `duration` [s]: length of the recording, over
-    which the drifts have their sizes; `closed`: closed fraction of both throttles; `command`: voltage command or
-    position target. A position target is followed by the controller of the name `controller`, built for the designed
-    `rig` and not for the machine.
+    `profile`, `seed`: from which the machine was drawn; `rig`: the designed rig; `overrides`: parameters in which the
+    machine deviates, by dotted name, in SI units; `duration` [s]: length of the recording, over which the drifts have
+    their sizes; `closed`: closed fraction of both throttles; `command`: voltage command or position target;
+    `controller`: name of the controller that follows a position target, with the parameters of the designed rig.
     """
 
     profile: str
@@ -52,13 +52,13 @@ class BenchMachine:
     def experiment(self, **arguments: Any) -> Experiment:
         """Make the experiment of this machine, with a start position from which its strokes are centred.
 
-        `arguments`: those of `Experiment.of`, such as leak and fault; seed, duration, command, load and drifts are
-        the machine's unless stated. Raises InputError as `Experiment.of` does, also if a drawn parameter is out of
+        `arguments`: those of `Experiment.of`, such as leak and fault. The machine's seed, duration, command, load and
+        drifts are used unless stated. Raises InputError as `Experiment.of` does, also if a drawn parameter is out of
         its range.
         """
         machine = self.rig.with_overrides(self.overrides, source=f"drawn from profile {self.profile}, seed {self.seed}")
-        machine_values = {"seed": self.seed, "duration": self.duration, "command": self.command, "drifts": self.drifts}
-        values = {"load": self.load, **machine_values, **arguments}
+        names = ("load", "seed", "duration", "command", "drifts")
+        values = {name: getattr(self, name) for name in names} | arguments
         if isinstance(values["command"], str):
             values["command"] = command_or_target(values["command"])
         if isinstance(values["command"], Position):
@@ -70,8 +70,8 @@ class BenchMachine:
 def centred_start(rig: Rig, command: Command | Position | str, duration: float) -> float:
     """Estimate the start position [m] from which the strokes under a command are centred at mid-stroke.
 
-    For a position target it is the target's first value. The result is limited to the stroke. `duration` [s]: length
-    of the run.
+    Under a position target, the start position is the target's first value. The result is limited to the stroke.
+    `duration` [s]: length of the run.
 
     The piston moves with the pump's flow, A v = q_b omega/(2 pi), and the motor is taken as unloaded and without
     inertia in its PI loop: (k_p + C_e) omega = k_p omega_d + K_i I, dI/dt = omega_d - omega (eqs. 4.2-4.5). Behind a
@@ -79,10 +79,12 @@ def centred_start(rig: Rig, command: Command | Position | str, duration: float) 
     """
     command = parse_command(command) if isinstance(command, str) else command
     motor, cylinder = rig.motor, rig.cylinder
-    dt, half_stroke = _PATH_STEP, 0.5 * cylinder.L
+    half_stroke = 0.5 * cylinder.L
     if isinstance(command, Position):
-        return float(np.clip(command.value_at(np.zeros(())), -half_stroke, half_stroke))
-    area, volts = 0.5 * (cylinder.A_A + cylinder.A_B), command.volts(np.arange(0.0, duration + dt, dt))
+        return float(np.clip(command.value_at(np.zeros(())), -half_stroke, half_stroke))  # the target at t = 0
+    dt = _PATH_STEP
+    volts = command.volts(np.arange(0.0, duration + dt, dt))
+    area = 0.5 * (cylinder.A_A + cylinder.A_B)
     if not rig.circuit.pump_feeds_chambers:
         flow_per_volt = drive_of(rig).unloaded_flow(1.0)
         positions = dt * np.cumsum(volts) * flow_per_volt / area
@@ -99,10 +101,10 @@ def centred_start(rig: Rig, command: Command | Position | str, duration: float) 
 
 
 def _random_stream(seed: int, name: str) -> np.random.Generator:
-    """Make the random generator of one nuisance, that is of one difference between machines.
+    """Make the random generator from which the nuisance `name` (a difference between machines) is drawn.
 
-    It depends on `seed` and `name` only, so that the draws of a nuisance do not depend on the other nuisances of a
-    profile.
+    The generator depends on `seed` and `name` only, so that the other nuisances of a profile do not change what is
+    drawn.
     """
     return np.random.default_rng([seed, zlib.crc32(name.encode())])
 
@@ -111,7 +113,7 @@ def _draw_path(random: np.random.Generator, shapes: tuple[str, ...], duration: f
     """Draw the course of a drift over `duration` [s]: linear with an end value of +-1, or a walk with a range of 1.
 
     The range is maximum minus minimum. `shapes`: names of the courses to choose from, "linear" and "wander" (a smooth
-    random walk); `warms`: a linear course always rises, otherwise it rises or falls at random.
+    random walk); `warms`: True for a linear course that always rises, False for one that rises or falls at random.
     """
     shape = shapes[int(random.integers(len(shapes)))]
     rises = random.random() < 0.5 or warms
@@ -122,28 +124,32 @@ def _draw_path(random: np.random.Generator, shapes: tuple[str, ...], duration: f
 
 
 def _draw_drift(random: np.random.Generator, drift: DriftRange, oil: Wander) -> Wander:
-    """Draw the course of a parameter's drift: a mixture of the oil temperature's course and an independent one.
+    """Draw the course of a parameter's drift: a mixture of the oil temperature's course and an independent course.
 
-    It is w oil + sqrt(1 - w^2) path, scaled to a range (maximum minus minimum) that is drawn uniformly from
-    `drift.size`. Here w is `drift.oil`, `oil` the course of the oil temperature, and path an independent course.
+    The mixture is w oil + sqrt(1 - w^2) path, with the weight w = `drift.oil`, the course `oil` of the oil's
+    temperature, and a path that is drawn. It is scaled to a range (maximum minus minimum) drawn uniformly from
+    `drift.size`.
     """
     path = _draw_path(random, drift.shapes, oil.duration)
-    # weights whose squares sum to 1, so that the mixture varies as much as either path
-    mixture = oil.times(drift.oil).plus(path.times((1.0 - drift.oil**2) ** 0.5)) if drift.oil else path
+    weight = drift.oil
+    # the squares of the weights sum to 1, so that the mixture varies as much as either path
+    mixture = oil.times(weight).plus(path.times((1.0 - weight**2) ** 0.5)) if weight else path
     return mixture.scale_to_range(float(random.uniform(*drift.size)))
 
 
 def _draw_nuisance(nuisance: Nuisance, seed: int, oil: Wander) -> tuple[dict[str, float], list[ParameterDrift]]:
-    """Draw the values of a nuisance, that is of one difference between machines, and its drifts.
+    """Draw the values and the drifts of a nuisance, which is a difference between machines.
 
     Returns the values by parameter, and the list of drifts. A value is in SI units, or a factor on the rig's value if
     `nuisance.scales`. `oil`: course of the oil temperature, which drifts may follow.
     """
     values: dict[str, float] = {}
     drifts: list[ParameterDrift] = []
-    groups = [(name,) for name in nuisance.parameters] if nuisance.each else [nuisance.parameters]
-    for group in groups:
-        random = _random_stream(seed, f"{nuisance.name}/{group[0]}" if nuisance.each else nuisance.name)
+    groups = [(nuisance.name, nuisance.parameters)]
+    if nuisance.each:  # the parameters are drawn one by one
+        groups = [(f"{nuisance.name}/{parameter}", (parameter,)) for parameter in nuisance.parameters]
+    for stream_name, group in groups:
+        random = _random_stream(seed, stream_name)
         value = float(random.uniform(nuisance.low, nuisance.high)) if nuisance.high > nuisance.low else nuisance.low
         values |= dict.fromkeys(group, value)
         if nuisance.drift is not None:
@@ -171,7 +177,7 @@ def draw(
     distribution = load_profile(profile) if isinstance(profile, str) else profile
     warms = bool(family) and distribution.family(family).warms
     distribution = distribution.of_family(family) if family else distribution
-    base = load_rig(rig)
+    designed_rig = load_rig(rig)
     if seed < 0:
         raise InputError(f"seed must be >= 0, got {seed}")
     if not (math.isfinite(duration) and duration > 0):
@@ -186,7 +192,9 @@ def draw(
             overrides |= dict.fromkeys(nuisance.parameters, value)
             continue
         values, nuisance_drifts = _draw_nuisance(nuisance, seed, oil)
-        overrides |= {name: float(base[name]) * value for name, value in values.items()} if nuisance.scales else values
+        if nuisance.scales:
+            values = {name: float(designed_rig[name]) * factor for name, factor in values.items()}
+        overrides |= values
         drifts += nuisance_drifts
     random, duty = _random_stream(seed, "duty"), distribution.duty
 
@@ -206,7 +214,7 @@ def draw(
     return BenchMachine(
         profile=distribution.name,
         seed=seed,
-        rig=base,
+        rig=designed_rig,
         duration=duration,
         overrides=overrides,
         drifts=tuple(drifts),

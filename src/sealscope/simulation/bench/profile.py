@@ -21,6 +21,7 @@ from sealscope.storage.toml_file import read_toml
 from sealscope.units import to_si
 
 _PACKAGED = Path(__file__).parent / "profiles"
+#: Setting of pydantic that refuses unknown fields.
 _KNOWN_ONLY = ConfigDict(extra="forbid")
 _Entries = TypeVar("_Entries", bound=tuple[Any, ...])
 
@@ -68,9 +69,9 @@ class _NuisanceEntry(BaseModel):
 class DriftRange:
     """The distribution from which a parameter's drift is drawn.
 
-    `size`: (low, high) limits of the drift's highest minus lowest value, in SI units if `absolute`, else relative to
-    the parameter; `shapes`: courses to choose from ("linear", "wander"); `oil`: weight of the oil temperature's
-    course in the drift, -1 .. 1, 0 for a drift that is independent of it.
+    `size`: low and high limit of the drift's maximum minus minimum, in SI units if `absolute`, else relative to the
+    parameter; `shapes`: courses to choose from ("linear", "wander"); `oil`: weight of the oil temperature's course in
+    the drift, -1 .. 1, 0 for a drift that does not depend on the oil.
     """
 
     size: tuple[float, float]
@@ -83,9 +84,9 @@ class DriftRange:
 class Nuisance:
     """A difference between healthy machines, distributed uniformly between `low` and `high`.
 
-    `low`, `high`: SI values, or factors on the rig's values if `scales`; `each`: True to draw each parameter by
-    itself, False to draw one value for all; `drift`: distribution of their drift, None for none; `why`: the reason
-    for the range.
+    `low`, `high`: SI values, or factors on the rig's values if `scales`; `each`: True to draw a value for each
+    parameter, False to draw one value for all; `drift`: distribution of the drift of the parameters, None if they do
+    not drift; `why`: the reason for the range.
     """
 
     name: str
@@ -102,8 +103,8 @@ class Nuisance:
 class NuisanceChoice:
     """A difference between healthy machines with a few possible values.
 
-    A machine has one of `values` for all `parameters`. `values`: numbers in SI units, or texts for a parameter that
-    is a choice; `why`: the reason for them.
+    A machine has one of the `values` for all `parameters`. `values`: numbers in SI units, or texts if the parameters
+    have texts as values, such as "present"; `why`: the reason for the values.
     """
 
     name: str
@@ -116,9 +117,14 @@ class NuisanceChoice:
 class Duty:
     """The commands and loads of a profile's machines, of which each machine draws one.
 
-    A machine draws one of `commands`, a factor on its amplitude from the range `amplitude`, the closed fraction of
-    both throttles from `closed` (in the file: per cent), one of `loads` on the rod, and one of `controllers` that
-    follow a position target (default: PI). `why`: the reason for them.
+    A machine draws one of each:
+
+    - `commands`, with a factor on the amplitude from the range `amplitude`;
+    - `closed`: closed fractions of both throttles (in the file: per cent);
+    - `loads` on the rod, without a load if there are none to choose from;
+    - `controllers` that follow a position target (default: PI).
+
+    `why`: the reason for this duty.
     """
 
     __pydantic_config__ = _KNOWN_ONLY
@@ -139,7 +145,7 @@ class Duty:
         for text in self.loads:
             parse_force(text)
 
-    def __repr__(self) -> str:  # seeds of cases derive from it: what a profile does not state is left out
+    def __repr__(self) -> str:  # seeds of cases are derived from this text: `loads` and `controllers` only if stated
         stated_fields = [
             part for part in fields(self) if part.default is MISSING or getattr(self, part.name) != part.default
         ]
@@ -150,9 +156,9 @@ AnyNuisance = Nuisance | NuisanceChoice
 
 
 def _parse_nuisance(table: Any) -> AnyNuisance:
-    """Parse an entry of a profile's file as a nuisance, that is a difference between healthy machines.
+    """Parse an entry of a profile's file as a nuisance, which is a difference between healthy machines.
 
-    Raises InputError, which names the entry, if it breaks a rule.
+    Raises InputError with the entry's name if the entry breaks a rule.
     """
     entry = _NuisanceEntry.model_validate(table)
     try:
@@ -169,7 +175,7 @@ def _convert_to_si(entry: _NuisanceEntry) -> AnyNuisance:
     parameters = tuple(resolve_name(name, declared_names()) for name in entry.parameters)
     declarations = [declared_fields()[parameter] for parameter in parameters]
     kinds = {(choices_of(declaration), unit_of(declaration)) for declaration in declarations}
-    choices, si_unit = next(iter(kinds))
+    choices, si_unit = next(iter(kinds))  # several are refused below, except for a `scale`, which has no unit
     if entry.values is not None:
         if len(kinds) > 1 or entry.range or entry.scale or entry.drift or entry.each:
             raise InputError(
@@ -198,8 +204,7 @@ def _convert_to_si(entry: _NuisanceEntry) -> AnyNuisance:
 def _convert_values(entry: _NuisanceEntry, choices: tuple[str, ...], si_unit: str) -> tuple[float | str, ...]:
     """Convert the possible values of a parameter in a profile's entry to SI units; texts are returned unchanged.
 
-    `choices`: texts that the parameter may have, () for a number. Raises InputError for a value that it cannot
-    have.
+    `choices`: texts that the parameter may have, () for a number. Raises InputError for any other value.
     """
     values = entry.values or ()
     for value in values:
@@ -222,7 +227,7 @@ def _parse_drift(entry: _DriftEntry, parameters: tuple[str, ...], si_unit: str) 
     for parameter in parameters:
         ParameterDrift(parameter, linear_path(0.0, 1.0), absolute)
     low, high = (to_si(value, entry.unit, si_unit if absolute else "1", name="drift") for value in entry.size)
-    can_fall = entry.oil != 1.0  # the oil alone only warms, so its drift only rises
+    can_fall = entry.oil != 1.0  # with weight 1 the drift follows the oil, which only warms
     if low < 0 or (not absolute and can_fall and high >= 1):
         raise InputError(f"size of the drift must be >= 0 and < 100 %, got {low:g} to {high:g}")
     if entry.shapes is not None and entry.oil is not None:
@@ -279,8 +284,8 @@ class Family:
 class Profile:
     """The differences between healthy machines of one kind (`nuisances`), and their duty, i.e. commands and loads.
 
-    `families`: groups of machines that differ from the others; `place`: the file, for messages; `seeds`: name from
-    which the seeds of cases are derived, "" for `name`, so that a renamed profile can draw the same cases.
+    `families`: groups of machines that differ from the others; `place`: path of the file, for messages; `seeds`: name
+    from which the seeds of cases are derived if the profile was renamed and must draw the same cases, "" for `name`.
     """
 
     name: str
@@ -313,10 +318,10 @@ class Profile:
 def _replace_nuisances(
     nuisances: tuple[AnyNuisance, ...], replacing: tuple[AnyNuisance, ...]
 ) -> tuple[AnyNuisance, ...]:
-    """Return the nuisances of a profile with some of them replaced.
+    """Replace some nuisances (differences between healthy machines) of a profile, and return all nuisances.
 
-    A nuisance is a difference between healthy machines. The parameters that `replacing` draws are removed from
-    `nuisances`, and then `replacing` is appended.
+    The parameters of `replacing` are removed from `nuisances`, which may leave a nuisance without parameters: it is
+    dropped. Then `replacing` is appended.
     """
     replaced_parameters = {parameter for nuisance in replacing for parameter in nuisance.parameters}
     remaining: list[AnyNuisance] = []
@@ -364,9 +369,9 @@ class _File(BaseModel):
 def _read_profile(path: Path, place: str) -> Profile:
     """Read a profile of machines from its TOML file.
 
-    If the file names a profile that it extends, it inherits the nuisances of that profile, and its duty (commands and
-    loads) unless it states one, but not its families. `place` names the file in messages. Raises InputError if the file
-    breaks a rule.
+    A file may name a packaged profile that it extends. It then inherits that profile's nuisances, and also the duty
+    (commands and loads) if it does not state one, but not the families. `place` names the file in messages. Raises
+    InputError if the file breaks a rule.
     """
     tree = read_toml(path, "a profile", place)
     try:
