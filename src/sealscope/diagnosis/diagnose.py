@@ -26,7 +26,7 @@ from sealscope.diagnosis.inference.volumes.balance_leak import BalanceLeak
 from sealscope.diagnosis.inspection import inspect_recording, select_comparable
 from sealscope.diagnosis.priors.decision import DECISION
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
-from sealscope.diagnosis.verdict.evidence import RMS_CHANGE, Evidence
+from sealscope.diagnosis.verdict.evidence import RMS_CHANGE, VOLUME_BALANCE, Evidence
 from sealscope.diagnosis.verdict.machine import assumed_rig
 from sealscope.diagnosis.verdict.severity import RepairLimit
 from sealscope.errors import InputError
@@ -59,13 +59,13 @@ class Examination:
     baseline : sequence of Recording or SummarisedRecording
         Leak-free recordings of the same machine, possibly none.
     false_alarm_probability : float
-        Probability of the verdict "leak" for a leak-free recording.
+        Allowed probability of the verdict "leak" on a leak-free recording.
     rig : Rig, str or path-like
         Sizes of the machine that the detectors assume.
     distrust : str or None
         Reason why the pressures cannot be trusted, in which case no detector runs.
     refusal : str or None
-        Reason why a baseline was given but no recording of it can be compared.
+        Reason why none of the given healthy recordings can be compared; None if one can, or if none was given.
     share : float
         Fraction of the original samples that `recording` contains.
     judged_until : float
@@ -89,12 +89,13 @@ class Examination:
         Healthy recordings stored as summaries are dropped, as channels cannot be removed from a summary.
         """
         names = set(channels)
-        recording, *baseline = (
-            entry.only(name for name in entry.channels if name in names)
-            for entry in (self.recording, *self.baseline)
-            if isinstance(entry, Recording)
-        )
-        return replace(self, recording=recording, baseline=baseline)
+
+        def select_channels(recording: Recording) -> Recording:
+            """Return the recording with only those of its channels that are in `names`."""
+            return recording.only(name for name in recording.channels if name in names)
+
+        baseline = [select_channels(healthy) for healthy in self.baseline if isinstance(healthy, Recording)]
+        return replace(self, recording=select_channels(self.recording), baseline=baseline)
 
     def report(self, name: str) -> Observed:
         """Run the detector called `name` on the recording, and return its observations.
@@ -114,20 +115,20 @@ class Examination:
 
     @cached_property
     def null(self) -> HealthyNull:
-        """Distribution of the detectors' test results in the healthy recordings, which have no leak.
+        """Distribution of the detectors' test results in the healthy recordings (`baseline`).
 
-        The scores of the judged recording are compared with it. If the volume balance found that valves cut the pump
-        off while the machine rests, the healthy recordings are evaluated with the same assumption.
+        The test results of the judged recording are compared with it. If the volume balance found that valves cut the
+        pump off while the judged machine rests, the same is assumed for the healthy recordings.
         """
-        leak = self.report(ORDER[0]).leak if ORDER[0] in detectors() else None
+        leak = self.report(VOLUME_BALANCE).leak if VOLUME_BALANCE in detectors() else None
         is_shut_at_rest = isinstance(leak, BalanceLeak) and leak.balance.shut
         return healthy_null(self.baseline, load_rig(self.rig), shut=is_shut_at_rest)
 
     def evidence(self, name: str) -> Evidence:
-        """Decide from the observations of one detector alone if the machine leaks.
+        """Decide from the observations of one detector if the machine leaks; other detectors are not asked.
 
-        Other causes of a change compete with a leak as its explanation. They are not considered for the detector `rms
-        change`, whose alarms count as leaks.
+        A change may have other causes than a leak, such as a change of duty (`signals`). These causes compete with a
+        leak as explanations, except for the detector `rms change`, whose alarms always count as leaks.
         """
         return self._decide_by(name, [self.signals], weigh_rivals=name != RMS_CHANGE)
 
@@ -135,7 +136,8 @@ class Examination:
         """Decide from the observations of all registered detectors if the machine leaks.
 
         The detectors that measure the size of a leak (`ORDER`) run one after the other until one of them reaches a
-        decision; all other detectors always run. If a measuring detector fails, the verdict cannot be "no leak".
+        decision; all other detectors always run. The verdict cannot be "no leak" if a measuring detector failed, or if
+        no recording of the given baseline can be compared (`refusal`).
         """
         names = sorted(detectors(), key=rank)
         reports = [self.signals, *(self.report(name) for name in names if name not in ORDER)]
@@ -172,23 +174,23 @@ def diagnose(
 ) -> Diagnosis:
     """Decide whether oil bypasses the piston in a recording.
 
-    The first method that the channels allow, and that reaches a decision, gives the verdict: the balance of volumes,
-    the response of the pressures, plug-ins, and last the change of RMS. The results of plug-ins and of the change of
-    RMS are always stated in addition.
+    Four methods are asked in this order: the balance of volumes, the response of the pressures, plug-ins, and the
+    change of RMS. The first one that the channels allow, and that reaches a decision, gives the verdict. The results of
+    plug-ins and of the change of RMS are always stated in addition.
 
     Parameters
     ----------
     recording : Recording
         The recording to judge.
     baseline : Recording or sequence of Recording, optional
-        Leak-free recordings of the same machine. Those that cannot be compared are left out, which a finding reports.
+        Leak-free recordings of the same machine. Those that cannot be compared are left out, and a finding names them.
         Without a baseline, the recording is tested for a leak that begins within it.
     false_alarm_probability : float, optional
         Probability of `leak` on a leak-free recording, 1e-4 to 0.2.
     rig : Rig, str or path-like, optional
         Sizes of the machine: a Rig, the name of a packaged rig or the path of a TOML file. By default the rig of the
         thesis is used. It counts as stated for a recording that was simulated with the same sizes. For any other
-        recording it is a mere assumption, and flows in L/min are stated only if a flow meter was recorded.
+        recording the default rig is a mere assumption, and L/min are stated only if a flow meter was recorded.
     limit : str, optional
         Leak from which the machine must be repaired: a flow (``"5 mL/min"``) or a creep speed of the piston
         (``"8 mm/min"``, the default).
@@ -214,7 +216,8 @@ def diagnose(
     >>> diagnosis.verdict, round(diagnosis.onset_s)
     ('leak', 30)
     """
-    repair, healthy = RepairLimit.parse(limit), _list_baseline(recording, baseline)
+    repair_limit = RepairLimit.parse(limit)
+    healthy = _list_baseline(recording, baseline)
     check_probability(false_alarm_probability)
     used_rig, machine = assumed_rig(rig, recording)
     with limit_threads():
@@ -239,22 +242,24 @@ def diagnose(
         quality=(*inspection.findings, *comparable.findings),
         false_alarm_probability=false_alarm_probability,
         baselines=len(comparable.parts),
-        limit=repair,
+        limit=repair_limit,
     )
 
 
 def _list_baseline(recording: object, baseline: Recording | Sequence[Healthy]) -> list[Healthy]:
-    """Return the baseline as a list; raise InputError unless it and the judged recording are of valid types.
+    """Return the baseline as a list of recordings; a single Recording becomes a list of one.
 
-    A single Recording counts as a baseline of one recording.
+    Raises InputError if the judged `recording` or an entry of the baseline is of another type, such as a path.
     """
     is_single = isinstance(baseline, Recording | str | os.PathLike)
     if not is_single and not isinstance(baseline, Iterable):
         raise InputError(f"baseline must be a Recording or a sequence of Recordings, got {type(baseline).__name__}")
     healthy: list[Any] = [baseline] if is_single else list(cast(Iterable[Any], baseline))
-    names = ["recording", *(["baseline"] if is_single else [f"baseline[{k}]" for k in range(len(healthy))])]
-    for name, value in zip(names, [recording, *healthy], strict=True):
-        if not isinstance(value, Recording if name == "recording" else Recording | SummarisedRecording):
+    arguments: list[tuple[str, object, Any]] = [("recording", recording, Recording)]
+    for k, entry in enumerate(healthy):
+        arguments.append(("baseline" if is_single else f"baseline[{k}]", entry, Recording | SummarisedRecording))
+    for name, value, allowed_type in arguments:
+        if not isinstance(value, allowed_type):
             hint = "; sealscope.read makes one of a file" if isinstance(value, str | os.PathLike) else ""
             raise InputError(f"{name} must be a Recording, got {type(value).__name__} {value!r:.40}{hint}")
     return healthy

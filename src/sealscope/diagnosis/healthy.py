@@ -35,7 +35,8 @@ class SummarisedRecording:
     about : mapping
         Pressure, oil temperature, noise and problems of the recording, for display.
     statistics : mapping of str to float or ndarray
-        Surprisals -log(chance) of the changes within the recording, by name (`observation.healthy_surprisals`).
+        Surprisals, -log(p-value), of the changes within the recording, by the key of the change
+        (`observation.healthy_surprisals`).
     """
 
     file: str

@@ -86,15 +86,17 @@ def inspect_recording(recording: Recording, channels: Iterable[str] | None = Non
 def _inspect(recording: Recording, names: Sequence[str]) -> Inspection:
     """Correct the samples of a recording, find the defects of its channels, and test if the pressures can be trusted.
 
-    `names` are the channels to search for defects.
+    `names` are the channels to search for defects. The pressures cannot be trusted if a chamber pressure is constant or
+    stuck, if all of them are mostly clipped, or if they are implausible for a hydraulic machine.
     """
-    chambers, (part, corrections, stuck, share) = chambers_of(recording), correct_samples(recording)
+    chambers = chambers_of(recording)
+    part, corrections, stuck, share = correct_samples(recording)
     findings = (*inspect(recording.only(names)), *corrections)
     on_chambers = [finding for finding in findings if finding.channel in chambers]
     defects = [finding for finding in on_chambers if finding.code == "constant"]
     defects += [finding for finding in findings if finding.channel in stuck and finding.code == "stuck"]
     mostly_clipped = [finding for finding in on_chambers if finding.code == "clipped" and finding.count > len(part) / 2]
-    if len(mostly_clipped) == len(chambers):  # with one chamber clipped, the other one is judged
+    if len(mostly_clipped) == len(chambers):  # one clipped chamber is no obstacle: the other chamber is judged
         defects += mostly_clipped
     distrust = f"the pressures cannot be trusted: {defects[0].text}" if defects else None
     if distrust is None and len(part) >= SHORTEST and (reason := find_implausibility(part)):
@@ -124,31 +126,36 @@ class Baselines(NamedTuple):
 def select_comparable(judged: Inspection, baseline: Sequence[Healthy]) -> Baselines:
     """Inspect the baselines of a judged recording and choose those that can be compared with it.
 
-    A baseline is left out if it cannot be trusted, if it lacks a chamber of the judged recording or has it in another
-    unit, or if it is the judged recording itself. Of several copies only the one with the most channels is used.
+    A baseline is left out if
+
+    - it cannot be trusted,
+    - it lacks a chamber pressure of the judged recording, or has it in another unit,
+    - it has the same samples as the judged recording, or as another baseline with more channels.
+
     Differences of speed, load and temperature are accepted, as the detectors allow for them.
     """
     healthy = [entry if isinstance(entry, SummarisedRecording) else inspect_recording(entry) for entry in baseline]
-    index_of_digest: dict[str, int] = {}  # of the recordings that can be compared
-    left_out: dict[tuple[Severity, str], list[int]] = {}  # indices by severity and reason
-    for k in sorted(range(len(healthy)), key=lambda k: -len(healthy[k].units)):
+    index_of_digest: dict[str, int] = {}  # index of each comparable recording, by its digest
+    left_out: dict[tuple[Severity, str], list[int]] = {}  # indices of the other recordings, by severity and reason
+    for k in sorted(range(len(healthy)), key=lambda k: -len(healthy[k].units)):  # most channels first
         entry = healthy[k]
-        if (reason := _find_obstacle(entry, judged)) is None and entry.digest in index_of_digest:
-            reason = "note", "the same samples as another baseline recording"
-        if reason is None:
+        obstacle = _find_obstacle(entry, judged)
+        if obstacle is None and entry.digest in index_of_digest:
+            obstacle = "note", "the same samples as another baseline recording"
+        if obstacle is None:
             index_of_digest[entry.digest] = k
         else:
-            left_out.setdefault(reason, []).append(k)
+            left_out.setdefault(obstacle, []).append(k)
     findings = []
     for (severity, text), indices in left_out.items():
         names = [healthy[k].file or f"number {k + 1}" for k in sorted(indices)]
         count = f"{len(names)} of {len(healthy)} baseline recordings {'is' if len(names) == 1 else 'are'}"
         note = f"{count} left out: {text} ({join_names(names, 3)})"
-        findings.append(Finding("baseline_left_out", severity, None, len(indices), None, note))
+        findings.append(Finding("baseline_left_out", severity, None, count=len(indices), first_t=None, text=note))
     refusal = None
     if healthy and not index_of_digest:
-        _, most_frequent = max(left_out, key=lambda kind: len(left_out[kind]))
-        refusal = f"no baseline recording can be used: {most_frequent}"
+        _, most_frequent_reason = max(left_out, key=lambda obstacle: len(left_out[obstacle]))
+        refusal = f"no baseline recording can be used: {most_frequent_reason}"
     entries = [healthy[k] for k in sorted(index_of_digest.values())]
     parts = tuple(entry.part if isinstance(entry, Inspection) else entry for entry in entries)
     return Baselines(parts, tuple(findings), refusal)

@@ -12,9 +12,9 @@ from sealscope.diagnosis.healthy import SummarisedRecording
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.evidence import LEAK
 
-#: Fewest recordings that are judged by each other, as the scatter of fewer is not known.
+#: Fewest recordings that are compared with each other, as the scatter of fewer recordings is not known.
 MIN_RECORDINGS = 4
-#: Words in the text on a recording that differs from the others.
+#: Words that mark the problem of a recording that differs from the other healthy recordings.
 BY_OTHERS = "by the others"
 
 
@@ -25,27 +25,29 @@ def cross_check(
 ) -> tuple[tuple[SummarisedRecording, ...], tuple[str, ...]]:
     """Diagnose each healthy recording against all others, and leave out those that seem to leak.
 
-    `judge(recording, reference)` diagnoses a recording against the healthy recordings `reference`. A recording judged
-    leaking is left out, unless `keep` is True, or at least half of the recordings leak and no healthy majority can be
-    assumed. Fewer than `MIN_RECORDINGS` recordings are not judged. Returns the remaining recordings and one line of
-    reason for each one left out. If a remaining recording shows a leak or another event, this is added to its list of
-    problems.
+    `judge(recording, reference)` diagnoses a recording against the healthy recordings `reference`. No recording is left
+    out if `keep` is True, or if at least half of the recordings seem to leak and no healthy majority can be assumed.
+    Fewer than `MIN_RECORDINGS` recordings are not judged.
+
+    Returns the remaining recordings, and a line with the reason for each recording left out. If a remaining recording
+    shows a leak or another event, this is added to its list of problems.
     """
-    verdicts, leaking = dict[str, str](), dict[str, str]()
+    problems, leaking = dict[str, str](), dict[str, str]()  # texts by the name of the recording's file
     for recording in healthy if len(healthy) >= MIN_RECORDINGS else ():
         diagnosis = judge(recording, tuple(other for other in healthy if other is not recording))
         if diagnosis.verdict == LEAK or diagnosis.cause is not None:
-            verdicts[recording.file] = f"{diagnosis.summary} {BY_OTHERS}: {diagnosis.reason}"
+            problems[recording.file] = f"{diagnosis.summary} {BY_OTHERS}: {diagnosis.reason}"
         if diagnosis.verdict == LEAK:
-            leaking[recording.file] = f"{recording.file}: {verdicts[recording.file]}"
+            leaking[recording.file] = f"{recording.file}: {problems[recording.file]}"
     if keep or 2 * len(leaking) >= len(healthy):
         leaking = {}
     remaining = (recording for recording in healthy if recording.file not in leaking)
-    return tuple(_add_problem(recording, verdicts.get(recording.file)) for recording in remaining), (*leaking.values(),)
+    checked = tuple(_add_problem(recording, problems.get(recording.file)) for recording in remaining)
+    return checked, tuple(leaking.values())
 
 
 def _add_problem(recording: SummarisedRecording, problem: str | None) -> SummarisedRecording:
-    """Return a copy of a healthy recording with `problem` added to its list of problems; unchanged if it is None."""
+    """Return a copy of a healthy recording with `problem` added to its list of problems; None adds nothing."""
     if problem is None:
         return recording
     return replace(recording, about={**recording.about, "wrong": [*recording.about.get("wrong", ()), problem]})

@@ -1,12 +1,12 @@
 """Read and write the file of healthy summaries, which lies next to a machine's text file (`machine_file`).
 
-The file consists of lines. The first line names the format. Each other line is the summary of a recording: its
-SHA-256, a blank and JSON. The text names the summaries it uses by their SHA-256. A summary that was altered or lost
-is therefore found and named, and a summary that no text names does no harm. A new file also contains the old
-summaries, and so fits both the old and the new text, at whichever instant a writer is killed.
+The file consists of lines. The first line names the format. Each other line is the summary of a recording: the
+SHA-256 of a JSON text, a blank and the JSON text. The machine's file refers to summaries by their SHA-256. A summary
+that was altered or lost is therefore found and named, and a summary that is not referred to does no harm. A new file
+also contains the old summaries. It therefore fits both the old and the new machine's file, whenever a writer is killed.
 
-JSON holds `digest`, `units`, `rate`, `seconds`, `start_s`, `about`, `summaries` by the names of detectors, and
-`statistics` by their names. Arrays are bytes (`storage.plain_state.plain_array`). Unknown names are read, too.
+The JSON text holds the fields of a `SummarisedRecording` except `file`. Arrays are stored as bytes
+(`storage.plain_state.plain_array`). Unknown names in `about` and in the summaries are kept.
 """
 
 from __future__ import annotations
@@ -37,18 +37,20 @@ from sealscope.storage.plain_values import convert_type, parse_json
 
 #: Ending of the file's name, and its first line.
 SUFFIX, _HEAD = ".healthy", b"sealscope healthy summaries 1\n"
-#: The same before version 0.1, which this version still reads. The key "summaries" was "lessons" then.
+#: The same of files from before version 0.1, which are still read. Their key "lessons" is now "summaries".
 OLD_SUFFIX, _OLD_HEAD = ".lessons", b"sealscope lessons 1\n"
 #: Largest file and longest line [bytes]; most summaries in a file.
 MAX_SIZE, _MAX_LINE, _MAX_SUMMARIES = 50_000_000, 5_000_000, 5000
-#: Most commas, brackets and braces in a line: this number plus this fraction of its bytes. Each becomes an object in
-#: memory.
+#: Most commas, brackets and braces in a line: the first number plus the second times the number of bytes. The limit
+#: saves memory, as each of these marks becomes an object.
 _MAX_MARKS, _MAX_FRACTION = 40, 0.1
-#: Largest size of a number, so that products of two do not overflow; times within the years that calendars have [s].
-_MAX_NUMBER, _FIRST_TIME, _LAST_TIME = 1e100, -6.2e10, 2.5e11
-#: Largest size of the logarithm of a number that is neither zero nor infinite (double precision).
+#: Largest magnitude of a number, so that products of two numbers do not overflow.
+_MAX_NUMBER = 1e100
+#: First and last time that `datetime` can represent, about the years 1 and 9999 [s since 1970].
+_FIRST_TIME, _LAST_TIME = -6.2e10, 2.5e11
+#: Largest magnitude of the logarithm of a number that is neither zero nor infinite (double precision).
 _MAX_LOGARITHM = 750.0
-#: Largest ratio of a squared product to the product of the squares, which exceeds 1 only by rounding (Cauchy).
+#: Largest ratio of a squared sum of products to the product of the sums of squares: 1 (Cauchy), plus rounding errors.
 _ROUNDING = 1.0 + 1e-6
 #: Length of a checksum in hexadecimal digits.
 _DIGITS = 64
@@ -82,7 +84,7 @@ def uniform_table_type(value_type: Any) -> Any:
     """
 
     def check_values(table: Any) -> Any:
-        """Return the table unchanged; raise ValueError if it is no table, or at the first value of another type."""
+        """Return the table unchanged; raise ValueError if it is not a table, or at the first value of another type."""
         if not isinstance(table, dict):
             raise ValueError(f"must be a table, got {table!r:.60}")
         for name, value in table.items():
@@ -124,10 +126,10 @@ def _check_statistic(value: Any) -> Any:
 def _check_sums(summary: Any) -> Any:
     """Return the summary of a recording's volume balance if it is consistent; raise ValueError otherwise.
 
-    `terms` must include the leak. `sums` (E, m, m) holds sums of products of the columns of a balance in the recording.
-    The m columns are the terms and, as the last one, the left side, a flow. The leak's column and the left side must
-    have positive sums of squares, and their sum of products must obey Cauchy's inequality. The shapes of the other
-    arrays are checked, too.
+    `sums` (E, m, m) holds for each of E balances the sums of products of its columns over the recording. The m columns
+    are the `terms` and, as the last one, the left side, which is a flow. `terms` must include the leak. The leak's
+    column and the left side must have positive sums of squares, and their sum of products must obey Cauchy's
+    inequality. The shapes of the other arrays are checked, too.
     """
     size = len(summary.terms) + 1
     if summary.sums.ndim != 3 or not len(summary.sums) or summary.sums.shape[1:] != (size, size):
@@ -143,7 +145,8 @@ def _check_sums(summary: Any) -> Any:
     if LEAK not in summary.terms:
         raise ValueError(f"terms must have {LEAK!r}, got {', '.join(summary.terms)}")
     leak = summary.terms.index(LEAK)
-    squares, product = summary.sums[:, [leak, -1], [leak, -1]], summary.sums[:, leak, -1]
+    squares = summary.sums[:, [leak, -1], [leak, -1]]  # (E, 2): of the leak's column and of the left side
+    product = summary.sums[:, leak, -1]
     if not (squares > 0.0).all() or not (product**2 <= _ROUNDING * squares.prod(axis=1)).all():
         raise ValueError("sums must be those of squares and products of a leak and a flow, got none such")
     return summary
@@ -152,9 +155,9 @@ def _check_sums(summary: Any) -> Any:
 def _check_levels(summary: Any) -> Any:
     """Return a recording's summary of wavelet details if its `levels` and `duty` are valid; else raise ValueError.
 
-    `levels` (5 per chamber,) are logarithms of the RMS of the pressures' wavelet details, and `duty` (4,) describes how
-    the machine is moved and loaded (`RmsBlocks`). At least one chamber must be named, and all numbers must be below 750
-    in magnitude.
+    `levels` (5 per chamber,) are logarithms of the RMS of the pressures' wavelet details. `duty` (4,) describes how the
+    machine is moved and loaded (`RmsBlocks`). At least one chamber must be named, and all numbers must be below 750 in
+    magnitude.
     """
     expected = (len(QUANTITIES) * len(summary.chambers),)
     if not summary.chambers or summary.levels.shape != expected or summary.duty.shape != (len(DUTY),):
@@ -277,9 +280,10 @@ _RECORDING = table_type(
 
 
 def _pack_arrays(value: Any) -> Any:
-    """Convert a value for JSON: drop entries that are None, and pack numbers compactly.
+    """Convert a value for JSON: drop entries of mappings that are None, and pack arrays compactly, at any depth.
 
-    Arrays, and lists of fractional numbers, are packed by `storage.plain_state.plain_array`.
+    Arrays of numbers, and lists that begin with a float or a list, become arrays as of `plain_state.plain_array`. Lists
+    with rows of unequal lengths are packed row by row, and arrays of other types become lists.
     """
     if isinstance(value, Mapping):
         return {str(name): _pack_arrays(member) for name, member in value.items() if member is not None}
@@ -291,7 +295,8 @@ def _pack_arrays(value: Any) -> Any:
         except ValueError:  # rows of unequal lengths
             return [_pack_arrays(row) for row in value]
     if isinstance(value, np.ndarray):
-        return plain_array(value) if value.dtype.kind in "fiu" else _pack_arrays(value.tolist())
+        is_numeric = value.dtype.kind in "fiu"  # float, signed or unsigned integer
+        return plain_array(value) if is_numeric else _pack_arrays(value.tolist())
     return [_pack_arrays(item) for item in value] if isinstance(value, list | tuple) else value
 
 
@@ -330,15 +335,16 @@ def format_summary(recording: SummarisedRecording) -> Line:
 
 
 def parse_summary(line: Line, file: str, place: str) -> SummarisedRecording:
-    """Parse a line of a file of summaries as those of the recording called `file`.
+    """Parse a line of a file of summaries; `file` is the name of the recording that the line summarises.
 
-    `place` is the path of the file of summaries, for error messages. Raises InputError if the checksum does not match
-    or a value is not valid.
+    `place` is the path of the file of summaries, for error messages. Raises InputError if the checksum does not match,
+    if a value is not valid, or if the line holds too many single values instead of packed arrays.
     """
     if sha256(line.data).hexdigest() != line.checksum:
         rule = f"must have the SHA-256 {line.checksum[:12]}..., got another"
         raise InputError(f"the summary of {file} {rule}: {_REMEDY} ({place})")
-    n_marks, max_marks = sum(line.data.count(mark) for mark in b",[{"), _MAX_MARKS + int(_MAX_FRACTION * len(line.data))
+    n_marks = sum(line.data.count(mark) for mark in b",[{")
+    max_marks = _MAX_MARKS + int(_MAX_FRACTION * len(line.data))
     try:
         if n_marks > max_marks:
             raise ValueError(f"it must hold its numbers in arrays, got {n_marks} values")
@@ -348,7 +354,7 @@ def parse_summary(line: Line, file: str, place: str) -> SummarisedRecording:
         fields = convert_type(_RECORDING, tree).model_dump(exclude_unset=True)
     except ValueError as error:
         raise InputError(f"the summary of {file} is wrong: {error} ({place})") from None
-    return SummarisedRecording(file, **{"start_s": None, **fields})
+    return SummarisedRecording(file, **{"start_s": None, **fields})  # an unknown start is not stored
 
 
 #: Advice for a summary that is lost or damaged.
@@ -396,26 +402,29 @@ def write_lines(lines: Collection[Line], path: Path) -> None:
 
 
 def _iter_lines(path: Path) -> Iterator[Line]:
-    """Yield the complete lines of a file of summaries; raise InputError if the file cannot be read."""
-    what = "a file of healthy summaries"
+    """Yield the lines of a file of summaries, without the first line and without incomplete ones.
+
+    Raises InputError if the file cannot be read, is too large or of another format.
+    """
+    noun = "a file of healthy summaries"
     try:
-        with open_regular(path, what) as file:
+        with open_regular(path, noun) as file:
             size = file.seek(0, os.SEEK_END)
             file.seek(0)
             if size > MAX_SIZE:
-                raise InputError(f"{what} must be at most {MAX_SIZE} bytes, got {size} ({path})")
+                raise InputError(f"{noun} must be at most {MAX_SIZE} bytes, got {size} ({path})")
             if file.readline(len(_HEAD)) not in (_HEAD, _OLD_HEAD):
-                raise InputError(f"{what} must begin with {_HEAD.decode().strip()!r}, got something else ({path})")
+                raise InputError(f"{noun} must begin with {_HEAD.decode().strip()!r}, got something else ({path})")
             for _ in range(_MAX_SUMMARIES + 1):
                 row = file.readline(_MAX_LINE)
                 if not row:
                     return
                 checksum, blank, data = row.rstrip(b"\n").partition(b" ")
-                if len(checksum) == _DIGITS and blank:  # else a torn line, whose summary is missing
+                if len(checksum) == _DIGITS and blank:  # otherwise the line is incomplete, and is skipped
                     yield Line(checksum.decode("ascii", "replace"), data)
-            raise InputError(f"{what} must have at most {_MAX_SUMMARIES} summaries, got more ({path})")
+            raise InputError(f"{noun} must have at most {_MAX_SUMMARIES} summaries, got more ({path})")
     except InputError:
         raise
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
-        raise InputError(f"{what} must be readable, got: {reason} ({path})") from None
+        raise InputError(f"{noun} must be readable, got: {reason} ({path})") from None

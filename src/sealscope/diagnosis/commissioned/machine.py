@@ -43,9 +43,9 @@ if TYPE_CHECKING:
 NO_RECORDINGS = frozenset(
     {".toml", ".healthy", ".lessons", ".html", ".htm", ".pdf", ".png", ".svg", ".md", ".jsonl", ".part", ".bak"}
 )
-#: Beginning of the text of a trend or a verdict that was written into the folder of the recordings.
+#: Beginning of a file with a trend or a verdict, which users may have written into the folder of the recordings.
 _OWN_OUTPUT = re.compile(rb'\s*\{\s*"(verdict|file)":|file,time[, ]')
-#: Most samples that are kept in memory between learning and judging; further recordings are read a second time.
+#: Most samples of all recordings that are kept in memory while commissioning; further recordings are read twice.
 _MAX_SAMPLES = 20_000_000
 
 #: Judgements that a person may give on an alarm.
@@ -103,7 +103,7 @@ def _format_date(moment: float) -> str:
 
 @dataclass(frozen=True)
 class CommissionedMachine:
-    """A machine with its healthy recordings, to which its other recordings are compared.
+    """A machine with its healthy recordings, with which its other recordings are compared.
 
     Parameters
     ----------
@@ -118,13 +118,13 @@ class CommissionedMachine:
     rate : float, optional
         Sampling rate [Hz] of logs without a time column.
     limit : str, optional
-        Leak from which it must be repaired, such as "5 mL/min".
+        Leak from which the machine must be repaired, such as "5 mL/min".
     left_out : tuple of str, optional
         Recordings that could not be used, each with the reason.
     alarms : tuple of JudgedAlarm, optional
         Judgements of persons on the monitor's alarms, and repairs.
     origin : Origin, optional
-        The file that it was loaded from.
+        The file that the machine was loaded from.
 
     Examples
     --------
@@ -151,9 +151,9 @@ class CommissionedMachine:
         return summarise_machine(self.healthy, self.rig, self.left_out)
 
     def read(self, path: str | os.PathLike[str]) -> Recording:
-        """Read a log of the machine with its channel map, or without the map if the log lacks the map's columns.
+        """Read a log of the machine with the channel map or, if the log does not fit the map, without it.
 
-        Raises UnreadableFile if neither succeeds.
+        Raises UnreadableFile if both attempts fail.
         """
         return read_by_map(path, self.channel_map, self.rate)
 
@@ -185,8 +185,10 @@ class CommissionedMachine:
         trusted.
         """
         extended = self._with_recording(recording, file, checksum)
-        if self.healthy and (result := self.diagnose(recording)).verdict == LEAK:
-            raise InputError(f"a healthy recording must not leak, got one that does: {result.reason} ({file})")
+        if self.healthy:
+            diagnosis = self.diagnose(recording)
+            if diagnosis.verdict == LEAK:
+                raise InputError(f"a healthy recording must not leak, got one that does: {diagnosis.reason} ({file})")
         start_s = start_seconds(recording, file)
         if start_s is not None and (leak := self._find_confirmed_leak(start_s, start_s + recording.duration)):
             raise InputError(f"a healthy recording must be of a time without a leak, got {leak} ({file})")
@@ -195,10 +197,11 @@ class CommissionedMachine:
     def _with_recording(self, recording: Recording, file: str, checksum: str) -> CommissionedMachine:
         """Return a copy of the machine with one more healthy recording, without testing it for a leak.
 
-        `file`, `checksum`: name and hash of the log. Raises InputError if the recording cannot be used or is a copy of
-        a known one.
+        `file`, `checksum`: name and SHA-256 of the log. Raises InputError if the recording cannot be used or is a copy
+        of a known recording.
         """
-        summarised = summarise_healthy(recording, assumed_rig(self.rig, recording)[0], file, checksum)
+        rig, _ = assumed_rig(self.rig, recording)
+        summarised = summarise_healthy(recording, rig, file, checksum)
         if copy := next((earlier for earlier in self.healthy if earlier.digest == summarised.digest), None):
             raise InputError(f"a healthy recording must be new, got the samples of {copy.file} ({file})")
         healthy = sorted((*self.healthy, summarised), key=lambda entry: (entry.start_s or 0.0, entry.file))
@@ -207,14 +210,15 @@ class CommissionedMachine:
     def _find_confirmed_leak(self, start_s: float, end_s: float) -> JudgedAlarm | None:
         """Find a confirmed leak that was open between `start_s` and `end_s` [s since 1970]; None if there was none.
 
-        An alarm that was judged "valid" or "repaired" is a confirmed leak. It is open from its onset until the next
-        repair. A later judgement "invalid" of an alarm with the same name revokes the confirmation, unless its onset is
-        after the time of the confirmation: it then concerns a new alarm.
+        An alarm that was judged "valid" or "repaired" is a confirmed leak, which is open from its onset until the next
+        repair. A later judgement "invalid" of an alarm with the same name revokes the confirmation. It does not if the
+        onset of the later alarm is after the time of the confirmation: the alarms are then different ones.
         """
         for number, leak in enumerate(self.alarms, 1):
+            later_judgements = self.alarms[number:]
             is_revoked = any(
                 later.mark == "invalid" and later.alarm == leak.alarm and later.onset_s <= leak.date_s
-                for later in self.alarms[number:]
+                for later in later_judgements
             )
             is_repaired = any(
                 alarm.mark == "repaired" and leak.onset_s <= alarm.date_s <= start_s for alarm in self.alarms
@@ -245,10 +249,10 @@ class CommissionedMachine:
 
 
 def read_by_map(path: str | os.PathLike[str], channel_map: ChannelMap, rate: float | None) -> Recording:
-    """Read a log with the channel map of its machine, or without the map if the log lacks the map's columns.
+    """Read a log with the channel map of its machine or, if the log does not fit the map, without it.
 
-    `rate` is the sampling rate [Hz] of a log without a time column. If neither way succeeds, raises the
-    UnreadableFile that reading with the map gave.
+    `rate` is the sampling rate [Hz] of a log without a time column. If both attempts fail, the UnreadableFile of the
+    first attempt is raised.
     """
     if not channel_map:
         return read(path, rate=rate)
@@ -264,8 +268,8 @@ def read_by_map(path: str | os.PathLike[str], channel_map: ChannelMap, rate: flo
 def recordings_in(paths: Iterable[str | os.PathLike[str]] | str | os.PathLike[str]) -> list[Path]:
     """List the files of recordings at one or several paths, each a file or a folder.
 
-    In a folder, hidden files, notes, pages and pictures (`NO_RECORDINGS`), and results that Sealscope wrote, are left
-    out. Links that lead out of the folder are left out with a warning. Raises InputError if no file remains.
+    In a folder, hidden files, files with a suffix in `NO_RECORDINGS`, and results that Sealscope wrote are left out.
+    Links that lead out of the folder are left out with a warning. Raises InputError if no file remains.
     """
     try:
         named_paths = [paths] if isinstance(paths, str | os.PathLike) else list(paths)
@@ -296,7 +300,7 @@ def _is_own_output(file: Path) -> bool:
 
 
 def summarise_healthy(recording: Recording, rig: Rig, file: str, checksum: str = "") -> SummarisedRecording:
-    """Compute the summaries of a healthy recording by all detectors that can read its channels.
+    """Compute the summaries of a healthy recording by all detectors that can use the recording.
 
     `file` is the name of the recording and `checksum` the SHA-256 of its file. A detector that fails is left out, and
     its error is logged. Raises InputError if the recording cannot be trusted, or if no detector can use it.
@@ -306,10 +310,7 @@ def summarise_healthy(recording: Recording, rig: Rig, file: str, checksum: str =
 
 
 def _summarise(recording: Recording, rig: Rig, file: str, checksum: str) -> SummarisedRecording:
-    """Compute the summaries of a healthy recording for `summarise_healthy`, without a limit on the number of threads.
-
-    Arguments and errors are as in `summarise_healthy`.
-    """
+    """Do the work of `summarise_healthy`, with the same arguments and errors, but without a limit on the threads."""
     from sealscope.diagnosis.commissioned.summary import describe_recording
 
     inspection = inspect_recording(recording)
@@ -401,10 +402,13 @@ def commission(
     """
     RepairLimit.parse(limit)
     stated_rig = None if rig is None else load_rig(rig)
-    channel_map = map if map is not None else {} if stated_rig is None else stated_rig.channel_map
-    machine, problems = CommissionedMachine(name, (), stated_rig, channel_map, rate, limit), list[str]()
-    # by file name; as many recordings as fit into memory
-    path_of, recording_of, n_samples = dict[str, Path](), dict[str, Recording](), 0
+    if map is None:
+        map = {} if stated_rig is None else stated_rig.channel_map
+    machine = CommissionedMachine(name, (), stated_rig, map, rate, limit)
+    problems: list[str] = []
+    path_of: dict[str, Path] = {}  # by file name
+    recording_of: dict[str, Recording] = {}  # by file name, as many recordings as fit into memory
+    n_samples = 0
     for path in recordings_in(paths):
         try:
             recording = machine.read(path)
@@ -412,7 +416,8 @@ def commission(
         except SealscopeError as error:
             problems.append(str(error))
             continue
-        path_of[path.name], n_samples = path, n_samples + len(recording) * len(recording.channels)
+        path_of[path.name] = path
+        n_samples += len(recording) * len(recording.channels)
         if n_samples < _MAX_SAMPLES:
             recording_of[path.name] = recording
     if not machine.healthy:

@@ -1,12 +1,15 @@
-"""Read and write the file of a commissioned machine: TOML that people can edit, with its summaries beside it.
+"""Read and write the file of a commissioned machine: TOML that people can edit.
 
-It is also a rig's file: `[rig]`, `[motor]` and so on state the machine's parameters, `[map]` its channels.
-`[machine]` names the machine, `[learnt]` summarises its healthy recordings for people to read, and each `[[healthy]]`
-names a recording and the checksum of its summary in the second file (`healthy_file`). `[[alarms]]` are judgements of
-persons.
+A second file in the same folder holds the summaries of the healthy recordings (`healthy_file`). Tables of the TOML:
 
-The summaries are written before the text. They include those that the present text and its backup, `.bak`, name. So
-no text ever lacks a summary, even if the writer is killed.
+- `[machine]`: name of the machine and its settings.
+- `[rig]`, `[motor]` and so on, `[map]`: parameters and channels of the machine, as in a rig's file.
+- `[learnt]`: figures from the healthy recordings, for people to read.
+- `[[healthy]]`: name of a healthy recording, and checksum of its summary in the second file.
+- `[[alarms]]`: judgement of a person on an alarm.
+
+The second file is written before the TOML. It includes the summaries that the present TOML and its backup, `.bak`,
+refer to. So no TOML ever lacks a summary, even if the writer is killed.
 """
 
 from __future__ import annotations
@@ -48,12 +51,17 @@ from sealscope.storage.folders import lock_file
 from sealscope.storage.plain_values import convert_type
 from sealscope.storage.toml_file import parse_toml, read_toml
 
-#: Format that this version writes and reads; names in [machine] that are written anew with each change.
-_FORMAT, _REWRITTEN = 2, ("sealscope", "written", "summaries")
-#: Summaries that neither text names are written, too, as long as the file is smaller than this [bytes].
+#: Format that this version writes and reads.
+_FORMAT = 2
+#: Names in [machine] that are written anew with each change.
+_REWRITTEN = ("sealscope", "written", "summaries")
+#: Present names of keys from before version 0.1.
+_RENAMED = {"lesson": "summary", "lessons": "summaries"}
+#: Summaries that no machine's file refers to are kept as long as all summaries are smaller than this [bytes].
 _SPARE = 5_000_000
 #: Longest wait [s] for another process that writes, and the error after it.
-_LONGEST_WAIT, _BUSY = 60.0, "a machine's file must be free to be written, got another process that writes it ({})"
+_LONGEST_WAIT = 60.0
+_BUSY = "a machine's file must be free to be written, got another process that writes it ({})"
 _HEAD = """\
 # A machine commissioned by Sealscope. [machine], [map] and [rig] may be edited; [learnt] is written anew with each
 # change; a [[healthy]] is a recording that diagnoses compare with: without it, the recording is forgotten. The numbers
@@ -207,13 +215,14 @@ def _lock(target: Path) -> AbstractContextManager[object]:
 def _write_files(machine: CommissionedMachine, target: Path) -> None:
     """Write the files of a machine: first its summaries, then a backup of the present text, then the new text.
 
-    In this order an interruption at any time leaves a complete text with all its summaries. The file of summaries
-    contains the machine's and all that the present text or its backup names. Other summaries in the present file are
-    kept while the total size stays below 5 MB (`_SPARE`). Raises InputError if the new text could not be read back.
+    In this order an interruption at any time leaves a complete text with all its summaries. The new file of summaries
+    contains those of the machine, and those that the present text or its backup names. Other present summaries are kept
+    while the total size stays below 5 MB (`_SPARE`). Raises InputError if the new text could not be read back.
     """
     data = _format_text(machine, target)
     _convert_tree(parse_toml(data, "a machine's file", str(target)), str(target))
-    backup, present_lines, named_checksums = target.with_suffix(".toml.bak"), dict[str, Line](), list[str]()
+    backup = target.with_suffix(".toml.bak")
+    present_lines, named_checksums = dict[str, Line](), list[str]()
     for path in (target, backup):
         tree = _read_if_valid(path)
         present_lines |= {line.checksum: line for line in read_lines(_summaries_path(path, tree))}
@@ -221,9 +230,11 @@ def _write_files(machine: CommissionedMachine, target: Path) -> None:
     lines = {checksum: present_lines[checksum] for checksum in named_checksums if checksum in present_lines}
     lines |= {line.checksum: line for line in map(format_summary, machine.healthy)}
     size = sum(len(line.data) for line in lines.values())
-    for checksum, line in present_lines.items():  # renamed or copied texts may name them
-        if checksum not in lines and (size := size + len(line.data)) < _SPARE:
-            lines[checksum] = line
+    for checksum, line in present_lines.items():  # renamed or copied texts may name other summaries
+        if checksum not in lines:
+            size += len(line.data)
+            if size < _SPARE:
+                lines[checksum] = line
     write_lines([*lines.values()], target.with_suffix(SUFFIX))
     if target.is_file():
         with atomic_write(backup) as temporary:
@@ -238,10 +249,10 @@ def _format_text(machine: CommissionedMachine, target: Path) -> bytes:
 
 
 def _parse_alarms(rows: Any) -> tuple[JudgedAlarm, ...]:
-    """Parse the tables of persons' judgements of alarms, `[[alarms]]` in a machine's file.
+    """Parse the tables `[[alarms]]` of a machine's file, in which persons judged alarms.
 
-    Raises ValueError with the number of the first table that is not valid. They are parsed one at a time, which saves
-    memory.
+    The tables are parsed one at a time, which saves memory. Raises ValueError with the number of the first table that
+    is not valid.
     """
     if not isinstance(rows, list):
         raise ValueError(f"alarms must be tables, got {rows!r:.60}")
@@ -300,10 +311,11 @@ def _read_tree(path: Path, place: str) -> dict[str, Any]:
     """
     tree = read_toml(path, "a machine's file", place)
     rows = tree.get("healthy")
-    for table in (tree.get("machine"), *(rows if isinstance(rows, list) else [])):
-        for name in ("lesson", "lessons") if isinstance(table, dict) else ():
-            if name in table:
-                table["summary" if name == "lesson" else "summaries"] = table.pop(name)
+    tables = [tree.get("machine"), *(rows if isinstance(rows, list) else [])]
+    for table in tables:
+        for old_name, name in _RENAMED.items():
+            if isinstance(table, dict) and old_name in table:
+                table[name] = table.pop(old_name)
     return tree
 
 
@@ -316,9 +328,9 @@ def _read_if_valid(path: Path) -> dict[str, Any]:
 
 
 def _named_summaries(tree: Mapping[str, Any]) -> list[str]:
-    """List the checksums of the healthy recordings' summaries that a machine's file names.
+    """List the checksums of summaries that a machine's file names.
 
-    `tree` holds the tables of the file, parts of which may not be valid.
+    `tree` holds the tables of the file. Tables and checksums that are not valid are skipped.
     """
     rows = tree.get("healthy")
     checksums = [row.get("summary") for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
@@ -328,8 +340,8 @@ def _named_summaries(tree: Mapping[str, Any]) -> list[str]:
 def _summaries_path(path: Path, tree: Mapping[str, Any]) -> Path:
     """Return the path of the file with the summaries of a machine's healthy recordings.
 
-    It has the name of the machine's file at `path` with another suffix. If there is no such file, it is the one named
-    in the tables `tree` of the machine's file.
+    It has the path of the machine's file with the suffix `.healthy` or, before version 0.1, `.lessons`. If no such file
+    exists, it is the file that the tables `tree` of the machine's file name.
     """
     machine_table = tree.get("machine")
     name = machine_table.get("summaries") if isinstance(machine_table, dict) else None
@@ -343,7 +355,6 @@ def _build_tree(machine: CommissionedMachine, path: Path) -> dict[str, Any]:
     """Build the nested tables of a machine's file, to be written at `path`."""
     from importlib.metadata import version
 
-    summary, columns = machine.summary, machine.channel_map
     machine_table = {
         "format": _FORMAT,
         "name": machine.name,
@@ -355,10 +366,12 @@ def _build_tree(machine: CommissionedMachine, path: Path) -> dict[str, Any]:
         "left_out": machine.left_out or None,
     }
     tree: dict[str, Any] = {"machine": machine_table}
-    if columns:
-        tree["map"] = {REST: columns} if isinstance(columns, str) else columns
+    if machine.channel_map:
+        is_auto = isinstance(machine.channel_map, str)
+        tree["map"] = {REST: machine.channel_map} if is_auto else machine.channel_map
     if machine.rig is not None:
         tree |= machine.rig.as_dict()
+    summary = machine.summary
     smallest = {} if summary.smallest is None else {"smallest_leak": summary.smallest._asdict()}
     terms = {name: term._asdict() for name, term in summary.terms.items()}
     tree["learnt"] = {"problems": summary.problems, "noise": summary.noise, **smallest, "terms": terms}
@@ -381,7 +394,7 @@ def _format_table(tree: Mapping[str, Any], path: str = "", heading: str = "") ->
     """Format a table as lines of TOML: first plain values and short tables in one line, then the other inner tables.
 
     `path` is the dotted name of the table, or "" for the whole file, in which a list becomes an array of tables.
-    `heading` is the first line. A table without plain values has no heading.
+    `heading` is the first line of the table; it is left out for a table without plain values.
     """
     lines, inner_lines = list[str](), list[str]()
     for name, value in tree.items():
@@ -404,7 +417,7 @@ def _format_key(name: str) -> str:
 
 
 def _format_value(value: Any) -> str:
-    """Format a plain value as TOML. Entries that are None are left out, and numbers keep all their digits."""
+    """Format a plain value as TOML. Entries of a table that are None are left out; numbers keep all their digits."""
     if isinstance(value, np.ndarray):
         value = value.tolist()
     if isinstance(value, Mapping):
@@ -414,7 +427,7 @@ def _format_value(value: Any) -> str:
         return "[" + ", ".join(map(_format_value, value)) + "]"
     if isinstance(value, float):
         return repr(value)
-    if isinstance(value, str):  # names of files may be no text
+    if isinstance(value, str):  # names of files may contain bytes that are not UTF-8
         value = value.encode("utf-8", "backslashreplace").decode()
     return json.dumps(value, ensure_ascii=False, default=str).replace("\x7f", "\\u007f")
 

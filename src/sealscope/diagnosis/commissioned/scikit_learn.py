@@ -55,7 +55,8 @@ class LeakDetector(OutlierMixin, BaseEstimator):  # type: ignore[misc]
 
     def __sklearn_tags__(self) -> Any:
         tags = super().__sklearn_tags__()
-        tags.input_tags.two_d_array, tags.input_tags.one_d_array, tags.input_tags.string = False, True, True
+        tags.input_tags.two_d_array = False
+        tags.input_tags.one_d_array = tags.input_tags.string = True  # a sequence of paths
         return tags
 
     def fit(self, X: Paths, y: object = None) -> Self:
@@ -64,22 +65,22 @@ class LeakDetector(OutlierMixin, BaseEstimator):  # type: ignore[misc]
         return self
 
     def score_samples(self, X: Paths) -> Array:
-        """Compute minus the leak score of each of n files (n,): lower for larger leaks, nan if not judged."""
+        """Compute minus the leak score of each of n files, shape (n,): lower for larger leaks, nan if not judged."""
         return -np.array([diagnosis.score for diagnosis in self._diagnoses(X)], dtype=float)
 
     def decision_function(self, X: Paths) -> Array:
-        """Compute threshold minus leak score of each of n files (n,): negative for a leak, nan if not judged."""
+        """Compute threshold minus leak score of each of n files, shape (n,): negative for alarms, nan if not judged."""
         diagnoses = self._diagnoses(X)
         score: Array = np.array([diagnosis.score for diagnosis in diagnoses], dtype=float)
         return np.array([diagnosis.threshold for diagnosis in diagnoses], dtype=float) - score
 
     def predict(self, X: Paths) -> NDArray[np.int64]:
-        """Classify each of n files (n,): -1 for a leak, 1 for no leak, 0 if it cannot be judged."""
+        """Classify each of n files, shape (n,): -1 for a leak, 1 for no leak, 0 if the file cannot be judged."""
         labels = {LEAK: -1, NO_LEAK: 1, CANNOT_TELL: 0}
         return np.array([labels[diagnosis.verdict] for diagnosis in self._diagnoses(X)], dtype=np.int64)
 
     def _diagnoses(self, X: Paths) -> list[Diagnosis]:
         """Diagnose each of the files `X` with the machine that `fit` has learned."""
         check_is_fitted(self)
-        p = self.false_alarm_probability
-        return [self.machine_.diagnose(path, false_alarm_probability=p) for path in X]
+        probability = self.false_alarm_probability
+        return [self.machine_.diagnose(path, false_alarm_probability=probability) for path in X]

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from sealscope.diagnosis.healthy import SummarisedRecording, Summary
     from sealscope.parameters import Rig
 
-#: Findings that a logger causes in each recording. They are corrected, and reported when the machine is commissioned.
+#: Codes of findings of the severity "note" that are listed as problems of the machine: its logger causes them always.
 _LOGGER_HABITS = ("unsigned_speed",)
 _PRIORS = COMMISSIONED.smallest
 
@@ -37,8 +37,8 @@ _PRIORS = COMMISSIONED.smallest
 class TermEstimate(NamedTuple):
     """Estimated coefficient of one term of the volume balance, such as leakage or compressed oil.
 
-    `value` is the estimate, `deviation` its standard error, `scatter` its standard deviation between recordings (None
-    for a single recording), and `unit` the unit of all three numbers.
+    `value` is the estimate and `deviation` its standard error. `scatter` is the standard deviation of the estimates
+    from single recordings, None if there is only one recording. `unit` is the unit of all three numbers.
     """
 
     value: float
@@ -94,8 +94,7 @@ class MachineSummary:
     def text(self, healthy: Sequence[SummarisedRecording], rig: Rig | None) -> str:
         """Format the summary of a machine as a table of about ten lines of text.
 
-        `healthy` are the recordings that it summarises, and `rig` the stated sizes of the machine, None if there are
-        none.
+        `healthy` are the summarised recordings, and `rig` the stated sizes of the machine, None if none are stated.
         """
         units = dict(healthy[0].units) if healthy else {}
         display_units = {name: _display_unit(healthy, name, unit) for name, unit in units.items()}
@@ -105,6 +104,7 @@ class MachineSummary:
         noise = []
         for name, value in self.noise.items():
             unit, display_unit = units.get(name, ""), display_units.get(name, "")
+            # a difference, as some units have a zero of their own
             deviation = from_si(value, display_unit, unit) - from_si(0.0, display_unit, unit) if unit else value
             noise.append(f"{name} {deviation:.2g} {display_unit}")
         seconds = sum(recording.seconds for recording in healthy)
@@ -142,8 +142,8 @@ class MachineSummary:
 def _describe_rig(rig: Rig | None) -> str:
     """Describe in one line the rig that is stated for a machine.
 
-    The text is the title of the rig. If only sizes are stated, it lists the stated ones of piston areas and pump
-    displacement. If none is stated, or `rig` is None, the text says that the size is not stated.
+    The text is the title of the rig or, if only sizes are stated, lists the piston areas and the pump displacement that
+    are stated. If neither is stated, or `rig` is None, the text says that the size is not stated.
     """
     rig = rig or unstated_rig()
     if rig.states("cylinder.M_eq"):  # a whole rig is stated, not sizes alone
@@ -170,8 +170,8 @@ def _display_unit(healthy: Sequence[SummarisedRecording], name: str, unit: str) 
 def _format_duty(healthy: Sequence[SummarisedRecording], pressure_unit: str) -> str:
     """Format the ranges of pump flow, pressure difference and oil temperature over the healthy recordings.
 
-    Unknown quantities are left out. The flow is known only if it can be stated in L/min, i.e. if displacement or piston
-    areas are stated or a flow meter is recorded. `pressure_unit`: unit in which the difference is displayed.
+    Unknown quantities are left out. The flow is known only if displacement or piston areas are stated or a flow meter
+    is recorded. `pressure_unit`: unit in which the pressure difference is displayed.
     """
     summaries = [recording.summaries.get(VOLUME_BALANCE, {}) for recording in healthy]
     flows = [summary.get("flow", 0.0) * summary.get("scale", 0.0) / LITRE_PER_MINUTE for summary in summaries]
@@ -193,12 +193,15 @@ def _format_duty(healthy: Sequence[SummarisedRecording], pressure_unit: str) -> 
 
 
 def describe_recording(recording: Recording, inspection: Inspection) -> dict[str, Any]:
-    """Collect figures of a healthy recording for display, by name.
+    """Collect figures of a healthy recording for display, by name. Unknown figures are left out.
 
-    They are `pressure_bar`, the mean of abs(p_A - p_B) [bar]; `oil_degC`, the oil temperature [deg C]; `noise`, the
-    standard deviation of the noise of each channel, in the channel's unit; `log_units`, the unit of each channel in the
-    log; and `wrong`, a list of problems as texts. Unknown figures are left out. `inspection` is the check of the same
-    `recording`.
+    - `pressure_bar`: mean of abs(p_A - p_B) [bar].
+    - `oil_degC`: oil temperature [deg C].
+    - `noise`: standard deviation of the noise of each channel, in the channel's unit.
+    - `log_units`: unit of each channel in the log.
+    - `wrong`: list of problems as texts.
+
+    `inspection` is the result of `inspect_recording` for the same `recording`.
     """
     part, description = inspection.part, dict[str, Any]()
     if {"p_A", "p_B"} <= set(part.channels) and part.units["p_A"] == "Pa":
@@ -222,10 +225,11 @@ def summarise_machine(
 ) -> MachineSummary:
     """Estimate the figures of a machine from the summaries of its healthy recordings.
 
-    The noise of a channel is the median over the recordings. The coefficients of the volume balance and the smallest
-    detectable leak are estimated from the recordings that allow a volume balance. Of these, a recording whose balance
-    has other terms than that of the first one is not used, and is listed as a problem. `left_out` are texts on
-    recordings that could not be used at all; they become the first problems. `rig` is None if nothing is stated.
+    The noise of a channel is the median over the recordings. The coefficients of the volume balance are estimated from
+    the recordings with a summary by the volume balance. A recording with other terms than the first of these is not
+    used, and is listed as a problem. The smallest detectable leak is estimated from the same recordings, if there are
+    two or more. `left_out` are texts on recordings that could not be used at all; they become the first problems. `rig`
+    is None if nothing is stated.
     """
     problems = [*left_out, *_collect_problems(healthy)]
     noises = defaultdict[str, list[float]](list)
@@ -241,7 +245,8 @@ def summarise_machine(
             summaries.append(summary)
         else:
             problems.append(f"{recording.file} has other channels than {with_balance[0].file}")
-    rig, channels = rig or unstated_rig(), frozenset(with_balance[0].units if with_balance else ())
+    rig = rig or unstated_rig()
+    channels = frozenset(with_balance[0].units if with_balance else ())
     if not (summaries and equations(rig, channels)):
         return MachineSummary({}, noise, None, problems)
     terms = _estimate_terms([np.asarray(summary["sums"], dtype=float)[0] for summary in summaries], rig, channels)
@@ -258,9 +263,11 @@ def _estimate_terms(sums: Sequence[Array], rig: Rig, channels: frozenset[str]) -
     Returns an estimate for each term with an unknown coefficient, by the name of the term.
     """
     equation = equations(rig, channels)[0]
-    roles, units = ColumnRoles(equation), {term.name: term.unit for term in equation.terms}
-    nuisance = list(roles.nuisance)
-    total, by_recording = np.sum(sums, axis=0), np.array([fit_columns(gram, roles, nuisance) for gram in sums])
+    roles = ColumnRoles(equation)
+    units = {term.name: term.unit for term in equation.terms}
+    nuisance = list(roles.nuisance)  # columns of the terms with unknown coefficients
+    by_recording = np.array([fit_columns(gram, roles, nuisance) for gram in sums])
+    total = np.sum(sums, axis=0)
     values = fit_columns(total, roles, nuisance)
     variance = np.diag(solve(total[np.ix_(nuisance, nuisance)], np.eye(len(nuisance))))  # rows have unit noise
     scatter = by_recording.std(axis=0, ddof=1).tolist() if len(sums) > 1 else [None] * len(nuisance)
@@ -273,8 +280,8 @@ def _estimate_terms(sums: Sequence[Array], rig: Rig, channels: frozenset[str]) -
 def fit_columns(gram: Array, roles: ColumnRoles, columns: Sequence[int]) -> Array:
     """Fit the coefficients x of a volume balance X x = y by least squares, as x = (X'X)^-1 X'y.
 
-    `gram` (m, m): products of the balance's m columns with each other, summed over the rows; `columns`: indices of the
-    c columns in X; `roles`: tells which column is the left side y. Returns x (c,).
+    `gram` (m, m): Gram matrix of the balance, i.e. the products of its m columns with each other, summed over the rows;
+    `columns`: indices of the c columns that X consists of; `roles.left`: index of the column y. Returns x (c,).
     """
     return solve(gram[np.ix_(columns, columns)], gram[columns, roles.left])
 
@@ -282,14 +289,14 @@ def fit_columns(gram: Array, roles: ColumnRoles, columns: Sequence[int]) -> Arra
 def _smallest_leak(balance: VolumeBalance, summaries: Sequence[Summary], channels: frozenset[str]) -> SmallestLeak:
     """Estimate the smallest leak that a recording of a later day will show if the machine moves and is loaded as usual.
 
-    `summaries` of the healthy recordings are by the detector `balance`; `channels` are the names of the recorded
-    channels. The leakage of a recording is compared with the healthy mean by Student's t test. `deviation` is the
-    standard deviation of this difference for a healthy recording of a later day. The smallest leak, which is detected
-    with the probability `power` (`priors.toml`), raises the leakage by
+    `balance`: detector that made the `summaries` of the healthy recordings; `channels`: names of the recorded channels.
+    The leakage of a recording is compared with the healthy mean by Student's t test. The smallest leak, which is
+    detected with the probability `power` (`priors.toml`), raises the leakage by
 
-        rise = (threshold of the test + normal quantile of `power`) deviation.
+        rise = (threshold of the test + normal quantile of `power`) * deviation,
 
-    More healthy days lower the threshold and the error of the healthy mean, but not the scatter between recordings.
+    where `deviation` is the standard deviation of a healthy recording's leakage from the healthy mean. More healthy
+    days lower the threshold and the error of the healthy mean, but not the scatter between recordings.
     """
     from scipy.special import ndtri
 
@@ -304,7 +311,7 @@ def _smallest_leak(balance: VolumeBalance, summaries: Sequence[Summary], channel
 
     pressure, flow, scale = (
         float(np.median([summary[name] for summary in summaries])) for name in ("pressure", "flow", "scale")
-    )
+    )  # `scale`: factor from the balance's flows to the true ones, 0 if unknown
     smallest = smallest_rise(1)
     halved_by = next((n for n in _PRIORS.repeats if smallest_rise(n) <= 0.5 * smallest), None)
     share = smallest * pressure / flow if flow > 0.0 else float("nan")
@@ -315,8 +322,8 @@ def _smallest_leak(balance: VolumeBalance, summaries: Sequence[Summary], channel
 def _collect_problems(healthy: Sequence[SummarisedRecording]) -> list[str]:
     """List the problems of all healthy recordings, one line for each kind of problem.
 
-    Problems with the same text before the first colon are of one kind. A line ends with the name of the file, or with
-    the number of recordings if several have the problem.
+    Problems with the same text before the first colon are of one kind. Of these texts the alphabetically last is shown.
+    The line ends with the name of the file, or with the number of recordings if there are several problems of the kind.
     """
     by_kind = defaultdict[str, list[tuple[str, str]]](list)
     for recording in healthy:
@@ -332,13 +339,13 @@ def _collect_problems(healthy: Sequence[SummarisedRecording]) -> list[str]:
 def _estimate_noise(values: Array) -> float:
     """Estimate the standard deviation of white noise in a channel from second differences of its samples.
 
-    Second differences have sqrt(6) times the deviation of the noise, and the median absolute value of a standard normal
-    number is 0.6745:
+    Second differences of white noise have sqrt(6) times its standard deviation, and the median absolute value of a
+    standard normal number is 0.6745:
 
         noise = median(abs(second differences)) / (0.6745 sqrt(6)).
 
-    The estimate is at least the rounding error of the channel's resolution. Returns 0 for fewer than three finite
-    values.
+    The estimate is at least the standard deviation of a rounding error, the channel's resolution / sqrt(12). Returns 0
+    for fewer than three finite values.
     """
     known = values[np.isfinite(values)]
     if known.size < 3:
@@ -348,9 +355,9 @@ def _estimate_noise(values: Array) -> float:
 
 
 def _describe_vacuum(part: Recording, name: str) -> str:
-    """Describe a pressure sensor that reads below vacuum in more than 1 % of the samples; "" if it does not.
+    """Describe a pressure sensor that reads below vacuum in about 1 % of the samples or more; else return "".
 
-    `name` is the channel of the recording `part`.
+    `name` is the channel of the recording `part`, a gauge pressure. A channel in another unit than Pa is not tested.
     """
     if part.units[name] != "Pa" or not (low_pressure := float(np.quantile(part[name], 0.01))) < -P_ATM:
         return ""
@@ -361,13 +368,14 @@ def _describe_vacuum(part: Recording, name: str) -> str:
 def _describe_glitches(part: Recording, name: str) -> str:
     """Describe a channel in which single samples stand out from both neighbours by more than the channel's range.
 
-    The result is "" if there are none. The range is the difference of the 99 % and the 1 % quantile of the channel.
+    The result is "" if there are no such samples. The range is the 99 % quantile of the channel minus its 1 % quantile.
     """
     values = part[name]
     if len(values) < 3:
         return ""
-    medians = np.median([values[:-2], values[1:-1], values[2:]], axis=0)
-    value_range = float(np.subtract(*np.quantile(values, (0.99, 0.01))))
+    medians = np.median([values[:-2], values[1:-1], values[2:]], axis=0)  # of each sample and its two neighbours
+    high, low = np.quantile(values, (0.99, 0.01))
+    value_range = float(high - low)
     if not (value_range > 0.0 and np.any(np.abs(values[1:-1] - medians) > value_range)):
         return ""
     return f"{name} has glitches: single samples jump beyond its whole range, and are weighted down"

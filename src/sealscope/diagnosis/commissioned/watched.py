@@ -24,6 +24,7 @@ from sealscope.storage.toml_file import read_toml
 
 #: Fewest healthy recordings that a leakage is compared with, as a single one has no scatter.
 _MIN_RECORDINGS = 2
+#: Names of the parameters for the piston areas and the pump's displacement.
 _AREAS, _DISPLACEMENT = ("cylinder.A_A", "cylinder.A_B"), "pump.q_b"
 
 
@@ -57,7 +58,11 @@ class WatchedMachine:
 
 
 def load_watched(rig: str) -> WatchedMachine:
-    """Load a packaged rig, a rig file or a machine file for the monitor; raise InputError if it cannot be read."""
+    """Load what the monitor needs of an actuator; raise InputError if it cannot be read.
+
+    `rig` is a packaged rig's name, or the path of a rig's or machine's file, ending in ".toml". Only a machine's file
+    gives repair limit, sampling rate and healthy recordings.
+    """
     if not rig.endswith(".toml") or "machine" not in read_toml(Path(rig), "a rig file", rig):
         named_rig = load_rig(rig)
         return WatchedMachine(named_rig, named_rig.channel_map)
@@ -76,9 +81,9 @@ def load_watched(rig: str) -> WatchedMachine:
 
 
 def is_remeasured(rig: Rig, rig_before: Rig) -> bool:
-    """Return True if two rigs differ in nothing but the pump's displacement, and in that by at most 5 %.
+    """Return True if two rigs are equal, except for pump displacements that differ by at most 5 %.
 
-    Two measurements of one pump's displacement may differ by that much.
+    Two measurements of the displacement of one pump may differ by this much.
     """
     values, values_before = rig.model_dump(), rig_before.model_dump()
     for tree in (values, values_before):
@@ -104,9 +109,9 @@ def _with_measured_displacement(rig: Rig, healthy: tuple[SummarisedRecording, ..
 def _healthy_level(healthy: tuple[SummarisedRecording, ...], rig: Rig) -> HealthyLevel | None:
     """Estimate the leakage conductance of pump and piston together in the healthy recordings.
 
-    Mean and standard deviation are over the recordings. The lower end of the range is at least the largest conductance
-    divided by the effect of the warmest oil (`oil.warmest` in `priors.toml`). The result is None if fewer than two
-    recordings have an estimate. A machine with a servo valve has several balances and no estimate.
+    Mean, standard deviation and range are over the recordings. The lower end of the range is at least the largest
+    conductance divided by `oil.warmest` of `priors.toml`, the factor by which the warmest oil raises the leakage. The
+    result is None if fewer than two recordings have an estimate.
     """
     levels = [level for recording in healthy if (level := _leak_conductance(recording, rig)) is not None]
     if len(levels) < _MIN_RECORDINGS:
@@ -114,22 +119,27 @@ def _healthy_level(healthy: tuple[SummarisedRecording, ...], rig: Rig) -> Health
     # the highest level may be due to the warmest oil, which limits how far the lowest one is below it
     low = max(min(levels), max(levels) / INFERENCE.oil.warmest)
     known_s = max((recording.start_s for recording in healthy if recording.start_s is not None), default=0.0)
-    return HealthyLevel(float(np.mean(levels)), low, max(levels), float(np.std(levels, ddof=1)), known_s, len(levels))
+    mean, deviation = float(np.mean(levels)), float(np.std(levels, ddof=1))
+    return HealthyLevel(mean, low, high=max(levels), deviation=deviation, known_s=known_s, count=len(levels))
 
 
 def _leak_conductance(recording: SummarisedRecording, rig: Rig) -> float | None:
     """Estimate the leakage conductance of pump and piston together in a recording [m^3/(s Pa)] from its summary.
 
-    It is fitted by least squares to the sums of products in the summary, together with the other coefficients of the
-    volume balance. The result is None if there is no such summary, or if the rig has no or several volume balances.
+    The conductance is fitted by least squares to the Gram matrix in the summary by the volume balance, together with
+    the other coefficients of the balance. The result is None without such a summary, for a rig with no or several
+    volume balances (servo valve), or if the fit fails.
     """
     summary, balances = recording.summaries.get(VOLUME_BALANCE), equations(rig, frozenset(recording.units))
     if summary is None or len(balances) != 1:
         return None
-    roles, gram = ColumnRoles(balances[0]), np.asarray(summary["sums"], dtype=float)[0]
-    if gram.shape != 2 * (roles.left + 1,):
+    roles = ColumnRoles(balances[0])
+    gram = np.asarray(summary["sums"], dtype=float)[0]
+    n_columns = roles.left + 1  # the left side is the last column
+    if gram.shape != (n_columns, n_columns):
         return None
     # without a column for the pump's leakage, which lies in parallel, the leak's column stands for both
     nuisance = [k for k in roles.nuisance if k != roles.leak and roles.names[k] != PUMP]
-    conductance = float(fit_columns(gram, roles, [*nuisance, roles.leak])[-1] * float(summary["scale"]))
+    *_, leak_coefficient = fit_columns(gram, roles, [*nuisance, roles.leak])
+    conductance = float(leak_coefficient * float(summary["scale"]))
     return conductance if np.isfinite(conductance) else None

@@ -32,10 +32,11 @@ LEVEL = "against the rig's file"
 class LeakTest(NamedTuple):
     """Result of a test for a leak.
 
-    `name`: WITHIN, AGAINST or LEVEL, i.e. within the recording, against healthy recordings, or against the rig's file;
-    `score`: statistic of the test, which grows with the evidence of a leak; `chance`: probability of at least this
-    score without a leak; `probability`: allowed probability of a false alarm, i.e. that without a leak the score
-    exceeds the `threshold`.
+    - `name`: WITHIN (change within the recording), AGAINST (against healthy recordings) or LEVEL (against the limit in
+      the rig's file).
+    - `score`: statistic of the test, which grows with the evidence of a leak.
+    - `threshold`: score that is exceeded without a leak with the `probability` allowed for a false alarm.
+    - `chance`: p-value, i.e. probability of at least this score without a leak.
     """
 
     name: str
@@ -48,9 +49,11 @@ class LeakTest(NamedTuple):
 class OtherEvent(NamedTuple):
     """Event other than a leak that explains a rare change in a recording.
 
-    `cause`, `description`: cause of the event, and what it changes in words; `probability`: posterior probability of an
-    event with this cause, rather than another one or none; `observable`: the rarest observable that it explains;
-    `chance`: probability that a healthy recording has at least its score.
+    - `cause`: cause of the event, such as "sensor fault".
+    - `description`: the quantities that the event changes, in words.
+    - `probability`: posterior probability of an event with this cause, against other causes and chance.
+    - `observable`: the rarest change that the event explains, as the result of a detector's test.
+    - `chance`: probability that a healthy recording has at least the score of the `observable`.
     """
 
     cause: str
@@ -64,10 +67,11 @@ class OtherEvent(NamedTuple):
 class Case:
     """Everything that a decision on one recording depends on.
 
-    `judge`: report of the detector that judges; `observables`: tests of all detectors that are considered; `null`:
-    distribution of the observables in healthy recordings; `false_alarm_probability`: allowed probability of the
-    verdict `leak` on a leak-free recording; `weigh_rivals`: true if other causes (rivals) compete with a leak, false
-    for a method that decides alone.
+    - `judge`: report of the detector that judges.
+    - `observables`: test results of all detectors that are considered.
+    - `null`: distribution of the test results in healthy recordings.
+    - `false_alarm_probability`: allowed probability of the verdict `leak` on a leak-free recording.
+    - `weigh_rivals`: true if other causes (rivals) compete with a leak; false for a method that decides alone.
     """
 
     judge: Observed
@@ -98,19 +102,19 @@ class Case:
     def leak_probability(self, alarm: LeakTest) -> float:
         """Compute the probability that a leak past piston or pump caused an alarm, rather than another event.
 
-        It is 1 if other causes are not weighed (`weigh_rivals`). If the alarm is a leakage above the limit of the rig's
-        file, a leak that began within the recording may have raised it: the result is then the probability for the
-        alarm of the test for such a leak, or 1 if that test raised none.
+        It is 1 if other causes are not weighed (`weigh_rivals`). An alarm by the limit in the rig's file (LEVEL) is
+        judged by the alarm for a change within the recording (WITHIN): the result is the probability for that alarm, or
+        1 if there is none.
         """
         if not self.weigh_rivals:
             return 1.0
         if alarm.name == LEVEL:
-            step_alarm = next((test for test in self.alarms if test.name == WITHIN), None)
-            return 1.0 if step_alarm is None else self.leak_probability(step_alarm)
+            within_alarm = next((test for test in self.alarms if test.name == WITHIN), None)
+            return 1.0 if within_alarm is None else self.leak_probability(within_alarm)
         return probability_of(self.explanations, *LEAK_EVENTS, data_kind=self._data_kind(alarm))
 
     def external_probability(self, alarm: LeakTest) -> float:
-        """Compute the probability that oil leaks out of the circuit, given the data that raised the alarm.
+        """Compute the probability that oil leaks out of the circuit (external leak), given the data of an alarm.
 
         It is 0 if other causes are not weighed (`weigh_rivals`).
         """
@@ -121,11 +125,12 @@ class Case:
     def _data_kind(self, alarm: LeakTest) -> str:
         """Return the kind of data (`Observable.data`) by which a test raised its alarm.
 
-        It is `RISE`, the difference from healthy recordings, if the alarm is from the comparison with them and leakage
-        is measured. Otherwise it is the kind of data that the judging detector tests for changes.
+        For measured leakage that was compared with healthy recordings, it is `RISE`. Otherwise it is the kind of data
+        of the judging detector's first test result.
         """
-        is_rise = alarm.name == AGAINST and self.leak is not None
-        return RISE if is_rise else self.judge.observables[0].data
+        if alarm.name == AGAINST and self.leak is not None:
+            return RISE
+        return self.judge.observables[0].data
 
     @cached_property
     def tests(self) -> tuple[LeakTest, ...]:
@@ -139,8 +144,8 @@ class Case:
     def alarms(self) -> tuple[LeakTest, ...]:
         """Tests that raise an alarm, i.e. whose p-value is below their allowed false-alarm probability.
 
-        The test for a leak that began within the recording comes first, unless the leak seems older than the
-        recording.
+        They have the order of `tests`, in which the test for a leak that began within the recording is the first. If
+        the leak seems older than the recording, the order is reversed.
         """
         alarms = [test for test in self.tests if test.chance < test.probability]
         return tuple(alarms if self._has_onset_within else reversed(alarms))
@@ -149,24 +154,25 @@ class Case:
     def _has_onset_within(self) -> bool:
         """True if a leak that began within the recording is a better explanation than an older leak.
 
-        An older leak explains only the leakage above that of healthy recordings (the rise). One that began within the
-        recording explains a step, i.e. a sudden increase of the leakage, and the rise that this step causes. The result
-        is also true if there are no healthy recordings, or if the times in which valves hold the load show that the
-        leak began within the recording (`rise_onset`).
+        An older leak explains only the rise, i.e. leakage above that of healthy recordings. A leak that began within
+        the recording explains a step (a sudden increase of the leakage) and the rise that this step causes. Without
+        measured leakage or healthy recordings, the result is True. It is also True if the times in which valves hold
+        the load show when the rise began (`rise_onset`).
         """
         leak = self.leak
         if leak is None or leak.step_rise is None or leak.rise_onset is not None:
             return True
-        step_factor = sum(log_bayes_factor(test.chance) for test in self.tests if test.name == WITHIN)
-        return step_factor + leak.step_rise.step_log_ratio > log_bayes_factor(leak.step_rise.rise.chance)
+        rise, step_log_ratio = leak.step_rise
+        within_factor = sum(log_bayes_factor(test.chance) for test in self.tests if test.name == WITHIN)  # 0 or 1 test
+        return within_factor + step_log_ratio > log_bayes_factor(rise.chance)
 
     @cached_property
     def other_event(self) -> OtherEvent | None:
         """Event other than a leak that explains a rare change with sufficient probability; None if there is none.
 
-        The changes are tried in the order of their probability in a healthy recording, the least probable first. The
-        search ends at a change that is more probable than the allowed probability of naming an event by mistake. Two
-        causes that the data cannot separate are named together if neither is probable enough alone (`joint_causes`).
+        The changes are tried in the order of their p-values in healthy recordings, the smallest first. The search ends
+        at the first change with a p-value of at least the allowed probability of naming an event by mistake. For each
+        change, single causes are tried first, then groups of causes that the data cannot separate (`joint_causes`).
         """
         named_events = [event for event in load_events() if event.cause and event.name not in LEAK_EVENTS]
         candidates_of = {
@@ -180,30 +186,33 @@ class Case:
         for observable in sorted(self.observables, key=chances.__getitem__):
             if chances[observable] >= allowed:
                 return None
-            single_causes = {event.cause: (event.cause,) for event in candidates_of[observable] if event.cause}
-            joined = {name: causes for name, causes in joint_causes().items() if single_causes.keys() & set(causes)}
-            for cause, alternatives in (single_causes | joined).items():
-                probability = self._probability_of_causes(alternatives, observable.data)
+            singles = {event.cause: (event.cause,) for event in candidates_of[observable] if event.cause}
+            groups = {name: causes for name, causes in joint_causes().items() if singles.keys() & set(causes)}
+            for name, causes in (singles | groups).items():
+                probability = self._probability_of_causes(causes, observable.data)
                 if probability is not None:
-                    description = " or ".join(self._describe(cause, observable.data) for cause in alternatives)
-                    return OtherEvent(cause, description, probability, observable, chances[observable])
+                    description = " or ".join(self._describe(cause, observable.data) for cause in causes)
+                    return OtherEvent(name, description, probability, observable, chances[observable])
         return None
 
     def _probability_of_causes(self, causes: Sequence[str], data_kind: str) -> float | None:
-        """Compute the probability that a change of a kind of data has one of the causes, and is not by chance.
+        """Compute the probability that one of the causes changed a kind of data, against other causes and chance.
 
-        None if it is too improbable to be named, be it against all other causes or against chance, or if one of
-        several causes is excluded.
+        The result is None, and the causes must not be named, unless three limits of `priors.toml` are exceeded:
+
+        - `explanation.happened` by the probability against other causes and chance,
+        - `explanation.named` by the probability against other causes alone,
+        - 1 - `explanation.sure` by the latter probability of each single cause.
         """
         limits = DECISION.explanation
-        among_events = [probability_of(self.explanations, causes=[cause], data_kind=data_kind) for cause in causes]
+        by_cause = [probability_of(self.explanations, causes=[cause], data_kind=data_kind) for cause in causes]
         probability = probability_beside_chance(self.explanations, causes, data_kind)
         is_named = probability_of(self.explanations, causes=causes, data_kind=data_kind) > limits.named
-        is_whole = min(among_events) > 1.0 - limits.sure
-        return probability if is_named and is_whole and probability > limits.happened else None
+        is_each_possible = min(by_cause) > 1.0 - limits.sure
+        return probability if is_named and is_each_possible and probability > limits.happened else None
 
     def _describe(self, cause: str, data_kind: str) -> str:
-        """Describe the most probable event with a cause that explains a kind of data (`Observable.data`) in words."""
+        """Describe in words the most probable event with a given cause that changes a kind of data."""
         tests = [observable for observable in self.observables if observable.data == data_kind]
         events = [event for event in load_events() if event.cause == cause and any(map(event.affects, tests))]
 
@@ -214,27 +223,31 @@ class Case:
 
 
 def _leak_tests(case: Case, leak: LeakMeasure) -> tuple[LeakTest, ...]:
-    """Make the tests for a leak from the measured leakage, as far as `leak` allows.
+    """Make the tests for a leak from the measured leakage: at most two of three, as far as `leak` allows.
 
-    The leakage is tested for a step (a sudden increase) within the recording, for a rise over healthy recordings, and
-    for a level above the limit in the rig's file. The tests share the allowed false-alarm probability. If a step and
-    a rise are tested, the fraction `questions.within` of `priors.toml` goes to the step; if a step and a level are
-    tested, it goes to the level.
+    - WITHIN: a step (a sudden increase) within the recording.
+    - AGAINST: a rise over healthy recordings.
+    - LEVEL: without healthy recordings, a level above the limit in the rig's file.
+
+    Two tests share the allowed false-alarm probability. The fraction `questions.within` of `priors.toml` goes to WITHIN
+    if the other test is AGAINST, and to LEVEL if that is the other test.
     """
-    from scipy.special import ndtr, ndtri
+    from scipy.special import ndtr, ndtri  # standard normal distribution and its inverse
 
-    allowed, tests = case.false_alarm_probability, []
+    allowed = case.false_alarm_probability
+    tests = []
     step, rise, excess = leak.step, leak.rise, leak.excess
     is_shared = step is not None and (rise is not None or excess is not None)
     reserved = DECISION.questions.within * allowed if is_shared else 0.0
     if step is not None:
-        probability, key = reserved if rise is not None else allowed - reserved, step_key(leak.provider)
+        probability = reserved if rise is not None else allowed - reserved
+        key = step_key(leak.provider)
         threshold = step.threshold(case.null.uncalibrated_chance(key, probability))
         tests.append(LeakTest(WITHIN, step.score, threshold, case.null.calibrate(key, step.chance), probability))
     if rise is not None:
         probability = allowed - reserved
         tests.append(LeakTest(AGAINST, rise.score, rise.threshold(probability), rise.chance, probability))
-    if excess is not None:
+    if excess is not None:  # a z score
         probability = reserved or allowed
         tests.append(LeakTest(LEVEL, excess, float(-ndtri(probability)), float(ndtr(-excess)), probability))
     return tuple(tests)
@@ -251,13 +264,12 @@ def step_key(provider: str) -> str:
 def _change_tests(case: Case) -> tuple[LeakTest, ...]:
     """Make the test for a leak from the report of a detector that does not measure leakage.
 
-    The detector tests each of its observables. Of those that a leak changes, the one with the smallest p-value
-    (`Observable.chance`) gives the test for a leak, with its score and its calibrated p-value (`HealthyNull.chance`).
-    The result is empty if a leak changes none of them.
+    Of the detector's test results (observables) that a leak changes, the one with the smallest p-value gives the score,
+    and its calibrated p-value (`HealthyNull.chance`). The result is empty if a leak changes none of them.
 
-    The detector states no threshold. It is estimated as the score at which the calibrated p-value would equal the
-    allowed false-alarm probability, from the score and the p-value of this observable, with the score taken as
-    proportional to the logarithm of the p-value.
+    The detector states no threshold. The threshold is estimated as the score for which the calibrated p-value equals
+    the allowed false-alarm probability. For this, scores are taken as proportional to the logarithm of the p-value that
+    the detector states.
     """
     leak = next(event for event in load_events() if event.name == LEAK_EVENTS[0])
     affected = [observable for observable in case.judge.observables if leak.affects(observable)]
@@ -265,8 +277,8 @@ def _change_tests(case: Case) -> tuple[LeakTest, ...]:
     if rarest is None:
         return ()
     allowed = case.false_alarm_probability
-    # a score is about proportional to the logarithm of its chance: the threshold is the score of the allowed chance
-    allowed_by_law = case.null.uncalibrated_chance(null_key(rarest), allowed)
-    threshold = rarest.score * np.log(allowed_by_law) / np.log(min(max(rarest.chance, 1e-300), 1.0 - 1e-9))
+    allowed_chance = case.null.uncalibrated_chance(null_key(rarest), allowed)  # p-value that the detector would state
+    rarest_chance = min(max(rarest.chance, 1e-300), 1.0 - 1e-9)  # the logarithm is finite and not 0
+    threshold = rarest.score * np.log(allowed_chance) / np.log(rarest_chance)
     name = WITHIN if rarest.onset is not None else AGAINST
     return (LeakTest(name, rarest.score, max(float(threshold), 0.0), case.null.chance(rarest), allowed),)

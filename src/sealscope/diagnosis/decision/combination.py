@@ -1,8 +1,8 @@
 """Choice of one decision among those of several detectors.
 
-If each of several detectors could raise the alarm, their false-alarm probabilities would add up. Therefore only one
-judges: the first of `ORDER` that reaches a verdict, then a user's own detectors, and last the change of RMS, which
-states no size.
+If each of several detectors could raise the alarm, their false-alarm probabilities would add up. Therefore only the
+first detector that decides is used. Detectors of `ORDER` come first, then a user's own detectors, and last the change
+of RMS, which states no size of a leak.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ ORDER = (VOLUME_BALANCE, PRESSURE_RESPONSE)
 
 
 def rank(detector: str) -> int:
-    """Return the place of a detector, by its name, in the order in which detectors may judge; 0 is the first.
+    """Return the rank of a detector, given its name; the detector of the lowest rank that decides gives the verdict.
 
-    Detectors that measure the leak come first, the most accurate one before the others. All plug-ins share the next
-    place. The change of the RMS is the last.
+    Detectors that measure the leak have the ranks 0, 1, ... in the sequence of `ORDER`. All plug-ins share the next
+    rank, and the change of RMS has the highest.
     """
     if detector == RMS_CHANGE:
         return len(ORDER) + 1
@@ -40,8 +40,8 @@ def rank(detector: str) -> int:
 def is_decided(evidence: Evidence) -> bool:
     """Return True if a detector could use the recording and has decided.
 
-    It has decided if its verdict is `leak` or `no leak`, if it states the cause of a change, or if it has raised an
-    alarm, i.e. its score is above the threshold.
+    A detector has decided if its verdict is `leak` or `no leak`, if it states the cause of a change, or if its score is
+    above the threshold (an alarm).
     """
     return evidence.usable and not evidence.abstains
 
@@ -49,10 +49,9 @@ def is_decided(evidence: Evidence) -> bool:
 def combine(decisions: Sequence[Evidence], refusal: str | None) -> Evidence:
     """Combine the decisions of several detectors into the decision of the first one, by rank, that decides.
 
-    All decisions become the `parts` of the result. A verdict `no leak` becomes `cannot tell` if the end of the
-    recording is not judged, or if `refusal` gives a reason why `no leak` must not be stated (None if there is none).
-    If no detector decides, the verdict is `cannot tell`, too. The change of RMS decides only if no detector that
-    measures the leak can use the recording.
+    All decisions become the `parts` of the result. The change of RMS decides only if no detector that measures the leak
+    can use the recording. The verdict becomes `cannot tell` if no detector decides, or instead of `no leak` if the end
+    of the recording is not judged or a `refusal` is given: the reason why `no leak` must not be stated, else None.
     """
     ranked = sorted(decisions, key=lambda decision: rank(decision.detector))
     usable = [decision for decision in ranked if decision.usable]
@@ -61,7 +60,8 @@ def combine(decisions: Sequence[Evidence], refusal: str | None) -> Evidence:
     judge = next((decision for decision in candidates if not decision.abstains), None)
     if judge is None:
         return _explain_undecided(ranked, usable)
-    reasons, doubts = [judge.reason], []
+    reasons = [judge.reason]
+    doubts = []  # reasons not to state `no leak`
     if judge.share < 1.0:
         reasons.append(text_of("doubt", "share", percent=100.0 * judge.share))
     if judge.verdict == NO_LEAK:
@@ -78,15 +78,16 @@ def combine(decisions: Sequence[Evidence], refusal: str | None) -> Evidence:
 def _explain_undecided(ranked: Sequence[Evidence], usable: Sequence[Evidence]) -> Evidence:
     """Make the verdict `cannot tell` with a reason, as no detector decides.
 
-    `ranked`: decisions of all detectors in the order of judging; `usable`: those that could use the recording. The
-    first usable detector states the reason or, if none is usable, the built-in detector that needs the fewest channels.
+    `ranked`: decisions of all detectors by rank; `usable`: those of detectors that could use the recording. The first
+    usable detector states the reason; if it is the change of RMS, the lack of the volume balance is stated before.
+    If no detector is usable, the last built-in one, which needs the fewest channels, states the reason.
     """
     if usable:
         undecided = usable[0]
-        needs = next((decision.reason for decision in ranked if decision.detector == ORDER[0]), "")
-        if undecided.detector == RMS_CHANGE and needs:
+        balance_reason = next((decision.reason for decision in ranked if decision.detector == VOLUME_BALANCE), "")
+        if undecided.detector == RMS_CHANGE and balance_reason:
             # a missing channel would help more than a higher sampling rate
-            undecided = replace(undecided, reason=f"the {ORDER[0]} {needs}; {undecided.reason}")
+            undecided = replace(undecided, reason=f"the {VOLUME_BALANCE} {balance_reason}; {undecided.reason}")
     else:
         built_in = [decision for decision in ranked if decision.detector in (*ORDER, RMS_CHANGE)] or list(ranked)
         undecided = Evidence(CANNOT_TELL, built_in[-1].reason if built_in else "there is no detector")

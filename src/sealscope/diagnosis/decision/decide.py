@@ -3,10 +3,11 @@
 The verdict is `leak` if both conditions hold for one test of the leakage:
 
 - An alarm: `chance` < `probability` (`Case.alarms`). `chance` is the probability that a healthy recording scores as
-  high, calibrated by healthy recordings. `probability` is the test's share (`case._leak_tests`) of the allowed
-  probability of a false alarm, which the caller states, by default 0.01. A quarter of it goes to a change within the
-  recording where there are healthy recordings to compare with, and the rest to the comparison; to a change within it
-  goes all or three quarters where there are none. Score and threshold are the same comparison, for display.
+  high, calibrated by healthy recordings. `probability` is the test's share of the allowed probability of a false alarm,
+  which the caller states, by default 0.01. With healthy recordings, the test for a change within the recording gets a
+  quarter, and the comparison with them the rest. Without them, the former gets three quarters if there is a limit in
+  the rig's file to test, which gets the rest, else all (`case._leak_tests`). Score and threshold are the same
+  comparison, for display.
 - No better explanation: the probability that a leak caused the alarm (`Case.leak_probability`) is above 0.5.
 
 These three numbers are `[false_alarm] probability`, `[questions] within` and `[explanation] leak` of `priors.toml`.
@@ -80,14 +81,15 @@ def decide(
 def _evidence_without_leak(case: Case) -> Evidence:
     """Make the evidence of a recording in which no test found a leak, with the verdict `no leak` or `cannot tell`.
 
-    The verdict is `no leak` if the upper bound of an undetected leak is small enough (`decide_without_leak`). The
-    evidence states this bound. If something changed for another reason than a leak, it states the event that explains
-    the change.
+    The verdict is `no leak` if the upper bound of an undetected leak is small enough (`decide_without_leak`). If
+    leakage is measured, the evidence states this bound. If another event than a leak explains a rare change, the
+    evidence states the cause of this event.
     """
-    alarm, leak, other = next(iter(case.alarms), None), case.leak, case.other_event
+    alarm = next(iter(case.alarms), None)
+    leak, other = case.leak, case.other_event
     bound = _leak_bound(case, alarm)
     verdict = decide_without_leak(*_bound_and_limit(case, bound))
-    evidence = Evidence(verdict, "", cause=None if other is None else other.cause)
+    evidence = Evidence(verdict, reason="", cause=None if other is None else other.cause)
     evidence = _add_tests(case, evidence, case.tests[0] if case.tests else None)
     if leak is not None:
         evidence = replace(
@@ -100,13 +102,14 @@ def _evidence_without_leak(case: Case) -> Evidence:
 
 
 def _leak_evidence(case: Case, alarm: LeakTest) -> Evidence:
-    """Make the verdict `leak`, with cause, onset and flow of the leak.
+    """Make the verdict `leak`, with cause and onset of the leak and, if leakage is measured, with its flow.
 
     `alarm`: test that detected the leak.
     """
-    leak, fields = case.leak, dict[str, Any]()
+    leak = case.leak
     if leak is None:
-        fields["cause"], onset = "piston leak", case.rarest_observable.onset
+        fields: dict[str, Any] = {"cause": "piston leak"}
+        onset = case.rarest_observable.onset
     else:
         if alarm.name == WITHIN and leak.step is not None:
             onset = leak.step.onset()
@@ -120,16 +123,16 @@ def _leak_evidence(case: Case, alarm: LeakTest) -> Evidence:
         }
     if onset is not None:
         fields |= {"onset_s": onset.value, "onset_interval_s": (onset.low, onset.high)}
-    evidence = _add_tests(case, Evidence(LEAK, "", **fields), alarm)
-    return replace(evidence, reason=reason_of(case, evidence, alarm, np.inf, None))
+    evidence = _add_tests(case, Evidence(LEAK, reason="", **fields), alarm)
+    return replace(evidence, reason=reason_of(case, evidence, alarm, bound=np.inf, other=None))
 
 
 def _leak_cause(case: Case, leak: LeakMeasure, alarm: LeakTest) -> Cause:
     """Return the cause of a detected leak, such as "piston or pump leak".
 
     It is "internal or external leak" if the data that raised the `alarm` do not exclude that oil leaves the circuit.
-    Otherwise it is the cause that the detector states (`leak.cause`), but "piston leak" in place of "piston or pump
-    leak" if the pump was tested separately and its leak has a negligible probability.
+    Otherwise it is the cause that the detector states (`leak.cause`). A cause "piston or pump leak" becomes "piston
+    leak" if the pump was tested separately and a pump leak has a negligible probability.
     """
     if case.external_probability(alarm) > 1.0 - DECISION.explanation.sure:
         return "internal or external leak"
@@ -141,9 +144,9 @@ def _leak_cause(case: Case, leak: LeakMeasure, alarm: LeakTest) -> Cause:
 def _size_fields(leak: LeakMeasure, flow: Flow | None) -> dict[str, Any]:
     """Compute the fields of `Evidence` that state how large a leak is, by their names.
 
-    `flow`: mean flow of the leak, None if unknown (no fields); `leak`: measured leakage, whose factors convert it. The
-    flow is stated as a fraction of the pump's mean flow (`relative`) and, if the machine's areas or displacement are
-    stated, in L/min with a 95 % interval; otherwise the field `refuses` says that L/min are not stated.
+    `flow`: mean flow of the leak; without a flow (None) there are no fields; `leak`: measured leakage, with the factors
+    that convert the flow. The flow is stated relative to the machine (`relative`) and, if a factor to L/min is known,
+    in L/min with a 95 % interval. Otherwise the field `refuses` says that L/min are not stated.
     """
     if flow is None:
         return {}
@@ -160,13 +163,15 @@ def _size_fields(leak: LeakMeasure, flow: Flow | None) -> dict[str, Any]:
 def _leak_bound(case: Case, alarm: LeakTest | None) -> float:
     """Compute the 95 % upper bound of a leak's mean flow [m^3/s].
 
-    If an `alarm` may be due to a leak, the bound is at least the upper end of that leak's interval. The bound is
-    infinite if it would reach the pump's mean flow, or if the leakage was not measured.
+    `alarm`: first alarm of the tests, None if there is none. If a leak may have caused it, the bound is at least the
+    upper end of that leak's 95 % interval. The bound is infinite if it would reach the pump's mean flow, where this is
+    above 0, or if the leakage was not measured.
     """
     leak = case.leak
     if leak is None:
         return np.inf
-    bound, mean_pump_flow = leak.bound_flow, leak.pump_flow[0]
+    bound = leak.bound_flow
+    mean_pump_flow, _ = leak.pump_flow  # over the whole recording
     if alarm is not None and case.leak_probability(alarm) > 1.0 - DECISION.explanation.sure:
         flow = leak.step_flow if alarm.name == WITHIN else leak.rise_flow
         if flow is not None:
@@ -178,12 +183,13 @@ def _leak_bound(case: Case, alarm: LeakTest | None) -> float:
 def _bound_and_limit(case: Case, bound: float) -> tuple[float, float]:
     """Return the 95 % upper bound of a leak, and the largest bound that still allows the verdict `no leak`.
 
-    `bound`: upper bound of the leak's flow [m^3/s]. If leakage is measured, both results are flows [m^3/s]. Otherwise
-    they are changes of the pressures' ringing (the RMS of their wavelet details), as a logarithm. The bound is infinite
-    if it was not measured, after an alarm, or if the sampling rate is too low for it to exclude a leak.
+    If leakage is measured, both results are flows [m^3/s], and the first one is the argument `bound`. Otherwise both
+    are changes of the logarithm of the pressures' ringing (the RMS of their wavelet details). The bound of the ringing
+    is infinite if the ringing was not measured, after an alarm, or at a sampling rate too low to exclude a leak.
     """
     if case.leak is not None:
-        return bound, bound_worth_stating(case.leak.pump_flow[1])
+        _, delivered_flow = case.leak.pump_flow  # mean over the time in which the pump delivers
+        return bound, bound_worth_stating(delivered_flow)
     ringing = case.judge.ringing
     if ringing is None or case.alarms or ringing.rate < RMS_PRIORS.rate.ringing:
         return np.inf, 0.0
@@ -203,11 +209,11 @@ def _findable_step(case: Case) -> float | None:
 
 
 def _add_tests(case: Case, evidence: Evidence, judging: LeakTest | None) -> Evidence:
-    """Add the results of the tests to the evidence, with the name of the detector.
+    """Add to the evidence what the judging detector reports, and the results of the tests for a leak.
 
-    The fraction of the recording that was judged is added, too, and the measured ratio of displacement to area.
-    `judging`: test whose score, threshold and chance are stated, None to add no results. If there are several tests,
-    all are added as `parts`.
+    - Of the detector: name, judged fraction of the recording, and measured ratio of displacement to area.
+    - Of the test `judging`: score, threshold and p-value; no results of tests are added if it is None.
+    - If there are several tests, the evidence of each as `parts`.
     """
     judge = case.judge
     evidence = replace(evidence, detector=judge.provider, share=judge.share, judged_until=judge.judged_until)
@@ -219,9 +225,9 @@ def _add_tests(case: Case, evidence: Evidence, judging: LeakTest | None) -> Evid
     parts = tuple(
         Evidence(
             LEAK if evidence.verdict == LEAK and test is judging else NO_LEAK,
-            test.name,
-            test.score,
-            test.threshold,
+            reason=test.name,
+            score=test.score,
+            threshold=test.threshold,
             detector=test.name,
             chance=max(test.chance, RAREST),
         )

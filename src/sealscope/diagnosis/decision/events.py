@@ -31,23 +31,23 @@ class Event:
 
     @property
     def is_sized(self) -> bool:
-        """True if large or small changes by the event are less probable than usual ones, by a prior on their sizes.
+        """True if the event has a prior on the sizes of its changes, by which unusually large or small ones count less.
 
-        This is so for events that a verdict may name, i.e. that have a cause. The prior is in `Observable.advantage`.
+        Events with a cause, which a verdict may name, have such a prior. It is part of `Observable.advantage`.
         """
         return self.cause is not None
 
     def affects(self, observable: Observable) -> bool:
-        """Return True if the event changes the quantity that an observable tests.
+        """Return True if the event changes the quantity that an observable (test result) is about.
 
-        Its "data: name" must then match one of the patterns `affected`.
+        The "data: name" of the observable must match one of the patterns `affected`.
         """
         return _matches(f"{observable.data}: {observable.name}", self.affected)
 
     def may_disturb(self, observable: Observable) -> bool:
-        """Return True if the event may change, as a side effect, the quantity that an observable tests.
+        """Return True if the event may change, as a side effect, the quantity that an observable is about.
 
-        Its "data: name" must then match one of the patterns `disturbed`.
+        The "data: name" of the observable must match one of the patterns `disturbed`.
         """
         return _matches(f"{observable.data}: {observable.name}", self.disturbed)
 
@@ -65,11 +65,11 @@ def load_events() -> Sequence[Event]:
     return tuple(
         Event(
             name,
-            row["cause"] or None,
-            row["probability"]["value"],
-            tuple(row["moves"]),
-            tuple(row.get("disturbs", ())),
-            row["words"],
+            cause=row["cause"] or None,
+            probability=row["probability"]["value"],
+            affected=tuple(row["moves"]),
+            disturbed=tuple(row.get("disturbs", ())),
+            description=row["words"],
         )
         for name, row in rows.items()
     )

@@ -43,10 +43,11 @@ LEAK_EVENTS = ("piston leak", "pump leak")
 
 @dataclass(frozen=True)
 class Explanation:
-    """A set of events that explains a recording, with its posterior probability, if some event has happened.
+    """A set of events that explains the changes in a recording.
 
-    `data`: kinds of data (`Observable.data`) that the set explains; `odds`: posterior probability of the set over that
-    of no event at all.
+    - `probability`: posterior probability of the set, given that some event has happened.
+    - `data`: kinds of data (`Observable.data`) in which the set explains a change.
+    - `odds`: posterior probability of the set over the probability that no event has happened.
     """
 
     events: tuple[Event, ...]
@@ -114,8 +115,8 @@ def _compare_by_likelihood(log_factors: Sequence[tuple[Observable, float]]) -> l
     """Reduce the log Bayes factors of terms of the volume balance that describe a change worse than the best term.
 
     The terms are alternative descriptions of the same residual. A term's log likelihood l is taken as the log Bayes
-    factor of the p-value that its detector states, i.e. without calibration by healthy recordings. With the log
-    likelihood L of the best term and its calibrated log Bayes factor B, each term gets
+    factor of the p-value that its detector states, i.e. without calibration by healthy recordings. L is the log
+    likelihood of the best term, and B its calibrated log Bayes factor. Each term gets
 
         log factor = max(B - (L - l) / (1 + 2 m L), 0),
 
@@ -123,32 +124,34 @@ def _compare_by_likelihood(log_factors: Sequence[tuple[Observable, float]]) -> l
     the best description is, but are too few to show which term is the best; for that only the judged recording counts.
 
     `log_factors`: observables with their calibrated log Bayes factors, corrected for the misfit
-    (`_correct_for_misfit`). Those of other data than the balance's are returned unchanged.
+    (`_correct_for_misfit`). Log factors of data other than the volume balance are returned unchanged.
     """
     likelihoods = [log_bayes_factor(observable.chance) for observable, _ in log_factors]
     volumes = [k for k, (observable, _) in enumerate(log_factors) if observable.data == VOLUMES]
     if not volumes:
         return list(log_factors)
     best = max(volumes, key=likelihoods.__getitem__)
-    level, factors = log_factors[best][1], list(log_factors)
+    _, best_factor = log_factors[best]
     misfit_divisor = 1.0 + 2.0 * DECISION.explanation.misfit * likelihoods[best]
+    factors = list(log_factors)
     for k in volumes:
+        observable, _ = log_factors[k]
         difference = (likelihoods[best] - likelihoods[k]) / misfit_divisor
-        factors[k] = (log_factors[k][0], max(level - difference, 0.0))
+        factors[k] = (observable, max(best_factor - difference, 0.0))
     return factors
 
 
 def _correct_for_misfit(log_factors: Sequence[tuple[Observable, float]]) -> list[tuple[Observable, float]]:
     """Reduce the log Bayes factors of observables, since a model describes its data only approximately.
 
-    Each is divided by 1 + 2 m B, where B is the largest log factor of the same kind of data and m the relative misfit
-    of models (`explanation.misfit` in `priors.toml`).
+    Each factor is divided by 1 + 2 m B, where B is the largest log factor of the same kind of data and m the relative
+    misfit of models (`explanation.misfit` in `priors.toml`).
     """
     max_factor: dict[str, float] = {}
     for observable, factor in log_factors:
         max_factor[observable.data] = max(factor, max_factor.get(observable.data, 0.0))
-    misfit = 2.0 * DECISION.explanation.misfit
-    return [(observable, factor / (1.0 + misfit * max_factor[observable.data])) for observable, factor in log_factors]
+    slope = 2.0 * DECISION.explanation.misfit
+    return [(observable, factor / (1.0 + slope * max_factor[observable.data])) for observable, factor in log_factors]
 
 
 class _Posterior(NamedTuple):
@@ -161,16 +164,17 @@ class _Posterior(NamedTuple):
 def _explain_by_group(group: Sequence[Event], gains_of: Mapping[str, Sequence[_Gains]]) -> _Posterior:
     """Compute the log posterior of a set of events, up to a constant, and the kinds of data that the set explains.
 
-        log posterior = sum of log priors of the events + sum over kinds of data of the largest log Bayes factor.
+        log posterior = sum of log priors of the events + sum over kinds of data of the largest log Bayes factor,
 
-    The largest is over the events of the set. For the rise over healthy recordings, the negative factors of events
-    that contradict it are added. `gains_of`: log Bayes factors of each event, by its name, for each possible onset
-    (`_possible_gains`). Of all combinations of onsets the one with the largest sum counts.
+    where the largest factor is chosen among the events of the set. For the rise over healthy recordings, the negative
+    factors of events that contradict the rise are added. `gains_of`: log Bayes factors by the name of the event, for
+    each of its possible onsets (`_possible_gains`). The combination of onsets with the largest sum counts.
     """
     log_prior = float(sum(np.log(event.probability) for event in group))
     best, explained = -np.inf, frozenset[str]()
-    for choice in product(*(gains_of[event.name] for event in group)):
-        gains = {data: max(other.get(data, 0.0) for other in choice) for event_gains in choice for data in event_gains}
+    for choice in product(*(gains_of[event.name] for event in group)):  # one onset for each event
+        all_data = [data for event_gains in choice for data in event_gains]
+        gains = {data: max(event_gains.get(data, 0.0) for event_gains in choice) for data in all_data}
         if RISE in gains:
             # the best description of the rise counts; each event that contradicts the rise reduces it
             rises = [event_gains.get(RISE, 0.0) for event_gains in choice]
@@ -192,7 +196,7 @@ def _possible_gains(
     gains = _gains_at_onset(event, factors)
     if rise is None or event.name not in LEAK_EVENTS:
         return [gains]
-    if gains.get("volumes", 0.0) > 0.0:
+    if gains.get(VOLUMES, 0.0) > 0.0:
         gains[RISE] = rise.step_log_ratio  # a leak that began within the recording explains the rise by its step
     return [gains, {RISE: log_bayes_factor(rise.rise.chance)}]
 
@@ -200,11 +204,14 @@ def _possible_gains(
 def _gains_at_onset(event: Event, factors: Sequence[tuple[Observable, float]]) -> dict[str, float]:
     """Compute the log Bayes factors of an event that begins within the recording, by kind of data.
 
-    `factors`: observables with the log Bayes factors of a change of them, against no change. Of the observables that
-    the event affects, the one with the largest factor gives the time of the event. The others count if they may have
-    changed at the same time. Observables that the event changes only as a side effect count if other data support it,
-    and for no more than these do: a side effect that is much clearer than the event itself has another cause. For each
-    kind of data the largest factor is returned, with the log odds of the prior on the size of the change.
+    `factors`: observables with the log Bayes factors of a change of them, against no change.
+
+    - Of the observables that the event affects, the one with the largest factor gives the time of the event. The other
+      ones count if they may have changed at the same time.
+    - Side effects of the event on further data count only if the event has support by its affected observables. Their
+      factors are limited to the largest affected one: a much clearer side effect has another cause.
+
+    For each kind of data the largest factor is returned, with the log odds of the prior on the size of the change.
     """
     affected = [(observable, gain) for observable, gain in factors if event.affects(observable)]
     if not affected:
@@ -229,11 +236,11 @@ def _gains_at_onset(event: Event, factors: Sequence[tuple[Observable, float]]) -
 def _log_factor(observable: Observable, chance: float, rise: LeakRise | None) -> float:
     """Compute the log Bayes factor of the hypothesis that an observable has changed, against no change.
 
-    `chance`: probability that a healthy recording has at least its score. An increase of the leakage beyond that of
-    healthy recordings (`rise`) makes an alternative to it, such as an external leak, seem to increase as well.
-    Therefore such an observable has at most
+    `chance`: probability that a healthy recording has at least the observable's score; `rise`: leakage above that of
+    healthy recordings. A rise of the leakage makes an alternative description of the same change, such as an external
+    leak, seem to rise as well. The log factor of an observable that is such an alternative is therefore at most
 
-        log factor = log factor of the rise + log likelihood ratio of the alternative to the leak.
+        log factor of the rise + log likelihood ratio of the alternative to the leak.
     """
     factor = log_bayes_factor(chance)
     if observable.log_ratio_to_leak is None or rise is None:
@@ -257,8 +264,8 @@ def log_bayes_factor(chance: float) -> float:
 def _coincide(observable: Observable, anchor: Observable) -> bool:
     """Return True if two observables may have changed at the same time, by the 95 % intervals of their onsets.
 
-    Their onsets then differ by at most half the sum of the widths of these intervals. An observable without an onset
-    may have changed at the same time as any other.
+    This is so if the onsets differ by at most half the sum of the widths of the intervals, or if one of the observables
+    has no onset.
     """
     if observable.onset is None or anchor.onset is None:
         return True
@@ -269,11 +276,10 @@ def _coincide(observable: Observable, anchor: Observable) -> bool:
 def probability_of(
     explanations: Sequence[Explanation], *names: str, causes: Sequence[str] = (), data_kind: str | None = None
 ) -> float:
-    """Compute the probability that one of the named events, or any event with one of the causes, happened.
+    """Compute the probability that an event with one of the `names` or one of the `causes` happened.
 
-    `explanations`: sets of events with their probabilities; `names`: names of events; `data_kind`: if given, only the
-    sets that explain this kind of data (`Observable.data`) count, and their probabilities are renormalised. The
-    result is 0 if no set remains.
+    `explanations`: sets of events with their probabilities; `data_kind`: if given, only the sets that explain this kind
+    of data (`Observable.data`) count, and their probabilities are renormalised. The result is 0 if no set remains.
     """
     relevant = [explanation for explanation in explanations if data_kind is None or data_kind in explanation.data]
     total = sum(explanation.probability for explanation in relevant)
@@ -284,10 +290,10 @@ def probability_of(
 
 
 def probability_beside_chance(explanations: Sequence[Explanation], causes: Sequence[str], data_kind: str) -> float:
-    """Compute the probability that an event with one of the causes has changed a kind of data, and not chance.
+    """Compute the probability that an event with one of the causes, rather than chance, has changed a kind of data.
 
-    It is the sum of the odds of the sets that contain such an event and explain this kind of data (`Observable.data`),
-    over 1 + the sum of the odds of all sets that explain it. The 1 stands for no event: the change is then by chance.
+    Of the sets of events that explain this kind of data (`Observable.data`), it is the sum of the odds of those that
+    contain such an event, over 1 + the sum of the odds of all. The 1 stands for no event: the change is by chance.
     """
     relevant = [explanation for explanation in explanations if data_kind in explanation.data]
     matching = sum(explanation.odds for explanation in relevant if explanation.has_cause(*causes))

@@ -57,23 +57,26 @@ class HealthyNull:
         healthy recordings, and w_k their posterior weights, given the `surprisals` under the `key` of the test.
         """
         weights, inflations = self._inflation(key)
-        return min(float(weights @ np.exp(np.log(max(chance, np.finfo(float).tiny)) / inflations)), 1.0)
+        log_chance = np.log(max(chance, np.finfo(float).tiny))
+        return min(float(weights @ np.exp(log_chance / inflations)), 1.0)
 
     def uncalibrated_chance(self, key: str, chance: float) -> float:
         """Compute the p-value that a detector must state so that the calibrated one is `chance`.
 
-        It is the inverse of `calibrate`; `key`: key of the test in `surprisals`.
+        It is the inverse of `calibrate`, but at least the smallest normal floating-point number. `key`: key of the test
+        in `surprisals`.
         """
         max_surprisal = -np.log(np.finfo(float).tiny)
         if self.calibrate(key, np.exp(-max_surprisal)) >= chance:
             return float(np.finfo(float).tiny)
-        return float(np.exp(-find_root(lambda u: self.calibrate(key, np.exp(-u)) - chance, 0.0, max_surprisal)))
+        surprisal = find_root(lambda u: self.calibrate(key, np.exp(-u)) - chance, 0.0, max_surprisal)
+        return float(np.exp(-surprisal))
 
     def _inflation(self, key: str) -> tuple[Array, Array]:
         """Return weights and values of lambda, a test's unknown mean surprisal in healthy recordings.
 
-        The weights are posterior probabilities; both have the shape (k,). A surprisal is -log(chance); its mean is 1
-        if the chances are stated correctly. `key`: key of the test in `surprisals`.
+        A surprisal is -log(p-value); its mean is 1 if the p-values are stated correctly. The weights are posterior
+        probabilities; both arrays have the shape (k,). `key`: key of the test in `surprisals`.
         """
         if key not in self._posteriors:
             self._posteriors[key] = _inflation_posterior(self.surprisals.get(key, ()))
@@ -81,20 +84,20 @@ class HealthyNull:
 
 
 def _inflation_posterior(surprisals: Sequence[float]) -> tuple[Array, Array]:
-    """Compute posterior weights and values of lambda, the mean of exponentially distributed surprisals -log(chance).
+    """Compute posterior weights and values of lambda, the mean of exponentially distributed surprisals -log(p-value).
 
-    Both have the shape (NODES + 1,); the first value is 1, for a detector that states its chances correctly. n
-    `surprisals` have the likelihood lambda^-n exp(-sum / lambda). Without any surprisals both results are [1].
+    Both arrays have the shape (NODES + 1,); the first value is 1, for a detector that states its p-values correctly.
+    The likelihood of n surprisals is lambda^-n exp(-their sum / lambda). Without surprisals both arrays are [1].
     """
-    prior_null = DECISION.null
+    priors = DECISION.null
     if not len(surprisals):
         return np.ones(1), np.ones(1)
-    logarithm = np.append(0.0, np.linspace(0.0, np.log(prior_null.largest), NODES))
-    inflation = np.exp(logarithm)
-    prior = np.exp(-logarithm / prior_null.inflation)
-    prior[1:] *= prior_null.fails / prior[1:].sum()  # `fails`: fraction of machines with wrong chances
-    prior[0] = 1.0 - prior_null.fails
-    log_posterior = np.log(prior) - len(surprisals) * logarithm - float(np.sum(surprisals)) / inflation
+    log_inflation = np.append(0.0, np.linspace(0.0, np.log(priors.largest), NODES))
+    inflation = np.exp(log_inflation)
+    prior = np.exp(-log_inflation / priors.inflation)
+    prior[1:] *= priors.fails / prior[1:].sum()  # `fails`: fraction of machines with wrong p-values
+    prior[0] = 1.0 - priors.fails
+    log_posterior = np.log(prior) - len(surprisals) * log_inflation - float(np.sum(surprisals)) / inflation
     weights = np.exp(log_posterior - log_posterior.max())
     return weights / weights.sum(), inflation
 
@@ -102,8 +105,8 @@ def _inflation_posterior(surprisals: Sequence[float]) -> tuple[Array, Array]:
 def null_key(observable: Observable) -> str:
     """Return the key under which `HealthyNull` stores an observable, such as "noise: noise of the pressures".
 
-    It consists of data and name. A comparison with healthy recordings, which has no onset, has a key without the name,
-    such as "rise: against", so that all comparisons by the same data share it.
+    The key consists of the observable's data and name. An observable without an onset is a comparison with healthy
+    recordings. All comparisons by the same data share one key without a name, such as "rise: against".
     """
     return comparison_key(observable.data) if observable.onset is None else f"{observable.data}: {observable.name}"
 

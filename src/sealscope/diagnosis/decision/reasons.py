@@ -26,10 +26,12 @@ _MIN_RINGING_RATE: float = RMS_PRIORS.rate.ringing
 
 
 def reason_of(case: Case, evidence: Evidence, alarm: LeakTest | None, bound: float, other: OtherEvent | None) -> str:
-    """Compose the reason of a verdict in words: the leak or its bound, then another explanation, then remarks.
+    """Compose the reason of a verdict in words: the leak or the bound of an undetected leak, then remarks.
 
-    `alarm`: test that raised the alarm, None if none did; `bound`: 95 % upper bound of the leak's flow [m^3/s];
-    `other`: event other than a leak that explains what changed, or None.
+    Between the bound and the remarks comes another explanation of the change, if there is one.
+
+    `alarm`: test that raised the alarm, None if no test did; `bound`: 95 % upper bound of the leak's flow [m^3/s], used
+    only without the verdict `leak`; `other`: event other than a leak that explains a change, or None.
     """
     if evidence.verdict == LEAK:
         return _leak_text(case, evidence, alarm) + _remarks(case)
@@ -50,9 +52,11 @@ def reason_of(case: Case, evidence: Evidence, alarm: LeakTest | None, bound: flo
 
 
 def _leak_text(case: Case, evidence: Evidence, alarm: LeakTest | None) -> str:
-    """Describe the detected leak in words; `alarm`: test that detected it."""
-    key = {WITHIN: "within", AGAINST: "against"}.get(alarm.name if alarm else "", "level")
-    total = evidence.total_leakage
+    """Describe a detected leak in words; `alarm`: test that detected it.
+
+    If leakage is measured, the text states the kind of test, with flows for a level above the limit in the rig's file.
+    Otherwise it states the rarest change that the detector has found.
+    """
     if case.leak is None:
         rarest = case.rarest_observable
         if rarest.data == "plug-in":
@@ -60,6 +64,8 @@ def _leak_text(case: Case, evidence: Evidence, alarm: LeakTest | None) -> str:
         percent = 100.0 * abs(np.expm1(rarest.size))
         where = _onset_text(rarest) or _against_text(case.judge.ringing)
         return text_of("leak", "details", what=f"RMS: {rarest.name}", percent=percent, where=where)
+    key = {WITHIN: "within", AGAINST: "against"}.get(alarm.name if alarm else "", "level")
+    total = evidence.total_leakage
     if key == "level" and total is not None and total.lpm is not None and total.healthy_lpm is not None:
         return text_of("leak", "level_flow", lpm=total.lpm, healthy=total.healthy_lpm)
     if key != "level" and case.leak.provider == PRESSURE_RESPONSE:
@@ -69,36 +75,43 @@ def _leak_text(case: Case, evidence: Evidence, alarm: LeakTest | None) -> str:
 
 
 def _bound_text(case: Case, evidence: Evidence, bound: float) -> str:
-    """Describe in words how large an undetected leak can be, and a recording that would bound it more closely.
+    """State in words how large a leak can be that was not detected.
 
-    `bound`: 95 % upper bound of its flow [m^3/s].
+    - If the detector measures leakage, the text states the upper bound of the flow: in L/min, else as a percentage of
+      the pump's flow, else as "any size". With the verdict `cannot tell`, the text adds advice for a better recording.
+    - If it does not, the text describes the pressures' ringing: its change after an alarm, else the limit of its fall.
+
+    `bound`: 95 % upper bound of the leak's mean flow [m^3/s], infinite if unknown.
     """
     leak, ringing = case.leak, case.judge.ringing
     if leak is None:
         if case.alarms and ringing is not None:
             return _changed_ringing_text(case, ringing)
         return _ringing_text(evidence, ringing, case.judge.provider)
+    mean_pump_flow, _ = leak.pump_flow
+    # a comparison with healthy recordings bounds the mean flow over the recording, and not that since an onset
     average = text_of("bound", "average") if leak.rise is not None else ""
-    limit, pump = text_of("bound", "any"), leak.pump_flow[0]
     if evidence.bound_lpm is not None:
         limit = text_of("bound", "flow", value=evidence.bound_lpm, average=average)
-    elif pump > 0.0 and np.isfinite(bound):
-        limit = text_of("bound", "share", value=100.0 * bound / pump, average=average)
+    elif mean_pump_flow > 0.0 and np.isfinite(bound):
+        limit = text_of("bound", "share", value=100.0 * bound / mean_pump_flow, average=average)
+    else:
+        limit = text_of("bound", "any")
     if evidence.verdict == NO_LEAK:
         return text_of("bound", "none", limit=limit)
-    closer = "position" if leak.provider == PRESSURE_RESPONSE else "longer"
-    return text_of("bound", "hidden", limit=limit) + text_of("doubt", closer)
+    advice = text_of("doubt", "position" if leak.provider == PRESSURE_RESPONSE else "longer")
+    return text_of("bound", "hidden", limit=limit) + advice
 
 
 def _ringing_text(evidence: Evidence, ringing: Ringing | None, provider: str) -> str:
-    """State in words the 95 % upper limit [%] of a fall of the pressures' ringing that the detector has not seen.
+    """State in words the 95 % upper limit [%] of an undetected fall of the pressures' ringing.
 
-    The ringing is an oscillation of the pressures, measured by the RMS of their wavelet details. The limit is of the
-    fall of this RMS, relative to healthy recordings or, without these, to the start of the same recording. If the
-    verdict is `cannot tell`, the text says that a fall by this limit would not show, otherwise that there is no larger
-    fall. If the sampling rate is too low for the ringing, it also says so, or names the columns that are not assigned
-    to a channel. `ringing`: facts on the comparison (`Ringing`), None if the ringing was not measured; `provider`: name
-    of the detector.
+    The ringing is an oscillation of the pressures, measured by the RMS of their wavelet details. The fall is relative
+    to healthy recordings or, without these, to the start of the same recording.
+
+    - Verdict `cannot tell`: the text says that a fall by this limit would not show; otherwise, that no fall is larger.
+    - Too low a sampling rate: the text also says so or, if there are unassigned columns, names these instead.
+    - Ringing not measured (None): the text says that the detector called `provider` sees no change.
     """
     if ringing is None:
         return text_of("bound", "unseen", provider=provider)
@@ -118,8 +131,8 @@ def _changed_ringing_text(case: Case, ringing: Ringing) -> str:
     """Describe in words the rarest change of the pressures' ringing, and the probability that a leak caused it.
 
     The ringing is an oscillation of the pressures, measured by the RMS of their wavelet details. The text names the
-    detail, its change [%], and the onset of the change. If it has no onset, the healthy recordings are named with which
-    the ringing was compared; `ringing` states their number, 0 for none.
+    wavelet detail, its change [%], and the onset of the change. For a change without an onset, the text states with how
+    many healthy recordings the ringing was compared (`ringing.healthy`).
     """
     rarest = case.rarest_observable
     percent = 100.0 * abs(np.expm1(rarest.size))
@@ -129,9 +142,9 @@ def _changed_ringing_text(case: Case, ringing: Ringing) -> str:
 
 
 def _against_text(ringing: Ringing | None) -> str:
-    """State in words how many healthy recordings the pressures' oscillation (ringing) was compared with.
+    """State in words with how many healthy recordings the pressures' oscillation (ringing) was compared.
 
-    "" if there are none, or if the ringing was not measured (`ringing` is None).
+    The text also says if their dates are unknown. It is "" without healthy recordings or ringing (None).
     """
     if ringing is None or not ringing.healthy:
         return ""
@@ -140,10 +153,11 @@ def _against_text(ringing: Ringing | None) -> str:
 
 
 def _rivals_text(case: Case, alarm: LeakTest) -> str:
-    """Describe the most probable explanation other than a leak, and how to tell it from a leak.
+    """Describe the most probable explanation other than a leak, and how to tell this explanation from a leak.
 
-    `alarm`: test that raised the alarm. If the explanation is a change of the operating point, only its time is
-    stated. The text is "" if there is no such explanation, or if that time is unknown.
+    `alarm`: test that raised the alarm. Of an explanation by several events, the first event is described. Of a change
+    of the operating point, only the time is stated. The text is "" if this time is unknown, or if there is no
+    explanation other than a leak.
     """
     leak_probability = case.leak_probability(alarm)
     best = next((explanation for explanation in case.explanations if not explanation.has(*LEAK_EVENTS)), None)
@@ -158,8 +172,8 @@ def _rivals_text(case: Case, alarm: LeakTest) -> str:
         key=lambda observable: observable.score,
         default=None,
     )
-    separates = find_separation(event.cause) or text_of("separates", "default")
     onset_text = "" if clearest is None else _onset_text(clearest)
+    separation = find_separation(event.cause) or text_of("separates", "default")
     return text_of(
         "doubt",
         "rivals",
@@ -167,28 +181,28 @@ def _rivals_text(case: Case, alarm: LeakTest) -> str:
         onset=onset_text,
         share=100.0 * (1.0 - leak_probability),
         leak=100.0 * leak_probability,
-        separates=separates,
+        separates=separation,
     )
 
 
 def _onset_text(observable: Observable) -> str:
-    """State the onset of an observable's change in words; "" if it has none."""
+    """State in words when the change of an observable began; "" for an observable without an onset."""
     return "" if observable.onset is None else text_of("doubt", "onset", seconds=observable.onset.value)
 
 
 def _observable_text(other: OtherEvent) -> str:
-    """Name the observable that shows an event; "" if the event's description already contains its name."""
+    """Name the observable that shows an event; "" if the event's description contains this name already."""
     name = other.observable.name
     return "" if name in other.description else text_of("doubt", "shown", name=name)
 
 
 def _rarity_text(chance: float) -> str:
-    """State the p-value `chance` of a change in words, as 1 in so many healthy recordings, at most 10 000."""
-    count = f"{float(f'{1.0 / max(chance, 1e-4):.2g}'):,.0f}".replace(",", " ")
-    return text_of("doubt", "rarity", count=count)
+    """State the p-value `chance` of a change in words, as 1 in n healthy recordings, with n up to 10 000."""
+    two_digits = float(f"{1.0 / max(chance, 1e-4):.2g}")
+    return text_of("doubt", "rarity", count=f"{two_digits:,.0f}".replace(",", " "))
 
 
 def _remarks(case: Case) -> str:
-    """Return the texts of all remarks on the measured leakage, joined; "" if there are none."""
+    """Join the texts of all remarks on the measured leakage; "" if there are no remarks or no leakage is measured."""
     leak = case.leak
     return "" if leak is None else "".join(text_of("remark", remark.key, **remark.values) for remark in leak.remarks)

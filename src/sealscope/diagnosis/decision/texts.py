@@ -11,7 +11,7 @@ from typing import Any
 
 @cache
 def _texts() -> Mapping[str, Mapping[str, str]]:
-    """Read `texts.toml`: the tables by name, each with its texts by key."""
+    """Read `texts.toml` once: its tables by name, each a mapping from key to text."""
     return tomllib.loads((files("sealscope.diagnosis.decision") / "texts.toml").read_text("utf-8"))
 
 

@@ -9,19 +9,20 @@ from sealscope.diagnosis.verdict.evidence import CANNOT_TELL, NO_LEAK, Verdict
 
 
 def decide_without_leak(bound: float, max_bound: float) -> Verdict:
-    """Return the verdict on a recording in which no test found a leak.
+    """Return the verdict on a recording in which no test found a leak: `no leak` or `cannot tell`.
 
-    It is `no leak` if `bound`, the 95 % upper bound of an undetected leak, is at most `max_bound` in the same unit,
-    and `cannot tell` otherwise.
+    It is `no leak` if `bound`, the 95 % upper bound of an undetected leak, is finite and at most `max_bound`. Both are
+    in the same unit.
     """
-    verdict: Verdict = NO_LEAK if math.isfinite(bound) and bound <= max_bound else CANNOT_TELL
+    is_small = math.isfinite(bound) and bound <= max_bound
+    verdict: Verdict = NO_LEAK if is_small else CANNOT_TELL
     return verdict
 
 
 def bound_worth_stating(flow: float) -> float:
     """Compute the largest upper bound of an undetected leak that still allows the verdict `no leak`.
 
-    It is a fraction (`worth.share` in `priors.toml`) of the pump's mean `flow` while it delivers, in the same unit, or
-    0 if `flow` is not positive.
+    `flow`: mean flow of the pump while it delivers. The result is a fraction of this flow (`worth.share` in
+    `priors.toml`), or 0 if `flow` is not positive.
     """
     return float(DECISION.worth.share) * flow if flow > 0.0 else 0.0

@@ -11,7 +11,7 @@ class SignalPriors(PriorTable):
     - `order`: number of successive differences of a signal, which leave its noise and remove motion and ringing.
     - `mains` [Hz]: frequencies of the electric grids.
     - `highest`: highest frequency at which hum is looked for, over the sampling rate.
-    - `neighbours` [bins]: distances of the spectral lines that a line of hum is compared with.
+    - `neighbours` [bins]: a spectral line of hum is compared with the lines at these distances from it.
     - `shortest` [s]: shortest block.
     - `busy`: a block counts as in motion if it moves for at least this fraction of the time of the busiest block.
     - `wander`: change of the logarithm of a feature within a recording, a standard deviation.
@@ -113,7 +113,7 @@ class ChargePriors(PriorTable):
     """Drift of the charge pressure, seen in the lowest pressures of the chambers.
 
     - `share`: smallest fraction of the samples in which a chamber fed at the charge pressure is low.
-    - `near` [Pa]: a pressure is low up to this difference from the lowest one.
+    - `near` [Pa]: a pressure is low if it exceeds the lowest pressure by at most this difference.
     - `seconds` [s]: averaging time.
     - `scatter` [Pa/s]: standard deviation of the drift between days.
     - `recordings`: the prior on the scatter weighs as much as this number of recordings.

@@ -29,9 +29,9 @@ class DriftPriors(PriorTable):
 
 
 class DifferencePriors(DriftPriors):
-    """Relative difference of each kind of coefficient between recordings of one machine.
+    """Standard deviation of the relative difference between recordings of one machine, for each kind of coefficient.
 
-    Each field is a standard deviation. The fields are those of `DriftPriors`, but without a unit, and in addition:
+    The fields have no unit. They are those of `DriftPriors` and, in addition:
 
     - `speed`: flow that the pump loses in proportion to its speed.
     """
@@ -78,7 +78,7 @@ class ScatterPriors(PriorTable):
     - `relative`: largest scatter of the leakage's logarithm.
     - `unlike`: fraction of days whose unrecorded oil temperature is unlike that of all others.
     - `session`: standard deviation of the leakage between sessions with oil of one viscosity.
-    - `tail`: probability that the healthy recordings do not predict a healthy recording, on either side.
+    - `tail`: probability that a healthy recording lies farther above the others than these predict, and the same below.
     """
 
     between: float

@@ -20,9 +20,9 @@ class LiveBlocks(PriorTable):
 
     - `seconds` [s]: length of a block.
     - `learned` [blocks]: number of blocks before the first estimate.
-    - `tells`: smallest precision of a leak's estimate in a block at standstill, over that of a usual block, with
-      which the block is used.
-    - `standstill`: mean square of the motion, over the usual one, below which a machine stands still.
+    - `tells`: a block at standstill is used if the precision of its estimate of the leak is at least this fraction of a
+      usual block's precision.
+    - `standstill`: a machine stands still if the mean square of its motion is below this fraction of the usual one.
     - `wakes` [blocks]: the machine is learned anew after this number of blocks with far more motion than ever before.
     """
 
@@ -59,7 +59,7 @@ class StepPriors(PriorTable):
     - `memory`: factor per block by which earlier blocks lose weight in the estimates of noise and random walk.
     - `recent` [blocks]: age up to which all possible onsets are kept; of older ones only some are.
     - `horizon` [blocks]: largest age of an onset.
-    - `stated` [blocks]: the stated variance of an estimate weighs as much as this number of blocks.
+    - `stated` [blocks]: the variance that an estimate states weighs as much as that observed in so many blocks.
     """
 
     walks: tuple[float, ...]
@@ -118,8 +118,8 @@ class LiveResponse(PriorTable):
     - `seconds` [s]: length of a block.
     - `begins` [s]: length of the first fit.
     - `settling`, `resuming` [blocks]: time until the simulated states have settled, after the start and after a gap.
-    - `described`: the model describes a block if its chi square is below this number of standard deviations.
-    - `lost` [blocks]: number of successive blocks without such a description after which the fit starts anew.
+    - `described`: the model describes a block if its chi square exceeds its mean by fewer standard deviations.
+    - `lost` [blocks]: the fit starts anew after this number of successive blocks that the model does not describe.
     - `usual` [blocks]: time over which the usual variance of the residuals is averaged.
     """
 

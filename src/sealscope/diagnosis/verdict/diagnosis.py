@@ -28,11 +28,13 @@ _COLUMNS = (
     *("file", "start", "machine", "verdict", "reason", "onset_s", "leak_lpm", "bound_lpm", "score", "threshold"),
     *("chance", "odds", "false_alarm_probability", "cause", "summary", "next_check"),
 )
-#: Fields that a diagnosis as JSON begins with.
+#: First fields of a diagnosis in JSON.
 _FIRST_FIELDS = (
     *("file", "verdict", "reason", "onset_s", "onset_interval_s", "leak_lpm", "leak_interval_lpm", "bound_lpm"),
     *("unused", "false_alarm_probability", "score", "threshold"),
 )
+#: Smallest p-value of a usual test result.
+_MIN_USUAL_CHANCE = 0.05
 #: Names in a recording's preamble that state its machine, in the order of preference.
 _MACHINE_NAMES = ("machine", "actuator", "asset", "serial number", "serial", "rig", "test rig", "maschine", "prüfstand")
 
@@ -41,8 +43,8 @@ _MACHINE_NAMES = ("machine", "actuator", "asset", "serial number", "serial", "ri
 class Diagnosis(Evidence):
     """Verdict on one recording: the combined evidence of all detectors.
 
-    It has the fields of `Evidence`, where `parts` is the evidence of every detector, with the deciding one first. Its
-    other fields are:
+    The fields of `Evidence` are those of the combined evidence. Of these, `parts` is the evidence of every detector,
+    with that of the deciding detector first. The other fields are:
 
     Parameters
     ----------
@@ -53,7 +55,7 @@ class Diagnosis(Evidence):
     quality : tuple of Finding
         Findings on the data.
     baselines : int
-        Number of leak-free recordings that it was compared with.
+        Number of leak-free recordings that the recording was compared with.
     machine : AssumedMachine, optional
         Assumed sizes of the machine, and whether they were stated.
     limit : RepairLimit
@@ -98,8 +100,8 @@ class Diagnosis(Evidence):
     ) -> Diagnosis:
         """Make the diagnosis of a recording from the combined evidence and from statements in the recording's file.
 
-        `file` is the name of the recording, by default the name of the file it was read from. `fields` are the
-        remaining fields of `Diagnosis`.
+        The size of the leak relative to the `machine` is added if the evidence lacks it. `file` is the name of the
+        recording; None stands for the name of the file it was read from. `fields` are the other fields of `Diagnosis`.
         """
         if evidence.relative is None:
             evidence = replace(evidence, relative=relative_leak(evidence, recording, machine))
@@ -126,20 +128,22 @@ class Diagnosis(Evidence):
 
         The result is None if the limit is a creep speed of the piston and the piston's area is not stated.
         """
-        is_stated = self.machine is not None and self.machine.area_stated
-        return self.limit.flow_lpm(self.machine.area if is_stated else None)  # type: ignore[union-attr]
+        area = self.machine.area if self.machine is not None and self.machine.area_stated else None
+        return self.limit.flow_lpm(area)
 
     @property
     def repair_lpm(self) -> float | None:
         """Repair limit [L/min] to draw in the plot of the leak over time (`course`).
 
-        The result is None if there is no such plot, or if the limit cannot be stated as a flow. If the plot shows the
-        total leakage, the limit is raised by the leakage of the healthy machine. This is the median of the plotted
-        flow before the onset, minus the leak if there is one that was open from the start.
+        If the plot shows the total leakage, the limit is raised by the leakage of the healthy machine. This is the
+        median of the plotted flow before the onset, minus the leak if there is one that was open from the start. The
+        result is None if there is no such plot, or if limit or healthy leakage is not known as a flow.
         """
         course, limit = self.course, self.limit_lpm
-        if course is None or limit is None or not course.whole:
-            return None if course is None else limit
+        if course is None or limit is None:
+            return None
+        if not course.whole:
+            return limit
         onset = math.inf if self.onset_s is None or not math.isfinite(self.onset_s) else self.onset_s
         lpm_before = course.lpm[(course.t < onset) & np.isfinite(course.lpm)]
         if not lpm_before.size:
@@ -151,9 +155,9 @@ class Diagnosis(Evidence):
 
     @property
     def measured_ratio(self) -> tuple[float, tuple[float, float]] | None:
-        """Measured over assumed ratio of displacement to piston area, and the two ends of its 95 % interval.
+        """Measured over assumed ratio of displacement to piston area, and its 95 % interval: (value, (low, high)).
 
-        It is None if no detector has measured the ratio.
+        It is that of the first detector which has measured the ratio, the deciding one before others; None without one.
         """
         for decision in (self, *self.parts):
             if decision.ratio is not None and decision.ratio_interval is not None:
@@ -167,7 +171,7 @@ class Diagnosis(Evidence):
 
     @property
     def methods(self) -> tuple[Evidence, ...]:
-        """Evidence of every detector, each followed by the evidence of its parts."""
+        """Evidence of every detector, each followed by the evidence of the detector's single tests."""
         return tuple(evidence for detector in self.parts for evidence in (detector, *detector.parts))
 
     @property
@@ -183,7 +187,8 @@ class Diagnosis(Evidence):
     def named_cause(self) -> str | None:
         """Cause that the verdict names, either of the leak or of another event; None if it names none.
 
-        Causes in `LEAKS`, such as "piston leak", are named only with the verdict `leak`, and any other only without it.
+        Causes in `LEAKS`, such as "piston leak", are named only with the verdict `leak`. Any other cause is named only
+        with another verdict.
         """
         return self.cause if (self.verdict == LEAK) == (self.cause in LEAKS) else None
 
@@ -197,8 +202,7 @@ class Diagnosis(Evidence):
     def state(self) -> MachineState:
         """State of the machine by NAMUR NE 107, such as "good".
 
-        It is a failure if the leak surely exceeds the repair limit. Page, terminal, JSON and metrics show its name,
-        letter, colour and severity.
+        It is "failure" if the leak surely exceeds the repair limit.
         """
         is_over_limit = self.severity is not None and self.severity.level == "repair"
         condition = "leak over the limit" if is_over_limit else self._condition
@@ -227,21 +231,22 @@ class Diagnosis(Evidence):
         total = self.total_leakage
         if total is None or total.lpm is None or total.interval_lpm is None or self.bound_lpm is None:
             return True
-        return total.interval_lpm[0] <= 0.0 or self.bound_lpm < total.lpm  # otherwise all of the total may be a leak
+        min_total, _ = total.interval_lpm
+        return min_total <= 0.0 or self.bound_lpm < total.lpm
 
     @property
     def rises_within(self) -> bool:
         """True if the leakage probably rose within the recording, although no onset is stated.
 
-        In the test for a rise within the recording, fewer than 1 in 20 healthy recordings then score as high.
+        The sign of this is that fewer than 1 in 20 healthy recordings score as high in the test for such a rise.
         """
         step_test = self._find_test(WITHIN)
         return self.onset_s is None and step_test is not None and not _is_usual(step_test)
 
     def _find_test(self, name: str) -> Evidence | None:
-        """Find the evidence of the test called `name` of the detector that decided; None if it made no such test."""
-        judge = self.parts[0].parts if self.parts else ()
-        return next((part for part in judge if part.detector == name), None)
+        """Find the evidence of a test by the deciding detector; None if it made no test of this name."""
+        tests = self.parts[0].parts if self.parts else ()  # the deciding detector is the first
+        return next((test for test in tests if test.detector == name), None)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the diagnosis as plain values for JSON, in the order of the output contract.
@@ -375,8 +380,8 @@ class Diagnosis(Evidence):
 
 
 def _is_usual(test: Evidence) -> bool:
-    """Return True if at least 1 in 20 healthy recordings scores as high in the test, or if this is not stated."""
-    return test.chance is None or test.chance >= 0.05
+    """Return True if at least 1 in 20 healthy recordings scores as high in the test, or if this is not known."""
+    return test.chance is None or test.chance >= _MIN_USUAL_CHANCE
 
 
 def find_machine_name(preamble: Mapping[str, str]) -> str | None:

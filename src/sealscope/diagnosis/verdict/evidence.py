@@ -9,9 +9,9 @@ from sealscope.diagnosis.priors.decision import DECISION
 from sealscope.recordings.recording import Array
 
 Verdict = Literal["leak", "no leak", "cannot tell"]
-#: The three verdicts; `decision.decide` alone gives one.
+#: The three verdicts.
 LEAK, NO_LEAK, CANNOT_TELL = get_args(Verdict)
-#: Causes of a change that the code names; those of events and their actions: `[causes]` in `states.toml`.
+#: Causes of a change. `[causes]` in `states.toml` states the action for each.
 Cause = Literal[
     "piston leak",
     "piston or pump leak",
@@ -25,15 +25,15 @@ Cause = Literal[
 ]
 #: Figures that a detector may refuse to state.
 Figure = Literal["onset_s", "leak_lpm"]
-#: The causes for which the verdict is `leak`. Piston and pump lie in parallel and often no channel separates them;
-#: without a position, a loss to the outside looks the same, too.
+#: The causes for which the verdict is `leak`. Piston and pump are hydraulically in parallel, and often no channel
+#: separates their leaks. Without a recorded position, an external leak looks the same, too.
 LEAKS: tuple[Cause, ...] = ("piston leak", "piston or pump leak", "internal or external leak")
 #: Tests of the leakage: for a rise within the recording, and for a rise over healthy recordings.
 WITHIN, AGAINST = "within the recording", "against the baseline"
-#: Smallest chance that is stated.
+#: Smallest p-value that is stated, as smaller ones cannot be trusted.
 RAREST: float = DECISION.false_alarm.rarest
 #: The built-in detectors. They use the balance of volumes, a model of the pressures, and changes of the pressures'
-#: wavelet details; the last one decides only where no other can, and states no size.
+#: wavelet details. RMS_CHANGE decides only if no other detector can, and states no size of a leak.
 VOLUME_BALANCE, PRESSURE_RESPONSE, RMS_CHANGE = "volume balance", "pressure response", "rms change"
 
 
@@ -48,8 +48,8 @@ class LeakCourse:
     lpm, low, high : ndarray, shape (k,)
         Flow at these times, and its 95 % interval [L/min].
     whole : bool
-        True for the total flow past pump and piston, which is stated if no leak began. False for the increase of that
-        flow since the onset of a leak.
+        True for the total flow past pump and piston, which is stated if no onset of a leak is known. False for the
+        increase of this flow since the onset.
     """
 
     t: Array
@@ -89,7 +89,7 @@ class TotalLeakage:
     def healthy(self) -> bool:
         """True if the upper end of the flow's 95 % interval is at most the largest flow of a healthy machine.
 
-        The result is False if either of them is not known.
+        The result is False if the interval or the largest healthy flow is not known.
         """
         is_known = self.healthy_lpm is not None and self.interval_lpm is not None
         return is_known and self.interval_lpm[1] <= self.healthy_lpm  # type: ignore[index,operator]
@@ -135,7 +135,7 @@ class Evidence:
         The detector's single tests, each with a score and a threshold; for a combined verdict, the evidence of every
         detector.
     cause : str, optional
-        Cause of the change. If it is something else than a leak past piston or pump, the verdict is `no leak` or
+        Cause of the change. For a cause other than a leak past piston or pump, the verdict is `no leak` or
         `cannot tell`.
     course : LeakCourse, optional
         The leak over the time of the recording, if the detector estimates it.
@@ -146,8 +146,8 @@ class Evidence:
     share : float
         Fraction of the recording, 0 to 1, that was used for the verdict.
     judged_until : float
-        Time of the last judged sample, as a fraction of the recording's duration. As a leak stays once it began, only
-        the rest of the recording may hide one.
+        Time of the last judged sample, as a fraction of the recording's duration. A leak does not end by itself:
+        therefore only one that begins after this time is overlooked.
     detector : str
         Name of the detector or of its test; for a combined verdict, the name of the deciding detector, "" if none did.
     usable : bool
@@ -198,7 +198,7 @@ class Evidence:
 
     @property
     def summary(self) -> str:
-        """The verdict in words; if the change is something else than a leak past piston or pump, with its cause."""
+        """The verdict in words, with the cause of the change if this is not a leak past piston or pump."""
         if self.cause is None or self.cause in LEAKS or self.verdict == LEAK:
             return self.verdict
         if self.verdict == CANNOT_TELL:
@@ -217,15 +217,15 @@ class Evidence:
     def odds(self) -> str | None:
         """The stated `chance` in words, such as "1 in 50 healthy recordings looks like this".
 
-        If the verdict is `no leak` and the test raised no alarm, it "shows as much change". None if the chance is
-        unknown.
+        If the verdict is `no leak` without an alarm, the text is "shows as much change" instead of "looks like this".
+        It is None if the chance is unknown.
         """
         if self.stated_chance is None:
             return None
         is_unchanged = self.verdict == NO_LEAK and not self.alarmed
         if self.stated_chance >= 0.2:
             return f"more than 1 in 5 healthy recordings {'show as much change' if is_unchanged else 'look like this'}"
-        rounded = float(f"{1.0 / self.stated_chance:.2g}")  # to two digits
-        count = f"{rounded:,.0f}".replace(",", " ")
-        share = f"{'fewer than ' if self.stated_chance == RAREST else ''}1 in {count} healthy recordings"
-        return f"{share} {'shows as much change' if is_unchanged else 'looks like this'}"
+        two_digits = float(f"{1.0 / self.stated_chance:.2g}")
+        count = f"{two_digits:,.0f}".replace(",", " ")
+        limit = "fewer than " if self.stated_chance == RAREST else ""
+        return f"{limit}1 in {count} healthy recordings {'shows as much change' if is_unchanged else 'looks like this'}"

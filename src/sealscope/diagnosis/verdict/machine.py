@@ -14,8 +14,9 @@ from sealscope.recordings.recording import Recording
 
 #: Who stated the rig: the caller, the recording's provenance, or nobody.
 StatedBy = Literal["call", "recording", "nobody"]
-#: Parameters that convert a motion to a flow; the rig assumed if none is stated, and the reason.
+#: Parameters that convert a motion to a flow.
 _GEOMETRY = ("cylinder.A_A", "cylinder.A_B", "pump.q_b")
+#: Name of the rig that is assumed if no rig is stated, and the reason that is noted with its values.
 _DEFAULT, _REASON = "thesis", "no rig was stated"
 
 
@@ -75,17 +76,19 @@ class AssumedMachine:
 def assumed_rig(rig: Rig | str | os.PathLike[str] | None, recording: Recording) -> tuple[Rig, AssumedMachine]:
     """Choose the rig that detectors assume for a recording, and tell if its areas and displacement are stated.
 
-    If `rig` is None, the thesis's rig is used. It counts as stated if the recording's provenance names a rig of the
-    same areas and displacement; otherwise all its values are marked as assumptions (`Rig.states`). Raises InputError
-    if `rig` cannot be read.
+    If `rig` is None, the thesis's rig is used. The thesis's rig counts as stated if the recording's provenance names a
+    rig of the same areas and displacement; otherwise all its values are marked as assumptions (`Rig.states`). A given
+    `rig` counts as stated by nobody if it states sizes, but not a whole rig. Raises InputError if `rig` cannot be read.
     """
     used_rig = load_rig(_DEFAULT if rig is None else rig)
-    stated_by: StatedBy = "call"
-    if rig is None:
-        stated_by = "recording" if _names_rig_of_same_geometry(recording.provenance, used_rig) else "nobody"
-        used_rig = used_rig if stated_by == "recording" else used_rig.as_assumed(_REASON)
-    elif not states_rig(used_rig):
+    stated_by: StatedBy
+    if rig is not None:
+        stated_by = "call" if states_rig(used_rig) else "nobody"
+    elif _names_rig_of_same_geometry(recording.provenance, used_rig):
+        stated_by = "recording"
+    else:
         stated_by = "nobody"
+        used_rig = used_rig.as_assumed(_REASON)
     return used_rig, AssumedMachine(
         used_rig.name,
         stated_by,
@@ -101,26 +104,26 @@ def assumed_rig(rig: Rig | str | os.PathLike[str] | None, recording: Recording) 
 
 def states_rig(rig: Rig) -> bool:
     """Return True if a whole rig was stated; False for the default rig, even with stated areas or displacement."""
-    # nobody states the mass alone: it is assumed for want of a rig, or it is the rig's
+    # the mass shows it, as no user states the mass separately: it is that of the stated rig, or assumed
     return rig.entry("cylinder.M_eq").source != f"{ASSUMED} {_REASON}"
 
 
 def measures_flow(units: Mapping[str, str]) -> bool:
-    """Return True if a flow meter measures the pump's flow in m^3/s, given the `units` of the channels by name.
+    """Return True if the pump's flow is measured by a flow meter in m^3/s, the channel `q_pump`.
 
-    The result is False if the flow is computed from the pump's angle or speed.
+    The result is False if the flow is computed from the pump's angle or speed. `units`: unit of each channel, by name.
     """
     return flow_source(units) == "q_pump" and units["q_pump"] == "m^3/s"
 
 
 def healthy_leakage(rig: Rig) -> float:
-    """Return the largest leakage conductance of a healthy pump [m^3/(s Pa)] that the rig gives; 0 if it is not known.
+    """Return the largest leakage conductance of a healthy pump [m^3/(s Pa)] by the rig (`pump.G_healthy`); else 0.
 
-    The parameter is `pump.G_healthy`. A value that a rig's file assumes for its own pump is used. The value of the
-    default rig is not used for another pump, of which only the displacement is stated.
+    A conductance that a rig's file assumes is used if the same file states the displacement of the pump. Otherwise the
+    conductance may belong to another pump, such as that of the default rig, and the result is 0.
     """
-    is_same_place = rig.entry("pump.G_healthy").place == rig.entry("pump.q_b").place
-    is_of_this_pump = states_rig(rig) and rig.states("pump.q_b") and is_same_place
+    is_from_same_file = rig.entry("pump.G_healthy").place == rig.entry("pump.q_b").place
+    is_of_this_pump = states_rig(rig) and rig.states("pump.q_b") and is_from_same_file
     return rig.pump.G_healthy if rig.states("pump.G_healthy") or is_of_this_pump else 0.0
 
 
@@ -130,7 +133,10 @@ def unstated_rig() -> Rig:
 
 
 def _names_rig_of_same_geometry(provenance: Mapping[str, Any], rig: Rig) -> bool:
-    """Return True if a recording's provenance names a packaged rig of the same areas and displacement as `rig`."""
+    """Return True if a recording's provenance names a packaged rig of the same areas and displacement as `rig`.
+
+    The recording is then a simulated one. The result is False if the simulation overrode areas or displacement.
+    """
     experiment = provenance.get("experiment")
     if not isinstance(experiment, Mapping):
         return False

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -15,9 +15,9 @@ from sealscope.errors import InputError
 from sealscope.recordings.recording import Recording
 from sealscope.units import LITRE_PER_MINUTE, ML_PER_MINUTE, MM_PER_MINUTE, parse_quantity
 
-#: Leak relative to the limit: surely over it ("repair"), surely under half of it ("monitor"), else "plan".
+#: Urgency of a repair: the leak is surely over the limit ("repair"), surely far below it ("monitor"), else "plan".
 Level = Literal["repair", "plan", "monitor"]
-#: A figure with its 95 % interval, None if it is not known.
+#: A figure with its 95 % interval, (value, low, high); None if the figure is not known.
 _Figure = tuple[float, float, float] | None
 
 
@@ -30,7 +30,7 @@ class RepairLimit:
     value : float
         A flow [m^3/s], or the speed at which the piston creeps with its lines shut [m/s].
     kind : {"flow", "creep"}
-        Which of the two `value` is.
+        Whether `value` is a flow or a creep speed.
     stated : bool
         True if the caller gave the limit, False for the default creep speed of `priors.toml`, which applies to any
         piston area.
@@ -48,15 +48,14 @@ class RepairLimit:
         """
         if text is None:
             return cls(VERDICT.repair.creep * MM_PER_MINUTE, "creep", stated=False)
+        has_unit = isinstance(text, str) and any(character.isalpha() for character in text)
         for kind, unit in (("flow", "m^3/s"), ("creep", "m/s")):
             try:
                 value = parse_quantity(text, unit, name="limit")
-            except InputError:
+            except InputError:  # of another dimension, or not a quantity
                 continue
-            has_unit = isinstance(text, str) and any(character.isalpha() for character in text)
-            if not (has_unit and value > 0):
-                break
-            return cls(value, kind, stated=True)  # type: ignore[arg-type]
+            if has_unit and value > 0:
+                return cls(value, kind, stated=True)  # type: ignore[arg-type]
         raise InputError(f"limit must be a flow or a speed > 0 with its unit, such as 5 mL/min or 8 mm/min, got {text}")
 
     def __str__(self) -> str:
@@ -65,16 +64,13 @@ class RepairLimit:
         return f"{self.value / MM_PER_MINUTE:.3g} mm/min of creep"
 
     def flow_lpm(self, area: float | None) -> float | None:
-        """Convert the limit to a flow [L/min]; None if it is a speed and the piston's `area` [m^2] is None."""
+        """Convert the limit to a flow [L/min]; None for a creep speed if the piston's `area` [m^2] is None."""
         if self.kind == "flow":
             return self.value / LITRE_PER_MINUTE
         return None if area is None else self.value * area / LITRE_PER_MINUTE
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the limit as plain values for JSON.
-
-        It is either a flow or a creep speed; the other of the two is None.
-        """
+        """Return the limit as plain values for JSON; a flow has no creep speed (None), a creep speed no flow."""
         return {
             "mL_per_min": self.value / ML_PER_MINUTE if self.kind == "flow" else None,
             "creep_mm_per_min": self.value / MM_PER_MINUTE if self.kind == "creep" else None,
@@ -107,21 +103,24 @@ class Severity:
 
     @property
     def level(self) -> Level | None:
-        """Urgency of the repair, from the 95 % interval of the leak divided by the repair limit.
+        """Urgency of the repair, from the 95 % interval of the leak divided by the repair limit (`of_limit`).
 
-        It is "repair" if the whole interval is above the limit, "monitor" if all of it is below half the limit, else
-        "plan". It is None if the leak is not known in the limit's unit.
+        - "repair": the whole interval is above 1.
+        - "monitor": the whole interval is below `repair.watch` of `priors.toml`.
+        - "plan": any other interval.
+        - None: `of_limit` is not known.
         """
         if self.of_limit is None:
             return None
         _, low, high = self.of_limit
-        return "repair" if low > 1.0 else "monitor" if high < VERDICT.repair.watch else "plan"
+        if low > 1.0:
+            return "repair"
+        return "monitor" if high < VERDICT.repair.watch else "plan"
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the severity as plain values for JSON: `level`, and two entries for each figure.
+        """Return the severity as plain values for JSON: `level`, and for each figure its value and 95 % interval.
 
-        The figure has its name, such as `creep_mm_per_min`; its 95 % interval has this name with `_interval` at the
-        end. Both are None if unknown.
+        An interval is named like `creep_mm_per_min_interval`. Both are None if the figure is not known.
         """
         plain: dict[str, Any] = {"level": self.level}
         for name in ("mL_per_min", "pump_share", "creep_mm_per_min", "of_limit"):
@@ -134,12 +133,13 @@ class Severity:
 def severity(evidence: Evidence, limit: RepairLimit) -> Severity | None:
     """Compute the severity of a detected leak relative to a repair limit.
 
-    The result is None if there is no leak or its size is unknown.
+    The result is None if the verdict is not `leak`, or if the size of the leak is unknown.
     """
     if evidence.verdict != LEAK or (evidence.leak_lpm is None and evidence.relative is None):
         return None
     relative = evidence.relative or RelativeLeak()
-    flow_lpm, creep = (evidence.leak_lpm, evidence.leak_interval_lpm), (relative.creep, relative.creep_interval)
+    flow_lpm = evidence.leak_lpm, evidence.leak_interval_lpm
+    creep = relative.creep, relative.creep_interval
     if limit.kind == "flow":
         of_limit = _convert_figure(*flow_lpm, LITRE_PER_MINUTE / limit.value)
     else:
@@ -155,16 +155,19 @@ def severity(evidence: Evidence, limit: RepairLimit) -> Severity | None:
 def relative_leak(evidence: Evidence, recording: Recording, machine: AssumedMachine) -> RelativeLeak | None:
     """Convert a leak in L/min to a fraction of the pump's flow and to a creep speed of the piston.
 
-    `machine` states displacement and piston area. The result is None if no L/min are stated. The fraction is None if
-    neither speed nor angle of the pump is recorded.
+    `machine` states the displacement and the piston area. The result is None if the evidence states no L/min. The
+    fraction is None if the pump stands still, or if neither its speed nor its angle is recorded.
     """
     if evidence.leak_lpm is None or evidence.leak_interval_lpm is None:
         return None
     flows = LITRE_PER_MINUTE * np.array([evidence.leak_lpm, *evidence.leak_interval_lpm])
-    pump_flow = _mean_speed(recording) / (2.0 * math.pi) * machine.displacement
     creep, *creep_ends = (flows / machine.area).tolist()
-    share, *share_ends = (flows / pump_flow).tolist() if pump_flow > 0.0 else (None,)
-    return RelativeLeak(share, tuple(share_ends) or None, creep, tuple(creep_ends))
+    relative = RelativeLeak(creep=creep, creep_interval=tuple(creep_ends))
+    pump_flow = _mean_speed(recording) / (2.0 * math.pi) * machine.displacement
+    if not pump_flow > 0.0:
+        return relative
+    share, *share_ends = (flows / pump_flow).tolist()
+    return replace(relative, pump_share=share, pump_share_interval=tuple(share_ends))
 
 
 def _mean_speed(recording: Recording) -> float:
@@ -177,10 +180,7 @@ def _mean_speed(recording: Recording) -> float:
 
 
 def _convert_figure(value: float | None, interval: tuple[float, float] | None, factor: float = 1.0) -> _Figure:
-    """Multiply a value and its interval by a factor; None if a number is missing or not finite.
-
-    Returns (value, low, high).
-    """
+    """Multiply a value and its interval by a factor: (value, low, high); None if a number is unknown or not finite."""
     if value is None or interval is None or not all(math.isfinite(number) for number in (value, *interval)):
         return None
     return factor * value, factor * interval[0], factor * interval[1]

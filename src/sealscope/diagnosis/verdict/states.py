@@ -16,7 +16,7 @@ from typing import Any
 
 from sealscope.diagnosis.verdict.evidence import LEAK
 
-#: Conditions of a machine that leaks past piston or pump: the cause does not change their state.
+#: Conditions of a machine that leaks past piston or pump. Their state is the same for all causes of the leak.
 LEAKING = (LEAK, "leak over the limit")
 
 
@@ -70,13 +70,14 @@ def state_of(
 ) -> MachineState:
     """Return the state of a machine for a condition of `states.toml`; raise KeyError for an unknown condition.
 
-    `cause` is the cause of the change. It determines the action and, unless the condition is a leak past piston or
-    pump, also the state. `since_s` is the time at which the state began [s]. `action` replaces the action of the
-    table.
+    `cause` is the cause of the change, None if unknown. If `states.toml` lists it, it determines the action and, unless
+    the condition is a leak past piston or pump (`LEAKING`), also the state. `since_s` is the time at which the state
+    began [s]. `action` replaces the action of the table.
     """
     tables = _tables()
-    condition_row, cause_row = tables["conditions"][condition], tables["causes"].get(cause or "", {})
-    name = condition_row["state"] if condition in LEAKING else cause_row.get("state", condition_row["state"])
+    name = tables["conditions"][condition]["state"]
+    if condition not in LEAKING:
+        name = tables["causes"].get(cause or "", {}).get("state", name)
     action = action or action_of(condition, cause)
     return MachineState(
         name=name, **tables["states"][name], condition=condition, since_s=since_s, cause=cause, action=action
@@ -85,23 +86,24 @@ def state_of(
 
 def find_separation(cause: str) -> str | None:
     """Return the text of `states.toml` that tells how to distinguish a cause from a leak; None if there is no text."""
-    words: str | None = _tables()["causes"].get(cause, {}).get("separates")
-    return words
+    text: str | None = _tables()["causes"].get(cause, {}).get("separates")
+    return text
 
 
 @cache
 def joint_causes() -> Mapping[str, tuple[str, ...]]:
-    """Return the names under which `states.toml` joins causes that some data cannot separate, each with its causes."""
+    """Return groups of causes that some data cannot separate, by the joint name of each group in `states.toml`."""
     return {name: tuple(row["joins"]) for name, row in _tables()["causes"].items() if "joins" in row}
 
 
 def action_of(condition: str, cause: str | None = None, parts: Sequence[str] = ()) -> str:
-    """Return the action for a condition of `states.toml`, or for the cause of a change if the table has one.
+    """Return the action that `states.toml` states for the cause of a change or, if it does not, for the condition.
 
-    `parts` are components that leak like a worn seal, such as a bypass valve. If the machine leaks, their checks come
-    first. Raises KeyError for an unknown condition or part.
+    `parts` are components of the machine that leak like a worn seal, such as "bypass". If the condition is a leak past
+    piston or pump, checks of these parts come first. Raises KeyError for an unknown condition or part.
     """
     tables = _tables()
-    action: str = tables["causes"].get(cause or "", tables["conditions"][condition])["action"]
+    row = tables["causes"].get(cause or "", tables["conditions"][condition])
+    action: str = row["action"]
     part_checks = [str(tables["parts"][part]) for part in parts] if condition in LEAKING else []
     return " ".join([*part_checks, action])
