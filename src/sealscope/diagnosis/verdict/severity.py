@@ -21,6 +21,15 @@ Level = Literal["repair", "plan", "monitor"]
 _Figure = tuple[float, float, float] | None
 
 
+def _is_number(text: str) -> bool:
+    """Return True if a text is a number without a unit, such as "5e-6"."""
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
 @dataclass(frozen=True)
 class RepairLimit:
     """Leak at which a machine must be repaired.
@@ -48,7 +57,7 @@ class RepairLimit:
         """
         if text is None:
             return cls(VERDICT.repair.creep * MM_PER_MINUTE, "creep", stated=False)
-        has_unit = isinstance(text, str) and any(character.isalpha() for character in text)
+        has_unit = isinstance(text, str) and not _is_number(text)
         for kind, unit in (("flow", "m^3/s"), ("creep", "m/s")):
             try:
                 value = parse_quantity(text, unit, name="limit")
