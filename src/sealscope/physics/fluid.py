@@ -32,7 +32,7 @@ def effective_bulk_modulus(p: float, K_oil: float, air: float, n_air: float) -> 
     liquid and gas); in this form the hydraulic fluid of the Simscape library, from which the thesis took its friction.
     """
     if not any_lane(air > 0.0):
-        return K_oil + 0.0 * p  # lanes if p is lanes
+        return K_oil + 0.0 * p  # of p's type: a number, or a vector of numbers (lanes)
     p_abs = max(p + P_ATM, _MIN_ABSOLUTE_PRESSURE)
     r = air_volume_ratio(p, air, n_air)
     return K_oil * (1.0 + r) / (1.0 + r * K_oil / (n_air * p_abs))

@@ -26,10 +26,11 @@ BELOW_VACUUM, BEYOND_DRIVE = 2, 3
 def standstill_force(x: float, p: RigNumbers) -> float:
     """Compute the force [N] that the chamber pressures must carry to hold the piston at rest at x [m].
 
-    It is the load against +x, including that of an opposing cylinder, minus the force of an end stop.
+    It is the load against +x, with the force of an opposing cylinder, minus the force of an end stop along +x.
     """
-    load = load_force(x, p.F_l, p.k_load) + opposing_force(0.0, p.A_opp, p.p_opp, 1.0)
-    return load - hard_stop_force(x, 0.0, p.L, p.k_stop, p.d_stop)  # type: ignore[no-any-return]
+    velocity = 0.0  # nothing then flows through the opposing cylinder's orifice: any coefficient will do, such as 1
+    load = load_force(x, p.F_l, p.k_load) + opposing_force(velocity, p.A_opp, p.p_opp, 1.0)
+    return load - hard_stop_force(x, velocity, p.L, p.k_stop, p.d_stop)  # type: ignore[no-any-return]
 
 
 @law
@@ -48,20 +49,18 @@ def pressures_at_standstill(force: float, p: RigNumbers) -> tuple[float, float]:
     if len(p.throttled) > 0:
         V_A, V_B = V_A + p.V_1, V_B + p.V_2
     missing_force = force - p.p_charge * (p.A_A - p.A_B)  # [N], not carried by the charge pressure
-    displaced_oil = missing_force / (p.A_A / V_A + p.A_B / V_B)
-    return p.p_charge + displaced_oil / V_A, p.p_charge - displaced_oil / V_B
+    moved_oil = missing_force / (p.A_A / V_A + p.A_B / V_B)  # from side B to A, times the bulk modulus [Pa m^3]
+    return p.p_charge + moved_oil / V_A, p.p_charge - moved_oil / V_B
 
 
 @law
 def stand_still(y: Any, x: float, force: float, p: RigNumbers) -> int:
-    """Set the state `y` (14,) to standstill of a pump-controlled rig; return 0, or a code if this is impossible.
+    """Set the state `y` (14,), until now all zeros, to standstill of a pump-controlled rig.
 
-    All elements of `y` are 0 before the call.
-
-    `x` [m]: position; `force` [N]: load against +x. The motor holds the pump with the current i = T_load/C_m, eq.
-    (4.5). The integral of the speed controller that gives this current is R_c i/K_i, eq. (4.3), or 0 if K_i = 0.
-    The code is `BELOW_VACUUM` if a pressure would be below vacuum, `BEYOND_DRIVE` if the current or voltage is
-    beyond the drive's limits.
+    `x` [m]: position of the piston; `force` [N]: load against +x. The motor holds the pump's torque T_load with the
+    current i = T_load/C_m, eq. (4.5). The integral of the speed controller that gives this current is R_c i/K_i, eq.
+    (4.3), or 0 if K_i = 0. Returns 0, or a code if this standstill is impossible: `BELOW_VACUUM` if a pressure is below
+    vacuum, `BEYOND_DRIVE` if the current or voltage is beyond the drive's limits.
     """
     p_A, p_B = pressures_at_standstill(force, p)
     y[POSITION] = x
@@ -80,7 +79,7 @@ def pressures_behind_valve(force: float, A_A: float, A_B: float, p_1: float, p_2
 
     `force` [N]: load against +x; `p_1`, `p_2` [Pa]: pressures of supply and return. p_A + p_B = p_1 + p_2, because
     the edges to supply and return are equal and have equal pressure drops (Merritt, Hydraulic Control Systems, 1967,
-    section 5.2). An overlapped valve may trap another mean pressure; this one is assumed.
+    section 5.2). This is also assumed of an overlapped valve, which may in fact trap another mean pressure.
     """
     p_A = (force + A_B * (p_1 + p_2)) / (A_A + A_B)
     return p_A, p_1 + p_2 - p_A
@@ -89,22 +88,22 @@ def pressures_behind_valve(force: float, A_A: float, A_B: float, p_1: float, p_2
 def supply_at_standstill(force: float, x: float, p: RigNumbers) -> tuple[float, float, float]:
     """Compute p_1, p_A, p_B [Pa] of a rig with its servo valve centred and its piston at rest at `x` [m].
 
-    `force` [N]: load against +x. The supply pressure p_1 is the one that stays constant: the root of dp_1/dt, which
-    falls as p_1 rises, is found by bisection.
+    `force` [N]: load against +x. The supply pressure p_1 must stay constant: bisection finds the root of dp_1/dt, which
+    falls as p_1 rises.
     """
     y = np.zeros(len(STATES))
     y[POSITION], y[P_2] = x, p.p_return
     low = p.p_return
-    high = low + p.p_set + p.q_b * p.omega_P / p.G_set  # the relief valve alone takes more
+    high = low + p.p_set + p.q_b * p.omega_P / p.G_set  # here the relief valve alone passes more than the pump delivers
     p_A, p_B = low, low
-    for _ in range(200):  # halvings, beyond the resolution of doubles
+    for _ in range(200):  # halvings, more than doubles resolve
         middle = 0.5 * (low + high)
         p_A, p_B = pressures_behind_valve(force, p.A_A, p.A_B, middle, p.p_return)
         y[P_A], y[P_B], y[P_1] = p_A, p_B, middle
         dp = middle - p.p_return
         Q_1 = pump_flow(p.omega_P, dp, p.q_b, p.G_pump) - turbulent_slip(dp, p.c_slip, p.dp_0)
-        rises = valve_rates(state_of(y), Q_1, p)[2] > 0.0
-        low, high = (middle, high) if rises else (low, middle)
+        _, _, supply_rate, _ = valve_rates(state_of(y), Q_1, p)
+        low, high = (middle, high) if supply_rate > 0.0 else (low, middle)
     return low, p_A, p_B
 
 
@@ -120,7 +119,8 @@ def initial_state(rig: Rig, x_0: float, push: float = 0.0) -> np.ndarray:
     Raises InputError if a pressure is below vacuum (with a servo valve: outside of the range from return to supply),
     or if the drive cannot hold the load.
     """
-    p, y = rig_numbers(rig), np.zeros(len(STATES))
+    p = rig_numbers(rig)
+    y = np.zeros(len(STATES))
     force = standstill_force(x_0, p) + push
     if rig.circuit.valve_controlled:
         return _fill_standstill_state(rig, y, x_0, force, p)
@@ -141,9 +141,7 @@ def initial_state(rig: Rig, x_0: float, push: float = 0.0) -> np.ndarray:
 
 
 def _fill_standstill_state(rig: Rig, y: np.ndarray, x: float, force: float, p: RigNumbers) -> np.ndarray:
-    """Fill the state `y` (14,) with the equilibrium of a rig whose servo valve is centred; return `y`.
-
-    `y` must be all zeros before the call, since only some of its elements are set.
+    """Fill the state `y` (14,), until now all zeros, with standstill of a rig whose servo valve is centred; return it.
 
     `x` [m]: position of the piston; `force` [N]: load against +x. Raises InputError if the pressures cannot carry the
     force, or if the drive cannot hold the supply.
