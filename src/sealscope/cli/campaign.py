@@ -121,14 +121,15 @@ def _campaign_folder(plan: AnyPlan, stated: Path | None) -> Path:
 
 
 def _format_progress(state: CampaignProgress) -> str:
-    """Format the number of records done and failed, and the computing time left."""
+    """Format the numbers of records done and failed, the computing time per record, and the computing time left."""
     text = f"records: {state.done} of {state.records} done"
     if state.failed:
         text += f", {state.failed} of them failed"
     if state.seconds is not None:
-        remaining_s = (state.records - state.done) * state.seconds
         text += f"; {state.seconds:.2f} s of one core each"
-        text += f", about {opt.format_duration(remaining_s)} of one core left" if remaining_s else ""
+        remaining_s = (state.records - state.done) * state.seconds
+        if remaining_s:
+            text += f", about {opt.format_duration(remaining_s)} of one core left"
     return text
 
 
@@ -145,8 +146,9 @@ def _show_progress() -> Iterator[ProgressCallback]:
 def _write_report(plan: AnyPlan, folder: Path, data: Path | None) -> int:
     """Write the tables and the page of a campaign, print its main table, and return the number of failed records.
 
-    `folder`: folder of the campaign, to which the files are written and which has the results of simulated records;
-    `data`: folder of the recordings for a plan over recordings, else None.
+    The first five failed records are also printed, on standard error. `folder`: folder of the campaign, which contains
+    the results of simulated records, and to which the files are written; `data`: folder of the recordings for a plan
+    over recordings, else None.
     """
     from sealscope.campaigns.results import write_result
     from sealscope.reporting.campaign.page import PAGE, campaign_text, write_campaign_page
@@ -164,8 +166,8 @@ def _write_report(plan: AnyPlan, folder: Path, data: Path | None) -> int:
 def _load_result(plan: AnyPlan, folder: Path, data: Path | None) -> CampaignResult:
     """Judge the detectors of a campaign by its records, and return the result.
 
-    A simulated plan is judged by the results stored in `folder`, others by the recordings in the folder `data`.
-    Raises InputError if the recordings are needed and `data` is None or no folder.
+    A simulated plan is judged by the results stored in `folder`, any other plan by the recordings in `data`. Raises
+    InputError if the recordings are needed but `data` is None or not a folder.
     """
     from sealscope.campaigns.plans.model import SimulatedPlan
     from sealscope.campaigns.results import judge_recorded_campaign, judge_simulated_campaign
