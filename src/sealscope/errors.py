@@ -20,9 +20,9 @@ def printable(text: str, kept: str = "", instead: str = "\N{REPLACEMENT CHARACTE
 
 
 class SealscopeError(Exception):
-    """Base of every error that Sealscope raises on purpose; its text is one line.
+    """Base class of the errors that Sealscope raises on purpose; the message is one line.
 
-    Line breaks become blanks, and the middle of a very long text is omitted.
+    Line breaks become blanks, and the middle of a very long message is omitted.
     """
 
     def __init__(self, message: object = "") -> None:

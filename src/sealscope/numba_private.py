@@ -76,13 +76,13 @@ ATTRIBUTES = {
 
 
 class TolerantCache(FunctionCache):  # type: ignore[misc]
-    """Cache of numba in which an unreadable or unwritable file is a cache miss."""
+    """Numba's cache of compiled code, changed so that an unreadable or unwritable file is a cache miss."""
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Load the compiled code of a function for the argument types `sig`; None if it is missing or damaged.
 
-        Loaded code needs numba's reference counting, which is set up here for `target_context`. The rest of numba's
-        set-up takes longer than loading, and is left to the next compilation.
+        Loaded code needs numba's reference counting, which is set up here for `target_context`. The remaining set-up of
+        numba takes longer than loading, and is left to the next compilation. A damaged cache is emptied.
         """
         try:
             rtsys.initialize(target_context)

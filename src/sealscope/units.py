@@ -294,8 +294,9 @@ def _find_conversion(unit: str, si_unit: str, name: str, place: str | None) -> _
     try:
         return _conversion(unit, si_unit)
     except InputError as error:
-        where = f" ({place})" if place else ""
-        raise InputError(" ".join(f"{name} must have {_describe_dimension(si_unit)}, {error}{where}".split())) from None
+        suffix = f" ({place})" if place else ""
+        message = f"{name} must have {_describe_dimension(si_unit)}, {error}{suffix}"
+        raise InputError(" ".join(message.split())) from None  # one line
 
 
 def _convert_exactly(value: Fraction, conversion: _Conversion) -> float:
@@ -373,14 +374,14 @@ def parse_quantity(
     a number, if the unit has another dimension or, with `finite`, if the number is infinite or NaN. The message names
     the quantity (`name`) and the file or option (`place`).
     """
-    where = f" ({place})" if place else ""
+    suffix = f" ({place})" if place else ""
     text = value if isinstance(value, str) else ""
     if isinstance(value, Real) and not isinstance(value, bool):
         text = repr(float(value))
     match = _NUMBER.fullmatch(text) if len(text) <= _MAX_TEXT else None
     if match is None:
         entry = repr(value[:60] if isinstance(value, str) else value)
-        raise InputError(f"{name} must be a number with or without a unit, such as 2[{si_unit}], got {entry}{where}")
+        raise InputError(f"{name} must be a number with or without a unit, such as 2[{si_unit}], got {entry}{suffix}")
     unit = match["rest"].strip() or si_unit
     if unit.startswith("[") and unit.endswith("]"):
         unit = unit[1:-1]
@@ -392,5 +393,5 @@ def parse_quantity(
     else:
         result = _convert_exactly(Fraction(match["number"]), _find_conversion(unit, si_unit, name, place))
     if finite and not math.isfinite(result):
-        raise InputError(f"{name} must be a finite number, got {text[:60].strip()}{where}")
+        raise InputError(f"{name} must be a finite number, got {text[:60].strip()}{suffix}")
     return result

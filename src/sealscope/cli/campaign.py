@@ -64,21 +64,23 @@ def run(
     from sealscope.campaigns.plans.model import SimulatedPlan
     from sealscope.campaigns.plans.reader import load_plan
 
-    loaded = load_plan(plan)
-    target = _campaign_folder(loaded, folder)
-    if not isinstance(loaded, SimulatedPlan):
+    loaded_plan = load_plan(plan)
+    target = _campaign_folder(loaded_plan, folder)
+    if not isinstance(loaded_plan, SimulatedPlan):
         if batch:
-            raise InputError(f"a plan in batches must simulate its records; run it without --batch ({loaded.place})")
-        if _write_report(loaded, target, data):
+            raise InputError(
+                f"a plan in batches must simulate its records; run it without --batch ({loaded_plan.place})"
+            )
+        if _write_report(loaded_plan, target, data):
             raise Exit(1)
         return
     opt.say_jobs(jobs)
     with _show_progress() as progress:
         state = carry_out(
-            loaded, target, jobs=jobs, cluster=cluster, retry=retry, progress=progress, batch=batch, trust=trust
+            loaded_plan, target, jobs=jobs, cluster=cluster, retry=retry, progress=progress, batch=batch, trust=trust
         )  # fmt: skip
     echo(_format_progress(state))
-    _write_report(loaded, target, data)
+    _write_report(loaded_plan, target, data)
     if state.failed:
         raise Exit(1)
 
@@ -90,9 +92,9 @@ def status(plan: PlanArgument, folder: FolderOption = None) -> None:
     from sealscope.campaigns.plans.model import SimulatedPlan
     from sealscope.campaigns.plans.reader import load_plan
 
-    loaded = load_plan(plan)
-    if isinstance(loaded, SimulatedPlan):
-        echo(_format_progress(read_progress(loaded, _campaign_folder(loaded, folder))))
+    loaded_plan = load_plan(plan)
+    if isinstance(loaded_plan, SimulatedPlan):
+        echo(_format_progress(read_progress(loaded_plan, _campaign_folder(loaded_plan, folder))))
     else:
         echo("a campaign over measured data has nothing to wait for; report it")
 
@@ -102,8 +104,8 @@ def report(plan: PlanArgument, folder: FolderOption = None, data: DataOption = N
     """Judge the records of a plan that are done so far, and write the tables and the page."""
     from sealscope.campaigns.plans.reader import load_plan
 
-    loaded = load_plan(plan)
-    _write_report(loaded, _campaign_folder(loaded, folder), data)
+    loaded_plan = load_plan(plan)
+    _write_report(loaded_plan, _campaign_folder(loaded_plan, folder), data)
 
 
 def _campaign_folder(plan: AnyPlan, stated: Path | None) -> Path:

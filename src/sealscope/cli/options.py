@@ -425,7 +425,7 @@ def complain(message: object) -> None:
 def attempt(file: Path, work: Callable[[], T]) -> T | None:
     """Return the result of `work`, or print a message on standard error and return None if it fails.
 
-    The command can then go on with other files. `file`: the file on which it works, for the message.
+    The command can then go on with other files. `file`: the file that `work` reads or writes, for the message.
     """
     try:
         return work()

@@ -52,12 +52,12 @@ def new(
     from sealscope.parameters import load_rig
     from sealscope.parameters.new_rig import piston_areas, rig_text, valve_rig_text
 
-    for option, value, needed in (
+    for option, value, required_kind in (
         ("--displacement", displacement, "pump"), ("--valve", valve, "valve"), ("--drop", drop, "valve"),
         ("--supply", supply, "valve"),
     ):  # fmt: skip
-        if value is not None and kind != needed:
-            raise InputError(f"{option} must stand with --kind {needed}, got --kind {kind}")
+        if value is not None and kind != required_kind:
+            raise InputError(f"{option} must stand with --kind {required_kind}, got --kind {kind}")
     if bore is not None:
         bore_m = _parse_size(bore, "m", _MM, "--bore")
         rod_m = _parse_size(rod or "0", "m", _MM, "--rod")

@@ -267,9 +267,9 @@ class Rig(Part):
         return self._stated_entries()[resolve_name(name, declared_names())]
 
     def states(self, *names: str) -> bool:
-        """Return True if all the named parameters are stated for this machine.
+        """Return True if all the named parameters are stated for this machine; False if a value is assumed.
 
-        The others are assumed: their sources begin with `assumed:`.
+        The source of an assumed value begins with `assumed:`.
         """
         return not any(self.entry(name).source.startswith(ASSUMED) for name in names)
 
@@ -355,8 +355,8 @@ class Rig(Part):
         """Return the SI values of the parameters by dotted name, without those that equal their `absent` value.
 
         The `absent` value of a parameter means that its part or effect is not in the model. The result identifies a
-        machine across versions of the package: a parameter that a later version adds has its `absent` value in older
-        rigs, so that their results do not change.
+        machine across versions of the package: it does not contain parameters that a later version has added, since
+        they have their `absent` values in older rigs.
         """
         return {name: self[name] for name, field in declared_fields().items() if self[name] != absent_of(field)}
 

@@ -123,7 +123,7 @@ if TYPE_CHECKING:
         def _asdict(self) -> dict[str, Any]: ...
 
     RigValues = RigNumbers
-else:  # numba takes a named tuple apart; its fields are those of the models
+else:  # plain named tuples, which numba takes apart into their fields
     RigNumbers = namedtuple("RigNumbers", (*NUMBERS, *CHOICES))
     RigValues = namedtuple("RigValues", VALUES)
 
@@ -511,7 +511,7 @@ def make_up_flows(y: State, p: RigNumbers) -> tuple[float, float]:
 def external_pressure_rates(y: State, p: RigNumbers) -> tuple[Pressures, float]:
     """Compute the pressure rates (dp_A/dt, dp_B/dt, dp_1/dt, dp_2/dt) [Pa/s] due to external leakage and make-up.
 
-    Also returns the flow [m^3/s] that leaves the make-up's accumulator, as a volume at the accumulator's pressure.
+    Also returns the volume flow [m^3/s] out of the make-up's accumulator, at the accumulator's pressure.
     """
     V_A, V_B = volumes_at(y[POSITION], p)
     K_A, K_B = bulk_modulus(y[P_A], p), bulk_modulus(y[P_B], p)
@@ -527,7 +527,7 @@ def external_pressure_rates(y: State, p: RigNumbers) -> tuple[Pressures, float]:
         return (-cylinder.pressure_rate(out_A, V_A, K_A), -cylinder.pressure_rate(out_B, V_B, K_B), rate_1, rate_2), fed
     rate_1 = cylinder.pressure_rate(makeup_1 - out_A, V_A, K_A)
     rate_2 = cylinder.pressure_rate(makeup_2 - out_B, V_B, K_B)
-    if len(p.valved) > 0:  # a supply's line has no rod seal
+    if len(p.valved) > 0:  # 1 and 2 are here supply and return, whose lines have neither rod seals nor make-up
         return (rate_1, rate_2, 0.0 * rate_1, 0.0 * rate_2), fed
     return (rate_1, rate_2, rate_1, rate_2), fed
 
