@@ -37,9 +37,8 @@ def piston_areas(bore: float, rod: float, *, double_rod: bool = False) -> tuple[
 def rig_text(name: str, area_A: float, area_B: float, stroke: float, displacement: float) -> str:
     """Format a new rig's TOML file, with comments, for a cylinder that is controlled by its pump.
 
-    All other parameters are taken from the rig `thesis` (equal areas) or `single-rod-eha`. Some are scaled to the
-    machine's size: friction coefficients with the bore or the area, the moving mass and the check valves with the
-    volume.
+    All other parameters are taken from the rig `thesis` if the areas are equal, else from `single-rod-eha`. Some of
+    them are scaled to the machine's size, such as friction with the bore or area, and the moving mass with the volume.
 
     Parameters
     ----------

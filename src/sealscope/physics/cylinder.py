@@ -87,8 +87,9 @@ def piston_acceleration(
 ) -> float:
     """Compute the piston's acceleration [m/s^2] from the forces on it, eq. (4.15) with end stops added.
 
-    It is (p_A A_A - p_B A_B - F_f - F_l + F_stop)/M_eq with the chamber pressures [Pa], the piston areas [m^2], the
-    moving mass `M_eq` [kg], and in N: `friction` F_f and `load` F_l, both against +x, and `stop` F_stop along +x.
+    It is (p_A A_A - p_B A_B - friction - load + stop)/M_eq. `p_A`, `p_B` [Pa]: chamber pressures; `A_A`, `A_B` [m^2]:
+    piston areas; `friction`, `load` [N]: forces against +x; `stop` [N]: force of the end stops along +x; `M_eq` [kg]:
+    moving mass.
     """
     return (p_A * A_A - p_B * A_B - friction - load + stop) / M_eq
 

@@ -23,8 +23,8 @@ def external_leakage(p: float, G_ext: float) -> float:
 def accumulator_pressure(V_up: float, p_charge: float, V_gas: float) -> float:
     """Compute the pressure [Pa gauge] of a gas accumulator that has delivered the oil volume V_up [m^3].
 
-    Its gas volume is V_gas [m^3] at `p_charge` [Pa gauge] and expands isothermally: Boyle's law, p_abs (V_gas + V_up)
-    = constant.
+    The gas has the volume `V_gas` [m^3] at `p_charge` [Pa gauge], and expands isothermally by Boyle's law,
+    p_abs (V_gas + V_up) = constant.
     """
     return (p_charge + P_ATM) * V_gas / (V_gas + V_up) - P_ATM
 

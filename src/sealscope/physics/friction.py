@@ -76,10 +76,10 @@ def bristle_rate(v: float, z: float, g: float, sigma_0: float) -> float:
 def lugre_friction(v: float, z: float, dz: float, sigma_0: float, sigma_1: float, F_v: float, v_th: float) -> float:
     """Compute LuGre's friction force [N] from the deflection of the contact's bristles and the velocity.
 
-    F = sigma_0 z + sigma_1 exp(-(v/v_th)^2) dz + F_v v, with the bristles' mean deflection z [m] and its rate dz [m/s]
-    (`bristle_rate`), the velocity v [m/s], the bristles' stiffness sigma_0 [N/m] and damping sigma_1 [N s/m], and the
-    viscous coefficient F_v [N s/m]. The damping decays at speeds above v_th [m/s]; otherwise the force could drive the
-    motion.
+    F = sigma_0 z + sigma_1 exp(-(v/v_th)^2) dz + F_v v. `v` [m/s]: velocity; `z` [m], `dz` [m/s]: the bristles' mean
+    deflection and its rate (`bristle_rate`); `sigma_0` [N/m], `sigma_1` [N s/m]: stiffness and damping of the bristles;
+    `F_v` [N s/m]: viscous coefficient. The damping decays at speeds above `v_th` [m/s]; otherwise the force could drive
+    the motion.
 
     Source: as `bristle_rate`, eq. (3); the decay: H. Olsson, Control Systems with Friction, Lund 1996, section 5.
     """
