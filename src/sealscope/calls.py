@@ -24,8 +24,8 @@ _MAX_WORD = 200
 def nearest(word: str, known: Iterable[str], count: int = 1, share: float = 0.5) -> list[str]:
     """Find up to `count` words of `known` that resemble `word`, the most similar first.
 
-    `share` (0 to 1): smallest similarity that counts, the `ratio` of difflib. The list is empty if no known word is
-    similar enough, or if `word` is longer than 200 characters.
+    `share` (0 to 1): lowest similarity of these words to `word`, by the `ratio` of difflib. The list is empty if no
+    known word is similar enough, or if `word` is longer than 200 characters.
     """
     return difflib.get_close_matches(word, known, n=count, cutoff=share) if len(word) <= _MAX_WORD else []
 
@@ -35,13 +35,13 @@ def suggestion(word: str, known: Iterable[str]) -> str:
 
     The text is ``; did you mean NAME?``, or empty if no known name is similar. Upper and lower case count as equal.
     """
-    name_of = {name.casefold(): name for name in known}
-    near = nearest(word.casefold(), name_of)
-    return f"; did you mean {name_of[near[0]]}?" if near else ""
+    name_by_folded = {name.casefold(): name for name in known}
+    similar = nearest(word.casefold(), name_by_folded)
+    return f"; did you mean {name_by_folded[similar[0]]}?" if similar else ""
 
 
 def checked_call(function: Callable[P, R]) -> Callable[P, R]:
-    """Wrap `function` to raise InputError for wrong arguments, with its signature and docstring preserved.
+    """Wrap `function` to raise InputError for wrong arguments; the wrapper has the same signature and docstring.
 
     The error for an unknown keyword suggests the nearest known one: ``simulate has no argument 'comand'; did you mean
     'command'?``. Missing and surplus arguments raise InputError too. Errors of the function itself pass unchanged.
@@ -75,8 +75,8 @@ def argument(default: Any, kind: str, text: str, *, unit: str = "") -> Any:
     """Declare an argument of a function as a dataclass field with a default value and documentation.
 
     `kind`: type of the argument in words, such as "float"; `text`: its meaning; `unit`: SI unit of a number, empty
-    for other values. They are stored in the field's metadata under these names, with the unit appended to the text.
-    The decorator `take_fields_of` makes the function's signature and docstring from such fields.
+    for other values. The field's metadata contain them under these names, with the unit appended to the text. The
+    decorator `take_fields_of` makes the function's signature and docstring from such fields.
     """
     return field(
         default=default, metadata={"kind": kind, "text": f"{text} [{unit}]." if unit else f"{text}.", "unit": unit}
@@ -86,9 +86,9 @@ def argument(default: Any, kind: str, text: str, *, unit: str = "") -> Any:
 def take_fields_of(declared: Callable[P, V]) -> Callable[[Callable[[V], R]], Callable[P, R]]:
     """Build a decorator that lets callers of a function pass the fields of a dataclass as its arguments.
 
-    `declared`: the dataclass, with fields declared by `argument`. The function itself takes an instance of it as its
-    only argument. The decorator puts the fields into the signature, and a section "Parameters" on them into the
-    docstring. Wrong arguments raise InputError.
+    `declared`: the dataclass, with fields declared by `argument`. The function itself takes an instance of `declared`
+    as its only argument. The decorator puts the fields into the function's signature, and a section "Parameters" on
+    them into its docstring, before the section "Returns". Wrong arguments raise InputError.
     """
     lines: list[str] = []
     for declared_field in fields(declared):  # type: ignore[arg-type]

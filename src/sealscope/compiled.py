@@ -46,7 +46,7 @@ _COMPILED_PACKAGES = (
     *("compiled.py", "numba_pipeline.py", "numba_private.py"),
     *("physics", "signals", "control", "simulation", "diagnosis", _MESSAGE_LIMITS),
 )
-#: Cache folders of the last sources that are not removed.
+#: Number of cache folders that are kept, those of the current sources and of the sources used before.
 _MAX_GENERATIONS = 4
 #: Range of numba versions with known private names: from the first to before the second.
 KNOWN_VERSIONS = (0, 61, 2), (0, 69, 0)
@@ -72,10 +72,8 @@ def _compiler() -> ModuleType:
     if is_known_version(numba.__version__):
         return import_module("sealscope.numba_private")
     low, high = (".".join(map(str, version)) for version in KNOWN_VERSIONS)
-    _log.warning(
-        "numba %s is not a version from %s to before %s: laws compile slowly and are not cached",
-        *(numba.__version__, low, high),
-    )
+    message = "numba %s is not a version from %s to before %s: laws compile slowly and are not cached"
+    _log.warning(message, numba.__version__, low, high)
     return import_module("sealscope.numba_pipeline")
 
 
@@ -86,9 +84,10 @@ def source_hash(root: Path) -> str:
     """
     digest = hashlib.sha256()
     for package in _COMPILED_PACKAGES:
-        place = root / package
-        files = (path for path in place.rglob("*") if path.suffix in (".py", ".toml"))
-        for path in sorted(files) if place.is_dir() else [place]:
+        files = [root / package]
+        if files[0].is_dir():
+            files = sorted(path for path in files[0].rglob("*") if path.suffix in (".py", ".toml"))
+        for path in files:
             digest.update(path.relative_to(root).as_posix().encode() + b"\0")
             digest.update(path.read_bytes())
     return digest.hexdigest()
@@ -122,10 +121,10 @@ def _prune(kernels: Path, current: str) -> None:
 
 
 def _check_owner(folder: Path, forbidden: int) -> None:
-    """Raise PermissionError unless `folder` is a directory that belongs to this user alone, and not a link.
+    """Raise PermissionError unless `folder` is a directory, not a link, that belongs to this user alone.
 
     `forbidden`: permission bits that must not be set, such as 0o022, with which others could write. On Windows all
-    folders pass.
+    existing folders pass.
     """
     status = folder.lstat()
     if not hasattr(os, "getuid"):  # on Windows the folders of a user are private
@@ -151,8 +150,8 @@ def cache_directory() -> Path | None:
     """Create the folder for the compiled code of these sources, and return its path.
 
     The user's cache folder is preferred; if it is not safe or not writable, a private folder among the temporary
-    files is used. Folders of older sources are removed (`_prune`). None if caching is turned off or no folder can be
-    used.
+    files is used. Folders of older sources are removed (`_prune`). Returns None if caching is turned off, and None
+    after a warning if no folder can be used.
     """
     base = _user_cache_folder()
     if base is None:
@@ -260,10 +259,10 @@ def call_at(context: Any, address: Any, memory: Any, sample: Any) -> Any:
     """
 
     def emit_call(target: Any, builder: Any, signature: Any, values: Any) -> Any:
-        """Emit the LLVM instructions that call the function at the address; return the double that it returns.
+        """Emit the LLVM instructions that call the function at the address; return its result, a double.
 
-        Numba passes the arguments: `values` are the addresses of the function and of the two arrays that it takes,
-        `memory` and `sample`, as 64-bit integers, which are converted to pointers.
+        Numba passes the arguments: `values` are the addresses of the function, of `memory` and of `sample` as 64-bit
+        integers, which are converted to pointers.
         """
         double = target.get_value_type(numba.float64)
         pointer = double.as_pointer()
@@ -293,8 +292,8 @@ def address_of(context: Any, pointer: Any) -> Any:
 def record_dtype(*numbers: str, **parts: Any) -> np.dtype[Any]:
     """Build the NumPy dtype of a record of doubles.
 
-    `numbers`: names of the fields that are single doubles; they come first. `parts`: by name of a further field, the
-    shape of its array of doubles, or the dtype of a nested record.
+    `numbers`: names of the fields that are single doubles; they come first. `parts`: further fields by name, each with
+    the shape of an array of doubles or with the dtype of a nested record.
     """
     shaped = [(name, part) if isinstance(part, np.dtype) else (name, "f8", part) for name, part in parts.items()]
     return np.dtype([*((name, "f8") for name in numbers), *shaped])
@@ -316,7 +315,7 @@ def record_view(layout: Any) -> Callable[[Any], Any]:
 
     `layout`: NumPy dtype of the record, with doubles and arrays of doubles as fields.
     """
-    kind = numba.types.CPointer(numba.from_dtype(layout))
+    record_pointer = numba.types.CPointer(numba.from_dtype(layout))
 
     @intrinsic  # type: ignore[misc]
     def cast_pointer(context: Any, pointer: Any) -> Any:
@@ -326,14 +325,13 @@ def record_view(layout: Any) -> Callable[[Any], Any]:
         """
 
         def emit_cast(target: Any, builder: Any, signature: Any, values: Any) -> Any:
-            """Emit the LLVM instruction that casts the pointer to doubles to one to the record; return its result.
+            """Emit the LLVM instruction that casts the pointer, the only item of `values`; return its result.
 
-            Numba passes the arguments: the instruction is added to `builder`, and the only item of `values` is the
-            pointer.
+            Numba passes the arguments.
             """
-            return builder.bitcast(values[0], target.get_value_type(kind))
+            return builder.bitcast(values[0], target.get_value_type(record_pointer))
 
-        return kind(pointer), emit_cast
+        return record_pointer(pointer), emit_cast
 
     @law
     def record(pointer: Any) -> Any:
@@ -349,8 +347,8 @@ def plain_code(function: Callable[..., Any], *arguments: str) -> tuple[str, str]
     `arguments`: type of each argument, "double*", "double" or "int64". The function must return an integer and
     allocate nothing. C calls it as ``int symbol(int64_t *result, void **unused, arguments...)``.
     """
-    kinds = {"double*": numba.types.CPointer(numba.float64), "double": numba.float64, "int64": numba.int64}
-    signature = numba.int64(*(kinds[argument] for argument in arguments))
+    numba_types = {"double*": numba.types.CPointer(numba.float64), "double": numba.float64, "int64": numba.int64}
+    signature = numba.int64(*(numba_types[argument] for argument in arguments))
     dispatcher = numba.njit(signature, nogil=True, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)(
         function
     )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 from sealscope.diagnosis.commissioned.machine import CommissionedMachine, commission
@@ -17,18 +16,19 @@ from sealscope.storage.folders import make_folder
 
 #: The command of the demo, on the thesis's rig.
 COMMAND = "3 sin(4t)"
-#: Number of healthy recordings for the commissioning, and the length of healthy recordings [s].
+#: Number of healthy recordings for the commissioning, and length of each healthy recording [s].
 N_HEALTHY, SECONDS = 5, 20.0
-#: The leak to be found: the thesis's smallest, from half of the recording on.
+#: The leak to be found: the smallest of the thesis, which begins in the middle of the leaking recording.
 LEAK = "0.0042 L/min from 30 s"
 
 
 @dataclass(frozen=True)
 class Demo:
-    """Results of the demo: the commissioned machine, two diagnoses, and the files written.
+    """Results of the demo.
 
-    `healthy`, `diagnosis`: diagnoses of a healthy recording and of the leaking one; `truth`: the simulated leak;
-    `machine_file`, `recording`, `page`: paths of the machine's file, the leaking recording and its page.
+    - `machine`: the commissioned machine; `truth`: the simulated leak.
+    - `healthy`, `diagnosis`: diagnoses of a healthy recording and of the leaking recording.
+    - `machine_file`, `recording`, `page`: paths of the machine's file, the leaking recording and the page on it.
     """
 
     machine: CommissionedMachine
@@ -48,7 +48,7 @@ def run_demo(folder: Path, seed: int = 1, progress: Progress | None = None) -> D
     """
     update = progress or (lambda task, share: None)
     names = [*(f"healthy/run{k + 1}.nc" for k in range(N_HEALTHY)), "healthy.nc"]
-    recordings = {}
+    recordings = {}  # by file name
     for k, name in enumerate(names):
         healthy_experiment = Experiment.of(command=COMMAND, duration=SECONDS, seed=len(names) * seed + k)
         recordings[name] = simulate_experiment(healthy_experiment).recording
@@ -56,15 +56,16 @@ def run_demo(folder: Path, seed: int = 1, progress: Progress | None = None) -> D
     experiment = Experiment.of(command=COMMAND, leak=LEAK, duration=60.0, seed=seed)
     result = simulate_experiment(experiment, progress)
     file, page = folder / "recording.nc", folder / "report.html"
+    recordings[file.name] = result.recording
     make_folder(folder / "healthy")
-    for name, recording in {**recordings, file.name: result.recording}.items():
+    for name, recording in recordings.items():
         write(recording, folder / name)
     update("commissioning", 0.0)
     machine = commission(folder / "healthy", rig=experiment.rig, name="demo")
     machine_file = write_machine(machine, folder / "machine.toml")
     update("diagnosing", 0.0)
-    diagnose = partial(_diagnose_file, machine, folder)
-    healthy, diagnosis = diagnose("healthy.nc"), diagnose(file.name)
+    healthy = _diagnose_file(machine, folder, "healthy.nc")
+    diagnosis = _diagnose_file(machine, folder, file.name)
     update("writing the page", 0.5)
     report(
         read(file),

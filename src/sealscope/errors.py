@@ -6,22 +6,23 @@ Each message is one line that names the rule, the value and the place, for examp
 
 from __future__ import annotations
 
-#: Most characters of a message at its beginning, with the rule, and at its end, with the place.
+#: Most characters that are kept of a long message: at its beginning, which states the rule, and at its end, which
+#: states the place.
 _MAX_BEGINNING, _MAX_END = 1500, 2500
 
 
 def printable(text: str, kept: str = "", instead: str = "\N{REPLACEMENT CHARACTER}") -> str:
-    """Replace unprintable characters, which may control a terminal, by `instead`.
+    """Replace each unprintable character, which may control a terminal, by the text `instead`.
 
-    Unprintable characters that occur in `kept`, such as a line break, stay.
+    Unprintable characters in the text `kept`, such as a line break, are not replaced.
     """
     return "".join(character if character.isprintable() or character in kept else instead for character in text)
 
 
 class SealscopeError(Exception):
-    """Base of every error that Sealscope raises on purpose; its text is one line.
+    """Base class of the errors that Sealscope raises on purpose; the message is one line.
 
-    Line breaks become blanks, and the middle of a very long text is omitted.
+    Line breaks become blanks, and the middle of a very long message is omitted.
     """
 
     def __init__(self, message: object = "") -> None:

@@ -23,7 +23,8 @@ from sealscope.simulation.simulate import simulate_experiment
 
 #: Length of a block [s].
 BLOCK_S = 1.0
-#: Settings of the demo: three actuators at 20 times real time, of which one begins to leak after two minutes.
+#: Settings of the demo: three actuators at `speed` times real time, of which one begins to leak after two simulated
+#: minutes. `port`: port of the monitor's page.
 DEMO = """\
 # Settings of `sealscope monitor demo`: what is learned is learned in 100 s.
 database = "monitor.db"
@@ -83,14 +84,15 @@ def _make_experiment(actuator: ActuatorSettings, settings: SimulateSettings) -> 
 def _make_source(name: str, experiment: Experiment, settings: SimulateSettings, say: Callable[[str], None]) -> Source:
     """Build a source that simulates an actuator and submits its samples to the monitor in blocks of 1 s.
 
-    The blocks arrive at `settings.speed` times real time; those that the monitor has already stored are left out.
-    `name`: the actuator's name; `say`: function that prints a message.
+    The blocks arrive at `settings.speed` times real time; blocks that the monitor has already stored are left out.
+    `name`: the actuator's name; `say`: called with a message at the start and at the end.
     """
 
     def play(receiver: BlockReceiver) -> None:
-        """Simulate the actuator, and submit each block to `receiver` at the time at which a real one would arrive.
+        """Simulate the actuator, and submit each block to `receiver` when its time has come, until all are submitted.
 
-        Blocks in the receiver's store are skipped; if it has all of them, nothing is simulated.
+        Blocks in the receiver's store are skipped; if all are there, nothing is simulated. Returns early if the
+        receiver is stopping.
         """
         blocks = range(math.floor(experiment.duration / BLOCK_S))
         # the store knows all blocks before some block, and none after it

@@ -38,9 +38,9 @@ EXTENSION_NAMES = {
 class ConstantLengths(FunctionPass):  # type: ignore[misc]
     """Compiler pass that replaces `len` of a tuple or array of known size by a constant.
 
-    It applies to `len(p)` of an argument `p` that is a tuple, and to `len(p.law)` if `p` is a named tuple or a record
-    and its field `law` a tuple or an array. A law of physics that a rig lacks has the length 0. Branches on the
-    length are thus decided before types are inferred, and the code of an absent law is not compiled.
+    It applies to `len(p)` of an argument `p` that is a tuple, and to `len(p.law)` of a field `law` of a named tuple or
+    record `p`, if this field is a tuple or an array. A law of physics that a rig lacks has the length 0. Branches on
+    the length are thus decided before types are inferred, and the code of an absent law is not compiled.
     """
 
     _name = "sealscope_settled_laws"
@@ -71,25 +71,27 @@ class ConstantLengths(FunctionPass):  # type: ignore[misc]
             if isinstance(source, ir.Arg):
                 return state.args[source.index]
             owner = find_definition(source.value) if getattr(source, "op", None) == "getattr" else None
-            kind = state.args[owner.index] if isinstance(owner, ir.Arg) else None
-            if isinstance(kind, types.BaseNamedTuple) and source.attr in kind.fields:
-                return kind.types[kind.fields.index(source.attr)]
-            return kind.typeof(source.attr) if isinstance(kind, types.Record) and source.attr in kind.fields else None
+            owner_type = state.args[owner.index] if isinstance(owner, ir.Arg) else None
+            if isinstance(owner_type, types.BaseNamedTuple) and source.attr in owner_type.fields:
+                return owner_type.types[owner_type.fields.index(source.attr)]
+            if isinstance(owner_type, types.Record) and source.attr in owner_type.fields:
+                return owner_type.typeof(source.attr)
+            return None
 
         def find_length(value: Any) -> int | None:
             """Find the number that a call of `len` returns.
 
-            `value`: expression in numba's intermediate code. Returns None if it is no such call, or if the length is
-            not known.
+            `value`: expression in numba's intermediate code. Returns None if it is not a call of `len`, or if the
+            length is not known.
             """
             if getattr(value, "op", None) != "call" or len(value.args) != 1:
                 return None
             if getattr(find_definition(value.func), "value", None) is not len:
                 return None
-            kind = type_of(find_definition(value.args[0]))
-            if isinstance(kind, types.NestedArray):
-                return int(kind.shape[0])
-            return kind.count if isinstance(kind, types.BaseTuple) else None
+            argument_type = type_of(find_definition(value.args[0]))
+            if isinstance(argument_type, types.NestedArray):
+                return int(argument_type.shape[0])
+            return argument_type.count if isinstance(argument_type, types.BaseTuple) else None
 
         for block in code.blocks.values():
             for statement in block.body:
@@ -141,12 +143,12 @@ def compile_at_address(function: Callable[..., Any], signature: Any, folder: Pat
 
     `signature`: numba's signature of `function`; `folder` is not used, as nothing is cached here.
     """
+    callbacks: list[Any] = []  # keeps the compiled code in memory
 
     def compile_address() -> int:
         """Compile `function` for C's calling convention and return the address of its machine code."""
         callback = numba.cfunc(signature, **_OPTIONS)(function)
-        callbacks.append(callback)  # keeps the code in memory
+        callbacks.append(callback)
         return int(callback.address)
 
-    callbacks: list[Any] = []
     return compile_address

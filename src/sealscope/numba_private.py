@@ -76,13 +76,13 @@ ATTRIBUTES = {
 
 
 class TolerantCache(FunctionCache):  # type: ignore[misc]
-    """Cache of numba in which an unreadable or unwritable file is a cache miss."""
+    """Numba's cache of compiled code, changed so that an unreadable or unwritable file is a cache miss."""
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Load the compiled code of a function for the argument types `sig`; None if it is missing or damaged.
 
-        Loaded code needs numba's reference counting, which is set up here for `target_context`. The rest of numba's
-        set-up takes longer than loading, and is left to the next compilation.
+        Loaded code needs numba's reference counting, which is set up here for `target_context`. The remaining set-up of
+        numba takes longer than loading, and is left to the next compilation. A damaged cache is emptied.
         """
         try:
             rtsys.initialize(target_context)
@@ -161,8 +161,8 @@ def compile_kernel(function: Callable[..., Any], fastmath: Any, folder: Path | N
 class _LawLibrary(JITCodeLibrary):  # type: ignore[misc]
     """Compiled code of a function that only other compiled functions call, without machine code of its own.
 
-    It is linked into these functions as LLVM code; it is never called by its address. It is optimised here once, not
-    within each of them, so that all compute identical results.
+    The code is linked into these functions as LLVM code, and never called by its address. It is optimised here once,
+    not in each function that calls it, so that all of them compute identical results.
     """
 
     def _finalize_final_module(self) -> None:
@@ -189,9 +189,9 @@ class _LawCompiler(_ShortCompiler):
 class _Law(CPUDispatcher):  # type: ignore[misc]
     """A law, i.e. a function for other compiled functions, without numba's wrapper for calls from Python.
 
-    The wrapper, which unpacks and checks each argument, takes longer to compile than the law. Its compiled code can
-    therefore not be called from Python. If Python calls a small law, i.e. one that is inlined, its Python source runs
-    uncompiled. A large one is compiled a second time, as a kernel with the wrapper, and cached in `folder`.
+    The wrapper, which unpacks and checks each argument, takes longer to compile than the law. Without it, Python cannot
+    call the law's compiled code. If Python calls a small law, i.e. a law that is inlined, its Python source runs
+    uncompiled. A large law is compiled a second time, as a kernel with the wrapper, and cached in `folder`.
     """
 
     folder: Path | None = None
@@ -207,9 +207,9 @@ class _Law(CPUDispatcher):  # type: ignore[misc]
 
     @cached_property
     def _for_python(self) -> Any:
-        """Function that runs if Python calls the law, whose own compiled code only compiled functions can call.
+        """Function that runs if Python calls the law.
 
-        It is the Python source of the law if the law is inlined (small), else a kernel that is compiled from it.
+        It is the law's Python source if the law is small (inlined), else a kernel that is compiled from this source.
         """
         inlined = self.targetoptions["forceinline"]
         return self.py_func if inlined else compile_kernel(self.py_func, self.targetoptions["fastmath"], self.folder)
@@ -222,8 +222,8 @@ class _Law(CPUDispatcher):  # type: ignore[misc]
 def compile_law(function: Callable[..., Any], fastmath: Any, inlined: bool, folder: Path | None) -> Any:
     """Compile a function for calls from other compiled functions.
 
-    `fastmath`: as for `numba.njit`; `inlined`: insert its code in place of each call; `folder`: cache for a large law
-    that Python calls, None without a cache.
+    `fastmath`: as for `numba.njit`; `inlined`: insert its code in place of each call, as for a small law; `folder`:
+    cache for a large law that Python calls (`_Law`), None without a cache.
     """
     options = {"nopython": True, "nogil": True, "error_model": "numpy", "fastmath": fastmath, "forceinline": inlined}
     options |= {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}

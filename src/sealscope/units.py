@@ -89,7 +89,7 @@ def _absolute_unit(unit: Unit) -> Unit:
 
 _DEFAULTS = {"factor": 1, "pi": 0, "offset": 0}
 _TABLES: dict[str, Any] = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
-#: Unit without powers, products and other spellings -> its meaning.
+#: Name of a single unit, such as `mbar` -> the unit; powers, products and other spellings are not in it.
 _ATOMS = {
     prefix + name: _build_unit({**row, "factor": Fraction(row.get("factor", 1)) * Fraction(10) ** power})
     for name, row in _TABLES["prefixed"].items()
@@ -113,6 +113,7 @@ _NUMBER = re.compile(
 _MARKED = re.compile(
     r"(?P<unit>.{1,40}?)[\s_]*\(?(?:(?P<absolute>a|A|abs\.?|absolute?)|g|G|gauge|gage|rel\.?|relative?|\u00fc|\u00dc)\)?"
 )
+#: Longest text [characters] that is parsed as a unit or a quantity.
 _MAX_TEXT = 200
 #: Most bits of a factor's numerator and denominator, and largest power of pi, so that the factor is a double.
 _MAX_BITS, _MAX_PI = 900, 100
@@ -161,10 +162,14 @@ def _tokenize(text: str) -> list[str]:
             raise ValueError
         position = match.end()
         name, digit = match["name"] or "", match["digit"] or ""
-        if not digit or name + digit in _SPELLINGS:
-            tokens.append(match["op"] or (f"^{match['power']}" if match["power"] else name + digit))
-        else:
+        if match["op"]:
+            tokens.append(match["op"])
+        elif match["power"]:
+            tokens.append(f"^{match['power']}")
+        elif digit and name + digit not in _SPELLINGS:  # a power without `^`, such as m3
             tokens += [name, f"^{digit}"]
+        else:
+            tokens.append(name + digit)
     return tokens
 
 
@@ -189,9 +194,9 @@ def _parse_product(tokens: list[str]) -> Unit:
         else:
             unit = _parse_name(token)
         power = Fraction(tokens.pop(0)[1:]) if tokens and tokens[0][0] == "^" else Fraction(1)
-        # only a single unit keeps its offset
-        is_single = result is None and power == 1
-        result = unit if is_single else (result or Unit()).times(unit, -power if divides else power)
+        if result is not None or power != 1:  # only a single unit keeps its offset
+            unit = (result or Unit()).times(unit, -power if divides else power)
+        result = unit
         divides = False
     if result is None or divides:
         raise ValueError
@@ -245,7 +250,7 @@ def _describe_dimension(si_unit: str) -> str:
 
 
 def same_dimension(unit: str, other: str) -> bool:
-    """Return True if values can be converted between two units; False also if one is not a unit."""
+    """Return True if values can be converted between two units; False also if one of the texts is not a unit."""
     try:
         return parse_unit(unit).powers == parse_unit(other).powers
     except InputError:
@@ -259,7 +264,12 @@ def is_familiar(unit: str) -> bool:
     """
     names = {*_ATOMS, *_SPELLINGS} - {""}
     parts = [unit] if unit in names else unit.split("/")
-    return all(names & {part, part.rstrip("23"), part[:-1] if part[-1:] in ("a", "g") else part} for part in parts)
+    for part in parts:
+        without_power = part.rstrip("23")
+        without_mark = part[:-1] if part.endswith(("a", "g")) else part  # of absolute or gauge pressure
+        if not names & {part, without_power, without_mark}:
+            return False
+    return True
 
 
 @lru_cache(maxsize=1024)
@@ -284,8 +294,9 @@ def _find_conversion(unit: str, si_unit: str, name: str, place: str | None) -> _
     try:
         return _conversion(unit, si_unit)
     except InputError as error:
-        where = f" ({place})" if place else ""
-        raise InputError(" ".join(f"{name} must have {_describe_dimension(si_unit)}, {error}{where}".split())) from None
+        suffix = f" ({place})" if place else ""
+        message = f"{name} must have {_describe_dimension(si_unit)}, {error}{suffix}"
+        raise InputError(" ".join(message.split())) from None  # one line
 
 
 def _convert_exactly(value: Fraction, conversion: _Conversion) -> float:
@@ -363,16 +374,17 @@ def parse_quantity(
     a number, if the unit has another dimension or, with `finite`, if the number is infinite or NaN. The message names
     the quantity (`name`) and the file or option (`place`).
     """
-    where = f" ({place})" if place else ""
+    suffix = f" ({place})" if place else ""
     text = value if isinstance(value, str) else ""
     if isinstance(value, Real) and not isinstance(value, bool):
         text = repr(float(value))
     match = _NUMBER.fullmatch(text) if len(text) <= _MAX_TEXT else None
     if match is None:
         entry = repr(value[:60] if isinstance(value, str) else value)
-        raise InputError(f"{name} must be a number with or without a unit, such as 2[{si_unit}], got {entry}{where}")
-    rest = match["rest"].strip()
-    unit = (rest[1:-1] if rest.startswith("[") and rest.endswith("]") else rest) if rest else si_unit
+        raise InputError(f"{name} must be a number with or without a unit, such as 2[{si_unit}], got {entry}{suffix}")
+    unit = match["rest"].strip() or si_unit
+    if unit.startswith("[") and unit.endswith("]"):
+        unit = unit[1:-1]
     number = float(match["number"])
     if not math.isfinite(number) or number == 0:  # exact arithmetic is for finite numbers; 1e-999999 is 0
         result = to_si(number, unit, si_unit, name=name, place=place)
@@ -381,5 +393,5 @@ def parse_quantity(
     else:
         result = _convert_exactly(Fraction(match["number"]), _find_conversion(unit, si_unit, name, place))
     if finite and not math.isfinite(result):
-        raise InputError(f"{name} must be a finite number, got {text[:60].strip()}{where}")
+        raise InputError(f"{name} must be a finite number, got {text[:60].strip()}{suffix}")
     return result

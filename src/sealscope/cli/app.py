@@ -1,4 +1,4 @@
-"""The command line of Sealscope, which only translates the words of a call to function calls."""
+"""The command line of Sealscope, which only translates the arguments of a call to function calls."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def _root(
     version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help=_VERBOSE)] = False,
 ) -> None:
-    """Handle the options that are valid for all commands."""
+    """Handle the options of all commands: `--verbose` logs details, `--version` prints the version and exits."""
     if verbose:
         import logging
 
@@ -72,50 +72,59 @@ def _root(
         raise typer.Exit
 
 
-def normalise_arguments(words: Sequence[str]) -> list[str]:
-    """Rearrange the words of a call to the form that typer understands.
+def normalise_arguments(arguments: Sequence[str]) -> list[str]:
+    """Rearrange the arguments of a call to the form that typer understands.
 
-    `-v` comes first, wherever it stood; `--baseline` is repeated before each baseline; and `monitor FILE` becomes
-    `monitor run FILE`. Raises InputError if no file follows `--baseline`.
+    - `-v` is moved to the beginning, once.
+    - `--baseline` is repeated before each baseline (`spread_baselines`).
+    - `monitor FILE` becomes `monitor run FILE`.
+
+    Raises InputError if no file follows `--baseline`.
     """
-    end = list(words).index("--") if "--" in words else len(words)  # behind it there are no options
-    verbose = [word for word in words[:end] if word in ("-v", "--verbose")]
-    other_words = [word for word in words[:end] if word not in ("-v", "--verbose")] + list(words[end:])
-    if other_words[:1] == ["monitor"] and len(other_words) > 1 and other_words[1] not in monitoring.COMMANDS:
-        other_words.insert(1, "run")  # `sealscope monitor FILE`
-    return [*verbose[:1], *spread_baselines(other_words)]
+    end = list(arguments).index("--") if "--" in arguments else len(arguments)  # after `--` there are no options
+    verbose = [argument for argument in arguments[:end] if argument in ("-v", "--verbose")]
+    remaining = [argument for argument in arguments[:end] if argument not in ("-v", "--verbose")]
+    remaining += arguments[end:]
+    if remaining[:1] == ["monitor"] and len(remaining) > 1 and remaining[1] not in monitoring.COMMANDS:
+        remaining.insert(1, "run")  # `sealscope monitor FILE`
+    return [*verbose[:1], *spread_baselines(remaining)]
 
 
-def spread_baselines(words: Sequence[str]) -> list[str]:
+def spread_baselines(arguments: Sequence[str]) -> list[str]:
     """Repeat the option `--baseline` before each of the files after it, as typer requires.
 
-    In this way `--baseline FILE...` of the commands diagnose and report accepts wildcards; the words of other
-    commands stay unchanged. All words after `--baseline` up to the next option are baselines. If no other FILE would
-    be left, only the first word after `--baseline` is a baseline, and the others are the files to diagnose. Raises
-    InputError if no file follows `--baseline`.
+    In this way `--baseline FILE...` of the commands diagnose and report accepts wildcards; the arguments of other
+    commands stay unchanged. All arguments after `--baseline` up to the next option are baselines. If the call has no
+    other files, only the first file after each `--baseline` is a baseline, and the others are the files to diagnose.
+    Raises InputError if no file follows `--baseline`.
     """
-    if "--baseline" not in words or words[0] not in ("diagnose", "report"):
-        return list(words)
-    end = list(words).index("--") if "--" in words else len(words)
+    if "--baseline" not in arguments or arguments[0] not in ("diagnose", "report"):
+        return list(arguments)
+    end = list(arguments).index("--") if "--" in arguments else len(arguments)
     baselines: list[list[str]] = []  # the files after each `--baseline`
-    other_words: list[str] = []
+    remaining: list[str] = []
     in_baseline = False
-    for word in words[1:end]:
-        if word == "--baseline":
+    for argument in arguments[1:end]:
+        if argument == "--baseline":
             baselines.append([])
             in_baseline = True
             continue
-        in_baseline = in_baseline and (word == "-" or not word.startswith("-"))
-        (baselines[-1] if in_baseline else other_words).append(word)
-    other_words += words[end:]
+        if argument != "-" and argument.startswith("-"):  # the next option ends the baselines; `-` is standard input
+            in_baseline = False
+        if in_baseline:
+            baselines[-1].append(argument)
+        else:
+            remaining.append(argument)
+    remaining += arguments[end:]
     if not all(baselines):
         raise InputError("--baseline must be followed by one file or more, got none")
-    command = _click_command().commands[words[0]]
-    files = command.make_context(words[0], list(other_words), resilient_parsing=True).params["files"]
+    command = _click_command().commands[arguments[0]]
+    # find out whether there are files among the remaining arguments; wrong options raise no error here
+    files = command.make_context(arguments[0], list(remaining), resilient_parsing=True).params["files"]
     used_groups = baselines if files else [group[:1] for group in baselines]
-    options = [word for group in used_groups for name in group for word in ("--baseline", name)]
+    options = [argument for group in used_groups for name in group for argument in ("--baseline", name)]
     moved_files = [] if files else [name for group in baselines for name in group[1:]]
-    return [words[0], *options, *moved_files, *other_words]
+    return [arguments[0], *options, *moved_files, *remaining]
 
 
 @cache
@@ -127,7 +136,8 @@ def _click_command() -> Any:
 def main() -> None:
     """Run the command line, and end the process with an exit status.
 
-    An error that the caller can act on is printed as one line on standard error, without a traceback.
+    The status is that of the command, 0 by default; 1 for a failure; 2 for a wrong call; or 130 for an interrupt
+    (Ctrl-C). An error that the caller can act on is printed as one line on standard error, without a traceback.
     """
     # some versions of typer contain a copy of click: take the exception of the module in which BadParameter is defined
     wrong_call: type[Any] = sys.modules[typer.BadParameter.__module__].ClickException

@@ -64,21 +64,23 @@ def run(
     from sealscope.campaigns.plans.model import SimulatedPlan
     from sealscope.campaigns.plans.reader import load_plan
 
-    loaded = load_plan(plan)
-    target = _campaign_folder(loaded, folder)
-    if not isinstance(loaded, SimulatedPlan):
+    loaded_plan = load_plan(plan)
+    target = _campaign_folder(loaded_plan, folder)
+    if not isinstance(loaded_plan, SimulatedPlan):
         if batch:
-            raise InputError(f"a plan in batches must simulate its records; run it without --batch ({loaded.place})")
-        if _write_report(loaded, target, data):
+            raise InputError(
+                f"a plan in batches must simulate its records; run it without --batch ({loaded_plan.place})"
+            )
+        if _write_report(loaded_plan, target, data):
             raise Exit(1)
         return
     opt.say_jobs(jobs)
     with _show_progress() as progress:
         state = carry_out(
-            loaded, target, jobs=jobs, cluster=cluster, retry=retry, progress=progress, batch=batch, trust=trust
+            loaded_plan, target, jobs=jobs, cluster=cluster, retry=retry, progress=progress, batch=batch, trust=trust
         )  # fmt: skip
     echo(_format_progress(state))
-    _write_report(loaded, target, data)
+    _write_report(loaded_plan, target, data)
     if state.failed:
         raise Exit(1)
 
@@ -90,9 +92,9 @@ def status(plan: PlanArgument, folder: FolderOption = None) -> None:
     from sealscope.campaigns.plans.model import SimulatedPlan
     from sealscope.campaigns.plans.reader import load_plan
 
-    loaded = load_plan(plan)
-    if isinstance(loaded, SimulatedPlan):
-        echo(_format_progress(read_progress(loaded, _campaign_folder(loaded, folder))))
+    loaded_plan = load_plan(plan)
+    if isinstance(loaded_plan, SimulatedPlan):
+        echo(_format_progress(read_progress(loaded_plan, _campaign_folder(loaded_plan, folder))))
     else:
         echo("a campaign over measured data has nothing to wait for; report it")
 
@@ -102,8 +104,8 @@ def report(plan: PlanArgument, folder: FolderOption = None, data: DataOption = N
     """Judge the records of a plan that are done so far, and write the tables and the page."""
     from sealscope.campaigns.plans.reader import load_plan
 
-    loaded = load_plan(plan)
-    _write_report(loaded, _campaign_folder(loaded, folder), data)
+    loaded_plan = load_plan(plan)
+    _write_report(loaded_plan, _campaign_folder(loaded_plan, folder), data)
 
 
 def _campaign_folder(plan: AnyPlan, stated: Path | None) -> Path:
@@ -121,14 +123,15 @@ def _campaign_folder(plan: AnyPlan, stated: Path | None) -> Path:
 
 
 def _format_progress(state: CampaignProgress) -> str:
-    """Format the number of records done and failed, and the computing time left."""
+    """Format the numbers of records done and failed, the computing time per record, and the computing time left."""
     text = f"records: {state.done} of {state.records} done"
     if state.failed:
         text += f", {state.failed} of them failed"
     if state.seconds is not None:
-        remaining_s = (state.records - state.done) * state.seconds
         text += f"; {state.seconds:.2f} s of one core each"
-        text += f", about {opt.format_duration(remaining_s)} of one core left" if remaining_s else ""
+        remaining_s = (state.records - state.done) * state.seconds
+        if remaining_s:
+            text += f", about {opt.format_duration(remaining_s)} of one core left"
     return text
 
 
@@ -145,8 +148,9 @@ def _show_progress() -> Iterator[ProgressCallback]:
 def _write_report(plan: AnyPlan, folder: Path, data: Path | None) -> int:
     """Write the tables and the page of a campaign, print its main table, and return the number of failed records.
 
-    `folder`: folder of the campaign, to which the files are written and which has the results of simulated records;
-    `data`: folder of the recordings for a plan over recordings, else None.
+    The first five failed records are also printed, on standard error. `folder`: folder of the campaign, which contains
+    the results of simulated records, and to which the files are written; `data`: folder of the recordings for a plan
+    over recordings, else None.
     """
     from sealscope.campaigns.results import write_result
     from sealscope.reporting.campaign.page import PAGE, campaign_text, write_campaign_page
@@ -164,8 +168,8 @@ def _write_report(plan: AnyPlan, folder: Path, data: Path | None) -> int:
 def _load_result(plan: AnyPlan, folder: Path, data: Path | None) -> CampaignResult:
     """Judge the detectors of a campaign by its records, and return the result.
 
-    A simulated plan is judged by the results stored in `folder`, others by the recordings in the folder `data`.
-    Raises InputError if the recordings are needed and `data` is None or no folder.
+    A simulated plan is judged by the results stored in `folder`, any other plan by the recordings in `data`. Raises
+    InputError if the recordings are needed but `data` is None or not a folder.
     """
     from sealscope.campaigns.plans.model import SimulatedPlan
     from sealscope.campaigns.results import judge_recorded_campaign, judge_simulated_campaign

@@ -13,7 +13,7 @@ from typer import Argument, Option, Typer, echo
 from sealscope.cli.options import check_folder, write_text
 from sealscope.errors import InputError
 
-#: Words after `monitor` that are commands or options, and no file of settings.
+#: Words after `monitor` that are commands or options; any other word is a file of settings.
 COMMANDS = ("init", "run", "demo", "export", "dashboard", "-h", "--help")
 
 monitor = Typer(
@@ -103,14 +103,16 @@ def dashboard(file: FileOption = Path("grafana.json")) -> None:
 
 
 def _serve(file: Path, *, once: bool = False) -> None:
-    """Run the monitor with a file of settings until it has finished, or receives SIGTERM or SIGINT.
+    """Run the monitor with a file of settings until this process receives SIGTERM or SIGINT.
 
-    `once`: finish when standard input and folders contain nothing new.
+    Without a page it also ends when all its sources of samples have ended. `once`: sources end when standard input and
+    folders contain nothing new. The address of the page, if the monitor has one, is printed on standard error.
     """
     from sealscope.monitor.service import Service
     from sealscope.monitor.settings import read_settings
 
-    settings, sources = read_settings(file), []
+    settings = read_settings(file)
+    sources = []
     if any(actuator.simulate is not None for actuator in settings.actuator):
         from sealscope.live_simulation import make_simulated_sources
 

@@ -40,10 +40,7 @@ _log = logging.getLogger(__name__)
 
 
 def make_completion(names: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
-    """Build a function for the shell that completes a partly typed name.
-
-    `names`: function that returns all names.
-    """
+    """Build the function by which the shell completes a partly typed name; `names`: function that returns all names."""
 
     def complete(incomplete: str) -> list[str]:
         """List the names that begin with the typed text; typer requires the name `incomplete`."""
@@ -68,17 +65,18 @@ def _override_names() -> list[str]:
 
     names = declared_names()
     symbols = [name.rpartition(".")[2] for name in names]
-    return [f"{name}=" for name in (*names, *(symbol for symbol in symbols if symbols.count(symbol) == 1))]
+    unique_symbols = [symbol for symbol in symbols if symbols.count(symbol) == 1]
+    return [f"{name}=" for name in (*names, *unique_symbols)]
 
 
 complete_rigs = make_completion(_rig_names)
 
 
 def declared_option(name: str, *, option: str = "", several: bool = False, **settings: Any) -> Any:
-    """Build the command-line option for an argument of `Experiment.of`, with the help text that is declared there.
+    """Build the command-line option for an argument of `Experiment.of`, with the help text declared in `Arguments`.
 
-    `name`: the argument; `option`: the flag, by default made from the name; `several`: the option may be repeated;
-    `settings`: further arguments of `typer.Option`.
+    `name`: name of the argument; `option`: the flag, by default made from the name; `several`: the option may be
+    repeated; `settings`: further arguments of `typer.Option`.
     """
     text = _argument_text(name) + (" Repeat for several." if several else "")
     return Option(option or f"--{name.replace('_', '-')}", help=text, **settings)
@@ -143,10 +141,13 @@ SheetOption = Annotated[Path | None, Option("--sheet", help=_SHEET)]
 class StatedMachine:
     """The machine that the options of a call describe, and the way to read its files.
 
-    `commissioned`: the machine of the option `--machine`, which determines everything else; None without this option.
-    `channel_map`, `rate`: choice of columns and sampling rate [Hz] for reading files. `rig`: what is known or assumed
-    of the machine; `limit`: leak from which the machine must be repaired, as text such as "5 mL/min"; `baseline`:
-    leak-free recordings. What is not given is None, {} or ().
+    - `commissioned`: the machine of the option `--machine`, which determines everything else.
+    - `channel_map`, `rate`: columns of the channels and sampling rate [Hz] for reading files.
+    - `rig`: known or assumed parameters of the machine.
+    - `limit`: leak from which the machine must be repaired, as text such as "5 mL/min".
+    - `baseline`: leak-free recordings of the machine.
+
+    Without its option, an attribute is None or empty.
     """
 
     commissioned: CommissionedMachine | None = None
@@ -197,22 +198,19 @@ class StatedMachine:
 
     @property
     def _rig_map(self) -> ChannelMap:
-        """Channel map in the rig's file, which states the column of each channel.
-
-        It is empty if there is none, or if `--map` replaces it.
-        """
+        """Channel map in the rig's file, which states the columns of channels; empty if `--map` replaces it."""
         return {} if self.rig is None or self.channel_map else self.rig.channel_map
 
     @property
     def has_map(self) -> bool:
-        """True if the options of the call, or the file of its rig, state the columns of channels (a channel map)."""
+        """True if the options of the call, or the file of the rig, state the columns of channels (a channel map)."""
         return bool(self.channel_map or self._rig_map)
 
     def read(self, file: Path) -> Recording:
         """Read the recording in a file, or on standard input for the file `-`.
 
-        The channel map of the rig is applied only to files that have its columns. Raises UnreadableFile for a folder
-        or an unreadable file.
+        A commissioned machine reads it in its own way. Otherwise the rig's channel map is applied only to files that
+        have its columns. Raises UnreadableFile for a folder or an unreadable file.
         """
         if self.commissioned is not None:
             return self.commissioned.read(file)
@@ -231,7 +229,7 @@ class StatedMachine:
                 raise UnreadableFile(str(error).replace(str(path), path.name)) from error
 
     def _read(self, file: Path) -> Recording:
-        """Read the recording in a file with the channel map of the call, or else of the rig's file.
+        """Read the recording in a file by the channel map of the call or, if it has none, of the rig's file.
 
         The rig's map is applied only to files that have its columns.
         """
@@ -256,14 +254,15 @@ class StatedMachine:
         from sealscope.recordings import join
 
         parts = [recording for _, recording in recordings if recording is not None]
-        yield files[0], join(parts, names=[file.name for file in files]) if len(parts) == len(files) else None
+        is_complete = len(parts) == len(files)
+        yield files[0], join(parts, names=[file.name for file in files]) if is_complete else None
 
     def diagnose(self, recording: Recording, baseline: Sequence[Recording], file: Path, **settings: Any) -> Diagnosis:
         """Diagnose a recording of this machine.
 
-        `baseline`: healthy recordings, or empty; a commissioned machine has its own instead. `file`: name of the
-        recording in the diagnosis; `settings`: further arguments of `sealscope.diagnose`, or of the commissioned
-        machine's `diagnose`.
+        `baseline`: healthy recordings, may be empty; not used with a commissioned machine, which has learned its own.
+        `file`: name of the recording in the diagnosis; `settings`: further arguments of `sealscope.diagnose`, or of the
+        commissioned machine's `diagnose`.
         """
         from dataclasses import replace
 
@@ -276,7 +275,7 @@ class StatedMachine:
 
 
 def with_machine_options(*names: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Build a decorator for a command, which replaces its parameter `stated` by options that describe a machine.
+    """Build a decorator that replaces the parameter `stated` of a command by options that describe a machine.
 
     `names`: parameters of `StatedMachine.of` that become options; by default all of them.
     """
@@ -299,7 +298,7 @@ def with_experiment_options(command: Callable[..., None]) -> Callable[..., None]
     }
     options = []
     for argument in fields(Arguments):
-        if argument.name == "drifts":  # has no textual form
+        if argument.name == "drifts":
             continue
         default = f"{argument.default:g}" if isinstance(argument.default, float) else argument.default
         kind = str | None if default is None else type(default)
@@ -322,9 +321,9 @@ def _build_experiment(rig: str, set: Sequence[str] | None, **arguments: Any) -> 
 def _replace_parameter(
     name: str, make: Callable[..., Any], options: Sequence[Parameter]
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Build a decorator for a command, which replaces its parameter `name` by `options`.
+    """Build a decorator that replaces the parameter `name` of a command by `options`.
 
-    `make`: function that builds the value of the parameter from the values of the options.
+    `make`: function that builds the parameter's value from the values of the options.
     """
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
@@ -382,11 +381,11 @@ def load_rig_with(name: str, overrides: Sequence[str] | None) -> Rig:
 
 
 def parse_channel_map(options: Sequence[str] | None) -> ChannelMap:
-    """Parse the `--map` options to a channel map, which states the column of each channel.
+    """Parse the `--map` options to a channel map, which states the columns of channels.
 
-    An option is `CHANNEL=COLUMN`, such as `p_A=PG_1` or `p_A=PG_1[psi]`, or the word `auto`. With `auto` the remaining
-    channels are found by the names of the columns; if it is the only option, the result is "auto". Without options the
-    map is empty. Raises InputError for an option of another form, an unknown channel, or a channel that is given twice.
+    An option is `CHANNEL=COLUMN`, such as `p_A=PG_1` or `p_A=PG_1[psi]`, or the word `auto`, by which the remaining
+    channels are found by the names of the columns. If all options are `auto`, the result is "auto"; without options it
+    is empty. Raises InputError for an option of another form, an unknown channel, or a channel that is given twice.
     """
     from sealscope.recordings import split_map_option
     from sealscope.recordings.formats.columns import REST
@@ -413,7 +412,7 @@ def say(text: str) -> None:
 def say_wrapped(text: str, head: str = "") -> None:
     """Print a paragraph on standard output, `head` and the text, wrapped at 80 columns.
 
-    Lines after the first are indented by the length of `head`, or by 2 without it.
+    Lines after the first are indented by the length of `head`, or by 2 if it is empty.
     """
     say(paragraph(text, head, len(head) or 2))
 
@@ -426,7 +425,7 @@ def complain(message: object) -> None:
 def attempt(file: Path, work: Callable[[], T]) -> T | None:
     """Return the result of `work`, or print a message on standard error and return None if it fails.
 
-    The command can then go on with other files. `file`: the file on which it works, for the message.
+    The command can then go on with other files. `file`: the file that `work` reads or writes, for the message.
     """
     try:
         return work()
@@ -461,9 +460,9 @@ def write_text(file: Path, text: str) -> None:
 
 
 def say_jobs(jobs: int | None) -> None:
-    """Warn on standard error if fewer processes will be started than `--jobs` asks for.
+    """Warn on standard error if fewer processes will be started than the option `--jobs` requests.
 
-    `jobs`: number of that option, None if it is not given.
+    `jobs`: value of the option, None if it is not given.
     """
     from sealscope.campaigns.execution.workers import process_count
 
@@ -475,8 +474,8 @@ def say_jobs(jobs: int | None) -> None:
 def progress(noun: str = "") -> Iterator[Callable[[str, float], None]]:
     """Show progress bars on standard error within the `with` block; yield a function of (task, fraction done).
 
-    Each task has a bar of its own, unless `noun` is given: the name of the things that a single bar counts. If
-    standard error is no terminal, a line is printed once a minute if `noun` is given, and else nothing.
+    Each task has its own bar, unless `noun` is given: all tasks then share one bar, which counts things with this name.
+    If standard error is not a terminal, there are no bars; with a `noun` a line is printed once a minute instead.
     """
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -503,7 +502,7 @@ def progress(noun: str = "") -> Iterator[Callable[[str, float], None]]:
 
 
 def _minute_reporter() -> Callable[[str, float], None]:
-    """Build a function of (task, fraction done) that prints the task and the time left once a minute."""
+    """Build a function of (task, fraction done) that prints the task and the time left, at most once a minute."""
     start = last_print = time.monotonic()
     start_fraction: float | None = None
 
@@ -531,9 +530,13 @@ def counted_progress(noun: str) -> Iterator[Callable[[int, int, str], None]]:
     `noun`: name of the things, in the plural; `note`: further text to show, "" for none.
     """
     with progress(noun) as show:
-        yield lambda done, total, note: show(
-            f"{done} of {total} {noun}{', ' if note else ''}{note}", done / max(total, 1)
-        )
+
+        def update(done: int, total: int, note: str) -> None:
+            """Show that `done` of `total` things are done."""
+            suffix = f", {note}" if note else ""
+            show(f"{done} of {total} {noun}{suffix}", done / max(total, 1))
+
+        yield update
 
 
 def format_duration(seconds: float) -> str:

@@ -68,19 +68,26 @@ def diagnose(
     from sealscope.diagnosis.diagnose import check_probability
 
     check_probability(false_alarm)
-    form = "jsonl" if output == "jsonl" else "line" if quiet else "whole" if opt.is_verbose(context) else "short"
+    if output == "jsonl":
+        form = "jsonl"
+    elif quiet:
+        form = "line"
+    else:
+        form = "whole" if opt.is_verbose(context) else "short"
     if stated.commissioned is not None and any(path.is_dir() for path in files):
         from sealscope.diagnosis.commissioned.machine import recordings_in
 
         files = recordings_in(files)
-        form = form if form == "jsonl" else "table"
+        if form != "jsonl":
+            form = "table"
     work = partial(_iter_dated_diagnoses, machine=stated, joined=join, false_alarm_probability=false_alarm)
     is_piped = _reads_standard_input([*files, *stated.baseline])
     # a baseline is read once per process, and only this process has standard input
     is_serial = join or is_piped or stated.baseline or stated.commissioned or len(files) < _MIN_PARALLEL_FILES
     results: Iterable[tuple[str, Iterable[DatedDiagnosis | None]]]
     results = [("", work(files))] if is_serial else _diagnose_in_parallel(work, files)
-    is_complete, is_failure = True, False
+    is_complete = True
+    is_failure = False  # True if `--fail-on` applies to a diagnosis
     starts: list[float | None] = []
     for messages, dated_diagnoses in results:
         echo(messages, err=True, nl=False)
@@ -104,8 +111,8 @@ def _diagnose_in_parallel(
     """Diagnose files in parallel processes, and yield the results in the order of the files.
 
     `work`: function that yields the dated diagnoses of some files, with None for an unreadable file. Each result is a
-    pair: messages for standard error, and the dated diagnoses of one file. On a single core all files are diagnosed
-    in this process, and one pair is yielded for all.
+    pair of the messages for standard error and the dated diagnoses of one file; if the process died, these are one
+    None. On a single core this process diagnoses all files, and yields one pair for all of them.
     """
     from sealscope.campaigns.execution.workers import cores, iter_results_in_order
 
@@ -122,8 +129,9 @@ def _diagnose_in_parallel(
 def _format_diagnosis(diagnosis: Diagnosis, form: str, start_s: float | None) -> str:
     """Format a diagnosis for printing.
 
-    `form`: "jsonl", a JSON object; "short", a short text; "whole", a text with all methods; "line", the first line of
-    the short text; or "table", a line with the start of the recording, `start_s` [s since 1970], None if unknown.
+    `form`: "jsonl" for a JSON object, "short" for a short text, "line" for the first line of the short text, "whole"
+    for a text with all methods, or "table" for a line with the start of the recording. `start_s` [s since 1970]: this
+    start, None if unknown.
     """
     from sealscope.reporting.messages import diagnosis_text, short_text, table_line
 
@@ -136,9 +144,9 @@ def _format_diagnosis(diagnosis: Diagnosis, form: str, start_s: float | None) ->
 
 
 def _matches_fail_on(reason: str, diagnosis: Diagnosis) -> bool:
-    """Return True if a word of `--fail-on` applies to a diagnosis.
+    """Return True if a value of `--fail-on` applies to a diagnosis.
 
-    `reason`: the word, either a verdict or a level of severity, which the leak must reach or exceed.
+    `reason`: the value, either a verdict or a level of severity (`_LEVELS`), which the leak must reach or exceed.
     """
     level = None if diagnosis.severity is None else diagnosis.severity.level
     return reason == diagnosis.verdict or (reason in _LEVELS and level in _LEVELS[_LEVELS.index(reason) :])
@@ -168,16 +176,16 @@ def _reads_standard_input(files: Iterable[Path]) -> bool:
 def _iter_diagnoses(
     files: Sequence[Path], machine: opt.StatedMachine, *, joined: bool, **settings: Any
 ) -> Iterator[DiagnosedRecording | None]:
-    """Yield each recording with its diagnosis, or None for an unreadable file or baseline.
+    """Yield each recording with its diagnosis, or None if the file cannot be read or diagnosed.
 
-    `machine`: the machine that the options describe, with its baseline, i.e. leak-free recordings for comparison. A
-    file never serves as its own baseline. `joined`: the files are parts of a single recording; `settings`: further
-    arguments of `sealscope.diagnose`. Raises InputError if the baseline of a file is only the file itself, and
-    UnreadableFile if no baseline can be read.
+    If a baseline, i.e. a leak-free recording for comparison, cannot be read, one None is yielded first. `machine`: the
+    machine that the options describe, with its baselines. A file never serves as its own baseline. `joined`: the files
+    are parts of a single recording; `settings`: further arguments of `sealscope.diagnose`. Raises InputError if the
+    only baseline of a file is the file itself, and UnreadableFile if no baseline can be read.
     """
     baseline = machine.baseline
-    for file in files if baseline else ():
-        if all(path.resolve() == file.resolve() for path in baseline):
+    for file in files:
+        if baseline and all(path.resolve() == file.resolve() for path in baseline):
             raise InputError(f"a baseline must be another recording than the file itself, got {file}")
     readable = [(file, recording) for file, recording in machine.read_all(baseline) if recording is not None]
     if len(readable) < len(baseline):
@@ -197,9 +205,9 @@ def _iter_diagnoses(
 
 
 def _iter_dated_diagnoses(files: Sequence[Path], **options: Any) -> Iterator[DatedDiagnosis | None]:
-    """Yield (start [s since 1970] or None, diagnosis) of each recording, or None for an unreadable file or baseline.
+    """Yield the start [s since 1970] and the diagnosis of each recording, or None where `_iter_diagnoses` yields None.
 
-    `options`: further arguments of `_iter_diagnoses`.
+    The start is None if it is unknown. `options`: further arguments of `_iter_diagnoses`.
     """
     for result in _iter_diagnoses(files, **options):
         yield None if result is None else (_start_seconds(result), result.diagnosis)
@@ -271,7 +279,8 @@ def report(
         make_folder(output)
     else:
         opt.check_folder(parse_page_path(output))
-    n_results, name = 0, None if stated.commissioned is None else stated.commissioned.name
+    name = None if stated.commissioned is None else stated.commissioned.name
+    n_results = 0
     written_pages: list[tuple[Path, Diagnosis]] = []
     for result in _iter_diagnoses(files, stated, joined=join, false_alarm_probability=false_alarm):
         n_results += 1
@@ -311,7 +320,8 @@ def _report_machine(files: Sequence[Path], machine: opt.StatedMachine, output: P
     ]
     if not entries:
         raise UnreadableFile("no recording could be read, so there is no page")
-    n_left_out, name = len(results) - len(entries), "" if machine.commissioned is None else machine.commissioned.name
+    n_left_out = len(results) - len(entries)
+    name = "" if machine.commissioned is None else machine.commissioned.name
     write_history_page(output, entries, title=name, left_out=n_left_out)
     opt.say(f"{name}: {format_count(len(entries), 'recording')} -> {output}")
     if n_left_out:
@@ -339,7 +349,8 @@ def inspect(
     map_to_save = stated.channel_map
     if save_map and (rig is None or not map_to_save):
         raise InputError("--save-map must stand with --rig and its file, and with the --map options to be saved")
-    is_complete, machine = True, stated if stated.has_map else replace(stated, channel_map="auto")
+    machine = stated if stated.has_map else replace(stated, channel_map="auto")
+    is_complete = True
     for file, recording in machine.read_all(files, joined=join):
         if recording is None:
             is_complete = False
@@ -397,7 +408,8 @@ def _convert_parts(source: Path, folder: Path, stated: opt.StatedMachine, every:
     for part in read_parts(source, length, map=stated.channel_map or None, rate=stated.rate):
         if not n_parts:
             folder.mkdir(exist_ok=True)
-        n_parts, n_samples = n_parts + 1, n_samples + len(part)
+        n_parts += 1
+        n_samples += len(part)
         file = folder / f"{source.stem}_{n_parts:04d}.nc"
         write(part, file)
         findings = "".join(f"; {finding.text}" for finding in inspect(part) if finding.severity != "note")

@@ -52,20 +52,21 @@ def new(
     from sealscope.parameters import load_rig
     from sealscope.parameters.new_rig import piston_areas, rig_text, valve_rig_text
 
-    for option, value, needed in (
+    for option, value, required_kind in (
         ("--displacement", displacement, "pump"), ("--valve", valve, "valve"), ("--drop", drop, "valve"),
         ("--supply", supply, "valve"),
     ):  # fmt: skip
-        if value is not None and kind != needed:
-            raise InputError(f"{option} must stand with --kind {needed}, got --kind {kind}")
+        if value is not None and kind != required_kind:
+            raise InputError(f"{option} must stand with --kind {required_kind}, got --kind {kind}")
     if bore is not None:
-        diameters = _parse_size(bore, "m", _MM, "--bore"), _parse_size(rod or "0", "m", _MM, "--rod")
-        areas = piston_areas(*diameters, double_rod=double_rod)
+        bore_m = _parse_size(bore, "m", _MM, "--bore")
+        rod_m = _parse_size(rod or "0", "m", _MM, "--rod")
+        areas = piston_areas(bore_m, rod_m, double_rod=double_rod)
     else:
-        sides = (area_A, "Piston area on side A", "--area-A"), (area_B, "... on side B", "--area-B")
-        areas = tuple(  # type: ignore[assignment]
-            _parse_size(text or _ask_size(label, _MM2), "m^2", _MM2, option) for text, label, option in sides
-        )
+        text_A = area_A or _ask_size("Piston area on side A", _MM2)
+        m2_A = _parse_size(text_A, "m^2", _MM2, "--area-A")
+        text_B = area_B or _ask_size("... on side B", _MM2)
+        areas = m2_A, _parse_size(text_B, "m^2", _MM2, "--area-B")
     length = _parse_size(stroke or _ask_size("Stroke", _MM), "m", _MM, "--stroke")
     if kind == "pump":
         volume = displacement or _ask_size("Displacement of the pump", _CM3)
@@ -95,14 +96,14 @@ def _ask_size(label: str, unit: str) -> str:
 
 
 def _parse_size(text: str, si_unit: str, default_unit: str, option: str) -> float:
-    """Parse the text of an option to a number in `si_unit`; without a unit it is in `default_unit`.
+    """Parse the text of an option to a number in `si_unit`; a text without a unit is in `default_unit`.
 
     `option`: name of the option for the error message. Raises InputError if the text does not begin with a finite
     number, or if its unit is unknown or has another dimension than `si_unit`.
     """
     from sealscope.units import parse_quantity
 
-    with suppress(ValueError):  # a text with a unit is no number
+    with suppress(ValueError):  # a text with a unit, which `float` refuses, stays unchanged
         text = f"{float(text)}[{default_unit}]"
     return parse_quantity(text, si_unit, name=option)
 

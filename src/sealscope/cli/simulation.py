@@ -50,7 +50,8 @@ def simulate(
     with opt.progress() as report:
         if fmu is None:
             run = simulate_experiment(experiment, report, prove=prove)
-            recording, (source, *lines) = run.recording, run.lines()
+            recording = run.recording
+            source, *lines = run.lines()
         else:
             from sealscope.fmu.recording import record_fmu
 

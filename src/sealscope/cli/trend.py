@@ -55,7 +55,9 @@ def trend(
     spacing = None if every is None else parse_quantity(every, "s", name="--every")
     if output is not None:
         _check_output(output, files)
-    paths, readings, n_undated = recordings_in(files), [], 0
+    paths = recordings_in(files)
+    readings: list[LeakReading] = []
+    n_undated = 0
     name = "" if stated.commissioned is None else stated.commissioned.name
     with opt.progress() as update:
         for k, (file, recording) in enumerate(stated.read_all(paths)):
@@ -63,7 +65,8 @@ def trend(
                 name = name or find_machine_name(recording.remarks) or ""
                 reading = opt.attempt(file, partial(estimate_reading, recording, stated.rig, file.name))
                 if reading is not None and reading.start is None and spacing is None:
-                    reading, n_undated = replace(reading, start=file_seconds(recording, file)), n_undated + 1
+                    reading = replace(reading, start=file_seconds(recording, file))
+                    n_undated += 1
                 if reading is not None:
                     readings.append(reading)
             update("recordings", (k + 1) / len(paths))
@@ -92,20 +95,20 @@ def trend(
 
 
 def _count_known(readings: Sequence[LeakReading], machine: CommissionedMachine) -> int:
-    """Count the recordings before the first one, by date, that the machine's file does not list as healthy.
+    """Count the first recordings, in the order of their dates, that the machine's file lists as healthy.
 
-    Copies of a recording count once. Recordings without a date come before all others.
+    The count ends at the first recording that is not listed. Recordings without a date come before all others, and
+    copies of a recording in the folder count once.
     """
     known = {recording.digest for recording in machine.healthy}
     by_date = sorted(readings, key=lambda reading: -math.inf if reading.start is None else reading.start)
-    # a set, as a folder may have copies of a recording
     return len({reading.digest for reading in takewhile(lambda reading: reading.digest in known, by_date)})
 
 
 def _check_output(output: Path, files: Sequence[Path]) -> None:
-    """Raise InputError if a trend cannot be written to `output`, or would replace one of its recordings.
+    """Raise InputError if a trend cannot be written to `output`, or would replace one of the recordings `files`.
 
-    `files`: the recordings.
+    Temporary files are removed that earlier calls left when they were stopped while writing this file.
     """
     from sealscope.reporting.template import parse_page_path
 

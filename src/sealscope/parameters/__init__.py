@@ -31,7 +31,8 @@ _NAMES = {
 
 
 def __getattr__(name: str) -> Any:
+    """Import an exported name when it is first used, because pydantic is slow to load."""
     for module, names in _NAMES.items():
-        if name in names:  # imported late: pydantic is slow to load
+        if name in names:
             return getattr(importlib.import_module(f"sealscope.parameters.{module}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -11,11 +11,14 @@ from sealscope.errors import InputError
 class HydraulicCircuit(NamedTuple):
     """Connection of pump and cylinder chambers: one of `CIRCUITS`, chosen by a parameter of the rig (`Rig.circuit`).
 
-    Other modules read the properties below instead of comparing circuits, so that another circuit can be added.
-    `valve_controlled` chooses the laws of `physics/rig.py` and `physics/standstill.py`, the longest step of
-    `physics/solvers/limits.py` (as `valved`), and the drawing of `reporting/schematic.py`. `pump_feeds_chambers`
-    chooses the volume balance (`diagnosis/inference/terms.py`: `equations`) and the controller's model of the drive
-    (`control/drive.py`: `drive_of`). A circuit that is diagnosed and never simulated needs an entry of `CIRCUITS` only.
+    Other modules read the properties below instead of comparing circuits, so that another circuit can be added:
+
+    - `valve_controlled` chooses the laws of `physics/rig.py` and `physics/standstill.py`, the longest step of
+      `physics/solvers/limits.py` (as `valved`), and the drawing of `reporting/schematic.py`.
+    - `pump_feeds_chambers` chooses the volume balance (`diagnosis/inference/terms.py`: `equations`) and the
+      controller's model of the drive (`control/drive.py`: `drive_of`).
+
+    A circuit that is diagnosed but never simulated needs an entry in `CIRCUITS` only.
 
     Attributes
     ----------
@@ -26,13 +29,13 @@ class HydraulicCircuit(NamedTuple):
     required : mapping of str to str
         Further parameters that must have a value in a rig with this circuit.
     simulated : bool
-        There are laws for it in `physics`. A rig with any other circuit can be diagnosed, but not simulated.
+        A rig with this circuit can be simulated, by laws in `physics`; otherwise it can only be diagnosed.
     valve_controlled : bool
         A servo valve on a supply of constant pressure meters the flow into each chamber; else the pump's speed does.
     pump_feeds_chambers : bool
         The pump delivers into chamber A and draws from B, or the reverse. One balance of volumes then holds for both
-        chambers; in it the pump's leakage cannot be told from that past the piston. If the piston areas are equal, the
-        balance does not need the piston's position.
+        chambers, but it cannot tell leakage of the pump from leakage past the piston. If the piston areas are equal,
+        the balance does not need the piston's position.
     pump_is_measured : bool
         An encoder on the pump's motor records its angle and speed.
     holds_load : bool
@@ -102,15 +105,16 @@ VALVE_CIRCUIT = HydraulicCircuit(
     watched_by=(("p_A", "p_B", "p_1", "p_2", "u", "x"),),
     needed_channels="x, u, p_A, p_B (for leaks in holds), and p_1, p_2 of supply and return for motion",
 )
-#: All circuits. A rig has the first one whose choice it meets, so that one with a choice of its own stands first.
+#: All circuits. A rig has the first circuit whose `parameter` has its `value` in the rig. As these two circuits cover
+#: all values of their parameter, a circuit that another parameter chooses must stand before them.
 CIRCUITS = (PUMP_CIRCUIT, VALVE_CIRCUIT)
 
 
 def check_circuit_property(subject: str, rig: str, circuit: HydraulicCircuit, flag: str) -> None:
-    """Check that the bool attribute `flag` of a rig's circuit is True, such as "pump_is_measured".
+    """Check that a rig's circuit has a property, the bool attribute named `flag`, such as "pump_is_measured".
 
-    Raises InputError otherwise. For its message, `subject` names what needs the property, such as "a unit", and `rig`
-    is the name of the rig.
+    Raises InputError otherwise. For the message, `subject` names what needs the property, such as "a simulation", and
+    `rig` is the name of the rig.
     """
     if not getattr(circuit, flag):
         suitable = " or ".join(str(candidate) for candidate in CIRCUITS if getattr(candidate, flag))

@@ -36,13 +36,13 @@ def choice(name: str, *, absent: str | None = None) -> Any:
 
 
 def unit_of(field: FieldInfo) -> str:
-    """Return the SI unit of a declared parameter: "1" if it has no unit, "" if it is a choice and no number."""
+    """Return the SI unit of a declared parameter: "1" for a number without unit, "" for a choice."""
     extra = field.json_schema_extra
     return str(extra["unit"]) if isinstance(extra, dict) else ""
 
 
 def absent_of(field: FieldInfo) -> float | str | None:
-    """Return the value of a parameter for a rig whose file does not state it; None if every rig must state it.
+    """Return the value that a parameter has in a rig whose file does not state it; None if every rig must state it.
 
     With this value the part or effect that the parameter describes is absent from the model.
     """
@@ -62,9 +62,10 @@ def with_unit(number: float, unit: str) -> str:
 
 
 def format_broken_rule(error: ValidationError, model: type[BaseModel]) -> str:
-    """Format the first of pydantic's errors on `model` as "SYMBOL must be ..., got ...".
+    """Format one of pydantic's errors on `model` as a line such as "SYMBOL must be ..., got ...".
 
-    The parameter's unit follows a bound.
+    It is the first error, or the error of an unknown name if there is one (`format_error`). If the broken rule is a
+    bound, the parameter's unit follows it.
     """
     first = error.errors(include_url=False)[0]
     symbol = ".".join(map(str, first["loc"]))
@@ -86,7 +87,10 @@ class Part(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
     def __init__(self, **values: Any) -> None:
-        """Make the group of parameters from their values by name; raise InputError for the first broken rule."""
+        """Make the group of parameters from their values by name.
+
+        Raises InputError for the first broken rule, PartsDisagreeError if this rule relates several parameters.
+        """
         try:
             super().__init__(**values)
         except ValidationError as error:
@@ -104,10 +108,9 @@ class Part(BaseModel):
 
 
 def iter_fields(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, FieldInfo]]:
-    """Yield the dotted name and the declaration of every parameter of a model, in order.
+    """Yield the dotted name and the declaration of each parameter of a rig or of a group of parameters, in order.
 
-    `model`: a rig or a group of its parameters, whose groups are searched, too; `prefix`: beginning of the dotted
-    names.
+    `model`: class of the rig or group; groups within it are searched, too. `prefix`: beginning of the dotted names.
     """
     for symbol, field in model.model_fields.items():
         annotation = field.annotation

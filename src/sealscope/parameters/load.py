@@ -128,7 +128,7 @@ def save_channel_map(path: str | os.PathLike[str], columns: Mapping[str, str]) -
     load_rig(file)
     lines = file.read_text(encoding="utf-8-sig").splitlines()
     map_lines = [number for number, line in enumerate(lines) if line.strip() == _MAP]
-    if map_lines:
+    if map_lines:  # delete the table up to the heading of the next one
         start = map_lines[0]
         end = next((k for k in range(start + 1, len(lines)) if lines[k].lstrip().startswith("[")), len(lines))
         del lines[start:end]
@@ -155,9 +155,10 @@ class _RigFile(NamedTuple):
 def _read_layers(path: Path, place: str, visited: tuple[Path, ...]) -> _RigFile:
     """Read a rig's file together with the files that it extends.
 
-    Its parameters replace those of the extended files. Its table `[map]`, if it has one, replaces theirs as a
-    whole. `place`: name of the file in messages; `visited`: the files that extend this one, to detect circles.
-    Raises InputError for a wrong table or key, a circle, or more than `_MAX_LAYERS` files.
+    Parameters of the file replace those of the files that it extends. So does its table `[map]` as a whole, if it has
+    one. Tables of a commissioned machine's file that do not describe a rig (`MACHINE_TABLES`) are left out. `place`:
+    name of the file in messages; `visited`: the files that extend this one, to detect circles. Raises InputError for a
+    wrong table or key, a circle, or more than `_MAX_LAYERS` files.
     """
     file = path.resolve()
     if file in visited or len(visited) >= _MAX_LAYERS:

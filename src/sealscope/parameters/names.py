@@ -19,9 +19,10 @@ _OTHER_NAMES = {
 
 
 def resolve_name(name: str, dotted: Sequence[str]) -> str:
-    """Find the dotted name of a parameter from a dotted name or a unique ending of it, such as `V_1` or `p_A.noise`.
+    """Find the dotted name of a parameter by this name or by its end, such as `V_1` or `p_A.noise`, if that is unique.
 
     `dotted`: the dotted names of all parameters. Raises InputError if no parameter has the name, or if several have.
+    The error for a name that is usual in other programs (`_OTHER_NAMES`) suggests the parameter.
     """
     if name in dotted:
         return name
@@ -34,10 +35,8 @@ def resolve_name(name: str, dotted: Sequence[str]) -> str:
     synonym = _OTHER_NAMES.get(name.casefold().replace("_", "").replace(" ", ""))
     if synonym in dotted:
         raise InputError(f"{name!r} is not a parameter; did you mean {synonym}?")
-    bare = [full_name.rpartition(".")[2] for full_name in dotted]
-    raise InputError(
-        f"{name!r} is not a parameter{suggestion(name, dotted if '.' in name else [*dict.fromkeys(bare)])}"
-    )
+    symbols = dict.fromkeys(full_name.rpartition(".")[2] for full_name in dotted)
+    raise InputError(f"{name!r} is not a parameter{suggestion(name, dotted if '.' in name else symbols)}")
 
 
 def parse_override(text: str) -> tuple[str, str]:

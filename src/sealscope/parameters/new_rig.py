@@ -13,9 +13,12 @@ from sealscope.units import BAR, LITRE_PER_MINUTE
 
 #: Dead volume of each side, divided by the larger swept volume.
 _DEAD_VOLUME_RATIO = 0.25
-#: Speed of a supply's pump [rev/s]; pressure [Pa] above its setting at which the relief valve passes the pump's whole
-#: flow; precharge of the accumulator, divided by that setting.
-_SUPPLY_SPEED, _RELIEF_RANGE, _PRECHARGE_RATIO = 25.0, 2.5e5, 0.7
+#: Speed of a supply's pump [rev/s].
+_SUPPLY_SPEED = 25.0
+#: Pressure [Pa] above the setting of a supply's relief valve at which the valve passes the pump's whole flow.
+_RELIEF_RANGE = 2.5e5
+#: Precharge pressure of a supply's accumulator, divided by the setting of the relief valve.
+_PRECHARGE_RATIO = 0.7
 _STATED = "stated when this file was written: replace by drawing or data sheet"
 
 
@@ -34,9 +37,8 @@ def piston_areas(bore: float, rod: float, *, double_rod: bool = False) -> tuple[
 def rig_text(name: str, area_A: float, area_B: float, stroke: float, displacement: float) -> str:
     """Format a new rig's TOML file, with comments, for a cylinder that is controlled by its pump.
 
-    All other parameters are taken from the rig `thesis` (equal areas) or `single-rod-eha`. Some are scaled to the
-    machine's size: friction coefficients with the bore or the area, the moving mass and the check valves with the
-    volume.
+    All other parameters are taken from the rig `thesis` if the areas are equal, else from `single-rod-eha`. Some of
+    them are scaled to the machine's size, such as friction with the bore or area, and the moving mass with the volume.
 
     Parameters
     ----------
@@ -109,7 +111,7 @@ def valve_rig_text(
     _check_arguments(name, sizes)
     assumed = f"assumed: that of {base.name}"
     usual_drop = "assumed: usual of servo valves; proportional valves are rated at 5 bar"
-    # the motor is scaled like several equal ones on one shaft, connected in parallel
+    # the motor is scaled as if `n_motors` motors of the base rig were on one shaft, connected in parallel
     n_motors = rated_flow / _SUPPLY_SPEED * setting / (base.pump.q_b * base.supply.p_set)
     motor = {key: f"{base[f'motor.{key}'] * n_motors:.4g}" for key in ("i_max", "J_M", "B_M")}  # type: ignore[operator]
     motor |= {key: f"{base[f'motor.{key}'] / n_motors:.4g}" for key in ("R_c", "L_c")}  # type: ignore[operator]
@@ -130,9 +132,9 @@ def valve_rig_text(
 
 
 def _check_arguments(name: str, sizes: dict[str, float]) -> None:
-    """Check that the rig's name is valid, and that its sizes are finite and > 0.
+    """Check that the name of a new rig is valid, and that its sizes are finite and > 0; raise InputError otherwise.
 
-    `sizes`: mapping from the name of an argument to its value. Raises InputError otherwise.
+    `sizes`: mapping from the name of an argument, such as "stroke", to its value.
     """
     for argument, value in sizes.items():
         if not (math.isfinite(value) and value > 0):
@@ -142,15 +144,15 @@ def _check_arguments(name: str, sizes: dict[str, float]) -> None:
 
 
 def _read_template(file: str) -> Template:
-    """Read a template of a rig's file, which is the file named `file` beside this module."""
+    """Read the template of a rig's file from the file named `file` in the folder of this module."""
     return Template(Path(__file__).with_name(file).read_text(encoding="utf-8"))
 
 
 def _volume_ratio(base: Rig, area_A: float, area_B: float, stroke: float) -> float:
-    """Compute the ratio of a new cylinder's chamber volume to that of the rig `base`.
+    """Compute a new cylinder's chamber volume, divided by the chamber volume V of the rig `base`.
 
-    The volume is that of the larger side at mid-stroke, including an assumed dead volume. `area_A`, `area_B` [m^2]:
-    piston areas of the new cylinder; `stroke` [m]: its stroke.
+    The volumes are those of the larger side at mid-stroke; the new one contains an assumed dead volume. `area_A`,
+    `area_B` [m^2]: piston areas of the new cylinder; `stroke` [m]: its stroke.
     """
     return (0.5 + _DEAD_VOLUME_RATIO) * max(area_A, area_B) * stroke / base.cylinder.V
 
@@ -163,8 +165,9 @@ def _cylinder_parameters(base: Rig, area_A: float, area_B: float, stroke: float)
     """
     volume_ratio = _volume_ratio(base, area_A, area_B, stroke)
     bore_ratio = math.sqrt(max(area_A, area_B) / max(base.cylinder.A_A, base.cylinder.A_B))
-    mass, friction = base.cylinder.M_eq * volume_ratio, base.friction
-    # V is the larger side's volume and V_rod what the rod takes from side B; a rod on side A takes nothing from it
+    mass = base.cylinder.M_eq * volume_ratio
+    friction = base.friction
+    # V is the volume of the larger side, and V_rod the volume that a rod on side B takes from that side
     V_rod = max(0.5 * (area_A - area_B) * stroke, 0.0)
     return {
         "kind": "Double" if area_A == area_B else "Single",

@@ -45,9 +45,9 @@ class ParameterEntry(NamedTuple):
 
 
 class ParameterRow(NamedTuple):
-    """A row of the table of parameters.
+    """A row of the table of a rig's parameters.
 
-    `value` is in the SI unit `unit`; `given` is value and unit as the rig's file states them.
+    `value` is in the SI unit `unit`; `given`: value and unit as text, as the rig's file or an override states them.
     """
 
     symbol: str
@@ -132,7 +132,8 @@ class Rig(Part):
         V, V_rod = cylinder.V, cylinder.V_rod
         if V_rod >= V:
             raise ValueError(f"cylinder.V_rod must be < V = {with_unit(V, 'm^3')}, got {with_unit(V_rod, 'm^3')}")
-        for symbol, volume in (("A_A", V), ("A_B", V - V_rod)) if cylinder.volumes == "position" else ():
+        sides = (("A_A", V), ("A_B", V - V_rod)) if cylinder.volumes == "position" else ()
+        for symbol, volume in sides:
             swept = getattr(cylinder, symbol) * cylinder.L / 2.0
             if swept >= volume:
                 rule = f'must be > {symbol} L/2 = {with_unit(swept, "m^3")} when volumes = "position"'
@@ -166,7 +167,8 @@ class Rig(Part):
         """
         supply, circuit = self.supply, self.circuit
         for name, required in circuit.required.items():
-            if (value := attrgetter(name)(self)) != required:
+            value = attrgetter(name)(self)
+            if value != required:
                 raise ValueError(f"a rig that is {circuit} must have {name} = {required}, got {value}")
         if supply.drive == "absent":
             return
@@ -183,8 +185,8 @@ class Rig(Part):
     def _check_lines(self) -> None:
         """Check the shut-off valves and filters of the lines, and the viscosities of the oil.
 
-        Valves and filters require lines, and oil must be thinner at 100 than at 40 deg C. Raises ValueError
-        otherwise.
+        Shut-off valves and filters require lines, clogging and bypass valves require a filter, and the oil must be
+        thinner at 100 than at 40 deg C. Raises ValueError otherwise.
         """
         line, oil = self.line, self.fluid
         for name, absent in (("open_A", 1.0), ("open_B", 1.0), ("R_A", 0.0), ("R_B", 0.0)):
@@ -233,7 +235,7 @@ class Rig(Part):
 
     @property
     def circuit(self) -> HydraulicCircuit:
-        """Hydraulic circuit of the rig, which one of its parameters chooses."""
+        """Hydraulic circuit of the rig: the first of `CIRCUITS` that a parameter of the rig chooses by its value."""
         return next(circuit for circuit in CIRCUITS if attrgetter(circuit.parameter)(self) == circuit.value)
 
     @property
@@ -265,9 +267,9 @@ class Rig(Part):
         return self._stated_entries()[resolve_name(name, declared_names())]
 
     def states(self, *names: str) -> bool:
-        """Return True if all the named parameters are stated for this machine, and none of them is assumed.
+        """Return True if all the named parameters are stated for this machine; False if a value is assumed.
 
-        A value is assumed if its source begins with `assumed:`.
+        The source of an assumed value begins with `assumed:`.
         """
         return not any(self.entry(name).source.startswith(ASSUMED) for name in names)
 
@@ -289,9 +291,10 @@ class Rig(Part):
     def with_overrides(self, overrides: Mapping[str, Value], *, source: str = "set by caller") -> Rig:
         """Return another rig with some values replaced, each of them with the source `source`.
 
-        `overrides`: name -> value. The name may be the bare symbol if that is unique (`V_1`), else it is dotted
-        (`sensors.p_A.noise`). A number is in SI; a text states its unit (`"0.8[ohm]"`, `"50 %"`) or is the value of a
-        choice. Raises InputError for an unknown or ambiguous name, a wrong unit or a value out of range.
+        `overrides`: mapping from name to value. The name may be the bare symbol if that is unique (`V_1`), else it is
+        dotted (`sensors.p_A.noise`). A number is in SI; a text states its unit (`"0.8[ohm]"`, `"50 %"`) or is the value
+        of a choice. Raises InputError for an unknown or ambiguous name, a parameter that is named twice, a wrong unit,
+        a value out of range or a blank `source`.
         """
         if not source.strip():
             raise InputError("source must not be blank")
@@ -326,9 +329,9 @@ class Rig(Part):
             scaled_values["makeup.V_gas"] = max(scale * self.makeup.V_gas, min_gas)
         assumed = f"{ASSUMED} that of {self._name}, scaled with the area"
         stated_values = {"cylinder.A_A": A_A, "cylinder.A_B": A_B}
-        for values, value_source in ((scaled_values, assumed), (stated_values, source)):
-            for full_name, value in values.items():
-                entries[full_name] = ParameterEntry(*_parse_value(full_name, value, source), value_source, source)
+        sources = dict.fromkeys(scaled_values, assumed) | dict.fromkeys(stated_values, source)
+        for full_name, value in {**scaled_values, **stated_values}.items():
+            entries[full_name] = ParameterEntry(*_parse_value(full_name, value, source), sources[full_name], source)
         rig = Rig.from_entries(entries, name=self._name, title=self._title, place=source)
         return rig.with_channel_map(self.channel_map)
 
@@ -351,9 +354,9 @@ class Rig(Part):
     def present_values(self) -> dict[str, Value]:
         """Return the SI values of the parameters by dotted name, without those that equal their `absent` value.
 
-        The `absent` value of a parameter means that the part or effect which it describes is not in the model. The
-        result identifies a machine across versions of the package: a parameter that a later version adds is absent
-        from older rigs, and so does not change it.
+        The `absent` value of a parameter means that its part or effect is not in the model. The result identifies a
+        machine across versions of the package: it does not contain parameters that a later version has added, since
+        they have their `absent` values in older rigs.
         """
         return {name: self[name] for name, field in declared_fields().items() if self[name] != absent_of(field)}
 
@@ -385,8 +388,8 @@ class Rig(Part):
         """Build a rig from the entries of its parameters by dotted name.
 
         A parameter without an entry gets its `absent` value, with which its part or effect is absent from the
-        model. `place`: where the entries come from, for messages. Raises InputError if a parameter has neither, for
-        an unknown name, and for an invalid value.
+        model. `place`: where the entries come from, for messages. Raises InputError if a parameter has neither entry
+        nor `absent` value, for an unknown name, and for an invalid value.
         """
         entries = {**_absent_entries(place), **entries}
         names = declared_names()
@@ -411,10 +414,9 @@ def declared_fields() -> dict[str, FieldInfo]:
 
 
 def _absent_entries(place: str) -> dict[str, ParameterEntry]:
-    """Build the entries of the parameters that a rig's file may omit.
+    """Build the entries of the parameters that a rig's file may omit, with the values that they then have.
 
-    Each has the value with which its part or effect is absent from the model (`absent_of`). `place`: the file, for
-    messages.
+    With these values their parts and effects are absent from the model (`absent_of`). `place`: the file, for messages.
     """
     return {
         full_name: ParameterEntry(value, unit_of(field), "absent from the model: not stated", place)
@@ -433,14 +435,14 @@ def _build_part(model: type[P], path: str, entries: Mapping[str, ParameterEntry]
     """Build a part of a rig, such as its pump, from the entries of its parameters.
 
     `model`: class of the part; `path`: beginning of the dotted names of its parameters, such as "pump.", empty for
-    the whole rig. An InputError names the place of the wrong value, or `place` if a rule on several parameters is
-    broken.
+    the whole rig. Raises InputError for an invalid value, with the place that states it, or with `place` if a rule on
+    several parameters is broken.
     """
     values: dict[str, Any] = {}
     for symbol, field in model.model_fields.items():
-        kind = field.annotation
-        if isinstance(kind, type) and issubclass(kind, Part):
-            values[symbol] = _build_part(kind, f"{path}{symbol}.", entries, place)
+        field_type = field.annotation
+        if isinstance(field_type, type) and issubclass(field_type, Part):
+            values[symbol] = _build_part(field_type, f"{path}{symbol}.", entries, place)
         else:
             values[symbol] = _si_value(path + symbol, field, entries[path + symbol])
     try:
@@ -455,7 +457,7 @@ def _build_part(model: type[P], path: str, entries: Mapping[str, ParameterEntry]
 def _qualify_symbol(full_name: str, text: str) -> str:
     """Replace the symbol at the beginning of a message by the parameter's dotted name, unless the symbol is unique.
 
-    `full_name`: the dotted name; `text`: the message.
+    `full_name`: the dotted name; `text`: the message, which may be the symbol only.
     """
     symbol = full_name.rpartition(".")[2]
     is_unique = sum(name.rpartition(".")[2] == symbol for name in declared_names()) <= 1
@@ -464,7 +466,7 @@ def _qualify_symbol(full_name: str, text: str) -> str:
 
 @cache
 def _short_name(full_name: str) -> str:
-    """Return the symbol of a parameter if no other one has it, else its dotted name."""
+    """Return the symbol of a parameter if no other parameter has the same symbol, else its dotted name."""
     return _qualify_symbol(full_name, full_name.rpartition(".")[2])
 
 
@@ -498,12 +500,12 @@ def _si_value(full_name: str, field: FieldInfo, entry: ParameterEntry) -> Value:
 
 
 def _parse_value(full_name: str, value: Any, place: str) -> tuple[Value, str]:
-    """Parse a value that replaces that of a parameter; return it in SI, and the SI unit, "" for a choice.
+    """Parse a new value of a parameter; return the value in SI and the SI unit, or the option of a choice and "".
 
-    For a number, `value` is a number in SI or a text with a unit such as "50[cm^3]", which is converted. For a choice
-    it is an option, of which only blanks at its ends are removed. Whether the parameter allows the value is checked
-    later (`_si_value`). `full_name`: dotted name of the parameter; `place`: where the value comes from, for messages.
-    Raises InputError for a text that is no quantity of the parameter's dimension.
+    `full_name`: dotted name of the parameter; `value`: a number in SI, a text with a unit such as "50[cm^3]", or an
+    option, from which blanks at the ends are removed; `place`: where the value comes from, for messages. Raises
+    InputError for a text that is not a quantity of the parameter's dimension. Range and options are checked later
+    (`_si_value`, `Part`).
     """
     field = declared_fields()[full_name]
     if choices_of(field):
@@ -518,7 +520,7 @@ def flatten_entries(tree: Iterable[tuple[str, Any]], place: str, prefix: str = "
     """Flatten nested tables `{group: {symbol: {value, unit, source}}}` to entries by dotted name.
 
     `tree`: pairs of key and table; `place`: the file, for messages; `prefix`: beginning of the dotted names. Raises
-    InputError for an unknown name.
+    InputError for an unknown name, and for an entry that `_parse_entry` refuses.
     """
     entries: dict[str, ParameterEntry] = {}
     for key, item in tree:

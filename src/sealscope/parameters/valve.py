@@ -12,7 +12,7 @@ _OVERLAP = "overlap of the edge from {} (< 0: underlap)"
 
 
 def _overlap(edge: str) -> Any:
-    """Declare the overlap [m] of a metering edge of the valve; `edge`: "P to A", for example."""
+    """Declare the parameter for the overlap [m] of a metering edge of the valve; `edge`: its ends, such as "P to A"."""
     return quantity(_OVERLAP.format(edge), "m", absent=0, ge=-0.1, le=0.1)
 
 

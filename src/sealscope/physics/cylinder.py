@@ -50,14 +50,13 @@ def pressure_rate(inflow: float, volume: float, K_oil: float) -> float:
 def hard_stop_force(x: float, v: float, L: float, k_stop: float, d_stop: float) -> float:
     """Compute the force [N] that the end stops of the cylinder exert on the piston, positive along +x.
 
-    The stops are at x = +-L/2. Each is a stiff spring `k_stop` [N/m] with a damper `d_stop` [N s/m] that acts only
-    while the piston touches it, and never pulls. `x` [m], `v` [m/s]: position of the piston from mid-stroke, and its
-    velocity.
+    The stops are at x = +-L/2. Each is a stiff spring `k_stop` [N/m] with a damper `d_stop` [N s/m]. It acts only while
+    the piston touches it, and never pulls. `x` [m]: position of the piston from mid-stroke; `v` [m/s]: its velocity.
     """
-    cap_sign = math.copysign(1.0, x)
+    side = math.copysign(1.0, x)  # of the nearer stop: +1 at L/2, -1 at -L/2
     depth = abs(x) - 0.5 * L
-    force = max(k_stop * depth + d_stop * (cap_sign * v), 0.0)
-    return select(depth > 0.0, -cap_sign * force, 0.0)  # type: ignore[no-any-return]
+    force = max(k_stop * depth + d_stop * (side * v), 0.0)
+    return select(depth > 0.0, -side * force, 0.0)  # type: ignore[no-any-return]
 
 
 @contracted
@@ -88,8 +87,9 @@ def piston_acceleration(
 ) -> float:
     """Compute the piston's acceleration [m/s^2] from the forces on it, eq. (4.15) with end stops added.
 
-    It is (p_A A_A - p_B A_B - F_f - F_l + F_stop)/M_eq with the chamber pressures [Pa], the piston areas [m^2], the
-    moving mass `M_eq` [kg], and in N: `friction` F_f and `load` F_l, both against +x, and `stop` F_stop along +x.
+    It is (p_A A_A - p_B A_B - friction - load + stop)/M_eq. `p_A`, `p_B` [Pa]: chamber pressures; `A_A`, `A_B` [m^2]:
+    piston areas; `friction`, `load` [N]: forces against +x; `stop` [N]: force of the end stops along +x; `M_eq` [kg]:
+    moving mass.
     """
     return (p_A * A_A - p_B * A_B - friction - load + stop) / M_eq
 
@@ -98,10 +98,10 @@ def piston_acceleration(
 def opposing_force(v: float, A_opp: float, p_opp: float, C_opp: float) -> float:
     """Compute the force A_opp p [N] with which a second cylinder pushes the piston against +x.
 
-    The second cylinder is fed at `p_opp` [Pa] through an orifice of flow coefficient `C_opp` [m^3/(s Pa^0.5)]. Its
-    pressure is p = p_opp + v |v| (A_opp/C_opp)^2, but never below vacuum, with the piston's velocity `v` [m/s]: the
-    orifice law solved for the pressure. The oil in the second cylinder is taken as incompressible (Merritt, Hydraulic
-    Control Systems, 1967, section 3.4, orifice).
+    The second cylinder, of piston area `A_opp` [m^2], moves at the piston's velocity `v` [m/s]. It is fed at the
+    pressure `p_opp` [Pa] through an orifice of flow coefficient `C_opp` [m^3/(s Pa^0.5)], and its oil is taken as
+    incompressible. The orifice law, solved for the pressure in this cylinder, is p = p_opp + v |v| (A_opp/C_opp)^2,
+    here limited to at least vacuum (Merritt, Hydraulic Control Systems, 1967, section 3.4, orifice).
     """
     drop_coefficient = A_opp / C_opp
     return A_opp * max(p_opp + v * abs(v) * drop_coefficient * drop_coefficient, -P_ATM)

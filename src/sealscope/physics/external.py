@@ -23,8 +23,8 @@ def external_leakage(p: float, G_ext: float) -> float:
 def accumulator_pressure(V_up: float, p_charge: float, V_gas: float) -> float:
     """Compute the pressure [Pa gauge] of a gas accumulator that has delivered the oil volume V_up [m^3].
 
-    Its gas volume is V_gas [m^3] at `p_charge` [Pa gauge] and expands isothermally: Boyle's law, p_abs (V_gas + V_up)
-    = constant.
+    The gas has the volume `V_gas` [m^3] at `p_charge` [Pa gauge], and expands isothermally by Boyle's law,
+    p_abs (V_gas + V_up) = constant.
     """
     return (p_charge + P_ATM) * V_gas / (V_gas + V_up) - P_ATM
 
@@ -33,9 +33,10 @@ def accumulator_pressure(V_up: float, p_charge: float, V_gas: float) -> float:
 def polytropic_pressure(V_up: float, p_charge: float, V_gas: float, n_gas: float) -> float:
     """Compute the pressure [Pa gauge] of a gas accumulator whose gas changes its volume polytropically.
 
-    The accumulator has delivered the oil volume `V_up` [m^3], < 0 if it has received oil, and has the gas volume
-    `V_gas` [m^3] at `p_charge` [Pa gauge]: p_abs (V_gas + V_up)^n = constant, n = `n_gas`. n = 1 is isothermal
-    (`accumulator_pressure`), n = 1.4 is adiabatic nitrogen (Merritt, Hydraulic Control Systems, 1967, accumulators).
+    p_abs (V_gas + V_up)^n = constant, with the exponent n = `n_gas`: n = 1 is isothermal (`accumulator_pressure`),
+    n = 1.4 is adiabatic nitrogen. `V_up` [m^3]: oil that the accumulator has delivered, < 0 if it has received oil;
+    `V_gas` [m^3]: volume of the gas at `p_charge` [Pa gauge]. Source: Merritt, Hydraulic Control Systems, 1967,
+    accumulators.
     """
     return (p_charge + P_ATM) * math.pow(V_gas / (V_gas + V_up), n_gas) - P_ATM
 
@@ -55,9 +56,8 @@ def gas_volume(p: float, p_pre: float, V_acc: float, n_acc: float) -> float:
 def accumulator_compliance(p: float, p_pre: float, V_gas: float, n_acc: float) -> float:
     """Compute the compliance [m^3/Pa] of an accumulator: the oil it takes in per unit rise of the line's pressure.
 
-    It is V_gas/(n p_abs) = -dV_gas/dp, where dV_gas/dp is the slope of `gas_volume`, for the gas volume `V_gas` [m^3]
-    at the pressure `p` [Pa gauge] and the polytropic exponent n = `n_acc`. It is 0 below the precharge pressure `p_pre`
-    [Pa gauge].
+    It is V_gas/(n p_abs), minus the slope of `gas_volume`, and 0 up to the precharge pressure `p_pre` [Pa gauge].
+    `V_gas` [m^3]: volume of the gas at the pressure `p` [Pa gauge]; `n_acc`: polytropic exponent n.
     """
     return select(p > p_pre, V_gas / (n_acc * (max(p, p_pre) + P_ATM)), 0.0)  # type: ignore[no-any-return]
 
@@ -74,12 +74,14 @@ def check_valve_flow(dp: float, p_crack: float, G_check: float) -> float:
 
 @contracted
 def pilot_opening(dp: float, dp_pilot: float, p_crack: float, k_pilot: float, p_open: float) -> float:
-    """Compute the opening, 0 to 1, of a pilot-operated check valve: (dp + k_pilot dp_pilot - p_crack)/p_open.
+    """Compute the opening of a pilot-operated check valve: (dp + k_pilot dp_pilot - p_crack)/p_open, limited to 0..1.
 
-    `dp` [Pa]: pressure drop across the valve in its free direction; `dp_pilot` [Pa]: pilot pressure minus inlet
-    pressure, which counts only if it is positive; `k_pilot`: pilot ratio, the piston area of the pilot over the area of
-    the valve's seat; `p_crack` [Pa]: pressure at which the valve begins to open; `p_open` [Pa]: further pressure at
-    which it is fully open. Oil flows backwards (dp < 0) while k_pilot dp_pilot > p_crack - dp.
+    - `dp` [Pa]: pressure drop across the valve in its free direction.
+    - `dp_pilot` [Pa]: pilot pressure minus inlet pressure, which counts only if it is positive.
+    - `k_pilot`: pilot ratio, the piston area of the pilot over the area of the valve's seat.
+    - `p_crack`, `p_open` [Pa]: pressure at which the valve begins to open, and further pressure until it is fully open.
+
+    Oil flows backwards (dp < 0) while k_pilot dp_pilot > p_crack - dp.
 
     Source: the pilot-operated check valve of the Simscape Fluids library (area linear in the pressure on the poppet).
     """
@@ -92,11 +94,8 @@ def pilot_valve_flow(
 ) -> float:
     """Compute the flow [m^3/s] through a pilot-operated check valve, positive in the free direction.
 
-    It is G_check dp times the opening of the valve (`pilot_opening`), 0 while it is shut. The flow is negative while
-    the pilot holds the valve open against a negative dp. `dp` [Pa]: pressure drop in the free direction, inlet minus
-    outlet; `dp_pilot` [Pa]: pilot pressure minus inlet pressure, which counts only if it is positive; `p_crack` [Pa]:
-    pressure at which the valve begins to open; `G_check` [m^3/(s Pa)]: conductance of the fully open valve; `k_pilot`:
-    pilot ratio, area of the pilot's piston over that of the seat; `p_open` [Pa]: further pressure at which the valve is
-    fully open.
+    It is G_check dp times the opening of the valve. `dp` [Pa]: pressure drop in the free direction, inlet minus outlet,
+    which is negative while the pilot holds the valve open against it; `G_check` [m^3/(s Pa)]: conductance of the fully
+    open valve. The other arguments are those of `pilot_opening`.
     """
     return G_check * dp * pilot_opening(dp, dp_pilot, p_crack, k_pilot, p_open)

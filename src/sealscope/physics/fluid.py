@@ -32,7 +32,7 @@ def effective_bulk_modulus(p: float, K_oil: float, air: float, n_air: float) -> 
     liquid and gas); in this form the hydraulic fluid of the Simscape library, from which the thesis took its friction.
     """
     if not any_lane(air > 0.0):
-        return K_oil + 0.0 * p  # lanes if p is lanes
+        return K_oil + 0.0 * p  # of p's type: a number, or a vector of numbers (lanes)
     p_abs = max(p + P_ATM, _MIN_ABSOLUTE_PRESSURE)
     r = air_volume_ratio(p, air, n_air)
     return K_oil * (1.0 + r) / (1.0 + r * K_oil / (n_air * p_abs))
@@ -61,10 +61,14 @@ def air_volume_ratio(p: float, air: float, n_air: float) -> float:
 def mixture_density_ratio(p: float, p_0: float, K_oil: float, air: float, n_air: float) -> float:
     """Compute the density ratio rho(p)/rho(p_0) of oil with free air, both pressures in Pa gauge.
 
-    Its logarithm is the integral of dp/K, with the modulus K of `effective_bulk_modulus`. The air contributes ln((1 +
-    r_0)/(1 + r)) exactly. The liquid, of bulk modulus `K_oil` [Pa], contributes the integral of dp/(K_oil (1 + r)),
-    computed by Simpson's rule with an error far below r dp/K_oil. r, r_0: volume of air over volume of oil at p and p_0
-    (`air_volume_ratio`); `air`: this ratio at atmospheric pressure; `n_air`: polytropic exponent of the air.
+    Its logarithm is the integral of dp/K from p_0 to p, with the modulus K of `effective_bulk_modulus`:
+
+    - the air contributes ln((1 + r_0)/(1 + r)) exactly, where r and r_0 are the ratios of the volumes of air and oil at
+      p and p_0 (`air_volume_ratio`);
+    - the liquid, of bulk modulus `K_oil` [Pa], contributes the integral of dp/(K_oil (1 + r)), which is computed by
+      Simpson's rule with an error far below r dp/K_oil.
+
+    `air`: the ratio at atmospheric pressure; `n_air`: polytropic exponent of the air.
     """
     r, r_0 = air_volume_ratio(p, air, n_air), air_volume_ratio(p_0, air, n_air)
     r_m = air_volume_ratio(0.5 * (p + p_0), air, n_air)

@@ -27,8 +27,8 @@ def stribeck_force(speed: float, F_C: float, K_brk: float, C_c: float) -> float:
     """Compute the Coulomb and Stribeck friction [N] of steady sliding at `speed` >= 0 [m/s], eq. (4.21) of the thesis.
 
     F_C (1 + (K_brk - 1) exp(-C_c speed)) falls from the breakaway force K_brk F_C at standstill to the Coulomb force
-    F_C [N] at high speed. `K_brk` is the ratio of the two, `C_c` [s/m] the transition coefficient. The viscous part is
-    not in it.
+    F_C [N] at high speed. `K_brk`: breakaway force over Coulomb force; `C_c` [s/m]: transition coefficient. Viscous
+    friction is not included.
     """
     return F_C * (1.0 + (K_brk - 1.0) * exponential(-C_c * speed))  # type: ignore[no-any-return]
 
@@ -66,8 +66,8 @@ def bristle_rate(v: float, z: float, g: float, sigma_0: float) -> float:
     bristles' stiffness `sigma_0` [N/m]. At a constant v, z settles at g/sigma_0 sign(v), its largest magnitude.
 
     Source: C. Canudas de Wit, H. Olsson, K. J. Astrom, P. Lischinsky, A new model for control of systems with
-    friction, IEEE Transactions on Automatic Control 40 (1995) 419-425, eq. (2), with g of eq. (4.21) in place of its
-    Gaussian.
+    friction, IEEE Transactions on Automatic Control 40 (1995) 419-425, eq. (2). The paper's g is a Gaussian of v, here
+    eq. (4.21) of the thesis (`stribeck_force`).
     """
     return v - sigma_0 * abs(v) / g * z
 
@@ -76,10 +76,10 @@ def bristle_rate(v: float, z: float, g: float, sigma_0: float) -> float:
 def lugre_friction(v: float, z: float, dz: float, sigma_0: float, sigma_1: float, F_v: float, v_th: float) -> float:
     """Compute LuGre's friction force [N] from the deflection of the contact's bristles and the velocity.
 
-    F = sigma_0 z + sigma_1 exp(-(v/v_th)^2) dz + F_v v, with the bristles' mean deflection z [m] and its rate dz [m/s]
-    (`bristle_rate`), the velocity v [m/s], the bristles' stiffness sigma_0 [N/m] and damping sigma_1 [N s/m], and the
-    viscous coefficient F_v [N s/m]. The damping decays at speeds above v_th [m/s]; otherwise the force could drive the
-    motion.
+    F = sigma_0 z + sigma_1 exp(-(v/v_th)^2) dz + F_v v. `v` [m/s]: velocity; `z` [m], `dz` [m/s]: the bristles' mean
+    deflection and its rate (`bristle_rate`); `sigma_0` [N/m], `sigma_1` [N s/m]: stiffness and damping of the bristles;
+    `F_v` [N s/m]: viscous coefficient. The damping decays at speeds above `v_th` [m/s]; otherwise the force could drive
+    the motion.
 
     Source: as `bristle_rate`, eq. (3); the decay: H. Olsson, Control Systems with Friction, Lund 1996, section 5.
     """

@@ -64,14 +64,14 @@ def _vector_type(lanes: Lanes) -> Any:
 
 @register_model(Lanes)
 class _LanesModel(models.PrimitiveModel):  # type: ignore[misc]
-    def __init__(self, manager: Any, kind: Any) -> None:
-        super().__init__(manager, kind, _vector_type(kind))
+    def __init__(self, manager: Any, lanes: Any) -> None:
+        super().__init__(manager, lanes, _vector_type(lanes))
 
 
 @register_model(Mask)
 class _MaskModel(models.PrimitiveModel):  # type: ignore[misc]
-    def __init__(self, manager: Any, kind: Any) -> None:
-        super().__init__(manager, kind, ir.VectorType(ir.IntType(1), kind.lanes.width))
+    def __init__(self, manager: Any, mask: Any) -> None:
+        super().__init__(manager, mask, ir.VectorType(ir.IntType(1), mask.lanes.width))
 
 
 def _broadcast(builder: Any, scalar: Any, lanes: Lanes) -> Any:
@@ -107,8 +107,8 @@ def _cast_to_lanes(context: Any, builder: Any, value_type: Any, lanes: Any, valu
 def _common_lanes_type(arg_types: tuple[Any, ...]) -> Lanes | None:
     """Find the type of lanes to which all arguments of a call can be converted.
 
-    Lanes are vectors of numbers; arguments may mix them with single numbers. Returns None if no argument is lanes,
-    if the lanes are of different types, or if there is an argument of another kind.
+    `arg_types`: types of the arguments, lanes (vectors of numbers) and single numbers. Returns None if there are no
+    lanes among them, lanes of different types, or a type that is neither.
     """
     lanes = {arg_type for arg_type in arg_types if isinstance(arg_type, Lanes)}
     compatible = len(lanes) == 1 and all(isinstance(arg_type, Lanes | types.Number) for arg_type in arg_types)
@@ -126,9 +126,9 @@ def _define_on_lanes(function: Any, build: Any, *, is_test: bool = False) -> Non
     @infer_global(function)
     class Template(AbstractTemplate):  # type: ignore[misc]
         def generic(self, args: tuple[Any, ...], kws: Any) -> Any:
-            """Return the function's signature for these types of arguments.
+            """Return the function's signature for arguments of the types `args`.
 
-            Returns None if none of them is a vector (lanes).
+            Returns None if they have no common type of lanes, or if keywords are used.
             """
             lanes = None if kws else _common_lanes_type(args)
             return None if lanes is None else signature(_MASKS[lanes] if is_test else lanes, *args)
@@ -138,7 +138,8 @@ def _define_on_lanes(function: Any, build: Any, *, is_test: bool = False) -> Non
         lanes = _common_lanes_type(sig.args)
         assert lanes is not None
         pairs = zip(args, sig.args, strict=True)
-        return build(builder, *(_convert_to_lanes(context, builder, value, kind, lanes) for value, kind in pairs))
+        vectors = [_convert_to_lanes(context, builder, value, value_type, lanes) for value, value_type in pairs]
+        return build(builder, *vectors)
 
     for arg_types in ((Lanes,), (Lanes, Lanes), (Lanes, types.Number), (types.Number, Lanes)):
         lower_builtin(function, *arg_types)(lower)
@@ -167,15 +168,16 @@ _define_on_lanes(operator.neg, lambda builder, a: builder.fneg(a))
 
 
 def _intrinsic_builder(name: str) -> Any:
-    """Return a function build(builder, *values) that adds the call of an LLVM intrinsic to compiled code.
+    """Return a function for the argument `build` of `_define_on_lanes`, which calls an LLVM intrinsic.
 
-    It adds the call to LLVM's `builder`, and returns the result of the call, a vector. The `values` are the arguments
-    of the intrinsic, vectors (lanes) of one type. `name`: name of the intrinsic without type, such as "sqrt". It serves
-    as `build` of `_define_on_lanes`.
+    `name`: name of the intrinsic without type, such as "sqrt".
     """
 
     def build(builder: Any, *values: Any) -> Any:
-        """Build the call of the intrinsic, whose full name ends with the vector's type, such as llvm.sqrt.v8f64."""
+        """Build the call of the intrinsic with vectors of one type, and return its result, a vector.
+
+        The full name of the intrinsic ends with the vector's type, such as llvm.sqrt.v8f64.
+        """
         vector = values[0].type
         bits = 64 if vector.element == ir.DoubleType() else 32
         function_type = ir.FunctionType(vector, [vector] * len(values))
@@ -249,9 +251,9 @@ def _lower_select(context: Any, builder: Any, arg_types: Any, values: Any) -> An
     result_type = _select_type(arg_types)
     pairs = zip(values[1:], arg_types[1:], strict=True)
     if isinstance(result_type, Lanes):
-        yes, no = (_convert_to_lanes(context, builder, value, kind, result_type) for value, kind in pairs)
+        yes, no = (_convert_to_lanes(context, builder, value, value_type, result_type) for value, value_type in pairs)
     else:
-        yes, no = (context.cast(builder, value, kind, types.float64) for value, kind in pairs)
+        yes, no = (context.cast(builder, value, value_type, types.float64) for value, value_type in pairs)
     return builder.select(values[0], yes, no)
 
 
@@ -288,16 +290,14 @@ def _float_constant(value_type: Any, value: float) -> Any:
 def nearest_integer(x: Any) -> Any:
     """Round x to the nearest whole number, returned as a float.
 
-    The magnitude of x must be below 2^51, in single precision below 2^22.
+    Adding a large constant leaves no bits for a fraction. The magnitude of x must be below 2^51, in single precision
+    below 2^22.
     """
     return (x + _ROUNDING_DOUBLE) - _ROUNDING_DOUBLE
 
 
 def _lower_nearest_integer(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
-    """Build the LLVM instructions of `nearest_integer`: add a large constant and subtract it again.
-
-    The constant is that of the argument's precision; adding it leaves no bits for a fraction.
-    """
+    """Build the LLVM instructions of `nearest_integer`: add the constant of x's precision and subtract it again."""
     large = _float_constant(arg_types[0], _ROUNDING_SINGLE if arg_types[0] == SINGLES else _ROUNDING_DOUBLE)
     return builder.fsub(builder.fadd(values[0], large, flags=_FLAGS), large, flags=_FLAGS)
 
@@ -306,15 +306,15 @@ register_lowering(nearest_integer, 1, lambda arg_types: arg_types[0], _lower_nea
 
 
 def power_of_two(n: Any) -> Any:
-    """Compute 2^n for a whole number n in -1022..1023, which is a float or lanes (a vector of floats).
+    """Compute 2^n, with n a float without fraction, or lanes (a vector) of such floats.
 
-    In single precision n is limited to -126..127.
+    n must be in -1022..1023; in single precision it is limited to -126..127.
     """
     return math.ldexp(1.0, int(n))
 
 
 def _lower_power_of_two(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
-    """Build the LLVM instructions of `power_of_two`: shift the biased exponent to its place above the mantissa."""
+    """Build the LLVM instructions of `power_of_two`: shift n plus the exponent's bias to the bits of the exponent."""
     n_type, n = arg_types[0], values[0]
     single = n_type == SINGLES
     integer = ir.IntType(32 if single else 64)
@@ -324,7 +324,8 @@ def _lower_power_of_two(context: Any, builder: Any, arg_types: Any, values: Any)
         n_min, n_max = _float_constant(n_type, -126.0), _float_constant(n_type, 127.0)
         n = builder.select(builder.fcmp_ordered("<", n, n_min), n_min, n)
         n = builder.select(builder.fcmp_ordered(">", n, n_max), n_max, n)
-    # the last bits of 1.5 * 2^52 + k (2^23) are the integer k: faster than converting each lane to an integer
+    # the last bits of 1.5 * 2^52 + k (in single precision 1.5 * 2^23 + k) are the integer k, here n + 1023 (n + 127):
+    # this is faster than converting each lane to an integer
     rounding = _float_constant(n_type, _ROUNDING_SINGLE + 127.0 if single else _ROUNDING_DOUBLE + 1023.0)
     exponent = builder.bitcast(builder.fadd(n, rounding), integers)
     shift = ir.Constant(integers, [mantissa_bits] * n_type.width if isinstance(n_type, Lanes) else mantissa_bits)
@@ -430,6 +431,7 @@ def exponential(x: Any) -> Any:
     r = (x - n * _LN2_HIGH) - n * _LN2_LOW
     s = r * r
     q = s * s
+    # Taylor's polynomial of degree 11, low + q middle + q^2 high
     low = (1.0 + r) + s * (0.5 + r * (1.0 / 6.0))
     middle = (1.0 / 24.0 + r * (1.0 / 120.0)) + s * (1.0 / 720.0 + r * (1.0 / 5040.0))
     high = (1.0 / 40320.0 + r * (1.0 / 362880.0)) + s * (1.0 / 3628800.0 + r * (1.0 / 39916800.0))

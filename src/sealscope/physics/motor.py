@@ -38,9 +38,9 @@ def winding_current_rate(
 def shaft_acceleration(i: float, omega: float, load_torque: float, C_m: float, B_M: float, J_M: float) -> float:
     """Compute the angular acceleration domega/dt [rad/s^2] of the motor's shaft, eq. (4.5).
 
-    It is (C_m i - B_M omega - load_torque)/J_M, with the current `i` [A], the speed `omega` [rad/s], the torque
-    `load_torque` [N m] of the pump, the torque constant `C_m` [N m/A], and the viscous damping `B_M` [N m s/rad] and
-    moment of inertia `J_M` [kg m^2] of motor and pump.
+    It is (C_m i - B_M omega - load_torque)/J_M. `i` [A]: current; `omega` [rad/s]: speed; `load_torque` [N m]: torque
+    of the pump; `C_m` [N m/A]: torque constant; `B_M` [N m s/rad], `J_M` [kg m^2]: viscous damping and moment of
+    inertia of motor and pump.
     """
     return (C_m * i - B_M * omega - load_torque) / J_M
 

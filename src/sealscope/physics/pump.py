@@ -59,10 +59,14 @@ def turbulent_slip(dp: float, c_slip: float, dp_0: float) -> float:
 def friction_torque(omega: float, dp: float, q_b: float, T_f: float, C_f: float, k_h: float, omega_f: float) -> float:
     """Compute the friction torque [N m] of motor and pump at the speed `omega` [rad/s], without viscous drag.
 
-    T = sat(omega/omega_f) (T_f + C_f D |dp|) + k_h omega |omega|: constant friction `T_f` [N m], friction with the
-    coefficient `C_f` that grows with the pressure difference `dp` [Pa], and the hydrodynamic torque with the
-    coefficient `k_h` [N m s^2]. D = q_b/(2 pi) [m^3/rad] is the displacement. sat limits its argument to +-1, so that T
-    is continuous at standstill: below the speed `omega_f` [rad/s] the friction is linear in the speed.
+    T = sat(omega/omega_f) (T_f + C_f D |dp|) + k_h omega |omega|, with the displacement D = q_b/(2 pi) [m^3/rad]:
+
+    - `T_f` [N m]: constant friction.
+    - `C_f`: coefficient of friction that grows with the pressure difference `dp` [Pa] of the ports.
+    - `k_h` [N m s^2]: coefficient of the hydrodynamic torque.
+
+    sat limits its argument to +-1, so that T is continuous at standstill: below the speed `omega_f` [rad/s] the
+    friction is linear in the speed.
     """
     smooth_sign = min(max(omega / omega_f, -1.0), 1.0)
     return smooth_sign * (T_f + C_f * abs(pump_torque(dp, q_b))) + k_h * omega * abs(omega)

@@ -21,8 +21,8 @@ def orifice_coefficient(C_d: float, area: float, rho: float) -> float:
 def series_coefficient(c: float, c_line: float, opening: Any) -> Any:
     """Compute the flow coefficient C [m^3/(s Pa^0.5)] of a throttle in series with a shut-off valve.
 
-    1/C^2 = 1/c^2 + (1/opening^2 - 1)/c_line^2, with the throttle's coefficient `c` and that of the free line,
-    `c_line`. The valve opens the fraction `opening` of the line's area: fully open C = c, shut C = 0.
+    1/C^2 = 1/c^2 + (1/opening^2 - 1)/c_line^2, with the flow coefficients `c` of the throttle and `c_line` of the free
+    line. The valve opens the fraction `opening` of the line's area: fully open C = c, shut C = 0.
 
     Source: Merritt, Hydraulic Control Systems, 1967, section 3.4: pressure drops of orifices in series add.
     """
@@ -30,6 +30,7 @@ def series_coefficient(c: float, c_line: float, opening: Any) -> Any:
     return c * c_line * opening * (c_line * c_line * square + c * c * (1.0 - square)) ** -0.5
 
 
+#: The same function for compiled code; `series_coefficient` itself also takes arrays.
 _series_coefficient = law(series_coefficient)
 
 
@@ -83,6 +84,7 @@ def _solve_scaled_flow(b: float, a: float) -> float:
         curvature = w * (r * r_2 * r_4) * (10.0 + 2.0 * r_4)  # its second derivative, times d^3
         step = 2.0 * residual * d * d * slope / (2.0 * d * slope * slope - residual * curvature)
         w = w - step
+        # convergence is cubic: after this step the relative error is of the order of (step/w)^3 r^2/(a + r)^2
         if not any_lane(abs(step * step * step) * r_2 > 1e-12 * square * w * (a + r) * (a + r)):
             break
     return w  # type: ignore[no-any-return]
@@ -107,15 +109,19 @@ def implicit_orifice_flow(total: float, g: float, c_forward: float, c_reverse: f
 def clogged_resistance(R: float, V: float, k: float, n: float) -> float:
     """Compute the resistance [Pa s/m^3] of a filter through which the oil volume `V` [m^3] has passed.
 
-    `R` is its resistance when new. The blocking laws of filtration at a constant dirt concentration, dR/dV = k R_new
-    (R/R_new)^n, give R = R_new (1 + (1 - n) k V)^(1/(1 - n)). The factor is 1 + k V for cake filtration (n = 0),
-    exp(k V) for intermediate (n = 1), (1 - k V/2)^-2 for standard (n = 1.5) and 1/(1 - k V) for complete blocking
-    (n = 2). 1 + (1 - n) k V is limited to at least 1e-3, where a filter with n > 1 passes almost nothing.
+    The blocking laws of filtration at a constant dirt concentration, dR_V/dV = k R (R_V/R)^n, give
+    R_V = R (1 + (1 - n) k V)^(1/(1 - n)): `R` is the resistance of the new filter, `k` [1/m^3] its relative rise per
+    volume at first, `n` the law. R_V/R is
+
+    - 1 + k V for cake filtration (n = 0) and exp(k V) for intermediate blocking (n = 1),
+    - (1 - k V/2)^-2 for standard (n = 1.5) and 1/(1 - k V) for complete blocking (n = 2).
+
+    1 + (1 - n) k V is limited to at least 1e-3, where a filter with n > 1 passes almost nothing.
 
     Source: J. Hermia, Constant pressure blocking filtration laws, Trans. IChemE 60 (1982) 183-187.
     """
     e = 1.0 - n
-    e = select(abs(e) < 1e-6, 1e-6, e)  # the limit n = 1
+    e = select(abs(e) < 1e-6, 1e-6, e)  # near n = 1, where the exponent 1/e is infinite
     return R * math.pow(max(1.0 + e * k * V, 1e-3), 1.0 / e)
 
 
@@ -125,23 +131,24 @@ def filtered_flow(
 ) -> float:
     """Compute the flow Q [m^3/s] of a throttle and a filter in series at the end of an implicit stage of the solver.
 
-    The equation is d + g Q(d) + dp_f(Q) = total, with d, g, `total` and the throttle's coefficients as in
-    `implicit_orifice_flow`. The filter has the resistance `R` [Pa s/m^3], and a bypass valve of conductance `G_bypass`
-    [m^3/(s Pa)] that opens at the drop `p_bypass` [Pa]. The filter's drop dp_f is R Q while the valve is shut, and
-    follows from Q = dp_f/R + G_bypass (dp_f - p_bypass) while it is open. In both cases dp_f is linear in Q, so that
-    `implicit_orifice_flow` solves the equation.
+    The filter has the resistance `R` [Pa s/m^3], and a bypass valve of conductance `G_bypass` [m^3/(s Pa)] that opens
+    at the filter's pressure drop `p_bypass` [Pa]. Q solves d + g Q + dp_f = total, with d, `g`, `total` and the
+    throttle's coefficients as in `implicit_orifice_flow`. The filter's drop dp_f is R Q while the bypass valve is shut;
+    while it is open, Q = dp_f/R + G_bypass (dp_f - p_bypass). As dp_f is linear in Q in both cases,
+    `implicit_orifice_flow` solves the equation for either case.
     """
-    filter_flow = implicit_orifice_flow(total, g + R, c_forward, c_reverse, dp_0)
+    shut_flow = implicit_orifice_flow(total, g + R, c_forward, c_reverse, dp_0)
     filter_fraction = 1.0 / (1.0 + G_bypass * R)  # of additional flow while the valve is open
     open_total = total - math.copysign(G_bypass * R * p_bypass * filter_fraction, total)
     open_flow = implicit_orifice_flow(open_total, g + R * filter_fraction, c_forward, c_reverse, dp_0)
-    return select(R * abs(filter_flow) > p_bypass, open_flow, filter_flow)  # type: ignore[no-any-return]
+    return select(R * abs(shut_flow) > p_bypass, open_flow, shut_flow)  # type: ignore[no-any-return]
 
 
 @contracted
 def flow_through_filter(Q: float, R: float, p_bypass: float, G_bypass: float) -> float:
-    """Compute the part of a flow [m^3/s, >= 0] that passes the filter rather than its bypass valve.
+    """Compute the part of a flow [m^3/s, >= 0] that passes a filter rather than its bypass valve.
 
+    It is the whole flow while the valve is shut, which is the smaller of the two values below.
     `Q` [m^3/s]: flow through filter and bypass together, of either sign; `R` [Pa s/m^3]: resistance of the filter.
     The bypass valve opens at the pressure drop `p_bypass` [Pa] and has the conductance `G_bypass` [m^3/(s Pa)].
     """

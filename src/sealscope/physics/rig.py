@@ -59,17 +59,17 @@ _DERIVED_ONLY = (
     *("cylinder.V_rod", "cylinder.V_hose_A", "cylinder.V_hose_B", "pump.C_st", "pump.C_h"),
 )
 #: Parameters that the laws do not take: informative ones, and those of changes within a run.
-_NOT_TAKEN = {*("pump.omega_max", "line.G_circ", "fluid.T_oil", "fluid.nu_40", "fluid.nu_100", "fluid.alpha")}
+_NOT_TAKEN = {"pump.omega_max", "line.G_circ", "fluid.T_oil", "fluid.nu_40", "fluid.nu_100", "fluid.alpha"}
 #: Dotted names of the parameters that the laws take, by symbol, in the order of declaration.
 PARAMETERS = {
     name.rpartition(".")[2]: name
     for name, field in iter_fields(Rig)
     if unit_of(field) and not name.startswith(("sensors.", "daq.")) and name not in _NOT_TAKEN | {*_DERIVED_ONLY}
 }
-#: Those, and the parameters from which numbers are derived.
+#: The same, followed by the parameters from which numbers are derived.
 VALUES = {**PARAMETERS, **{name.rpartition(".")[2]: name for name in _DERIVED_ONLY}}
-#: Choices that the laws take as truth values, each with the parameter and its value that means True. A further one,
-#: `made_up`, is True with check valves of either kind.
+#: Choices that the laws take as truth values, each with the parameter and its value that means True. A further choice,
+#: `made_up`, is True if the make-up has check valves, plain or pilot-operated.
 _CHOICES = {
     "position_dependent": ("cylinder.volumes", "position"),
     "coulomb_of_difference": ("friction.coulomb_pressure", "difference"),
@@ -80,17 +80,28 @@ _CHOICES = {
 DERIVED = ("c_A_in", "c_A_out", "c_B_in", "c_B_out", "V_A", "V_B", "c_slip", "k_h")
 #: The numbers of `RigNumbers`.
 NUMBERS = (*PARAMETERS, *DERIVED)
-#: Laws that only some rigs have. Each is a tuple, empty if the law is not in force: numba specialises on its length,
-#: so that the law is then not compiled in. In this order: throttles in the lines; air in the oil; leaking rod seals
-#: or a make-up; balance of mass in place of volume; Karnopp's friction; LuGre's friction; friction that differs between
-#: the directions; pilot-operated check valves; relief valves; an accumulator that is not isothermal; a damper; a load
-#: in addition to the rig's own, (True,) over time, or its two tables (`piecewise_linear_force`) over position and
-#: velocity; a servo valve and its supply; filters in the lines; losses of motor and pump beyond the linear ones; an
-#: opposing cylinder; boiling oil; filters that clog; filters with a bypass.
+#: Laws that only some rigs have. Each is a tuple in `RigNumbers`, empty if the rig does not have the law: numba
+#: specialises on its length, so that the law is then not compiled in.
 LAWS = (
-    *("throttled", "aerated", "open_circuit", "conserving", "sticking", "bristled", "one_sided"),
-    *("piloted", "relieved", "polytropic", "damped", "pushed", "valved"),
-    *("filtered", "lossy", "opposed", "boiling", "clogging", "bypassed"),
+    "throttled",  # throttles in the lines
+    "aerated",  # air in the oil
+    "open_circuit",  # leaking rod seals, or a make-up
+    "conserving",  # balance of mass in place of volume
+    "sticking",  # Karnopp's friction
+    "bristled",  # LuGre's friction
+    "one_sided",  # friction that differs between the directions
+    "piloted",  # pilot-operated check valves
+    "relieved",  # relief valves
+    "polytropic",  # a make-up accumulator that is not isothermal
+    "damped",  # a damper
+    "pushed",  # an additional load: (True,) over time, or tables over position and velocity (`piecewise_linear_force`)
+    "valved",  # a servo valve and its supply
+    "filtered",  # filters in the lines
+    "lossy",  # losses of motor and pump beyond the linear ones
+    "opposed",  # an opposing cylinder
+    "boiling",  # boiling oil
+    "clogging",  # filters that clog
+    "bypassed",  # filters with a bypass
 )
 #: The choices: truth values, and the laws.
 CHOICES = (*_CHOICES, "made_up", *LAWS)
@@ -112,7 +123,7 @@ if TYPE_CHECKING:
         def _asdict(self) -> dict[str, Any]: ...
 
     RigValues = RigNumbers
-else:  # numba takes a named tuple apart; its fields are those of the models
+else:  # plain named tuples, which numba takes apart into their fields
     RigNumbers = namedtuple("RigNumbers", (*NUMBERS, *CHOICES))
     RigValues = namedtuple("RigValues", VALUES)
 
@@ -202,7 +213,7 @@ def rig_numbers(rig: Rig) -> RigNumbers:
         "relieved": rig.makeup.G_relief > 0,
         "polytropic": choices["made_up"] and rig.makeup.n_gas != 1.0,
         "damped": rig.cylinder.d_load > 0,
-        "pushed": False,
+        "pushed": False,  # callers add an additional load
         "valved": rig.circuit.valve_controlled,
         "filtered": rig.line.R_A > 0 or rig.line.R_B > 0,
         "lossy": rig.motor.T_f > 0 or rig.pump.C_st > 0 or rig.pump.C_f > 0 or rig.pump.C_h > 0,
@@ -212,7 +223,7 @@ def rig_numbers(rig: Rig) -> RigNumbers:
         "bypassed": rig.line.G_bypass > 0,
     }
     return RigNumbers(
-        *values[: len(PARAMETERS)],
+        *values[: len(PARAMETERS)],  # `VALUES` begins with `PARAMETERS`
         *derived_numbers(values, *throttle_readings(rig)),
         **choices,
         **{name: (True,) if is_present else () for name, is_present in laws.items()},
@@ -225,9 +236,10 @@ def _record_type(lengths: tuple[int, ...]) -> np.dtype[Any]:
 
     `lengths`: for each law in `LAWS`, the length of its tuple in `RigNumbers` (0: the rig does not have this law).
     """
-    truths = [(name, "?") for name in CHOICES if name not in LAWS]
+    numbers = [(name, "f8") for name in NUMBERS]
+    truth_values = [(name, "?") for name in CHOICES if name not in LAWS]
     laws = [(name, "f8", (length,)) for name, length in zip(LAWS, lengths, strict=True)]
-    return np.dtype([*((name, "f8") for name in NUMBERS), *truths, *laws], align=True)  # type: ignore[list-item]
+    return np.dtype([*numbers, *truth_values, *laws], align=True)  # type: ignore[list-item]
 
 
 def pack_numbers(p: RigNumbers) -> Any:
@@ -235,9 +247,9 @@ def pack_numbers(p: RigNumbers) -> Any:
 
     If the rig has a load over position or velocity, whose tables do not fit into a record, `p` is returned unchanged.
     """
-    lengths = tuple(len(getattr(p, name)) for name in LAWS)
     if len(p.pushed) > 1:
         return p
+    lengths = tuple(len(getattr(p, name)) for name in LAWS)
     return np.array([tuple(p)], _record_type(lengths)).view(np.recarray)[0]
 
 
@@ -245,9 +257,12 @@ def pack_numbers(p: RigNumbers) -> Any:
 def limit_state(y: State, p: RigNumbers) -> State:
     """Limit the motor current and the spool of a servo valve in a state, after a step of the solver.
 
-    The current is limited to +-i_max; the spool's position to its stroke, and its speed to +-v_max. Returns the new
-    state. States that the rig does not use are overwritten: without lines p_1 = p_A and p_2 = p_B; with a servo valve
-    p_2 is the return's pressure. States that no law of the rig changes are set to 0, so that the compiler removes them.
+    - The current is limited to +-i_max, the spool's position to its stroke, and its speed to +-v_max.
+    - Pressures that are no states of the rig are set: without lines p_1 = p_A and p_2 = p_B; with a servo valve p_2 is
+      the return's pressure.
+    - Other states that no law of the rig changes are set to 0, so that the compiler removes them.
+
+    Returns the new state.
     """
     V_up = y[MADE_UP] if len(p.open_circuit) > 0 else 0.0
     bristle = y[BRISTLE] if len(p.bristled) > 0 else 0.0
@@ -266,9 +281,9 @@ def limit_state(y: State, p: RigNumbers) -> State:
 def vapour_floor(q: float, p: RigNumbers) -> float:
     """Compute the pressure [Pa] of an oil volume from its pressure state q [Pa]: q, but at least the vapour pressure.
 
-    Below the vapour pressure `p_vap` [Pa absolute] the oil boils. The state q then continues by the oil's bulk
-    modulus so that mass balances hold: rho(q) V is the mass of oil in the volume V, and V (1 - rho(q)/rho(p_vap)) the
-    cavity.
+    Below the vapour pressure `p_vap` [Pa absolute] the oil boils. The state q may fall further, so that mass balances
+    hold: with the density rho(q) that follows from the oil's bulk modulus, rho(q) V is the mass of oil in the volume V,
+    of which V (1 - rho(q)/rho(p_vap)) is vapour.
 
     Source: E. B. Wylie, V. L. Streeter, Fluid Transients, 1978, chapter 8: vapour cavities at constant pressure.
     """
@@ -347,11 +362,11 @@ def implicit_flows(
 ) -> tuple[float, float]:
     """Compute the line flows Q_A, Q_B [m^3/s] at the end of an implicit stage of the solver.
 
-    Q_A flows from line 1 to chamber A, Q_B from chamber B to line 2. On each side the pressure drop d of the throttle
-    [Pa] at the end of the stage solves d + g Q(d) = total. `total` [Pa] is the drop if nothing flowed in the stage, and
-    `g` [Pa s/m^3] its fall over the stage per unit flow (`implicit_orifice_flow`). A filter in series with the
-    throttle, p_1 - p_A = d + R Q at the pump's port 1, adds its resistance R to g. If it has a bypass valve, the flow
-    is that of `filtered_flow`.
+    Q_A flows from line 1 to chamber A, Q_B from chamber B to line 2. On each side the throttle's pressure drop d [Pa]
+    at the end of the stage solves d + g Q(d) = total (`implicit_orifice_flow`). `total_A`, `total_B` [Pa]: the drops if
+    nothing flowed in the stage; `g_A`, `g_B` [Pa s/m^3]: their fall over the stage per unit flow. A filter in series
+    with the throttle has the additional drop R Q, so that its resistance R is added to g. With a bypass valve of the
+    filter, `filtered_flow` solves the equation.
     """
     if len(p.filtered) > 0:
         R_A, R_B = filter_resistances(y, p)
@@ -380,12 +395,13 @@ def filter_flows(y: State, p: RigNumbers) -> tuple[float, float]:
 def throttle_flows(y: State, p: RigNumbers) -> tuple[float, float]:
     """Compute the flows [m^3/s] through the throttles: Q_A from line 1 to chamber A, Q_B from chamber B to line 2.
 
-    Eqs. (4.9)-(4.12). A filter in series with a throttle has the pressure drop R Q (Darcy's law).
+    Eqs. (4.9)-(4.12). A filter in series with a throttle has the pressure drop R Q (Darcy's law), until its bypass
+    valve, if any, opens (`filtered_flow`).
     """
     p_A, p_B, p_1, p_2 = pressures_of(y, p)
     dp_A, dp_B = p_1 - p_A, p_B - p_2
     if len(p.filtered) > 0:
-        return implicit_flows(dp_A, dp_B, 0.0, 0.0, y, p)
+        return implicit_flows(dp_A, dp_B, 0.0, 0.0, y, p)  # g = 0: the pressures are those of `y`
     Q_A = restrictors.orifice_flow(dp_A, restrictors.one_way_coefficient(dp_A, p.c_A_in, p.c_A_out), p.dp_0)
     return Q_A, restrictors.orifice_flow(dp_B, restrictors.one_way_coefficient(dp_B, p.c_B_out, p.c_B_in), p.dp_0)
 
@@ -406,10 +422,10 @@ def bulk_modulus(pressure: float, p: RigNumbers) -> float:
 
 @contracted
 def density_ratio(pressure: float, reference: float, p: RigNumbers) -> float:
-    """Compute the oil's density at `pressure` over that at `reference`, both in Pa gauge.
+    """Compute the ratio of the oil's densities at two pressure states, `pressure` and `reference` [Pa gauge].
 
-    Air in the oil and boiling are taken into account if the rig has them. Below the vapour pressure the ratio
-    continues with the pressure states, so that mass is conserved (`vapour_floor`).
+    Air in the oil and boiling are taken into account if the rig has them. The ratio also holds for states below the
+    vapour pressure, so that mass is conserved (`vapour_floor`).
     """
     if len(p.aerated) == 0:
         return oil_density_ratio(pressure - reference, p.K_oil)
@@ -424,11 +440,11 @@ def density_ratio(pressure: float, reference: float, p: RigNumbers) -> float:
 
 @contracted
 def flows_at_both_ends(Q: float, source: float, sink: float, p: RigNumbers) -> tuple[float, float]:
-    """Compute the volume flow [m^3/s] out of a source and that into a sink, which differ if the oil's density does.
+    """Compute the volume flows [m^3/s] of a stream where it leaves a source and where it enters a sink.
 
-    `Q` [m^3/s] is the flow at the upstream end: at the source, or at the sink for Q < 0. The flow at the other end
-    carries the same mass, rho_in Q_in = rho_out Q_out, with the densities at the pressures `source` and `sink` [Pa].
-    In a rig that balances volumes instead of masses both flows are Q.
+    `Q` [m^3/s]: flow at the upstream end, which is the source, or the sink for Q < 0. The flow at the downstream end
+    carries the same mass, rho_up Q_up = rho_down Q_down, with the oil's densities rho at the pressures `source` and
+    `sink` [Pa]. In a rig that balances volumes instead of masses both flows are Q.
     """
     if len(p.conserving) == 0:
         return Q, Q
@@ -459,9 +475,9 @@ def throttle_rates(y: State, Q_A: float, Q_B: float, p: RigNumbers) -> Pressures
 def supply_pressure(y: State, p: RigNumbers) -> float:
     """Compute the pressure [Pa gauge] of the make-up's accumulator, which replaces oil that the circuit has lost.
 
-    It follows from the oil volume V_up in the state `y` that the accumulator has delivered.
+    The state `y` contains the oil volume V_up that the accumulator has delivered.
     """
-    if len(p.polytropic) > 0:  # empty unless the gas is polytropic, so that the law is chosen at compile time
+    if len(p.polytropic) > 0:
         return external.polytropic_pressure(y[MADE_UP], p.p_charge, p.V_gas, p.n_gas)
     return external.accumulator_pressure(y[MADE_UP], p.p_charge, p.V_gas)
 
@@ -471,8 +487,8 @@ def make_up_flows(y: State, p: RigNumbers) -> tuple[float, float]:
     """Compute the flows [m^3/s] from the make-up's accumulator to sides 1 (A) and 2 (B), through its valves.
 
     The valves are check valves and, for the opposite direction, relief valves. Sides 1 and 2 are the pump's ports,
-    or the chambers A and B in a rig without lines. The pressure on each side can open the check valve of the other
-    if these are pilot-operated.
+    or the chambers A and B in a rig without lines. The pressure on one side is the pilot pressure of the other side's
+    check valve, if these are pilot-operated. Without a make-up the flows are 0.
     """
     supply = supply_pressure(y, p)
     p_A, p_B, p_1, p_2 = pressures_of(y, p)
@@ -482,7 +498,7 @@ def make_up_flows(y: State, p: RigNumbers) -> tuple[float, float]:
         makeup_1 = external.pilot_valve_flow(supply - p_1, p_2 - supply, p.p_crack, p.G_check, p.k_pilot, p.p_open)
         makeup_2 = external.pilot_valve_flow(supply - p_2, p_1 - supply, p.p_crack, p.G_check, p.k_pilot, p.p_open)
     else:
-        G_check = p.G_check if p.made_up else 0.0 * p.G_check
+        G_check = p.G_check if p.made_up else 0.0 * p.G_check  # a zero of G_check's type: a number or lanes
         makeup_1 = external.check_valve_flow(supply - p_1, p.p_crack, G_check)
         makeup_2 = external.check_valve_flow(supply - p_2, p.p_crack, G_check)
     if len(p.relieved) > 0:
@@ -495,7 +511,7 @@ def make_up_flows(y: State, p: RigNumbers) -> tuple[float, float]:
 def external_pressure_rates(y: State, p: RigNumbers) -> tuple[Pressures, float]:
     """Compute the pressure rates (dp_A/dt, dp_B/dt, dp_1/dt, dp_2/dt) [Pa/s] due to external leakage and make-up.
 
-    Also returns the flow [m^3/s] that leaves the make-up's accumulator, as a volume at the accumulator's pressure.
+    Also returns the volume flow [m^3/s] out of the make-up's accumulator, at the accumulator's pressure.
     """
     V_A, V_B = volumes_at(y[POSITION], p)
     K_A, K_B = bulk_modulus(y[P_A], p), bulk_modulus(y[P_B], p)
@@ -511,7 +527,7 @@ def external_pressure_rates(y: State, p: RigNumbers) -> tuple[Pressures, float]:
         return (-cylinder.pressure_rate(out_A, V_A, K_A), -cylinder.pressure_rate(out_B, V_B, K_B), rate_1, rate_2), fed
     rate_1 = cylinder.pressure_rate(makeup_1 - out_A, V_A, K_A)
     rate_2 = cylinder.pressure_rate(makeup_2 - out_B, V_B, K_B)
-    if len(p.valved) > 0:  # a supply's line has no rod seal
+    if len(p.valved) > 0:  # 1 and 2 are here supply and return, whose lines have neither rod seals nor make-up
         return (rate_1, rate_2, 0.0 * rate_1, 0.0 * rate_2), fed
     return (rate_1, rate_2, rate_1, rate_2), fed
 
@@ -611,7 +627,7 @@ def rates_without_throttles(y: State, u: float, G: float, C: float, F: float, p:
         rate_1 = cylinder.pressure_rate(to_1, p.V_1, bulk_modulus(y[P_1], p))
         rate_2 = cylinder.pressure_rate(-from_2, p.V_2, bulk_modulus(y[P_2], p))
     elif len(p.valved) > 0:
-        valve_part = valve_rates(y, Q_1, p)
+        valve_part = valve_rates(y, Q_1, p)  # rates of p_A, p_B, p_1 and p_2
         rate_A = valve_part[0] + cylinder.pressure_rate(-p.A_A * v - from_A, V_A, K_A)
         rate_B = valve_part[1] + cylinder.pressure_rate(p.A_B * v + to_B, V_B, K_B)
         rate_1, rate_2 = valve_part[2], valve_part[3]
@@ -622,7 +638,7 @@ def rates_without_throttles(y: State, u: float, G: float, C: float, F: float, p:
         rate_1, rate_2 = rate_A, rate_B
     fed, d_x_s, d_v_s = 0.0 * v, 0.0 * v, 0.0 * v  # zeros of v's type: a number or lanes
     if len(p.open_circuit) > 0:
-        external_part, fed = external_pressure_rates(y, p)
+        external_part, fed = external_pressure_rates(y, p)  # rates of p_A, p_B, p_1 and p_2; flow of the accumulator
         rate_A, rate_B = rate_A + external_part[0], rate_B + external_part[1]
         rate_1, rate_2 = rate_1 + external_part[2], rate_2 + external_part[3]
     if len(p.valved) > 0:

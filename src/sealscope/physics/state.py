@@ -11,7 +11,8 @@ INTEGRAL, CURRENT, OMEGA, THETA, POSITION, VELOCITY, P_A, P_B, P_1, P_2, MADE_UP
     len(STATES)
 )
 
-#: In a rig with lines, which has no servo valve, the spool's places are the oil [m^3] that passed the filters A and B.
+#: Oil [m^3] that has passed the clogging filters in lines A and B. A rig with lines has no servo valve, so that these
+#: states take the indices of the spool's.
 PASSED_A, PASSED_B = SPOOL, SPOOL_SPEED
 
 #: Outputs of a run at each output instant: the states and the quantities that follow from them.
@@ -30,7 +31,7 @@ def state_of(y: np.ndarray) -> State:
 
 @contracted
 def add_step(y: State, h: float, dy: State) -> State:
-    """Compute the state y + h dy, number by number."""
+    """Compute y + h dy, element by element, for a state or its rates `y` and for rates `dy`."""
     return (
         y[0] + h * dy[0],
         y[1] + h * dy[1],
@@ -51,9 +52,6 @@ def add_step(y: State, h: float, dy: State) -> State:
 
 @contracted
 def add_to_pressures(y: State, h: float, s: Pressures) -> State:
-    """Compute the state y with h s added to its pressures p_A, p_B, p_1 and p_2.
-
-    `h` [s]: length of a step; `s`: the four rates of the pressures [Pa/s].
-    """
+    """Compute a state, or its rates, `y` with h s added to the elements of p_A, p_B, p_1 and p_2; `s`: four rates."""
     p_A, p_B, p_1, p_2 = y[P_A] + h * s[0], y[P_B] + h * s[1], y[P_1] + h * s[2], y[P_2] + h * s[3]
     return y[0], y[1], y[2], y[3], y[4], y[5], p_A, p_B, p_1, p_2, y[10], y[11], y[12], y[13]

@@ -44,12 +44,12 @@ def advance(
 ) -> None:
     """Integrate the state `y` (14,) in place over n steps of h [s], with outputs before each `every`-th step.
 
-    The inputs (n, nodes) hold a value for each of the times within a step that the method needs (`step_nodes`):
-    command `u` [V], leakage coefficients `G` [m^3/(s Pa)] and `C` [m^3/(s Pa^0.5)] of the piston (`piston_leakage`),
-    and load `F` [N] in addition to the rig's own, of shape (0, 0) if there is none. `implicit` is `IMPLICIT` or
-    `EXPLICIT`, the integration method. `numbers` are the model's parameters. `rows` (n // every, 21) receives the
-    outputs. With `euler_integral` the explicit method changes the controller's integral only at the end of each step
-    (`rk4_step`).
+    - `implicit`: `IMPLICIT` or `EXPLICIT`, the integration method. With `euler_integral` the explicit method changes
+      the speed controller's integral only at the end of each step (`rk4_step`).
+    - `u`, `G`, `C`, `F` (n, nodes): inputs at the times within each step that the method needs (`step_nodes`). They are
+      the command [V], the leakage coefficients [m^3/(s Pa)] and [m^3/(s Pa^0.5)] of the piston (`piston_leakage`), and
+      the load [N] in addition to the rig's own, of shape (0, 0) if there is none.
+    - `numbers`: parameters of the model. `rows` (n // every, 21): receives the outputs.
     """
     z = state_of(y)
     for step in range(u.shape[0]):
@@ -78,11 +78,11 @@ def advance_closed(
     rows: np.ndarray,
     loop: Loop,
 ) -> int:
-    """Integrate a run whose voltage a controller sets; return the number of outputs written.
+    """Integrate a run, or a part of it, whose voltage a controller sets; return the number of outputs written.
 
-    The arguments are those of `advance`, with the controller `loop` in place of a command. `rows` may receive a later
-    part of the run: rows[0] is output number `start`, counted from the beginning of the run. If the controller returns
-    a voltage that is not finite, the integration stops there and writes fewer outputs than `rows` has.
+    The arguments are those of `advance`, with the controller `loop` in place of a command. `start`: number of the
+    output in rows[0], counted from the beginning of the run. If the controller returns a voltage that is not finite,
+    the integration stops there and writes fewer outputs than `rows` has.
     """
     spacing, n_rows = loop.counters[SPACING], rows.shape[0]
     u = np.empty((spacing * every, G.shape[1]))

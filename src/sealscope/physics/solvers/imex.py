@@ -61,8 +61,8 @@ W = (82889 / 524892, 0.0, 15625 / 83664, 69875 / 102672, -2260 / 8211, GAMMA)
 def _add_stage(z: State, h: float, e: float, f: State, i: float, s: Pressures) -> State:
     """Compute the state z + h (e f + i s), the contribution of one Runge-Kutta stage to the state z.
 
-    `f`: explicit rates of all states; `s`: implicit rates of the four pressures; `e`, `i`: coefficients of the two
-    in the method's tableau; `h` [s]: step.
+    `f`: explicit rates of all states; `s`: implicit rates of the four pressures; `e`, `i`: coefficients of `f` and `s`
+    in the method's tableau; `h` [s]: length of the step.
     """
     return add_to_pressures(add_step(z, h * e, f), h * i, s)
 
@@ -71,7 +71,8 @@ def _add_stage(z: State, h: float, e: float, f: State, i: float, s: Pressures) -
 def _solve_stage(z: State, h: float, p: RigNumbers) -> tuple[State, Pressures]:
     """Solve one implicit stage of a step; return its state, and the pressure rates [Pa/s] due to the throttles.
 
-    `h` [s]: length of the step; `z`: the state without the implicit rates of this stage. In the body, r [Pa/m^3] is the
+    `h` [s]: length of the step; `z`: the state without the implicit rates of this stage. If bulk moduli and densities
+    depend on the pressures, the stage is solved repeatedly (`MAX_STAGE_ITERATIONS`). In the body, r [Pa/m^3] is the
     pressure rate of an oil volume per unit flow, and g [Pa s/m^3] the fall of a throttle's pressure difference over the
     stage per unit flow. Boiling oil keeps its pressure, so its r is 0.
     """
@@ -146,8 +147,8 @@ def implicit_step(
 ) -> State:
     """Integrate the state `z` over step number `step` by the implicit-explicit method; return the new state.
 
-    `h` [s]: length of the step. Row `step` of `u` [V], `G` and `C` (n, 6) holds the command and the leakage
-    coefficients at the nodes of the step (`imex_step`). `F` (n, 6) [N] is read only if the rig has an additional load.
+    `h` [s]: length of the step. `u`, `G`, `C` and `F` (n, 6) hold the inputs of n steps at the `IMEX_NODES`, one step
+    in a row (`imex_step`). `F` is read only if the rig has an additional load.
     """
     volts = (u[step, 0], u[step, 1], u[step, 2], u[step, 3], u[step, 4], u[step, 5])
     laminar = (G[step, 0], G[step, 1], G[step, 2], G[step, 3], G[step, 4], G[step, 5])

@@ -31,9 +31,9 @@ def _end_volumes(p: RigNumbers) -> tuple[tuple[float, float], ...]:
 def _longest_mode_step(damping: float, stiffness: float) -> float:
     """Compute the longest step [s] that resolves the two modes of s^2 + damping s + stiffness = 0.
 
-    `damping` [1/s], `stiffness` [1/s^2]. An oscillation may advance by one radian a step, 1/sqrt(stiffness). A decay of
-    rate lambda, the faster of the two, must be stable: 2.785/lambda, the limit of the Runge-Kutta method of order four.
-    Infinite if the modes neither oscillate nor decay.
+    `damping` [1/s], `stiffness` [1/s^2]. If the modes oscillate, they may advance by one radian a step: the result is
+    1/sqrt(stiffness). If they decay, the faster one, of rate lambda, must be stable: 2.785/lambda, the limit of the
+    Runge-Kutta method of order four. The result is infinite if the modes neither oscillate nor decay.
     """
     discriminant = damping * damping - 4.0 * stiffness
     if discriminant < 0.0:
@@ -53,8 +53,9 @@ def _steepest_rise(breakpoints: np.ndarray) -> float:
 def stiffest_rate(p: RigNumbers) -> float:
     """Compute the fastest decay rate lambda [1/s] of a rig with throttles; RK4 is stable for h lambda < 2.785.
 
-    lambda = K_oil (1/V_1 + 1/V) c/sqrt(dp_0): the pressures of a line volume V_1 and of a chamber V equalise through
-    a throttle, whose slope at dp = 0 is c/sqrt(dp_0). V is the smallest chamber volume over the stroke.
+    lambda = K_oil (1/V_1 + 1/V) c/sqrt(dp_0): the pressures of a line volume V_1 and of a chamber V equalise through a
+    throttle, whose slope dQ/dp at dp = 0 is c/sqrt(dp_0). The smallest line and chamber volumes over the stroke and the
+    largest flow coefficient c are taken.
     """
     c = max(p.c_A_in, p.c_A_out, p.c_B_in, p.c_B_out)
     min_chamber = min(volume for volumes in _end_volumes(p) for volume in volumes)
@@ -64,19 +65,24 @@ def stiffest_rate(p: RigNumbers) -> float:
 def longest_step(p: RigNumbers, G: float = 0.0, C: float = 0.0) -> float:
     """Compute the longest step [s] that resolves all of a rig except its throttles and end stops.
 
-    `G` [m^3/(s Pa)], `C` [m^3/(s Pa^0.5)]: leakage coefficients. The result is the minimum over these parts, each
-    resolved as in `_longest_mode_step`: speed loop (winding and shaft); piston between its oil columns, with the load's
-    spring and damper, both while it slides and within the linear part of the friction (slope F_C/v_th, F_C at the
-    charge pressure); pump and motor between the volumes at the pump's ports; leakage between the chambers; external
-    leakage and make-up; a servo valve and its supply. The stability limit of a decay is that of RK4; the explicit part
-    of ARK4(3)6L[2]SA is stable beyond it. Position-dependent volumes are taken at the end of the stroke where the oil
-    is stiffer. Air is left out because it only makes the oil softer.
+    `G` [m^3/(s Pa)], `C` [m^3/(s Pa^0.5)]: leakage coefficients of the piston. The result is the shortest of the steps
+    that resolve these parts (`_longest_mode_step`):
+
+    - the speed loop of winding and shaft, and pump and motor between the volumes at the pump's ports;
+    - the piston between its oil columns, with the load's spring and damper, both while it slides and near standstill,
+      where friction acts like a steep damper (about K_brk F_C/v_th at the charge pressure) or like LuGre's spring;
+    - the leakage between the chambers, external leakage and make-up, and a servo valve with its supply.
+
+    The stability limit of a decay is that of RK4; the explicit part of ARK4(3)6L[2]SA is stable beyond it.
+    Position-dependent volumes are taken at the end of the stroke where the oil is stiffer. Air is left out because it
+    only makes the oil softer.
     """
     ends = _end_volumes(p)
+    # stiffness of the oil in both chambers, and in the volumes at the pump's ports [Pa/m^3]
     chambers = p.K_oil * max(1.0 / V_A + 1.0 / V_B for V_A, V_B in ends)
     ports = p.K_oil * (1.0 / p.V_1 + 1.0 / p.V_2) if len(p.throttled) > 0 else chambers
     B_M, G_pump = p.B_M, p.G_pump
-    if len(p.lossy) > 0:  # slopes at rest under the motor's largest torque, and at no pressure
+    if len(p.lossy) > 0:  # steepest slopes: of friction at rest under the largest torque, of slip at no pressure
         B_M += (p.T_f + p.C_f * p.C_m * p.i_max) / p.omega_f
         G_pump += p.c_slip / math.sqrt(p.dp_0)
     loop_stiffness = (p.R_c * B_M + p.C_m * (p.C_e + p.k_p)) / (p.L_c * p.J_M)
@@ -84,8 +90,9 @@ def longest_step(p: RigNumbers, G: float = 0.0, C: float = 0.0) -> float:
     # stiffness of the oil columns and the load's spring, over the mass [1/s^2]
     column = (p.K_oil * max(p.A_A**2 / V_A + p.A_B**2 / V_B for V_A, V_B in ends) + p.k_load) / p.M_eq
     F_C = p.F_pr + (0.0 if p.coulomb_of_difference else p.F_cfr * 2.0 * p.p_charge)
-    friction_slope = F_C * (p.K_brk + (p.F_v * p.v_th if p.literal_bracket else 0.0)) / p.v_th
-    friction_slope += 0.0 if p.literal_bracket else p.F_v
+    friction_slope = F_C * p.K_brk / p.v_th + p.F_v
+    if p.literal_bracket:
+        friction_slope = F_C * (p.K_brk + p.F_v * p.v_th) / p.v_th
     damper = p.d_load
     if len(p.pushed) > 1:
         column += _steepest_rise(p.pushed[0]) / p.M_eq
@@ -94,10 +101,11 @@ def longest_step(p: RigNumbers, G: float = 0.0, C: float = 0.0) -> float:
     sticking_step = _longest_mode_step((max(1.0, p.backward) * friction_slope + damper) / p.M_eq, column)
     if len(p.bristled) > 0:
         sticking_step = _longest_mode_step((p.sigma_1 + p.F_v + damper) / p.M_eq, column + p.sigma_0 / p.M_eq)
-    ports = 0.0 if len(p.valved) > 0 else ports  # the pump then feeds the supply (`_longest_valve_step`)
+    if len(p.valved) > 0:
+        ports = 0.0  # the pump feeds the supply (`_longest_valve_step`)
     pump_step = _longest_mode_step(ports * G_pump, ports * (p.q_b / (2.0 * math.pi)) ** 2 / p.J_M)
     leak_step = _longest_mode_step(chambers * (G + C / math.sqrt(p.dp_0)), 0.0)
-    # Q = G dp (dp - p_crack)/p_open of a pilot-operated valve is steepest where it is fully open
+    # dQ/dp over G: Q = G dp (dp - p_crack)/p_open of a pilot-operated valve is steepest where it just opens fully
     steepest = 2.0 + p.p_crack / p.p_open if len(p.piloted) > 0 else 1.0
     valves = max(p.G_check * steepest * p.made_up, p.G_relief * (len(p.relieved) > 0))
     external_step = _longest_mode_step(chambers * max(p.G_ext_A, p.G_ext_B) + ports * valves, 0.0)

@@ -10,23 +10,27 @@ import numpy as np
 from sealscope.compiled import call_at, law
 from sealscope.physics.state import P_A, P_B, POSITION, THETA
 
-#: Indices of `Loop.counters`: solver outputs between two samples of the controller, samples from a measurement to its
-#: voltage, samples so far, 1 once a compensated flow was reported.
+#: Indices of `Loop.counters`:
+#: - SPACING: the controller takes a sample at each SPACING-th output of the solver.
+#: - DELAY: samples from a measurement to the time at which its voltage acts.
+#: - SAMPLED: samples taken so far. REPORTED: 1 once the controller has reported a compensated flow, until then 0.
 SPACING, DELAY, SAMPLED, REPORTED = range(4)
-#: Indices of `Loop.numbers`: encoder count of position [m] and of angle [rad], lowest pressure [Pa], largest voltage
-#: [V], last voltage of the controller before it is limited [V].
+#: Indices of `Loop.numbers`: one count of the encoders of position [m] and angle [rad], lowest pressure [Pa], largest
+#: voltage [V], and the controller's last voltage before it was limited [V].
 COUNT_X, COUNT_THETA, MIN_PRESSURE, MAX_VOLTAGE, LAST_VOLTAGE = range(5)
 
 
 class Loop(NamedTuple):
     """Inputs, memory and outputs of a controller over a run, as arrays for compiled code.
 
-    `inputs` (samples, 5): time [s], target [m], speed of the target [m/s], noise of p_A and of p_B [Pa]; `volts`
-    (samples + delay,): the voltage [V] that acts from each sample on; `compensated` (samples,): leakage flow [m^3/s]
-    that the controller compensates; `measured` (7,): the latest time, target, speed of the target, position [m], p_A
-    and p_B [Pa] and motor angle [rad], which the control law reads; `memory`: state of the control law, which begins
-    with the compensated flow, NaN if it reports none; `addresses` (3,): memory addresses of the control law's machine
-    code, of `memory` and of `measured`; `numbers`, `counters`: indexed by the constants above.
+    - `inputs` (samples, 5): time [s], target [m], speed of the target [m/s], noise of p_A and of p_B [Pa].
+    - `volts` (samples + delay,): the voltage [V] that acts from each sample on.
+    - `compensated` (samples,): leakage flow [m^3/s] that the controller compensates.
+    - `measured` (7,): latest inputs of the control law: time, target, speed of the target, position [m], p_A and p_B
+      [Pa], and motor angle [rad].
+    - `memory`: state of the control law. Its first element is the compensated flow, NaN if the law reports none.
+    - `addresses` (3,): memory addresses of the control law's machine code, of `memory` and of `measured`.
+    - `numbers`, `counters`: indexed by the constants above.
     """
 
     inputs: np.ndarray
@@ -47,11 +51,11 @@ def quantize(value: float, count: float) -> float:
 
 @law
 def sample_controller(loop: Loop, k: int, y: np.ndarray) -> bool:
-    """Measure the state `y` (14,) and call the controller for its sample number k.
+    """Measure the state `y` (14,) and call the controller for its sample number k; return False if it fails.
 
-    The controller's voltage, limited to the largest one, is stored in `loop.volts` at the index k plus the delay
-    [samples]. Returns False if the voltage is not finite. A sample that the controller has already taken, as when the
-    solver repeats a part of the run at half the step, is not taken again and keeps its voltage.
+    The controller's voltage, limited to +-MAX_VOLTAGE, is stored in `loop.volts` at the index k + DELAY, and the flow
+    that it compensates, if it reports one, in `loop.compensated`. It fails if the voltage is not finite. If the solver
+    repeats a part of the run at half the step, samples that are already taken keep their voltages.
     """
     counters, numbers, measured = loop.counters, loop.numbers, loop.measured
     if k < counters[SAMPLED]:
@@ -62,7 +66,7 @@ def sample_controller(loop: Loop, k: int, y: np.ndarray) -> bool:
     measured[4] = max(y[P_A], numbers[MIN_PRESSURE]) + loop.inputs[k, 3]
     measured[5] = max(y[P_B], numbers[MIN_PRESSURE]) + loop.inputs[k, 4]
     measured[6] = quantize(y[THETA], numbers[COUNT_THETA])
-    u = call_at(loop.addresses[0], loop.addresses[1], loop.addresses[2])
+    u = call_at(loop.addresses[0], loop.addresses[1], loop.addresses[2])  # law, memory, measured
     numbers[LAST_VOLTAGE] = u
     if not isfinite(u):
         return False

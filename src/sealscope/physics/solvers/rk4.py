@@ -62,11 +62,8 @@ def explicit_step(
 ) -> State:
     """Integrate the state `z` over step number `step` by the Runge-Kutta method of order four; return the new state.
 
-    `h` [s]: length of the step. `u`, `G`, `C` and `F` (n, 3) hold the inputs of n steps, one in a row; the three
-    columns are their values at the beginning, middle and end of the step. `u` [V]: command; `G` [m^3/(s Pa)], `C`
-    [m^3/(s Pa^0.5)]: conductance of the laminar leak and flow coefficient of the orifice leak past the piston; `F` [N]:
-    additional load, read only if the rig has one. `p`: the rig's parameters; `euler_integral`: True if the integral of
-    the speed controller is updated once a step by Euler's method (`rk4_step`).
+    `h` [s]: length of the step. `u`, `G`, `C` and `F` (n, 3) hold the inputs of n steps at the `RK4_NODES`, one step in
+    a row (`rk4_step`). `F` is read only if the rig has an additional load. `p`, `euler_integral`: as for `rk4_step`.
     """
     volts = (u[step, 0], u[step, 1], u[step, 2])
     laminar, orifice = (G[step, 0], G[step, 1], G[step, 2]), (C[step, 0], C[step, 1], C[step, 2])

@@ -20,8 +20,9 @@ from sealscope.physics.solvers.imex import imex_step
 from sealscope.physics.solvers.rk4 import rk4_step
 from sealscope.physics.state import P_A, P_B, POSITION, STATES, State
 
-#: Rows that describe the leak of each lane: G [m^3/(s Pa)], C [m^3/(s Pa^0.5)], start [s], slope of the opening [1/s],
-#: and the G and C whose flow is summed in the totals (those of the leak, or of one that is being sized).
+#: Rows that describe the leak of each lane: coefficients G [m^3/(s Pa)] and C [m^3/(s Pa^0.5)] of the leak that acts,
+#: start [s] and slope [1/s] of its opening, and G and C of the leak whose flow is summed in the totals. That is the
+#: same leak, except while coefficients are searched for.
 LEAK_ROWS = 6
 #: Channels that a run writes at each output: p_A, p_B [Pa].
 CHANNELS = 2
@@ -36,8 +37,8 @@ FLOW, OPENING, MAX_TRAVEL, MIN_PRESSURE, DIVERGED = range(N_TOTALS)
 def _compile(text: str, **scope: Any) -> Any:
     """Compile a function from its source text, in which it has the name `law`.
 
-    `scope`: the objects that the source uses, by name. The source is generated as text because numba needs each
-    element of a tuple written out.
+    `scope`: by name, the objects that the source uses in addition to `load`. The source is generated as text because
+    numba needs each element of a tuple written out.
     """
     scope["load"] = load
     exec(text, scope)
@@ -49,11 +50,12 @@ def _row_loader(count: int) -> Any:
 
     Each row holds one number for each run of a group, and is loaded as lanes.
     """
-    return _compile(f"def law(array, row):\n    return ({', '.join(f'load(array, row + {k})' for k in range(count))})")
+    elements = ", ".join(f"load(array, row + {k})" for k in range(count))
+    return _compile(f"def law(array, row):\n    return ({elements})")
 
 
 load_state, load_leak, load_totals = _row_loader(len(STATES)), _row_loader(LEAK_ROWS), _row_loader(N_TOTALS)
-_FIELDS = [*(f"{name}=load(table, row + {k})" for k, name in enumerate(NUMBERS)), *(f"{c}=p.{c}" for c in CHOICES)]
+_FIELDS = [f"{name}=load(table, row + {k})" for k, name in enumerate(NUMBERS)] + [f"{c}=p.{c}" for c in CHOICES]
 #: The function (table, row, p) that loads a group's numbers from row `row` on, with the choices of `p`.
 load_numbers = _compile(f"def law(table, row, p):\n    return RigNumbers({', '.join(_FIELDS)})", RigNumbers=RigNumbers)
 
@@ -62,19 +64,18 @@ load_numbers = _compile(f"def law(table, row, p):\n    return RigNumbers({', '.j
 def leak_opening(leak: Leak, t: float) -> float:
     """Compute the opening of a leak, 0 to 1, at t [s].
 
-    It rises linearly from the leak's start on and then stays at 1. `leak`: the numbers of the leak, of which the
-    third is the start [s] and the fourth the slope [1/s] (`LEAK_ROWS`).
+    It rises linearly from the leak's start on and then stays at 1. `leak`: the numbers of the leak, by `LEAK_ROWS`.
     """
-    return min(max((t - leak[2]) * leak[3], 0.0), 1.0)
+    return min(max((t - leak[2]) * leak[3], 0.0), 1.0)  # [2]: start [s]; [3]: slope [1/s]
 
 
 def _build_inputs_law(count: int) -> Any:
-    """Compile the function that computes the inputs of the rig for a group of runs in step k of the solver.
+    """Compile the function (t, nodes, shape, k, drive, leak, p) that computes the inputs of a group of runs in step k.
 
-    The inputs are the command u [V], the leakage coefficients G and C, and the load F [N], each at the `count` times
-    within a step (nodes) that the method needs. The function's arguments are (t, nodes, shape, k, drive, leak, p): `t`
-    [s] is the start of the step, `drive` the gain and the offset [V] of the command of each run, `leak` the numbers of
-    each run's leak (`LEAK_ROWS`); the others are those of `advance`.
+    It returns the command u [V], the leakage coefficients G and C, and the load F [N], each at the `count` times
+    within a step (nodes) that the integration method needs. Its arguments are: `t` [s], start of the step; `drive`,
+    gain and offset [V] of each run's command; `leak`, numbers of each run's leak (`LEAK_ROWS`); and `nodes`, `shape`
+    and `p` of `advance`.
     """
 
     def for_nodes(text: str) -> str:
@@ -100,10 +101,10 @@ _rk4_inputs, _imex_inputs = _build_inputs_law(3), _build_inputs_law(6)
 
 @contracted
 def _add_output(z: State, leak: Leak, t: float, totals: Totals, q: RigNumbers) -> Totals:
-    """Add one output of a group of runs to the totals of these runs: sums, extremes, and the flag of diverged runs.
+    """Add one output of a group of runs to the totals of these runs, which `N_TOTALS` lists; return the new totals.
 
-    `z`: states of the runs at the output; `leak`: their leaks; `t` [s]: time of the output; `totals`: as listed at
-    `N_TOTALS`; `q`: numbers of the runs' rigs. Returns the new totals.
+    `z`: states of the runs at the output; `leak`: numbers of their leaks (`LEAK_ROWS`), of which the last two are the
+    coefficients G and C of the summed flow; `t` [s]: time of the output; `q`: numbers of the runs' rigs.
     """
     flow_sum, opening_sum, max_travel, min_pressure, diverged = totals
     opening = leak_opening(leak, t)
@@ -140,15 +141,16 @@ def advance(
 ) -> None:
     """Integrate groups of runs in place over n steps of h [s]; write their pressures and add to their totals.
 
-    The groups are `groups[0]` <= g < `groups[1]`, each of WIDTH runs; the first step is `start`.
-
-    `implicit`: `IMPLICIT` or `EXPLICIT`, the integration method. `y` (groups, 14, WIDTH): states. `shape` (n, nodes):
-    the commands' common waveform at the times `nodes` [s] within each step; (n, 2 nodes) if the load [N] at the same
-    times follows. `drive` (groups, 2, WIDTH): gain and offset [V] of the command. `leaks` (groups, LEAK_ROWS, WIDTH):
-    numbers of the leaks. `table` (groups, cells, fields, WIDTH): the rigs' numbers, constant within a cell, which is a
-    span of steps. `bounds` (cells + 1,): steps at which the cells begin, and the end. `p`: the choices that all rigs
-    share. `pressures` (groups, outputs, CHANNELS, WIDTH): written from output `begin` on, before every `every`-th step.
-    `totals` (groups, N_TOTALS, WIDTH): sums and extremes of each run.
+    - `implicit`: `IMPLICIT` or `EXPLICIT`, the integration method.
+    - `groups`: the first group, and the group after the last; each group has WIDTH runs. `y` (groups, 14, WIDTH):
+      states. `start`: number of the first step.
+    - `shape` (n, nodes): the commands' common waveform at the times `nodes` [s] within each step; (n, 2 nodes) if the
+      load [N] at the same times follows. `drive` (groups, 2, WIDTH): gain and offset [V] of the command.
+    - `leaks` (groups, LEAK_ROWS, WIDTH): numbers of the leaks.
+    - `table` (groups, cells, fields, WIDTH): the rigs' numbers, constant within a cell, which is a span of steps;
+      `bounds` (cells + 1,): steps at which the cells begin, and the end. `p`: the choices that all rigs share.
+    - `pressures` (groups, outputs, CHANNELS, WIDTH): written from output `begin` on, before each `every`-th step.
+    - `totals` (groups, N_TOTALS, WIDTH): sums and extremes of each run.
     """
     cells, fields, states = table.shape[1], table.shape[2], y.shape[1]
     for g in range(groups[0], groups[1]):
