@@ -155,7 +155,7 @@ class HoldPriors(PriorTable):
 class ReadingPriors(PriorTable):
     """Limits beyond which pressures and speeds cannot come from one hydraulic machine.
 
-    - `noise` [share of the variance]: part of white noise in a pressure above which the pressure is taken for mere noise.
+    - `noise` [share of the variance]: white noise in a pressure, above which the pressure is taken for mere noise.
 
     The motor speed is compared with the rate of the motor angle:
 
