@@ -14,6 +14,7 @@ import sealscope as ss
 from sealscope.control import CONTROLLERS, Drive, FaultTolerant, Flatness, PositionPI, controller_named
 from sealscope.control.leak_observer import conductance as estimate_of
 from sealscope.control.leak_observer import make_observer, update_observer
+from sealscope.control.registry import find_controller_source
 from sealscope.parameters import load_rig
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.integrate import integrate_run
@@ -267,6 +268,11 @@ def test_controllers_have_names_and_a_user_s_own_too():
 def test_a_wrong_name_is_one_line(name, words):
     with refusal(*words.split(", ")):
         controller_named(name, RIG)
+
+
+def test_the_source_of_an_unknown_name_is_refused_by_that_name():
+    with refusal("controller", "'flatnes'"):
+        find_controller_source("flatnes")
 
 
 def test_numbers_that_cannot_be():

@@ -104,10 +104,12 @@ def controller_named(name: str, rig: Rig) -> Controller:
 def find_controller_source(name: str) -> Path | None:
     """Find the source file of a user's or an installed controller without importing it.
 
-    Returns None for a built-in controller. Raises InputError if there is no such file.
+    Returns None for a built-in controller. Raises InputError if the name is not that of a controller
+    (`check_controller_name`), or if there is no such file.
     """
     if name in CONTROLLERS:
         return None
+    check_controller_name(name)
     stated_module_or_file, _, _ = name.rpartition(":")
     module_or_file = _installed()[name].module if name in _installed() else stated_module_or_file
     path = Path(module_or_file) if module_or_file.endswith(".py") else _find_module_file(module_or_file)
