@@ -22,6 +22,7 @@ from sealscope.errors import InputError, UnreadableFile
 if TYPE_CHECKING:
     from sealscope.diagnosis.verdict.diagnosis import Diagnosis
     from sealscope.recordings import Recording
+    from sealscope.recordings.formats.columns import ChannelMap
 
     #: Start [s since 1970], or None, and diagnosis of a recording.
     DatedDiagnosis = tuple[float | None, Diagnosis]
@@ -341,34 +342,46 @@ def inspect(
     """Show the content of a file and its defects; columns without a map are recognised by their names."""
     from sealscope.parameters.load import save_channel_map
     from sealscope.recordings import inspect as find_defects
-    from sealscope.recordings.formats.columns import explicit_columns, reconstruct_map, uses_names
     from sealscope.reporting.overview import overview_text
 
     _reads_standard_input(files)
     stated = opt.StatedMachine.of(None, maps, rate, rig)
-    map_to_save = stated.channel_map
-    if save_map and (rig is None or not map_to_save):
+    if save_map and (rig is None or not stated.channel_map):
         raise InputError("--save-map must stand with --rig and its file, and with the --map options to be saved")
     machine = stated if stated.has_map else replace(stated, channel_map="auto")
     is_complete = True
+    columns: dict[str, str] | None = None  # channel -> column; in the first readable file if the map is `auto`
     for file, recording in machine.read_all(files, joined=join):
         if recording is None:
             is_complete = False
             continue
         opt.say(overview_text(str(file), recording, find_defects(recording)))
-        if uses_names(map_to_save):  # replace `auto` by the columns that it has chosen
-            # a converted recording states the columns of its source, which is another file
-            is_source = recording.provenance.get("file") == file.name
-            by_names = {**reconstruct_map(recording.provenance), **explicit_columns(map_to_save)}
-            map_to_save = by_names if is_source else {}
+        if columns is None:
+            columns = _resolve_map(stated.channel_map, file, recording)
     if not is_complete:
         raise Exit(1)
-    if save_map and rig is not None and not uses_names(map_to_save):
-        if not map_to_save:
+    if save_map and rig is not None:
+        if not columns:
             own_names = "columns with the channels' own names"
             raise InputError(f"--save-map must have a map to save, got {own_names} ({files[0]})")
-        save_channel_map(rig, explicit_columns(map_to_save))
+        save_channel_map(rig, columns)
         opt.say(f"map saved in {rig}: later calls with --rig {rig} use it")
+
+
+def _resolve_map(channel_map: ChannelMap, file: Path, recording: Recording) -> dict[str, str]:
+    """Return a map, channel -> column, in which `auto` is replaced by the columns that it has chosen in a recording.
+
+    A map without `auto` is returned as it is. `file`: file from which the `recording` was read. With `auto` the result
+    is empty if the recording was converted from another file, because it then states the columns of that file.
+    """
+    from sealscope.recordings.formats.columns import explicit_columns, reconstruct_map, uses_names
+
+    stated_columns = explicit_columns(channel_map)
+    if not uses_names(channel_map):
+        return stated_columns
+    if recording.provenance.get("file") != file.name:
+        return {}
+    return {**reconstruct_map(recording.provenance), **stated_columns}
 
 
 @opt.with_machine_options("maps", "rate")
