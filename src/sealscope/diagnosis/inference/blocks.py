@@ -249,27 +249,27 @@ class ColumnRoles:
         roles.between_deviation[self.leak] = INFERENCE.between.pump
         return roles
 
-    def leak_deviation(self, test: int, blocks: Blocks) -> float:
+    def leak_deviation(self, column: int, blocks: Blocks) -> float:
         """Compute the prior standard deviation of a leak's coefficient in a healthy machine, in the coefficient's unit.
 
-        `test`: index of the coefficient's column. For a flow through an orifice, the prior gives the same mean flow
-        over `blocks` as the prior of a laminar leak. The result is infinite for columns that no pressure drives, or
-        without a prior.
+        `column`: index of the leak's column. For a flow through an orifice, the prior gives the same mean flow over
+        `blocks` as the prior of a laminar leak. The result is infinite for a column that no pressure drives (the left
+        side is one), or without a prior.
         """
-        driver = self.drivers[test] if test < self.left else ""
+        driver = self.drivers[column] if column < self.left else ""
         pressure, root = float(np.mean(blocks.mean_pressure())), float(np.mean(blocks.mean_root()))
         per_conductance = {"": float("inf"), "pressure": 1.0, "root": pressure / root if root > 0.0 else 1.0}
         return self.healthy_conductance * per_conductance[driver]
 
-    def offset_deviation(self, test: int, blocks: Blocks) -> float:
+    def offset_deviation(self, column: int, blocks: Blocks) -> float:
         """Compute the prior standard deviation of the error that a pressure sensor's offset causes in a column.
 
-        `test`: index of the regression's column. The result is in Pa for the column of a laminar leak, in Pa^0.5 for
+        `column`: index of the regression's column. The result is in Pa for the column of a laminar leak, in Pa^0.5 for
         the column of an orifice. It is 0 for columns that no pressure drives, or in an equation without flow offset.
         The standard deviation of the offset itself is limited to the mean of abs(p_A - p_B) over `blocks`, since
         recordings may be in counts instead of Pa.
         """
-        driver = self.drivers[test] if test < self.left and self.bias is not None else ""
+        driver = self.drivers[column] if column < self.left and self.bias is not None else ""
         root = float(np.mean(blocks.mean_root()))
         # derivatives of the driver by the pressure: d sqrt(p)/dp = 1/(2 sqrt(p))
         per_pascal = {"": 0.0, "pressure": 1.0, "root": 0.5 / root if root > 0.0 else 0.0}
@@ -420,17 +420,17 @@ def _build_normal_equations(
 ) -> _NormalEquations:
     """Build the normal equations of a regression on drifting nuisance columns and one tested column.
 
-    `gram` (K, m, m): Gram matrices of K blocks; `polynomials` (K, degrees): drift polynomials; `nuisance`: indices of
-    the columns that are multiplied by each polynomial; `test`, `left`: indices of the tested column and of the left
-    side.
+    `gram` (K, m, m): Gram matrices of K blocks; `polynomials` (K, n_polynomials): drift polynomials; `nuisance`:
+    indices of the columns that are multiplied by each polynomial; `test`, `left`: indices of the tested column and of
+    the left side.
     """
-    n, degrees = len(nuisance), polynomials.shape[1]
-    size = n * degrees
+    n, n_polynomials = len(nuisance), polynomials.shape[1]
+    size = n * n_polynomials
     # sum over k of gram[k, i, j] P_p P_q by one matrix product, which is faster than einsum
-    products = (polynomials[:, :, None] * polynomials[:, None, :]).reshape(len(gram), degrees**2)
+    products = (polynomials[:, :, None] * polynomials[:, None, :]).reshape(len(gram), n_polynomials**2)
     sums = gram[:, nuisance][:, :, nuisance].reshape(len(gram), n * n).T @ products
     return _NormalEquations(
-        gram=sums.reshape(n, n, degrees, degrees).transpose(0, 2, 1, 3).reshape(size, size),
+        gram=sums.reshape(n, n, n_polynomials, n_polynomials).transpose(0, 2, 1, 3).reshape(size, size),
         moment=np.einsum("ki,kp->ip", gram[:, nuisance, left], polynomials).ravel(),
         coupling=np.einsum("ki,kp->kip", gram[:, nuisance, test], polynomials).reshape(len(gram), size),
         energy=gram[:, test, test],
@@ -456,30 +456,33 @@ class _Prior(NamedTuple):
 class _NuisanceFit(NamedTuple):
     """Fit of the nuisance coefficients: `coefficients` (c,), and `variance` of a row's residual.
 
-    The variance is inflated for overlapping rows. `prior_precision` (c,): prior precision of the coefficients, times
-    `variance`; `prior_moment` (c,): product of `prior_precision` and the prior mean of the coefficients.
+    Each nuisance column has `n_polynomials` successive coefficients, first that of the constant polynomial. The last
+    column is that of the sensor offset's error. The variance is inflated for overlapping rows. `prior_precision` (c,):
+    prior precision of the coefficients, times `variance`; `prior_moment` (c,): product of `prior_precision` and the
+    prior mean of the coefficients.
     """
 
     coefficients: Array
     prior_precision: Array
     prior_moment: Array
     variance: float
+    n_polynomials: int
 
 
-def _fit_nuisance(normal: _NormalEquations, prior: _Prior, degrees: int, n_rows: float) -> _NuisanceFit:
+def _fit_nuisance(normal: _NormalEquations, prior: _Prior, n_polynomials: int, n_rows: float) -> _NuisanceFit:
     """Fit all coefficients of a regression except the tested one, and the residual variance of a row.
 
     `normal`: normal equations of the regression, from which the tested coefficient, free in each block, is eliminated.
-    Each other (nuisance) column has `degrees` coefficients: a constant one, and one for each polynomial of its drift.
-    `prior`: prior standard deviations of these; `n_rows`: number of rows in all blocks. The variance determines the
-    weight of the prior, and so the fit; both are found by iteration, until the variance changes by at most the
-    fraction `TOLERANCE`.
+    Each other (nuisance) column has `n_polynomials` coefficients, one for each polynomial of its drift, the constant
+    polynomial first. `prior`: prior standard deviations of these; `n_rows`: number of rows in all blocks. The variance
+    determines the weight of the prior, and so the fit; both are found by iteration, until the variance changes by at
+    most the fraction `TOLERANCE`.
     """
     gram, moment, left_square = normal.eliminate_tested()
     min_variance = 1e-14 * normal.left_square / n_rows  # rounding errors of the sums
     variance = max(left_square / n_rows, min_variance)
     for _ in range(MAX_ITERATIONS):
-        precision, mean = np.zeros((2, len(prior.drift), degrees))
+        precision, mean = np.zeros((2, len(prior.drift), n_polynomials))
         with np.errstate(divide="ignore", over="ignore"):
             precision[:, 0] = OVERLAP * variance / prior.level**2
             precision[:, 1:] = (OVERLAP * variance / prior.drift**2)[:, None]
@@ -492,7 +495,8 @@ def _fit_nuisance(normal: _NormalEquations, prior: _Prior, degrees: int, n_rows:
         previous, variance = variance, max(left_square - float(moment @ coefficients), min_variance) / n_rows
         if abs(variance - previous) <= TOLERANCE * previous:
             break
-    return _NuisanceFit(coefficients, prior_precision, prior_moment, max(OVERLAP * variance, np.finfo(float).tiny))
+    row_variance = max(OVERLAP * variance, np.finfo(float).tiny)
+    return _NuisanceFit(coefficients, prior_precision, prior_moment, row_variance, n_polynomials)
 
 
 class _EquationFit(NamedTuple):
@@ -518,7 +522,7 @@ def _fit_equation(gram: Array, blocks: Blocks, roles: ColumnRoles, test: int, nu
     left side); `test`: index of the column of g; `nuisance`: indices of the nuisance columns.
     """
     polynomials, minutes = _drift_polynomials(blocks)
-    n_rows, degrees = max(float(blocks.rows.sum()), 1.0), polynomials.shape[1]
+    n_rows, n_polynomials = max(float(blocks.rows.sum()), 1.0), polynomials.shape[1]
     total = gram.sum(axis=0)
     constants = solve(total[np.ix_(nuisance, nuisance)], total[nuisance, roles.left])  # without drifts
     magnitudes = np.minimum(np.abs(constants), roles.level_deviation[nuisance])
@@ -530,8 +534,8 @@ def _fit_equation(gram: Array, blocks: Blocks, roles: ColumnRoles, test: int, nu
     for iteration in range(_MAX_OFFSET_STEPS + 1):
         shifted = _shift_offset(gram, roles, test, coefficients, offset)
         normal = _build_normal_equations(shifted, polynomials, nuisance_and_offset, test, roles.left)
-        fit = _fit_nuisance(normal, prior._replace(current_offset=offset), degrees, n_rows)
-        step = float(fit.coefficients[-degrees])  # constant part of the last coefficient, the offset's error
+        fit = _fit_nuisance(normal, prior._replace(current_offset=offset), n_polynomials, n_rows)
+        step = float(fit.coefficients[-n_polynomials])  # constant part of the last coefficient, the offset's error
         is_last = iteration == _MAX_OFFSET_STEPS or not offset_deviation > 0.0
         if is_last or (iteration > 0 and abs(step) <= TOLERANCE * offset_deviation):
             break
@@ -663,10 +667,10 @@ def estimate_weighted_mean(blocks: Blocks, roles: ColumnRoles, weights: Mapping[
     """
     nuisance = _nuisance_columns(roles)
     normal, fit, _ = _fit_equation(blocks.gram[:, 0], blocks, roles, roles.leak, nuisance)
-    degrees = len(fit.coefficients) // (len(nuisance) + 1)  # the last coefficient is the offset's error
-    contrast = np.zeros(len(fit.coefficients))
+    contrast = np.zeros(len(fit.coefficients))  # weights of all coefficients of the fit
     for column, weight in weights.items():
-        contrast[nuisance.index(column) * degrees] = weight
+        constant = nuisance.index(column) * fit.n_polynomials  # index of the first of the column's coefficients
+        contrast[constant] = weight
     precision = normal.eliminate_tested()[0] + np.diag(fit.prior_precision)
     variance = float(contrast @ solve(precision, contrast)) * fit.variance
     return float(contrast @ fit.coefficients), float(np.sqrt(max(variance, 0.0)))

@@ -125,10 +125,10 @@ class LiveLeak:
         """Return None: for a running machine no leak is stated relative to the pump's flow."""
 
     def total(self, detectable_flow: float | None) -> None:
-        """Return None, as the estimate of each block states the total leakage."""
+        """Return None: the total leakage is not stated here, as each block's estimate already states it."""
 
     def history(self, onset_s: float | None) -> None:
-        """Return None, as the estimates of the blocks are the history of the leak."""
+        """Return None: the leakage over time is not stated here, as the estimates of the blocks already state it."""
 
 
 def decide_on_stream(leak: LiveLeak | None, false_alarm_probability: float, lack: str = "") -> Evidence:

@@ -155,16 +155,17 @@ def _estimate_level(part: Recording, rig: Rig, machine: AssumedMachine) -> dict[
     fields: dict[str, Any] = {"ringing": details.learn(part) if unusable_reason(details, part) is None else None}
     solution = balance.balance(part) if balance_lack is None else None
     if solution is not None and len(solution.columns) == 1:  # several balances have no common leak
-        return fields | _balance_level(solution, machine)
+        return fields | _balance_fields(solution, machine)
     if response_lack is None and (reading := response.reading(part)) is not None:
         level, error = reading.level
+        mean_pump_flow, _ = reading.pump_flow
         return fields | {
             "basis": "pressure response",
             "level": level,
             "error": error,
             "states_flow": reading.stated,
             "area": machine.area if reading.stated else None,
-            "pump": reading.pump_flow[0],
+            "pump": mean_pump_flow,
             "size_error": conductance_scale_error(),
         }
     log_rms, _ = measure_levels(part)
@@ -179,12 +180,14 @@ def _estimate_level(part: Recording, rig: Rig, machine: AssumedMachine) -> dict[
     return {"problem": "no detector states a level: " + "; ".join(reasons)}
 
 
-def _balance_level(solution: RecordedBalance, machine: AssumedMachine) -> dict[str, Any]:
-    """Return the fields of `LeakReading` that a solved volume balance gives, by name, such as "level" and "error".
+def _balance_fields(solution: RecordedBalance, machine: AssumedMachine) -> dict[str, Any]:
+    """Collect the fields of `LeakReading` that follow from a solved volume balance, by name.
 
-    `machine`: assumed sizes, of which only the piston area is used.
+    The balance uses assumed sizes; its flows and conductances times `size.scale` (`recorded.Size`) are the true ones.
+    `machine`: assumed machine, of which only the piston area is used.
     """
-    size, total = solution.size, solution.conductance
+    size = solution.size
+    total = solution.conductance  # with its 95 % interval
     return {
         "basis": "volume balance",
         "level": total.value * size.scale,

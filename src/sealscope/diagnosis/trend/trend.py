@@ -248,7 +248,10 @@ class Trend:
         )
 
     def _format_day(self, day: float) -> str | float | None:
-        """Format a time, in days since the first recording, in ISO format; return the days if no dates are known."""
+        """Format a time, in days since the first recording, as a date and time in ISO format.
+
+        If no dates are known, or if `day` is not finite, `day` is returned as it is.
+        """
         if not math.isfinite(day) or not self.dated:
             return day
         time_ms = np.datetime64(round(self.points[0].time_of_day(day) * 1e3), "ms")

@@ -172,14 +172,18 @@ def _is_tested(term: Term, roles: ColumnRoles, has_accumulator: bool) -> bool:
     the volume of an accumulator.
     """
     if term.name.startswith("motion"):
-        return False  # area and displacement change together, as a scale
-    if term.name in (SPEED_LOSS, ORIFICE):
-        return False  # taken as zero within a recording; an orifice is tested as another law of the leak
+        # a change of area, displacement or a sensor's scale changes all coefficients of motion: the test of SCALE
+        return False
+    if term.name == SPEED_LOSS:
+        return False  # a single recording has too little variety of motion to determine it
+    if term.name == ORIFICE:
+        return False  # a leak through an orifice is tested as another law of the leak
     if term.name == HOLDING:
         return False  # a leaking piston raises this coefficient as well: the test of the leak covers it
     if AIR in roles.names and term.cause == "air in the oil" and term.nuisance:
-        return False  # free air, which is tested, changes these coefficients together
-    return not (has_accumulator and term.name == BIAS)  # with an accumulator, its pressure drives an external leak
+        return False  # free air changes all these coefficients: the test of AIR (not a nuisance term) covers it
+    # a constant flow stands for an external leak that no pressure drives; with an accumulator, its pressure drives it
+    return not (has_accumulator and term.name == BIAS)
 
 
 def _observable_name(term: Term) -> str:

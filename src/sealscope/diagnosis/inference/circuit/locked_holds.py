@@ -95,7 +95,7 @@ class LockedHold(NamedTuple):
         sums = np.add.reduceat(values, self.edges[:-1], axis=-1)
         return np.asarray(sums / np.diff(self.edges))
 
-    def own_offset(self, offset: float) -> tuple[float, float]:
+    def offset_in_hold(self, offset: float) -> tuple[float, float]:
         """Estimate the sensor offset of p_A - p_B [Pa] in this hold, given the recording's `offset` [Pa].
 
         Different gains of the two sensors make the offset vary with the pressure: in a hold it differs from `offset`
@@ -190,8 +190,8 @@ class UnitLeak(NamedTuple):
 class _OilRegression(NamedTuple):
     """Regression of displaced volumes on the properties of the oil, over r readings (sample means) of all holds.
 
-    The properties are compressibility, dead volume of A, dead volume of B, and free air, each relative to its usual
-    value. The regression is on their logarithms (4,), with a normal prior about 0.
+    The properties are compressibility, dead volume of A, dead volume of B, and free air, each divided by its usual
+    value. The unknowns are their logarithms (4,), which have a normal prior with the mean 0.
 
     - `displaced` (r,): volume displaced by the piston [m^3].
     - `strained`, `aired` (r, 3): volumes [m^3] taken up by the compression of the oil and of the free air, with the
@@ -210,7 +210,7 @@ class _OilRegression(NamedTuple):
     def leaked(self, logs: Array) -> Array:
         """Compute the volume [m^3] that left each chamber by each reading (r,): the displaced minus the compressed one.
 
-        `logs` (4,): logarithms of the oil's properties.
+        `logs` (4,): logarithms of the oil's properties (`_oil_factors`).
         """
         oil, air, volumes = _oil_factors(logs)
         return self.displaced - (oil * self.strained + air * self.aired) @ volumes
@@ -228,10 +228,14 @@ class _OilRegression(NamedTuple):
 
 
 def _oil_factors(logs: Array) -> tuple[float, float, Array]:
-    """Convert logarithms (4,) of the oil's properties to factors on their usual values.
+    """Convert log factors of the oil's properties to factors, in the order in which compressed volumes are computed.
 
-    `logs`: of compressibility, dead volume of A, dead volume of B, and free air. Returns the factor on compressibility,
-    the factor on free air, and factors (3,) on the volume of the stroke, which is always 1, and on the dead volumes.
+    `logs` (4,): log(property / usual value) of compressibility, dead volume of A, dead volume of B, and free air.
+    Returns three items:
+
+    - factor on the compressibility;
+    - factor on the free air;
+    - factors (3,) on the volume of the stroke (always 1, as it is not estimated) and on the dead volumes of A and B.
     """
     compressibility, dead_A, dead_B, air = np.exp(logs)
     return float(compressibility), float(air), np.array([1.0, dead_A, dead_B])
@@ -325,7 +329,7 @@ class HeldChambers:
     @cached_property
     def _regressions(self) -> tuple[_OilRegression, _OilRegression]:
         """Regressions on the oil's properties: without check valves, and with check valves that refill a chamber."""
-        return self._build_regression(False), self._build_regression(True)
+        return self._build_regression(is_refilled=False), self._build_regression(is_refilled=True)
 
     def _build_regression(self, is_refilled: bool) -> _OilRegression:
         """Build the regression of displaced volumes on the oil's properties from all holds (`_OilRegression`).
@@ -375,9 +379,9 @@ class HeldChambers:
         """Compute the flow past the piston in each hold for a leak with a coefficient of 1, in Pa^`exponent`.
 
         The flow is sign(dp) |dp|^`exponent` with dp = p_A - p_B - z, where z is the sensor offset in the hold. It may
-        differ a little from the `offset` [Pa] of the recording (`LockedHold.own_offset`).
+        differ a little from the `offset` [Pa] of the recording (`LockedHold.offset_in_hold`).
         """
-        differences = [hold.p_A - hold.p_B - hold.own_offset(offset)[0] for hold in self.holds]
+        differences = [hold.p_A - hold.p_B - hold.offset_in_hold(offset)[0] for hold in self.holds]
         return UnitLeak([np.sign(values) * np.abs(values) ** exponent for values in differences], (1.0, -1.0))
 
     def _unit_outside_leak(self, is_A: bool) -> UnitLeak:
@@ -397,7 +401,7 @@ class HeldChambers:
         or a shuttle valve connect it to the charge pressure.
         """
         sign = 1.0 if is_A else -1.0
-        differences = [sign * (hold.p_A - hold.p_B - hold.own_offset(0.0)[0]) for hold in self.holds]
+        differences = [sign * (hold.p_A - hold.p_B - hold.offset_in_hold(0.0)[0]) for hold in self.holds]
         flows = [np.maximum(difference, 0.0) for difference in differences]
         return UnitLeak(flows, (1.0, 0.0) if is_A else (0.0, 1.0))
 
@@ -440,8 +444,9 @@ class HeldChambers:
     @cached_property
     def _fits_without_leak(self) -> tuple[_LeakRegression, _LeakRegression]:
         """Fits of the oil's properties without any leak, first without and then with check valves."""
-        without, refilled = (np.empty((len(regression.displaced), 0)) for regression in self._regressions)
-        return self._fit(without, False), self._fit(refilled, True)
+        n_readings = len(self._regressions[0].displaced)  # as many with check valves as without
+        no_leaks = np.empty((n_readings, 0))
+        return self._fit(no_leaks, is_refilled=False), self._fit(no_leaks, is_refilled=True)
 
     def fit_piston_leak(self, onset: float, offset: float, exponent: float = 1.0) -> LeakFit:
         """Fit a leak past the piston that begins at `onset` [s] to the times in which shut valves hold the load.
@@ -454,7 +459,7 @@ class HeldChambers:
 
     def _offset_cost(self, offset: float) -> float:
         """Compute -2 log of the prior density of a sensor offset [Pa] and of the deviations of all holds from it."""
-        return offset_cost(offset) + sum(hold.own_offset(offset)[1] for hold in self.holds)
+        return offset_cost(offset) + sum(hold.offset_in_hold(offset)[1] for hold in self.holds)
 
     def leaks_since(self, onset: float) -> Array | None:
         """Estimate the conductances of three leaks from the holds, each followed by its standard deviation, shape (6,).

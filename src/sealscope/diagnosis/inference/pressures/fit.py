@@ -149,20 +149,23 @@ class Joint:
         return Joint(priors, theta, mean, covariance, prior_precision, variance)
 
     def information(self, parameter: int, time: Array, wander: float) -> Information:
-        """Compute the likelihood of one parameter in each block, with all other parameters eliminated.
+        """Compute the likelihood of one parameter in K blocks, with all other parameters eliminated, as `Information`.
 
-        The prior that the fit used for this parameter is removed. Instead the result has a prior on a linear change and
-        on a random walk, with the scale `wander` over all blocks. `parameter`: index of the parameter; `time` (K,):
+        A likelihood is stored as its precision matrix and the vector precision @ estimate. Both follow from the fitted
+        posterior by subtracting the prior of the fit. The result then has another prior: on a linear change and on a
+        random walk, both with the scale `wander` over all blocks. `parameter`: index of the parameter; `time` (K,):
         middles of the blocks [s].
         """
-        indices = slice(parameter, None, self.theta.shape[1])
-        # precision with the prior, of deviations from theta
+        indices = slice(parameter, None, self.theta.shape[1])  # of the parameter in all blocks
+        unit = self.priors.unit[parameter]
+        # precisions of posterior and prior, of the deviations from `linearised_at` in units of `unit`
         posterior = np.linalg.inv(self.covariance[indices, indices])
-        prior, unit = self.prior_precision[indices, indices], self.priors.unit[parameter]
-        # precision of the likelihood = posterior - prior; then from deviations to the parameter itself
-        value, precision = self.theta[:, parameter] / unit, posterior - prior
-        prior_gradient = prior @ (value - self.priors.centre[parameter] / unit)
-        vector = posterior @ self.mean[indices] + prior_gradient + precision @ value
+        prior = self.prior_precision[indices, indices]
+        precision = posterior - prior
+        linearised_at = self.theta[:, parameter] / unit
+        prior_gradient = prior @ (linearised_at - self.priors.centre[parameter] / unit)
+        # the first two addends: likelihood of the deviations; the third changes to the parameter itself
+        vector = posterior @ self.mean[indices] + prior_gradient + precision @ linearised_at
         precision = 0.5 * (precision + precision.T) / unit**2
         return Information(time, precision, vector / unit, slope=wander, walk=wander)
 

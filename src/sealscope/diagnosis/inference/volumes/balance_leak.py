@@ -33,7 +33,7 @@ from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.diagnosis.verdict.evidence import Cause, LeakCourse, RelativeLeak, TotalLeakage
 from sealscope.diagnosis.verdict.machine import healthy_leakage
 from sealscope.recordings.recording import Array
-from sealscope.units import LITRE_PER_MINUTE
+from sealscope.units import BAR, LITRE_PER_MINUTE
 
 
 class _HoldLaws(NamedTuple):
@@ -405,19 +405,21 @@ class BalanceLeak:
     def total(self, detectable_flow: float | None) -> TotalLeakage:
         """Return the total leakage of pump and piston, with its interval and the limit for a healthy machine.
 
-        `detectable_flow`: flow [m^3/s] of the smallest leak that would be detected if it began within the recording,
-        None if that was not tested. The result only repeats it, in L/min and as a fraction of the pump's flow
-        (`findable_lpm`, `findable_share`).
+        Behind a servo valve, with a balance for each chamber, the flow is not stated, since the valve's edges leak as
+        well. `detectable_flow`: flow [m^3/s], by the assumed sizes, of the smallest leak that would be detected if it
+        began within the recording; None if that was not tested. The result repeats it in L/min and as a fraction of the
+        pump's flow (`findable_lpm`, `findable_share`).
         """
         balance = self.balance
         size, pressure, pump_flow = balance.size, balance.mean_pressure(), balance.mean_flow
         value, low, high = balance.conductance
         limit, lpm_per_flow = healthy_leakage(balance.rig), size.scale / LITRE_PER_MINUTE
-        is_single = len(balance.columns) == 1  # else a servo valve's edges leak as well, by an unknown amount
-        is_stated, size_factor = size.stated and is_single, 1.0 + WITHIN_95 * size.deviation
-        # the uncertainty of the size widens the interval at both ends
-        low = low * pressure * lpm_per_flow * (1.0 / size_factor if low > 0.0 else size_factor)
-        high = high * pressure * lpm_per_flow * (size_factor if high > 0.0 else 1.0 / size_factor)
+        is_single = len(balance.columns) == 1  # one balance for both chambers, so not behind a servo valve
+        is_stated = size.stated and is_single
+        # the uncertain factor from computed to true flows (`size.scale`) widens the interval at both ends
+        widening = 1.0 + WITHIN_95 * size.deviation
+        low = low * pressure * lpm_per_flow * (1.0 / widening if low > 0.0 else widening)
+        high = high * pressure * lpm_per_flow * (widening if high > 0.0 else 1.0 / widening)
         return TotalLeakage(
             lpm=value * pressure * lpm_per_flow if is_stated else None,
             interval_lpm=(low, high) if is_stated else None,
@@ -456,7 +458,7 @@ class BalanceLeak:
         if size.ratio is not None and size.disagrees:
             remarks.append(Remark("sizes disagree", {"ratio": size.ratio.value}))
         if abs(offset) > 2.0 * WITHIN_95 * INFERENCE.zero.pressure:  # twice the 95 % limit of usual sensors
-            remarks.append(Remark("zero too high" if offset > 0.0 else "zero too low", {"bar": abs(offset) / 1e5}))
+            remarks.append(Remark("zero too high" if offset > 0.0 else "zero too low", {"bar": abs(offset) / BAR}))
         # a delay of one sample is usual
         if delay is not None and abs(delay.value) > 1.0 / balance.recording.rate + WITHIN_95 * delay.deviation:
             remarks.append(Remark("x late" if delay.value > 0.0 else "x early", {"ms": 1e3 * abs(delay.value)}))
@@ -467,7 +469,7 @@ class BalanceLeak:
         for condition in find_unusual_conditions(self.balance.recording_sums, self.healthy):
             value, low, high = condition.value, condition.low, condition.high
             if condition.name == "load":
-                yield Remark("load beyond", {"value": value / 1e5, "low": low / 1e5, "high": high / 1e5})
+                yield Remark("load beyond", {"value": value / BAR, "low": low / BAR, "high": high / BAR})
             elif condition.name == "speed":
                 yield Remark("speed beyond", {"ratio": value / (high if value > high else low)})
             else:

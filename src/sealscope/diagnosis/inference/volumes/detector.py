@@ -146,7 +146,10 @@ class VolumeBalance:
         return min(usable, key=lambda candidate: BalanceLeak(self.name, candidate).bound_flow, default=None)
 
     def _compute_blocks(self, recording: Recording) -> RecordedBlocks | None:
-        """Compute, only once, the blocks of a recording for a volume balance with a position; None without these."""
+        """Compute the blocks of a recording for a volume balance with a position; None if it allows no such balance.
+
+        The result is cached with the recording, since several methods of this class need it.
+        """
         return compute_once(recording, (self.name, self.rig), lambda samples: recorded_blocks(samples, self.rig), READ)
 
     def _build_balance(self, recording: Recording, regime: RegimeBlocks) -> RecordedBalance:
@@ -166,15 +169,18 @@ class VolumeBalance:
     def learn(self, recording: Recording) -> Summary | None:
         """Summarise a healthy recording for later comparisons; None if it allows no volume balance.
 
-        The summary contains the fields of `scatter.RecordingSums` that are known, and
+        While the pump rests, do valves cut it off from the cylinder? A single recording may leave this open. The
+        summary therefore has the sums for both cases, and log odds, which are later combined over all healthy
+        recordings. Its entries are:
 
+        - the fields of `scatter.RecordingSums` that are known, for a pump that stays connected at rest;
         - `terms`: names of the balance's terms;
-        - `scale`: factor from computed to true flows, 0 if no flow can be stated in L/min (`Size`);
-        - if the machine rests, `shut_sums`: Gram matrices for a pump that valves cut off at rest, and `shut_odds`: log
-          odds that valves cut it off, from the leakage at rest;
-        - if it holds a load at rest, `held`: leaks while shut valves hold the load, and `held_odds`: the same log odds,
-          from these leaks;
-        - if no pump's flow is recorded (`is_creep`), `creep_odds`: log odds that the load creeps by leakage.
+        - `scale`: factor from computed to true flows (`Size`), 0 if no flow can be stated in L/min;
+        - `shut_sums`, `shut_odds`, if the machine rests: Gram matrices for a pump that valves cut off at rest, and log
+          odds that they do, from the leakage at rest;
+        - `held`, `held_odds`, if it holds a load at rest: leaks while shut valves hold the load, and log odds that the
+          valves are shut, from these leaks;
+        - `creep_odds`, if no pump's flow is recorded (`is_creep`): log odds that the load creeps by leakage.
         """
         has_position_balance = bool(equations(self.rig, frozenset(recording.channels)))
         recorded = self._compute_blocks(recording) if has_position_balance else None
@@ -186,27 +192,30 @@ class VolumeBalance:
         if recorded is not None and recorded.shut is not None:
             shut_sums = self._build_balance(recording, recorded.shut).recording_sums
             summary |= {"shut_sums": shut_sums.sums, "shut_odds": recorded.odds}
-            hold_odds = replace(balance, locked=True).locked_odds()
+            hold_odds = replace(balance, locked=True).locked_log_odds()
             if shut_sums.held is not None and hold_odds is not None:
                 summary |= {"held": shut_sums.held, "held_odds": hold_odds}
         if balance.is_creep:
             summary["creep_odds"] = balance.creep_log_odds()
         return {"terms": list(balance.columns[0].names), "scale": scale, **summary}
 
-    def predict_rise(self, summaries: Sequence[Summary], channels: frozenset[str], repeated: int = 1) -> Rise:
-        """Predict the rise [m^3/(s Pa)] that a healthy recording of a later day will show, and its uncertainty.
+    def predict_rise(self, summaries: Sequence[Summary], channels: frozenset[str], n_repeats: int = 1) -> Rise:
+        """Predict the distribution of the rise [m^3/(s Pa)] that a healthy recording of a later day will seem to show.
 
-        The rise is the leakage above that of the healthy recordings with the given `summaries` (`learn`). `channels`:
-        names of their channels; `repeated`: number of times that these recordings count, each time as further sessions.
+        The rise is the leakage of a recording minus that of the healthy recordings with the given `summaries`
+        (`learn`). Without a leak it scatters about 0, by differences between days and errors of the estimates; a leak
+        must exceed this scatter. The later recording is taken to have the Gram matrices of the first healthy one, and
+        the median flow and pressure. `channels`: names of the recorded channels; `n_repeats`: number of times that the
+        healthy recordings count, as if they had been repeated on other days.
         """
         shut = _are_valves_shut(summaries, "shut_odds") or self._shut_log_odds(summaries, channels) > 0.0
         healthy = [_sums_from_summary(summary, shut) for summary in summaries]
-        repetitions = [sums._replace(start_s=_shift_start(sums, k)) for k in range(repeated) for sums in healthy]
+        repetitions = [sums._replace(start_s=_shift_start(sums, k)) for k in range(n_repeats) for sums in healthy]
         flow, pressure = (float(np.median([summary[name] for summary in summaries])) for name in ("flow", "pressure"))
         typical = healthy[0]._replace(flow=flow, pressure=pressure, start_s=None, held=None)
         first_dated = next((sums for sums in healthy if sums.start_s is not None), typical)
-        judged = typical._replace(start_s=_shift_start(first_dated, repeated))
-        return rise(judged, repetitions, self._columns(channels, shut))
+        later_recording = typical._replace(start_s=_shift_start(first_dated, n_repeats))
+        return rise(later_recording, repetitions, self._columns(channels, shut))
 
     def _shut_log_odds(self, summaries: Sequence[Summary], channels: frozenset[str]) -> float:
         """Compute the log odds that valves cut the pump off at rest, from summaries of healthy recordings (`learn`).
@@ -354,8 +363,8 @@ def _are_valves_shut(summaries: Sequence[Summary], odds_key: str) -> bool:
 def _shift_start(recorded: RecordingSums, n_ages: int) -> float | None:
     """Return the start of a recording [s since 1970], postponed by `n_ages` times the longest life of a machine.
 
-    Copies of a recording that are postponed by different multiples count as different sessions. Return None if the
-    recording is undated.
+    Copies of a recording that are postponed by different multiples therefore count as recordings of different days.
+    Return None if the recording is undated.
     """
     return None if recorded.start_s is None else recorded.start_s + n_ages * _MAX_AGE_S
 

@@ -192,9 +192,9 @@ class RecordedBalance:
 
     @cached_property
     def chambers(self) -> HeldChambers | None:
-        """Estimator of the chambers' leaks in holds, i.e. while shut valves cut the chambers off from the resting pump.
+        """Estimator of the chambers' leaks from holds: times in which the pump rests and shut valves hold the load.
 
-        None if valves do not hold the load (`locked`), if no hold is long enough or loaded, if the pressures have no
+        None if valves do not hold the load (`locked`), if no hold is long enough and loaded, if the pressures have no
         unit, or if the piston's areas are unknown.
         """
         sides = self._cylinder_sides() if self.locked and self.recording.units["p_A"] != COUNTS else None
@@ -249,12 +249,12 @@ class RecordedBalance:
         log_load_density = -float(np.log(max(max_load, np.finfo(float).tiny)))
         return log_load_density - log_offset_density > INFERENCE.held_oil.loaded
 
-    def locked_odds(self) -> float | None:
-        """Compute the log odds that valves really shut off the chambers in holds; None without holds.
+    def locked_log_odds(self) -> float | None:
+        """Compute the log odds that valves are shut in holds, and not open; None without holds.
 
-        A hold is a time in which shut valves are supposed to hold the load. The leaks in holds are compared with the
-        total leakage of pump and piston, which holds would show if the valves were open. Positive log odds mean that
-        the valves are shut. The log odds are limited to +-`rest.most` of `priors.toml`.
+        A hold is a time in which shut valves are supposed to hold the load. With open valves the leakage in holds would
+        be the total leakage of pump and piston; with shut valves it is smaller. The two are compared. The log odds are
+        limited to +-`rest.most` of `priors.toml`.
         """
         if self.chambers is None:
             return None
