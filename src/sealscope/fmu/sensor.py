@@ -217,7 +217,7 @@ def build_functions(choice: SensorChoice) -> dict[str, Callable[..., Any]]:
 
     layout = memory_layout(choice)
     interval = 1.0 / choice.rate  # [s] between samples
-    add_sample, memory = _build_sample_law(choice), record_view(layout)
+    add_sample, memory = _build_add_sample(choice), record_view(layout)
     n_memory = layout.itemsize // 8  # doubles
     n_inputs, n_results, n_values = len(INPUTS), len(SENSOR_RESULTS), len(VALUES)
     size_error = choice.size_error
@@ -264,7 +264,7 @@ def build_functions(choice: SensorChoice) -> dict[str, Callable[..., Any]]:
     return {"start": start, "advance": advance, "report": report}
 
 
-def _build_sample_law(choice: SensorChoice) -> Callable[..., Any]:
+def _build_add_sample(choice: SensorChoice) -> Callable[..., Any]:
     """Build the compiled function that adds one sample of the measurements to a soft sensor's memory.
 
     A sample has one measurement of each of the channels `INPUTS`. `choice`: settings of the sensor.
@@ -274,7 +274,7 @@ def _build_sample_law(choice: SensorChoice) -> Callable[..., Any]:
     n_support, n_block = SPAN * n_stride, n_stride * block_strides
     # phi = peak (1 - s^2)^4; the first value of `test_function` is at the middle of the first interval
     peak = float(test_function(rate)[0, 0]) / (1.0 - (1.0 / n_support - 1.0) ** 2) ** 4
-    finish_block = _build_block_law(choice)
+    finish_block = _build_finish_block(choice)
 
     @law
     def add_sample(m: Any, displacement: float, p_A: float, p_B: float, theta: float, x: float) -> None:
@@ -319,7 +319,7 @@ def _add_pressure_difference(m: Any, k: int, n_block: int, rate: float) -> None:
 
     `n_block`: samples in a block; `rate` [Hz]: sampling rate. An interval with a missing measurement is left out.
     """
-    slot = (k // n_block) % (SUPPORT + 1)
+    slot = (k // n_block) % (SUPPORT + 1)  # of this block in the ring buffer `pressure_sums`
     if k % n_block == 0:
         m.pressure_sums[slot, _SUM] = m.pressure_sums[slot, _NUMBER] = 0.0
     # increments[_LEAK]: mean of p_A - p_B over the interval, times its duration 1/rate; an interval without the
@@ -477,20 +477,22 @@ def _update_with_block(m: Any, size_error: float, b: int, n_rows: float, pressur
         _fit_to_waiting(m, size_error)
 
 
-def _build_block_law(choice: SensorChoice) -> Callable[..., Any]:
-    """Build the compiled function that finishes a block of a soft sensor: `finish_block`.
+def _build_finish_block(choice: SensorChoice) -> Callable[..., Any]:
+    """Build the compiled function `finish_block` of a soft sensor, to be called when a block's last row is complete.
 
-    The function weights the rows of the volume balance and estimates the leakage. `choice`: settings of the sensor.
+    A block is a few seconds of measurements. `choice`: settings of the sensor.
     """
     column_order, n_fast, size_error = choice.column_order, choice.n_fast, choice.size_error
 
     @large_law
     def finish_block(m: Any, rows: Any, ends: Any, block: int) -> None:
-        """Weight the rows of the volume balance in all open blocks, and estimate the leakage of each block.
+        """Finish the newest block: weight the rows of all open blocks, and use each in the estimate of the leakage.
 
-        A block is open if it is not yet weighted. The first `SUPPORT` blocks are weighted together, later blocks one
-        by one as they end. `m`: the sensor's memory; `rows`: rows of the open blocks; `ends`: index past the last row
-        of each open block, set here for the newest block; `block`: number of the newest block.
+        A block is open until its rows are weighted. The first `SUPPORT` blocks stay open until the last of them ends,
+        so the calls for the earlier ones only store the block's end. Each later block is weighted when it ends.
+
+        `m`: the sensor's memory; `rows`: rows of the volume balance in the open blocks; `ends`: index past the last row
+        of each open block, of which the last is set here; `block`: number of the newest block in the run, from 0.
         """
         n_rows, n_open, is_first = len(rows), len(ends), m.n_weighted == 0.0
         ends[n_open - 1] = n_rows
@@ -500,7 +502,7 @@ def _build_block_law(choice: SensorChoice) -> Callable[..., Any]:
         if is_first:
             _find_angle_sign(m, n_rows)
         for r in range(n_rows):
-            rows[r, _RESPONSE] *= m.angle_sign
+            rows[r, _RESPONSE] *= m.angle_sign  # -1 if the pump's angle is recorded with the opposite sign, else 1
         m.n_weighted += n_open
         weigh_rows(
             rows,
@@ -515,7 +517,7 @@ def _build_block_law(choice: SensorChoice) -> Callable[..., Any]:
         m.n_open = m.n_rows = 0.0
         for b in range(n_open):
             block_rows = ends[b] - (ends[b - 1] if b else 0.0)
-            slot = (block - n_open + 1 + b) % (SUPPORT + 1)
+            slot = (block - n_open + 1 + b) % (SUPPORT + 1)  # of this block in the ring buffer `pressure_sums`
             mean_pressure = m.pressure_sums[slot, _SUM] / max(m.pressure_sums[slot, _NUMBER], 1.0)
             if block_rows > 0.0:
                 _update_with_block(m, size_error, b, block_rows, max(mean_pressure, TINY))
@@ -552,12 +554,18 @@ def _variance_of_mean(history: Any, newest: int, n: int) -> float:
 def _write_results(m: Any, size_error: float, quantiles: Any, out: Any) -> None:
     """Compute the outputs of the soft sensor by the formulas of the module's docstring, and write them to `out`.
 
-    The leakage is the mean conductance of the last blocks (at most `WINDOW`), times their mean abs(p_A - p_B). The rise
-    is the mean conductance of the last blocks after the baseline (at most `WINDOW`), minus that of the baseline (the
-    first `WINDOW` blocks), times the mean abs(p_A - p_B) of these last blocks. `m`: the sensor's memory; `size_error`:
-    relative standard error of the leakage due to the machine's sizes; `quantiles`: Student's t for 1, 2, ... degrees of
-    freedom; `out`: outputs in the order of `SENSOR_RESULTS`. The number of blocks and the misfit are always written;
-    the other outputs are 0 while there are too few blocks.
+    The baseline is the first `WINDOW` blocks. With means over the last blocks, and p = abs(p_A - p_B),
+
+        leakage = (mean of p) (mean of G),
+        rise = (mean of p) ((mean of g) - (mean of g in the baseline)),
+
+    where G is a block's conductance, and g the conductance that can be compared between blocks (`_COMPARABLE_G`). The
+    means are over the last `WINDOW` blocks, for the rise without those of the baseline. The leakage needs two blocks,
+    the rise two blocks after the baseline; without them their outputs are 0. The number of blocks and the misfit are
+    always written.
+
+    `m`: the sensor's memory; `size_error`: relative standard error of the leakage due to the machine's sizes;
+    `quantiles`: Student's t for 1, 2, ... degrees of freedom; `out`: outputs in the order of `SENSOR_RESULTS`.
     """
     out[:] = 0.0
     history, n_estimated, newest = m.history, int(m.n_estimated), int(m.n_estimated) - 1
@@ -578,7 +586,9 @@ def _write_results(m: Any, size_error: float, quantiles: Any, out: Any) -> None:
     base, pressure = m.base_sum / WINDOW, _mean(history, newest, n, _PRESSURE)
     rise = _mean(history, newest, n, _COMPARABLE_G) - base
     base_variance = max((m.base_square_sum - WINDOW * base**2) / (WINDOW - 1.0), m.base_variance_sum / WINDOW)
-    # variance of the random walk from the baseline's middle to that of the last n blocks, over `base_variance`
+    # variance of a healthy machine's random walk from the middle of the baseline to the middle of the last n blocks,
+    # over `base_variance`; the divisor is there because the walk also adds WALK (WINDOW + 1)/6 to that variance, where
+    # the variance of a block's noise is 1
     walk = WALK * (n_estimated - 0.5 * (n + WINDOW)) / (1.0 + WALK * (WINDOW + 1.0) / 6.0)
     variance = _variance_of_mean(history, newest, n) + base_variance * (1.0 / WINDOW + walk)
     half_width = math.hypot(quantiles[n - 2] * math.sqrt(variance), WITHIN_95 * size_error * rise)

@@ -110,7 +110,7 @@ class AlarmJudge:
 
     `alarm`: the open alarm, None if there is none; `raised`: number of alarms so far; `above`, `error`, `below`:
     numbers of successive blocks above the warning threshold, above the error threshold, and below the threshold at
-    which the alarm ends; `over_s` [s]: time at which the last alarm ended.
+    which the alarm ends; `over_s` [s]: time of the last change of an alarm that was no longer active (`Alarm.active`).
     """
 
     actuator: str
@@ -188,9 +188,10 @@ class AlarmJudge:
         return self._set_alarm(updated), event
 
     def _raise_alarm(self, **findings: Any) -> Alarm:
-        """Raise a new alarm, or raise the open alarm, whose leak had ended, again under its id; return the alarm.
+        """Raise an alarm and return it: a new one, or the open alarm again if its leak had ended before.
 
-        `findings`: fields of the alarm besides id, actuator, state and shelving.
+        An alarm that is raised again keeps its id and its shelving. `findings`: all other fields of the alarm, except
+        for actuator and state.
         """
         shelved_until_s = 0.0
         if self.alarm is None:
@@ -249,14 +250,14 @@ class AlarmJudge:
         return self._raise_alarm(cause=verdict.cause, baseline=baseline, **findings), "raised"
 
     def _set_alarm(self, alarm: Alarm) -> Alarm:
-        """Store a changed alarm as the open alarm, or None if it is closed or invalid; return the changed alarm.
+        """Store a changed alarm as the open alarm, or end it if it is closed or invalid; return the changed alarm.
 
-        If its cause has ended, or it is closed or invalid, the time of its change is stored as the end of the last
-        alarm (`over_s`).
+        An alarm can end in two steps: first its cause ends, but the alarm stays open until a person has seen it; then
+        it is closed. Either step stores the time of the change in `over_s`, as does every change in between.
         """
-        if not alarm.active:
+        if not alarm.active:  # the cause has ended, or the alarm is closed or invalid
             self.over_s = alarm.updated_s
-        self.alarm = None if alarm.is_over else alarm
+        self.alarm = None if alarm.is_over else alarm  # closed or invalid
         return alarm
 
     def apply_mark(self, mark: str, t: float, *, until: float = 0.0, reason: str = "") -> Alarm:

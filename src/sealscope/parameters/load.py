@@ -101,7 +101,7 @@ def _load_packaged(name: str) -> Rig:
 def _is_path(text: str) -> bool:
     """Return True if a text is the path of a rig's file, rather than the name of a packaged rig.
 
-    A path ends in .toml, contains a separator of folders, or names an existing file.
+    A path ends in .toml, contains a slash or the system's path separator, or names an existing file.
     """
     return text.endswith(".toml") or "/" in text or os.sep in text or is_file_path(text)
 

@@ -352,11 +352,11 @@ class Rig(Part):
         ]
 
     def present_values(self) -> dict[str, Value]:
-        """Return the SI values of the parameters by dotted name, without those that equal their `absent` value.
+        """Return the SI values of the parameters whose part or effect is in the model, by dotted name.
 
-        The `absent` value of a parameter means that its part or effect is not in the model. The result identifies a
-        machine across versions of the package: it does not contain parameters that a later version has added, since
-        they have their `absent` values in older rigs.
+        A parameter is left out if it has the `absent` value of its declaration, such as the volume 0 of a hose. The
+        result identifies a machine across versions of the package: a parameter that a later version adds has its
+        `absent` value in older rigs, and so does not change their result.
         """
         return {name: self[name] for name, field in declared_fields().items() if self[name] != absent_of(field)}
 

@@ -24,11 +24,10 @@ def coulomb_friction(p_A: float, p_B: float, F_pr: float, F_cfr: float, use_diff
 
 @contracted
 def stribeck_force(speed: float, F_C: float, K_brk: float, C_c: float) -> float:
-    """Compute the Coulomb and Stribeck friction [N] of steady sliding at `speed` >= 0 [m/s], eq. (4.21) of the thesis.
+    """Compute the sum of Coulomb and Stribeck friction [N] at `speed` >= 0 [m/s], eq. (4.21) without viscous friction.
 
-    F_C (1 + (K_brk - 1) exp(-C_c speed)) falls from the breakaway force K_brk F_C at standstill to the Coulomb force
-    F_C [N] at high speed. `K_brk`: breakaway force over Coulomb force; `C_c` [s/m]: transition coefficient. Viscous
-    friction is not included.
+    The sum F_C (1 + (K_brk - 1) exp(-C_c speed)) falls from the breakaway force K_brk F_C at standstill to the Coulomb
+    force F_C [N] at high speed. `K_brk`: breakaway force over Coulomb force; `C_c` [s/m]: transition coefficient.
     """
     return F_C * (1.0 + (K_brk - 1.0) * exponential(-C_c * speed))  # type: ignore[no-any-return]
 

@@ -109,9 +109,10 @@ def edge_samples(wavelet: str = "db8", levels: int = 4, transform: Transform = "
 
 
 def min_samples(wavelet: str = "db8", levels: int = 4, transform: Transform = "stationary") -> int:
-    """Compute the length [samples] of the shortest signal with a sample in each level that does not depend on padding.
+    """Compute how many samples a signal needs, so that each level has a sample that does not depend on padding.
 
-    It is 226 for db8 to level 4 and the stationary transform.
+    The deepest level decides, since padding affects most samples there. The result is 226 for db8 to level 4 and the
+    stationary transform.
     """
     return int(edge_samples(wavelet, levels, transform)[-1].sum()) + 1
 

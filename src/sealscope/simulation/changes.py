@@ -103,9 +103,10 @@ def block_bounds(effects: Sequence[Effect], n_out: int, rate: float) -> np.ndarr
     which the solver writes its results, `n_out` of them at `rate` [Hz]; `effects`: changes of parameters within the
     run.
 
-    A block is at most `LONGEST_BLOCK` long, and short enough that no effect changes by more than its `max_change`
-    within it, but not shorter than the effect's `min_block`. Breakpoints of effects fall on bounds, to within one
-    output interval.
+    A block is at most `LONGEST_BLOCK` long, and breakpoints of effects fall on bounds, to within one output interval.
+    Longer blocks are divided into equal parts, as many as the effect that needs most: enough that it changes by at most
+    its `max_change` from part to part, but no more than keep the parts as long as its `min_block`. A part may therefore
+    be shorter than the `min_block` of another effect. Between close breakpoints it may be shorter than any.
     """
     if not effects:
         return np.array([0, n_out], dtype=np.int64)
@@ -287,7 +288,7 @@ class Wander:
 
 
 def linear_path(size: float, duration: float) -> Wander:
-    """Make the course of a drift that changes by `size` over `duration` [s], and continues with the same slope."""
+    """Make a drift that is linear in time: 0 at the start of the run, `size` at the time `duration` [s]."""
     return Wander((), duration, size)
 
 

@@ -61,7 +61,7 @@ def decimate(values: Array, factor: int, n: int, delay: float = 0.0) -> Array:
     reach = FILTER_REACH * factor
     whole_delay = math.floor(delay)
     taps = anti_alias_taps(factor, delay - whole_delay)
-    if taps.size == 1:  # not filtered, only delayed by whole samples: the same filter with the usual length
+    if taps.size == 1:  # a single coefficient 1, for a delay by whole intervals: `padded` needs the usual filter length
         taps = np.r_[np.zeros(reach), 1.0, np.zeros(reach)]
     padded = np.concatenate([np.full(reach + whole_delay, values[0]), values])
     windows = np.lib.stride_tricks.sliding_window_view(padded, taps.size)[::factor]

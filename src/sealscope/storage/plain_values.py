@@ -74,14 +74,16 @@ _PLAIN_RULES = {
 
 
 def format_error(error: ValidationError, entry_name: Callable[[str], str] = str, unit: str = "") -> str:
-    """Format the first error of pydantic as one line, "ENTRY must be ..., got ...".
+    """Format one of pydantic's errors as a line such as "ENTRY must be ..., got ...".
 
-    An unknown entry is stated before all other errors. `entry_name` converts the name of an entry ("" for the whole
-    value) to its name in the text. `unit` is appended to the rule.
+    It is the error of the first unknown entry if there is one, else the first error. The line starts with the name of
+    the outermost entry ("" for the whole value), which `entry_name` converts, and the names of the entries within it.
+    `unit`: text that is appended to the broken rule.
     """
     errors = error.errors(include_url=False)
     first = next((detail for detail in errors if _PLAIN_RULES.get(detail["type"]) == "is not known"), errors[0])
-    entry, *path = (str(part) for part in first["loc"] or ("",) if part != "[key]")  # pydantic's mark of a wrong key
+    # pydantic appends "[key]" if the key of an entry is wrong, rather than its value
+    entry, *path = (str(part) for part in first["loc"] or ("",) if part != "[key]")
     inner_names = [f"[{int(part) + 1}]" if part.isdigit() else f".{part}" for part in path]  # items count from 1
     place = entry_name(entry) + "".join(inner_names)
     if plain_rule := _PLAIN_RULES.get(first["type"]):

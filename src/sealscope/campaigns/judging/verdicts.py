@@ -54,14 +54,15 @@ def compute_thresholds(
     promise: Promise = "average",
     confidence: float = 0.95,
 ) -> Thresholds:
-    """Compute the threshold of each scorer that needs one, for each duty with enough leak-free rows.
+    """Compute the threshold of each scorer that needs one, for each duty with enough leak-free records.
 
-    The duty of a row is its command and stroke direction (`duty_label`). A row without a score (a record that could not
-    be scored) cannot raise an alarm, so it counts as the lowest score.
+    `rows`: results of the records; those for calibration without an error count. The duty of a record is its command
+    and stroke direction (`duty_label`). A record without a score cannot raise an alarm, so it counts as the lowest
+    score of its duty.
 
     `false_alarm`: wanted false-alarm probability; `promise`: "average" if it is kept on average over sets of leak-free
-    rows, "bound" if it is kept with the probability `confidence`. Returns thresholds by (detector, duty). Raises
-    InputError if a scorer needs a threshold and no duty has enough rows for `false_alarm`.
+    records, "bound" if it is kept with the probability `confidence`. Returns thresholds by (detector, duty). Raises
+    InputError if a scorer needs a threshold and no duty has enough records for `false_alarm`.
     """
     scorers = [name for name in detectors if parse_detector_name(name).needs_threshold]
     leak_free: dict[str, list[CaseRow]] = {}
@@ -77,7 +78,7 @@ def compute_thresholds(
         for duty, group in leak_free.items():
             scores = [score for row in group if (score := row.score(name)) is not None]
             if scores and len(group) >= needed:
-                scores += [min(scores)] * (len(group) - len(scores))  # for the rows without a score
+                scores += [min(scores)] * (len(group) - len(scores))  # for the records without a score
                 thresholds[name, duty] = quantile_threshold(scores, false_alarm, confidence, promise)
     return thresholds
 

@@ -130,10 +130,10 @@ class SparkplugNode:
         return self._topic("NDEATH"), spb.encode_payload(payload)
 
     def _on_connect(self, client: Any, userdata: Any, flags: Any, reason: Any, properties: Any) -> None:
-        """Subscribe to commands after a connection, and mark the birth messages, which state all metrics, as due.
+        """Handle the broker's answer to an attempt to connect; called by the library paho.
 
-        The library paho calls this after an attempt to connect. If the broker refuses the connection, that is only
-        logged.
+        After a connection the node subscribes to commands, and its birth messages, which state all metrics, become due.
+        If the broker refuses the connection, that is only logged.
         """
         if reason.is_failure:
             _log.error("the broker %s refuses the Sparkplug node: %s", self._broker.host, reason)

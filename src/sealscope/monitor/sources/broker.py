@@ -125,10 +125,11 @@ class _Connection:
             self._link.close()
 
     def _on_connect(self, client: Any, userdata: Any, flags: Any, reason: Any, properties: Any) -> None:
-        """Subscribe to all topics after a connection, or begin an outage if the broker refuses it.
+        """Handle the broker's answer to an attempt to connect; called by the library paho.
 
-        A Sparkplug primary host also publishes that it is online. The decoder is told, so that it requests the births
-        of Sparkplug nodes.
+        If the broker refuses the connection, an outage begins. Otherwise an outage ends, and all topics are subscribed;
+        a Sparkplug primary host first publishes that it is online. The decoder is told of the connection, so that it
+        requests the births of Sparkplug nodes.
         """
         self._connection += 1
         if reason.is_failure:
@@ -140,7 +141,7 @@ class _Connection:
             client.publish(*self._state_message(online=True), qos=1, retain=True)
         for topic in (*self._names, *(self._host.topics if self._host is not None else ())):
             client.subscribe(topic, qos=1)
-        self._received.put((self._connection, None), 0, always=True)
+        self._received.put((self._connection, None), 0, always=True)  # no message: a new connection
 
     def _offline_message(self) -> tuple[str, str]:
         """Build topic and payload of the last will, by which a Sparkplug primary host states that it is offline.

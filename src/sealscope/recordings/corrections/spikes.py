@@ -28,7 +28,7 @@ _N_CHANGES = 2**15
 
 
 def remove_spikes(recording: Recording) -> tuple[Recording, list[Finding]]:
-    """Set spikes to NaN, i.e. single samples that leap and return at once, and report them as findings.
+    """Remove spikes, i.e. single samples at which a channel leaps and returns at once: they become NaN.
 
     Slow channels and the command are left as they are. Returns the recording, and a finding for each channel with
     spikes.
@@ -51,9 +51,9 @@ def find_spikes(values: Array) -> NDArray[np.intp]:
     """Find the indices of the samples at which a channel (n,) leaps and returns at once.
 
     Such a sample lies above both neighbours, or below both. The smaller of the two changes must be several times
-    (`spike.times` of `priors.toml`) larger than usual changes, other leaps nearby and the local slope. The result is
-    empty if there are so many such samples that the signal itself leaps: more than a logger's errors at the rate
-    `spike.share` explain, which have Poisson's distribution.
+    (`spike.times` of `priors.toml`) larger than usual changes, other leaps nearby and the local slope. The number of a
+    logger's errors has a Poisson distribution, with the fraction `spike.share` of the samples as its mean. If there are
+    many more such samples, the signal itself leaps, and the result is empty.
     """
     known = np.flatnonzero(np.isfinite(values))
     if known.size < _MIN_SAMPLES:

@@ -130,11 +130,16 @@ def simulate_batch(
     All runs must have the same duration and sampling rate. Rigs, drifts, faults of the machine and loads may differ. A
     run may have one leak, which opens abruptly or linearly.
 
-    Runs are integrated together if they have the same choices of the rig (such as the friction law), command waveform,
-    load, method, step and error. Unless they state a step, one is chosen for all of them by their error, or else by
-    `error`. A run's results do not depend on `threads`. They depend on the other runs only through what is chosen for
-    all of them: the step, the blocks of time in which changing parameters are constant, and the end of the search for
-    leakage coefficients. The noise differs from that of `simulate`.
+    Runs with the same choices of the rig (such as the friction law), command waveform, load, method, step and error are
+    a set, which is integrated together. If the runs of a set state no step, one is chosen for the set, by the error
+    that they state or else by `error`. The results of a run do not depend on `threads`. They depend on the other runs
+    of its set only through
+
+    - the step;
+    - the blocks of time in which changing parameters are taken as constant;
+    - the number of iterations in the search for leakage coefficients.
+
+    The noise of a run differs from its noise in `simulate`.
 
     Parameters
     ----------

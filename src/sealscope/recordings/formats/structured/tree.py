@@ -71,8 +71,8 @@ def _struct_fields(value: Any) -> Mapping[str, Any] | None:
 def _iter_struct(group: str, name: str, fields: Mapping[str, Any], clock: Clock | None, depth: int) -> Iterator[Series]:
     """Yield the series of samples in a struct: a time series, a signal, or a group of other values.
 
-    A time series has samples and their times. A signal has samples and a unit, or is that of a Simulink log. `fields`:
-    the fields of the struct by name; other arguments as for `_iter_value`.
+    A time series has samples and their times. A signal has samples and a unit or, in a Simulink log, the fields `name`
+    and `values`. `fields`: the fields of the struct by name; other arguments as for `_iter_value`.
     """
     by_name = {key.rstrip("_").casefold(): value for key, value in fields.items()}
     unit = _first_text(by_name, _UNIT_FIELDS)
@@ -91,7 +91,11 @@ def _iter_struct(group: str, name: str, fields: Mapping[str, Any], clock: Clock 
 
 
 def _iter_time_series(group: str, name: str, by_name: Mapping[str, Any], clock: Clock, depth: int) -> Iterator[Series]:
-    """Yield the series of samples in a struct that also contains their times.
+    """Yield the series of samples in a struct that also contains their times, in one of three layouts.
+
+    - Simulink's structure with time: field `signals`, a struct or an array of structs with `values` and `label`.
+    - MATLAB's `timeseries`: field `data` with an array.
+    - Other time series: field `data` with a struct or another value that contains the series.
 
     `by_name`: the fields of the struct by their names in lower case; `clock`: the times; other arguments as for
     `_iter_value`.

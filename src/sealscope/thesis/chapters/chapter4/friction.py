@@ -29,9 +29,9 @@ def thesis_rig() -> Rig:
 def stribeck_force(v: Array, F_C: float, *, literal_bracket: bool = False) -> Array:
     """Compute the friction [N] of the thesis's rig at the velocities `v` (n,) [m/s], eqs. (4.21), (4.22) of the thesis.
 
-    It has a Coulomb, a Stribeck and a viscous part (`stribeck_friction`). `F_C` [N]: Coulomb force; `literal_bracket`:
-    True to close the unbalanced bracket of eq. (4.22) at its end, so that the friction jumps at the threshold velocity
-    v_th.
+    The friction is the sum of Coulomb, Stribeck and viscous friction (`stribeck_friction`). `F_C` [N]: Coulomb force;
+    `literal_bracket`: True to close the unbalanced bracket of eq. (4.22) at its end. The friction then jumps at the
+    threshold velocity v_th.
     """
     f = thesis_rig().friction
     friction = getattr(stribeck_friction, "py_func", stribeck_friction)  # uncompiled: a few hundred points
@@ -54,7 +54,7 @@ def friction_at_threshold(F_C: float) -> dict[str, tuple[float, float]]:
 
 
 def falling_friction_limit(F_C: float) -> float:
-    """Compute the velocity [m/s] up to which the friction falls with speed, for the Coulomb force `F_C` [N].
+    """Compute the velocity [m/s] up to which the friction falls with speed, for the Coulomb force `F_C` > 0 [N].
 
     At this velocity v, viscous friction rises as fast as Stribeck friction falls: F_v = F_C (K_brk - 1) C_c exp(-C_c
     v). The result is 0 if the friction never falls. The parameters are those of the thesis's rig: F_v [N s/m] viscous
