@@ -208,7 +208,8 @@ class ColumnRoles:
     - `fast`, `slow`: terms whose coefficients are free in each block, or common to all, while rows are weighted.
 
     Prior standard deviations of the coefficients (m - 1,): `drift_rate`, drift relative to the coefficient [1/min];
-    `between_deviation`, relative difference between recordings, infinite without a prior; `level_deviation`, of the
+    `between_deviation`, relative difference between recordings, infinite without a prior, 0 for a zero of the flow that
+    repeats; `level_deviation`, of the
     constant part of the coefficient, in its unit. `names` and `drivers` (m - 1,): names and drivers of the terms;
     `healthy_conductance` [m^3/(s Pa)]: standard deviation of a healthy machine's leak.
     """
@@ -235,8 +236,34 @@ class ColumnRoles:
         states = [self.names.index(name) for name in (TURNING, MOVING_BIAS)] if MOVING_BIAS in self.names else []
         self.slow = (*(k for k in self.nuisance if k not in self.fast), *states)
         self.bias = self.names.index(BIAS) if BIAS in self.names else None
+        # where valves shut at rest, it stands for the pump's losses in motion; with an angle, for oil that leaks
+        if self.bias is not None and equation.terms[self.bias].drift == "bias" and not is_shut:
+            self.between_deviation[self.bias] = 0.0
         self.drivers = tuple(term.driver for term in equation.terms)
         self.healthy_conductance = equation.healthy
+
+    def difference_precisions(self, indices: Sequence[int], coefficients: Array, leak_coefficient: float) -> Array:
+        """Compute the precisions of the priors on the differences of c coefficients between recordings.
+
+        `indices` (c,): indices of their columns; `coefficients` (c,): their values in the other recordings;
+        `leak_coefficient`: that of the leak there [m^3/(s Pa)]. The prior deviations are relative to the coefficients.
+        The zero of the flow repeats, but p_A - p_B may be off by `zero.pressure` (`priors.toml`) more or less than in
+        the other recordings, which changes the constant flow by the leak's flow at this pressure.
+        """
+        is_leak = np.array(indices) == self.names.index(LEAK)
+        deviations = np.abs(coefficients) * np.where(is_leak, INFERENCE.between.pump, self.between_deviation[indices])
+        is_zero = (np.array(indices) == self.bias) & (self.between_deviation[indices] == 0.0)
+        deviations[is_zero] = abs(leak_coefficient) * INFERENCE.zero.pressure
+        with np.errstate(divide="ignore", over="ignore"):
+            return np.asarray(1.0 / deviations**2)
+
+    def with_free_zero(self) -> ColumnRoles:
+        """Return a copy of these column roles with a zero of the flow that may differ freely between recordings."""
+        roles = copy(self)
+        if self.bias is not None:
+            roles.between_deviation = self.between_deviation.copy()
+            roles.between_deviation[self.bias] = INFERENCE.between.bias
+        return roles
 
     def replace_leak(self, name: str) -> ColumnRoles:
         """Return a copy of these column roles in which the term `name` is tested instead of the leak.

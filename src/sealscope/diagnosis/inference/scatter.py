@@ -1,10 +1,11 @@
 """Rise of a recording's leakage, i.e. the leakage above that of healthy recordings, whose scatter is estimated.
 
-The Gram matrices of the healthy recordings, without the flow's offset, are added up and give the coefficients of all
-terms of the volume balance. A recording's residual under these coefficients, projected on the leak's column, is its
-rise. The recording's other coefficients may differ from the healthy ones within a prior. The rise r_j of each healthy
-recording over the n - 1 others measures the scatter, including all effects that the model does not describe. The
-comparison uses y_j = r_j (n - 1)/n, the rise over the mean of all n, and for the judged recording y, its rise.
+The Gram matrices of the healthy recordings are added up and give the coefficients of all terms of the volume balance.
+A recording's residual under these coefficients, projected on the leak's column, is its rise. The recording's other
+coefficients may differ from the healthy ones within a prior. The zero of the flow repeats: a free one would absorb a
+leak whose flow is nearly constant, and what it changes from day to day is part of the scatter. The rise r_j of each
+healthy recording over the n - 1 others measures this scatter, including all effects that the model does not describe.
+The comparison uses y_j = r_j (n - 1)/n, the rise over the mean of all n, and for the judged recording y, its rise.
 
 The width of the prior on the other coefficients is known only to within a factor: one machine, held at one temperature,
 repeats its coefficients to a thousandth; another changes by a tenth from run to run. With too narrow a prior the rises
@@ -43,7 +44,7 @@ import numpy as np
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, solve, sum_blocks
 from sealscope.diagnosis.inference.onset import BOUND_PROBABILITY
 from sealscope.diagnosis.inference.rows.weak_form import MAX_READING
-from sealscope.diagnosis.inference.terms import LAG, ORIFICE
+from sealscope.diagnosis.inference.terms import LAG, LEAK, ORIFICE
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.evaluation.scalar_search import find_near_root, find_root
 from sealscope.recordings.recording import Array
@@ -252,7 +253,7 @@ class RecordingSums(NamedTuple):
     """Summary of one recording, for the comparison with other recordings of the same machine.
 
     - `sums` (E, m, m): Gram matrix of the m columns of each of E equations, divided by the residual variance of a row,
-      with the flow's offset eliminated;
+      with the coefficients eliminated that recordings do not share (`eliminate_unshared`);
     - `flow`, `pressure`: mean magnitudes of the pump's flow [m^3/s] and of p_A - p_B [Pa];
     - `start_s`, `oil_degC`: date [s since 1970] and temperature of the oil, None if unknown;
     - `held` (6,): leaks while shut valves hold the load, in the order of `locked_holds.HeldLeaks`, or None;
@@ -277,7 +278,7 @@ class RecordingSums(NamedTuple):
     ) -> RecordingSums:
         """Summarise a recording from its `blocks`: sum of the Gram matrices, mean flow and mean pressure.
 
-        The sum is divided by the residual variance of a row, and the flow's offset is eliminated. The means are
+        The sum is divided by the residual variance of a row. Unshared coefficients are eliminated. The means are
         weighted by the numbers of rows. `columns`: for each equation the indices of its columns by role (leak, motion,
         left side); `start_s`: date [s since 1970] and `oil_degC`: oil temperature, None if unknown, are stored as they
         are.
@@ -285,7 +286,7 @@ class RecordingSums(NamedTuple):
         weights = np.maximum(blocks.rows, 1e-9)
         flow = float(np.average(blocks.flow, weights=weights))
         pressure = float(np.average(blocks.mean_pressure(), weights=weights))
-        return cls(_eliminate_unshared(sum_blocks(blocks, columns), columns), flow, pressure, start_s, oil_degC)
+        return cls(eliminate_unshared(sum_blocks(blocks, columns), columns), flow, pressure, start_s, oil_degC)
 
 
 def _conductance_of_flow(recording: RecordingSums) -> float:
@@ -568,14 +569,13 @@ def leak_deviations_from_mean(recordings: Sequence[RecordingSums], columns: Sequ
     """Compute the deviation of each recording's leak coefficient from the mean of all n recordings, shape (n,).
 
     It is (n - 1)/n times the difference of the recording's coefficient from the common coefficient of the other n - 1
-    recordings. The coefficients of all other terms may differ between recordings within the usual prior. `columns`: for
-    each equation the indices of its columns by role (leak, motion, left side).
+    recordings. The coefficients of all other terms may differ between recordings within the usual prior, the zero of
+    the flow freely. `columns`: for each equation the indices of its columns by role (leak, motion, left side).
     """
-    usual_width = np.ones(1)
-    all_sums = np.sum([recording.sums for recording in recordings], axis=0)
-    rises = [
-        _project_on_leak(recording.sums, all_sums - recording.sums, columns, usual_width)[0] for recording in recordings
-    ]
+    usual_width, columns = np.ones(1), [roles.with_free_zero() for roles in columns]
+    all_sums = [eliminate_unshared(recording.sums, columns) for recording in recordings]
+    total = np.sum(all_sums, axis=0)
+    rises = [_project_on_leak(sums, total - sums, columns, usual_width)[0] for sums in all_sums]
     return np.array(rises) * ((len(recordings) - 1) / len(recordings))
 
 
@@ -781,8 +781,7 @@ def motion_change(judged: Array, healthy: Array, roles: ColumnRoles) -> tuple[fl
     fitted = [k for k in roles.compared if k == roles.leak or np.isfinite(roles.between_deviation[k])]
     reference = solve(healthy[np.ix_(fitted, fitted)], healthy[fitted, roles.left])
     is_free = np.isin(fitted, [*roles.motion, roles.leak])
-    with np.errstate(divide="ignore", over="ignore"):
-        precision = 1.0 / (np.abs(reference) * roles.between_deviation[fitted]) ** 2
+    precision = roles.difference_precisions(fitted, reference, reference[fitted.index(roles.leak)])
     gram = judged[np.ix_(fitted, fitted)]
     prior = np.where(is_free, 0.0, np.minimum(precision, 1e9 * np.diag(gram)))
     weights = np.where(np.isin(fitted, motion), np.diag(gram), 0.0)
@@ -810,8 +809,8 @@ def student_rise(value: float, deviations: Sequence[float] | Array, prior_scatte
     return Rise(value, max(float(deviation), np.finfo(float).tiny), freedom)
 
 
-def _eliminate_unshared(gram: Array, columns: Sequence[ColumnRoles]) -> Array:
-    """Eliminate the coefficients that recordings do not share, such as the flow's offset, from each equation.
+def eliminate_unshared(gram: Array, columns: Sequence[ColumnRoles]) -> Array:
+    """Eliminate the coefficients that recordings do not share, such as a constant loss of oil, from each equation.
 
     These are the coefficients without a prior on differences between recordings. The leakage of a pump that holds the
     load is not eliminated, but set to zero first, since it counts only within a recording (`ColumnRoles.hold_leak`).
@@ -937,9 +936,7 @@ def _residual_products(gram: Array, reference: Array, roles: ColumnRoles, *, has
     coefficients = np.zeros(len(gram))
     coefficients[compared] = -solve(reference[np.ix_(compared, compared)], reference[compared, roles.left])
     nuisance = [k for k in compared if has_leak or k != roles.leak]
-    relative_sd = np.where(np.array(nuisance) == roles.leak, INFERENCE.between.pump, roles.between_deviation[nuisance])
-    with np.errstate(divide="ignore", over="ignore"):
-        prior = 1.0 / (np.abs(coefficients[nuisance]) * relative_sd) ** 2
+    prior = roles.difference_precisions(nuisance, coefficients[nuisance], coefficients[roles.names.index(LEAK)])
     coefficients[roles.left] = 1.0
     products = gram @ coefficients
     products[roles.left] = coefficients @ products  # the residual's sum of squares

@@ -18,7 +18,14 @@ from sealscope.diagnosis.inference.blocks import ColumnRoles, solve
 from sealscope.diagnosis.inference.circuit.locked_holds import HeldLeaks
 from sealscope.diagnosis.inference.differences import compare_with_healthy, excess_error, size_penalty
 from sealscope.diagnosis.inference.observable import Observable
-from sealscope.diagnosis.inference.scatter import MIN_WITH_HOLDS, RISE, RecordingSums, compare_with_leak, rise
+from sealscope.diagnosis.inference.scatter import (
+    MIN_WITH_HOLDS,
+    RISE,
+    RecordingSums,
+    compare_laws,
+    compare_with_leak,
+    rise,
+)
 from sealscope.diagnosis.inference.terms import AIR, LEAK, SPEED_LOSS, TURNING
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Array
@@ -65,6 +72,7 @@ def rival_rises(
     columns_to_test = [k for k, name in enumerate(names) if name in (AIR, *turning) or name.startswith("external leak")]
     if hold_rivals is not None:
         columns_to_test = [k for k in columns_to_test if not names[k].startswith("external leak")]
+    laws = compare_laws(judged, healthy, columns)
     healthy_gram = np.sum([recording.sums for recording in healthy], axis=0)
     observables = list[Observable]()
     for k in columns_to_test:
@@ -89,6 +97,8 @@ def rival_rises(
             observable = replace(observable, chance=max(observable.chance, pump_rise.chance))
         elif not is_air:
             log_ratio = compare_with_leak(judged, healthy, columns, names[k])  # for one independent residual
+            if log_ratio is not None and laws is not None:
+                log_ratio -= max(laws.log_ratio, 0.0)  # of the leak by the better law, laminar or an orifice
             log_ratio_to_leak = None if log_ratio is None else INFERENCE.size.readings * log_ratio
             observable = _penalise_size(observable, judged, unit_flows)
             observable = replace(observable, log_ratio_to_leak=log_ratio_to_leak)
@@ -148,15 +158,12 @@ def _estimate_change(gram: Array, reference: Array, columns: Sequence[ColumnRole
     information the change is 0 and the error infinite.
     """
     precision, moment = 0.0, 0.0
-    leak_deviation: float = INFERENCE.between.pump
     for e, roles in enumerate(columns):
-        deviations = roles.between_deviation.copy()
-        deviations[roles.names.index(LEAK)] = leak_deviation
-        free = [k for k in roles.compared if k != tested and np.isfinite(deviations[k])]
+        leak = roles.names.index(LEAK)
+        free = [k for k in roles.compared if k != tested and (k == leak or np.isfinite(roles.between_deviation[k]))]
         coefficients = solve(reference[e][np.ix_(free, free)], reference[e][free, roles.left])
         residual = gram[e][:, roles.left] - gram[e][:, free] @ coefficients
-        with np.errstate(divide="ignore", over="ignore"):
-            prior = 1.0 / (np.abs(coefficients) * deviations[free]) ** 2
+        prior = roles.difference_precisions(free, coefficients, coefficients[free.index(leak)])
         matrix, cross = gram[e][np.ix_(free, free)], gram[e][free, tested]
         # a coefficient of about 0 has a nearly infinite precision, which is limited
         regularised = matrix + np.diag(np.minimum(prior, 1e9 * np.diag(matrix)))
