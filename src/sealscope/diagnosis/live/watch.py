@@ -146,7 +146,7 @@ class Watch:
 
     @property
     def learned_with(self) -> tuple[Rig, Mapping[str, bool], float]:
-        """Settings with which the baseline is learned: rig, `litres` of the constructor, and learning time [h]."""
+        """Settings with which the baseline is learned, i.e. rig, `litres` of the constructor, and learning time [h]."""
         return self._rig, self._litres, self.learn_hours
 
     @property

@@ -155,7 +155,7 @@ class Diagnosis(Evidence):
 
     @property
     def measured_ratio(self) -> tuple[float, tuple[float, float]] | None:
-        """Measured over assumed ratio of displacement to piston area, and its 95 % interval: (value, (low, high)).
+        """Measured over assumed ratio of displacement to piston area, and the (low, high) ends of its 95 % interval.
 
         It is that of the first detector which has measured the ratio, the deciding one before others; None without one.
         """
