@@ -235,7 +235,7 @@ class Rig(Part):
 
     @property
     def circuit(self) -> HydraulicCircuit:
-        """Hydraulic circuit of the rig, i.e. the first of `CIRCUITS` that a parameter of the rig chooses by its value."""
+        """Hydraulic circuit of the rig, i.e. the first of `CIRCUITS` that a parameter of the rig chooses."""
         return next(circuit for circuit in CIRCUITS if attrgetter(circuit.parameter)(self) == circuit.value)
 
     @property

@@ -97,8 +97,8 @@ class Leak:
 
     `law`: "laminar", Q = G dp with G [m^3/(s Pa)] (worn seal), or "orifice", Q = C sign(dp) sqrt(abs(dp)) with C
     [m^3/(s Pa^0.5)] (needle valve); `opening`: how far the leak is open over time, 0 to 1. The size at full opening is
-    stated by one of `coefficient`, which is G or C, and `mean` [m^3/s], which is the mean of abs(Q) while the leak is open
-    (`sizing.mean_while_open`). For a stated mean, `sizing.size_leaks` finds the coefficient.
+    stated by one of `coefficient`, which is G or C, and `mean` [m^3/s], which is the mean of abs(Q) while the leak is
+    open (`sizing.mean_while_open`). For a stated mean, `sizing.size_leaks` finds the coefficient.
     """
 
     law: Literal["laminar", "orifice"] = "laminar"
