@@ -18,7 +18,8 @@ class HydraulicCircuit(NamedTuple):
     - `pump_feeds_chambers` chooses the volume balance (`diagnosis/inference/terms.py`: `equations`) and the
       controller's model of the drive (`control/drive.py`: `drive_of`).
 
-    A circuit that is diagnosed but never simulated needs an entry in `CIRCUITS` only.
+    A circuit that is diagnosed but never simulated needs an entry in `CIRCUITS` only, and its `value` among those that
+    the parameter may have.
 
     Attributes
     ----------

@@ -18,6 +18,7 @@ import pytest
 import sealscope as ss
 from sealscope.diagnosis.detectors.detector import make_observable
 from sealscope.diagnosis.inference.changes.charge_pressure import FALL, LOW
+from sealscope.diagnosis.inference.changes.features import SENSOR_FEATURES, sensor_features
 from sealscope.diagnosis.inference.changes.healthy_levels import DRIFTS, FRICTION
 from sealscope.diagnosis.inference.changes.levels import PATTERNS
 from sealscope.diagnosis.inference.changes.signals import observe_signals
@@ -107,6 +108,12 @@ def test_whatever_a_provider_makes_shows_some_event() -> None:
     patterns = [pattern for name, row in ROWS.items() if name not in CATCH_ALL for pattern in row["moves"]]
     unexplained = [key for key in known_names() if not any(fnmatchcase(key, pattern) for pattern in patterns)]
     assert sorted(unexplained) == []
+
+
+def test_every_sensor_feature_is_watched_live_too() -> None:
+    random = np.random.default_rng(1)
+    blocks = {name: random.standard_normal((2, 1000)) for name in ("p_A", "p_B", "omega")}
+    assert {name for name, _ in sensor_features(blocks, 1000.0)} == set(SENSOR_FEATURES)
 
 
 def test_the_reference_lists_every_observable_and_no_other() -> None:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from sealscope.diagnosis.inference.changes.features import (
+    SENSOR_FEATURES,
     amplitude_step_tests,
     feature_step_test,
     is_in_motion,
@@ -45,13 +46,7 @@ WINDOW: int = LIVE.explanation.window
 MIN_BLOCKS: int = CHANGES.levels.blocks[-1]
 #: Features of a block.
 DUTY = ("command", "motion")
-FEATURES = (
-    *DUTY,
-    "sense of p_A - p_B",
-    "noise of the pressures",
-    "noise of p_A beside that of p_B",
-    *(f"hum of {hertz:g} Hz" for hertz in CHANGES.features.mains),
-)
+FEATURES = (*DUTY, *SENSOR_FEATURES)
 #: Columns of a stored block: begin and end [s], number of samples, top speed, fraction of its time in motion, features,
 #: Gram matrix for the levels.
 _BEGIN, _END, _SAMPLES, _SPEED, _MOVING = range(5)

@@ -134,13 +134,22 @@ def _split_blocks(recording: Recording, length: int) -> tuple[Array, dict[str, A
     return recording.t[0] + (np.arange(count) + 0.5) * length / recording.rate, blocks
 
 
+#: Names of all that `sensor_features` yields, of which a running machine's blocks keep one number each.
+SENSOR_FEATURES = (
+    "sense of p_A - p_B",
+    "noise of the pressures",
+    "noise of p_A beside that of p_B",
+    *(f"hum of {hertz:g} Hz" for hertz in _PRIORS.mains),
+)
+
+
 def sensor_features(blocks: Mapping[str, Array], rate: float) -> Iterator[tuple[str, Array]]:
     """Yield the name and the values (K,) of each feature of the pressures that only a change of a sensor shifts.
 
     The features are the sign of p_A - p_B relative to the flow, the noise of both pressures, the difference of their
     noise, and the hum at the frequencies of the mains. The first word of a name is the kind of data that events list
-    (`Observable.data`), such as "noise". `blocks`: samples (K, length) by channel name, including p_A and
-    p_B, NaN where missing; `rate`: sampling rate [Hz].
+    (`Observable.data`), such as "noise". All names are in `SENSOR_FEATURES`. `blocks`: samples (K, length) by channel
+    name, including p_A and p_B, NaN where missing; `rate`: sampling rate [Hz].
     """
     p_A, p_B = blocks["p_A"], blocks["p_B"]
     if channel := next((name for name in ("omega", "u", "theta", "x") if name in blocks), None):
