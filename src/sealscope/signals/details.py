@@ -127,9 +127,15 @@ def details(
 ) -> Details:
     """Compute the wavelet details d_1 .. d_levels of a `signal` (n,), all at its length and sampling times.
 
-    The stationary details are ``a_0 = signal, d_j[n] = sum_k g[k] a_(j-1)[n + 2^(j-1)(L/2 - k)]``, and a_j is the
-    same with h in place of g (`reach` gives the support of each level). `edge` is the way in which the signal is
-    padded beyond its ends; `Details.inside` excludes the samples that depend on it.
+    Let g and h be the wavelet's decomposition filters, high-pass and low-pass, with L taps each. The `transform` is
+
+    - "stationary": ``a_0 = signal, d_j[n] = sum_k g[k] a_(j-1)[n + 2^(j-1)(L/2 - k)]``, and a_j is the same with h in
+      place of g (`reach` gives the support of each level);
+    - "decimated": Mallat's transform, with each coefficient of level j repeated 2^j times;
+    - "reconstructed": d_j is the part of the signal that comes from level j.
+
+    `edge` is the way in which the signal is padded beyond its ends; `Details.inside` excludes the samples that depend
+    on it.
 
     The alignment is that of PyWavelets: the energy of an event appears 5, 7, 9 and 13 samples early in db8's d_1 ..
     d_4 (5 in every decimated level, 0 in every reconstructed one). A causal system knows d_j of sample n only at

@@ -199,7 +199,7 @@ class BlockStream:
         self._left_signs = tuple(float(sign) for sign in require_part(state, "signs", Sequence))
         self._weighting.load_state(require_part(state, "weighting", Mapping))
 
-    def _left_side_signs(self, rows: Sequence[Array]) -> tuple[float, ...]:
+    def _flow_signs(self, rows: Sequence[Array]) -> tuple[float, ...]:
         """Estimate the sign of the recorded flow in each volume balance: 1 if it is right, -1 if a sensor is reversed.
 
         `rows`: for each balance the rows (r, m) of its regression, one for each test function of the weak form.
@@ -249,7 +249,7 @@ class BlockStream:
         roots = np.sqrt(weights[is_counted])[:, None]
         by_balance = zip(*(batch.rows for batch in batches), strict=True)
         rows = [np.concatenate(parts)[is_counted] * roots for parts in by_balance]
-        self._left_signs = self._left_signs or self._left_side_signs(rows)
+        self._left_signs = self._left_signs or self._flow_signs(rows)
         for equation_rows, columns, sign in zip(rows, self.columns, self._left_signs, strict=True):
             equation_rows[:, columns.left] *= sign
         block_ends = np.cumsum(is_counted.reshape(-1, self._strides_per_block).sum(axis=1))  # [counted rows]
@@ -354,7 +354,7 @@ def _sign_log_odds(z: float, other_cause: float) -> float:
 
         log odds = log((Phi(z) + c/2) / (Phi(-z) + c/2)).
 
-    `BlockStream._left_side_signs` lists the three symptoms.
+    `BlockStream._flow_signs` lists the three symptoms.
     """
     from scipy.special import ndtr
 

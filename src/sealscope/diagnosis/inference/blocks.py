@@ -292,10 +292,12 @@ class ColumnRoles:
         """Compute the prior standard deviation of the error that a pressure sensor's offset causes in a column.
 
         `column`: index of the regression's column. The result is in Pa for the column of a laminar leak, in Pa^0.5 for
-        the column of an orifice. It is 0 for columns that no pressure drives, or in an equation without flow offset.
+        the column of an orifice. It is 0 if no pressure drives the flow of the column's term. It is also 0 in an
+        equation without flow offset, since the error is removed by means of the flow offset's column (`_shift_offset`).
         The standard deviation of the offset itself is limited to the mean of abs(p_A - p_B) over `blocks`, since
         recordings may be in counts instead of Pa.
         """
+        # what drives the flow of the column's term: "pressure", "root" (square root of a pressure), or "" for neither
         driver = self.drivers[column] if column < self.left and self.bias is not None else ""
         root = float(np.mean(blocks.mean_root()))
         # derivatives of the driver by the pressure: d sqrt(p)/dp = 1/(2 sqrt(p))

@@ -40,7 +40,7 @@ MIN_FRACTION = 0.1
 _TINY = np.finfo(float).tiny
 
 
-def law_shapes(blocks: Blocks, columns: Sequence[ColumnRoles]) -> dict[float, Array]:
+def apparent_conductances(blocks: Blocks, columns: Sequence[ColumnRoles]) -> dict[float, Array]:
     """Compute the conductance that a leak with the flow |p_A - p_B|^e appears to have in each of K blocks.
 
     It is the regression coefficient of this flow on p_A - p_B within the block. For an orifice, e = 1/2, the Gram
@@ -87,7 +87,7 @@ def find_leak_step(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Informa
     likelihood of the leak's coefficient in the K blocks. Return None if too few blocks have information.
     """
     weights = np.maximum(leak.precision.sum(axis=0), 0.0)
-    shapes = law_shapes(blocks, columns)
+    shapes = apparent_conductances(blocks, columns)
     tests = []
     for exponent, prior in zip(EXPONENTS, law_priors(), strict=True):
         mean_shape = float(weights @ shapes[exponent]) / max(float(weights.sum()), _TINY)
@@ -129,7 +129,7 @@ def estimate_step_flow(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Inf
     positions = _onset_positions(leak, onsets)
     rows = np.maximum(blocks.rows, 1e-9)
     n_rows_after = np.maximum(rows @ step_shapes(len(blocks), positions), _TINY)
-    shapes, unit_flows = law_shapes(blocks, columns), law_flows(blocks)
+    shapes, unit_flows = apparent_conductances(blocks, columns), law_flows(blocks)
     log_weights, flows, standard_errors = [], [], []
     for growth, probability in _growth_priors():
         steps = step_shapes(len(blocks), positions, growth)

@@ -125,36 +125,38 @@ class _WhitenedSteps(NamedTuple):
 
 
 def _whiten_steps(blocks: Blocks, roles: ColumnRoles) -> _WhitenedSteps | None:
-    """Whiten the residuals of leak and constant flow in blocks, and their changes by unit steps of both.
+    """Convert the estimates of leak and constant flow in K blocks to residuals with independent unit noise.
 
-    `roles`: indices of the columns of the first equation by role (leak, motion, left side). Let P (2 K, 2 K) and
-    `vector` be the precision and the vector of the joint likelihood of leak and constant flow in K blocks. Then
-    P^(-1/2) vector are residuals with unit noise, and P^(1/2) converts changes of the coefficients to changes of the
-    residuals. Slow changes are projected out: level and slope of the leak, and a quadratic drift of the constant flow
-    (F and B of the module). Return None if the blocks have too little information.
+    Also computes how unit steps of leak and constant flow change these residuals. `roles`: indices of the columns of
+    the first equation by role (leak, motion, left side). Return None if the blocks have too little information.
+
+    The 2 K estimates (K leaks, K constant flows) have the inverse covariance P. With a root R of it, P = R' R, the
+    residuals are R times the estimates. Slow changes are then projected out: level and slope of the leak, and a
+    quadratic drift of the constant flow (F and B of the module).
     """
     count = len(blocks)
     precision, vector, pressure = estimate_leak_and_bias(blocks, roles)
     energies = np.diag(precision).reshape(2, count)  # of leak and constant flow; zero in some blocks at rest
     floors = np.maximum(np.finfo(float).eps * energies.max(axis=1), np.finfo(float).tiny)
     scale = np.sqrt(np.maximum(energies, floors[:, None])).ravel()
-    values, vectors = np.linalg.eigh(precision / np.outer(scale, scale))
-    is_informative = values > RANK_TOLERANCE * max(float(values[-1]), 0.0)
-    index = np.linspace(-1.0, 1.0, count)
-    trend, drift = (np.polynomial.legendre.legvander(index, degree) for degree in (1, 2))
+    eigenvalues, eigenvectors = np.linalg.eigh(precision / np.outer(scale, scale))
+    is_informative = eigenvalues > RANK_TOLERANCE * max(float(eigenvalues[-1]), 0.0)
+    position = np.linspace(-1.0, 1.0, count)  # of each block in the recording
+    trend, drift = (np.polynomial.legendre.legvander(position, degree) for degree in (1, 2))
     trend_and_drift = np.block([[trend, np.zeros_like(drift)], [pressure[:, None] * trend, drift]])
     # `MIN_BLOCKS` counts level and slope as well, which are two of the columns of trend and drift
     if np.count_nonzero(is_informative) < trend_and_drift.shape[1] + MIN_BLOCKS - 2:
         return None
-    root = np.sqrt(values[is_informative])
-    design = (vectors[:, is_informative] * root).T * scale
-    fixed = design @ trend_and_drift
-    fixed /= np.maximum(np.linalg.norm(fixed, axis=0), np.finfo(float).tiny)
-    complement = np.linalg.qr(fixed, mode="complete")[0][:, fixed.shape[1] :].T  # orthogonal to trend and drift
-    residuals = complement @ ((vectors[:, is_informative].T @ (vector / scale)) / root)
-    unit_steps = np.tril(np.ones((count, count)))
-    flow_offset = complement @ design[:, count:]
-    leak = complement @ design[:, :count] + flow_offset * pressure
+    root_eigenvalues = np.sqrt(eigenvalues[is_informative])
+    whitening = (eigenvectors[:, is_informative] * root_eigenvalues).T * scale  # R, of the informative directions
+    slow_changes = whitening @ trend_and_drift
+    slow_changes /= np.maximum(np.linalg.norm(slow_changes, axis=0), np.finfo(float).tiny)
+    complement = np.linalg.qr(slow_changes, mode="complete")[0][:, slow_changes.shape[1] :].T  # orthogonal to these
+    # R times the estimates, which are P^-1 vector
+    residuals = complement @ ((eigenvectors[:, is_informative].T @ (vector / scale)) / root_eigenvalues)
+    unit_steps = np.tril(np.ones((count, count)))  # column k: 1 from block k on
+    flow_offset = complement @ whitening[:, count:]
+    leak = complement @ whitening[:, :count] + flow_offset * pressure
     return _WhitenedSteps(leak @ unit_steps, flow_offset @ unit_steps, residuals)
 
 

@@ -308,12 +308,13 @@ def rise(judged: RecordingSums, baseline: Sequence[RecordingSums], columns: Sequ
     rises, rise_errors = np.zeros((SCALES, count)), np.zeros((SCALES, count))
     if count > 1:  # rises of each healthy recording over the others, scaled to its rise over the mean of all
         projections = [
-            _project_on_leak(recording.sums, healthy_sums - recording.sums, columns, widths) for recording in baseline
+            _estimate_leak_excess(recording.sums, healthy_sums - recording.sums, columns, widths)
+            for recording in baseline
         ]
         rises, rise_errors = (
             np.array(estimates).T * ((count - 1) / count) for estimates in zip(*projections, strict=True)
         )
-    values, error = _project_on_leak(judged.sums, healthy_sums, columns, widths)
+    values, error = _estimate_leak_excess(judged.sums, healthy_sums, columns, widths)
     level, level_error = _leak_level(healthy_sums, columns)
     errors = prior.estimate * np.median(np.column_stack([error, rise_errors]), axis=1)
     errors = np.maximum(errors, max(prior.finest * _conductance_of_flow(judged), 1.0 / MAX_READING))
@@ -372,15 +373,18 @@ class _Estimates(NamedTuple):
 def _compare_levels(judged: RecordingSums, baseline: Sequence[RecordingSums], estimates: _Estimates) -> Rise:
     """Estimate by how much the judged leak coefficient exceeds the coefficient that the healthy recordings predict.
 
-    `estimates`: rises of all recordings over the healthy mean. A level is the leak coefficient of one recording. Levels
-    are compared as z = asinh(level / 2 c), which is logarithmic for large levels (`_LevelScale`) and normal about an
-    unknown mean. Each recording has an unknown scatter sigma; sessions, oil and unusual conditions add covariances (see
-    the module).
+    `estimates`: rises of the judged and of the n healthy recordings over the healthy mean, with their errors. Each of
+    its s rows belongs to one width of the prior on the other coefficients; there is one row if no such prior is used.
+
+    The sum of healthy mean and rise is the leak coefficient a of a recording. Leak coefficients are compared as z =
+    asinh(a / 2 c), which is logarithmic for large a (`_LevelScale`). From z the predicted effect of the oil is
+    subtracted. The rest is normal about an unknown mean, with an unknown standard deviation sigma of single recordings;
+    sessions, oil and unusual conditions add covariances (see the module).
     """
     values, rises, errors, level, level_error, min_crossover = estimates
     prior = INFERENCE.scatter
     conductance_of_flow = _conductance_of_flow(judged)
-    # log widths of the prior on the other coefficients, in standard deviations; estimates from holds have no such prior
+    # log width of the prior in each row, in standard deviations; estimates from holds have no such prior
     exponents = np.linspace(-MAX_SCALE, MAX_SCALE, SCALES) if len(values) == SCALES else np.zeros(len(values))
     recordings = [*baseline, judged]
     oils = _oil_hypotheses(recordings)
@@ -391,12 +395,12 @@ def _compare_levels(judged: RecordingSums, baseline: Sequence[RecordingSums], es
     scale = _LevelScale(level, max(level_error, float(np.median(errors)), scatter, 0.1 * level, min_crossover))
     steepness = scale.slope(level)
     relative_slope = steepness * level
-    excess = sum(condition.log_excess for condition in find_unusual_conditions(judged, baseline))
+    log_condition_excess = sum(condition.log_excess for condition in find_unusual_conditions(judged, baseline))
     sessions = number_sessions([recording.start_s for recording in recordings], 3600.0 * INFERENCE.oil.shift)
     max_relative = min(steepness * prior.largest * conductance_of_flow, prior.relative)
     max_sigma = np.maximum(max_relative, 10.0 * steepness * errors)
     sigma = np.geomspace(steepness * errors, max_sigma, NODES, axis=1)
-    transformed, healthy = scale.transform(values), scale.transform(rises)
+    judged_z, healthy_z = scale.transform(values), scale.transform(rises)
     # log Jacobian of z, plus log prior of the width
     estimate_logarithms = np.log(scale.slope(level + rises)).sum(axis=1) - 0.5 * exponents**2
     predictions = []
@@ -406,13 +410,13 @@ def _compare_levels(judged: RecordingSums, baseline: Sequence[RecordingSums], es
             oil,
             relative_slope,
             session_deviation=steepness * prior.session * conductance_of_flow,
-            condition_deviation=relative_slope * (excess * INFERENCE.conditions.leak),
+            condition_deviation=relative_slope * (log_condition_excess * INFERENCE.conditions.leak),
         )
         shifts = relative_slope * oil.thinning  # effect of the oil on z
         predicted = Population(*candidates).predict(
-            transformed - shifts[-1], healthy - shifts[:-1], sigma, estimate_logarithms + oil.log_probability
+            judged_z - shifts[-1], healthy_z - shifts[:-1], sigma, estimate_logarithms + oil.log_probability
         )
-        predictions.append(scale.to_levels(predicted, transformed))
+        predictions.append(scale.to_levels(predicted, judged_z))
     all_oils = Mixture(*(np.concatenate(parts, axis=1) for parts in zip(*predictions, strict=True)))
     return _rise_of_mixture(all_oils, values)
 
@@ -575,7 +579,7 @@ def leak_deviations_from_mean(recordings: Sequence[RecordingSums], columns: Sequ
     usual_width, columns = np.ones(1), [roles.with_free_zero() for roles in columns]
     all_sums = [eliminate_unshared(recording.sums, columns) for recording in recordings]
     total = np.sum(all_sums, axis=0)
-    rises = [_project_on_leak(sums, total - sums, columns, usual_width)[0] for sums in all_sums]
+    rises = [_estimate_leak_excess(sums, total - sums, columns, usual_width)[0] for sums in all_sums]
     return np.array(rises) * ((len(recordings) - 1) / len(recordings))
 
 
@@ -944,16 +948,19 @@ def _residual_products(gram: Array, reference: Array, roles: ColumnRoles, *, has
     return _Residual(products, nuisance, np.minimum(prior, 1e9 * np.diag(gram)[nuisance]))
 
 
-def _project_on_leak(
+def _estimate_leak_excess(
     gram: Array, reference: Array, columns: Sequence[ColumnRoles], widths: Array
 ) -> tuple[Array, Array]:
     """Estimate by how much a recording's leak coefficient exceeds that of other recordings, and the standard errors.
 
-    `gram`, `reference` (E, m, m): Gram matrices of the recording and of the sum of the others, for each equation.
-    `columns`: for each equation the indices of its columns by role (leak, motion, left side); `widths` (s,): factors on
-    the usual prior standard deviations of the differences of all other coefficients, which are eliminated (Schur
-    complement). Then the excess is moment / precision, both summed over the equations. Both results have the shape (s,)
-    and are 0 where there is no information.
+    Both results have the shape (s,), for s widths of a prior, and are 0 where there is no information.
+
+    - `gram`, `reference` (E, m, m): Gram matrices of the recording, and of the sum of the others, for E equations.
+    - `columns`: for each equation the indices of its columns by role (leak, motion, left side).
+    - `widths` (s,): factors on the prior standard deviations of the differences of the nuisance coefficients.
+
+    The nuisance coefficients are eliminated (Schur complement). Each equation then states precision x excess = moment.
+    Precisions and moments are summed over the equations, and the excess is moment / precision.
     """
     precision, moment = np.zeros((2, len(widths)))
     for e, roles in enumerate(columns):
@@ -961,6 +968,7 @@ def _project_on_leak(
         matrix, cross = gram[e][np.ix_(nuisance, nuisance)], gram[e][nuisance, roles.leak]
         right = np.column_stack([cross, residual[nuisance]])
         for s, width in enumerate(widths):
+            # at most 1e9 times as precise as the recording, which already fixes a coefficient
             regularised = matrix + np.diag(np.minimum(prior / width**2, 1e9 * np.diag(matrix)))
             solved = solve(regularised, right)
             precision[s] += float(gram[e][roles.leak, roles.leak] - cross @ solved[:, 0])

@@ -142,18 +142,22 @@ def _fit_to_blocks(model: Coefficients, grams: Any, column_order: Any, rows: Any
 
 @kernel
 def _estimate_leak(
-    model: Coefficients, gram: Any, column_order: Any, rows: float, is_learned: bool
+    model: Coefficients, gram: Any, column_order: Any, n_equations: float, updates_model: bool
 ) -> tuple[float, float, float, float]:
     """Estimate the leak's coefficient in one block of a volume balance.
 
-    `gram` (m, m) are the products of the balance's columns, summed over the `rows` equations of the block.
+    `gram` (m, m) are the products of the balance's columns, summed over the `n_equations` equations of the block.
     `column_order` (n + 2,) holds the indices of these columns: n nuisances (terms other than the leak), the leak, and
-    the left side. With `is_learned`, the block is also added to the sums in `model`, from which the nuisances'
-    coefficients are computed. Returns (w, w g, w s, w^2 V) for the estimate g, its precision w, the shift s of the
-    series of estimates and the variance V of g due to the nuisances (`coefficients.estimate_leak`).
+    the left side. With `updates_model`, the block is also added to the sums in `model`, from which the nuisances'
+    coefficients are computed. Returns (w, w g, w s, w^2 V) with
+
+    - g: the estimate;
+    - w: its precision;
+    - s: the shift that is subtracted from g to keep the series of estimates continuous;
+    - V: the variance of g due to errors of the nuisances' coefficients.
     """
     load_block(model, gram, column_order)
-    return estimate_leak(model, rows, is_learned)  # type: ignore[no-any-return]
+    return estimate_leak(model, n_equations, updates_model)  # type: ignore[no-any-return]
 
 
 class LiveBalance:
@@ -309,14 +313,13 @@ class LiveBalance:
     def _solve_block(self, block: Blocks, is_learned: bool = True) -> tuple[float, ...]:
         """Estimate the leak in a block from all volume balances of the machine together.
 
-        Each balance gives the estimate g with its precision w, the shift s that is subtracted from g to keep the series
-        of estimates continuous while the other coefficients improve, and the variance V of g due to the errors of these
-        coefficients. Returns (w, w g, w s, w^2 V), each summed over the balances. With `is_learned`, the block also
-        updates the other coefficients.
+        Returns (w, w g, w s, w^2 V), each summed over the balances: `_estimate_leak` gives the estimate g by one
+        balance, its precision w, shift s and variance V. With `is_learned`, the block also updates the other
+        coefficients.
         """
-        rows = float(block.rows[0])
+        n_equations = float(block.rows[0])
         results = [
-            _estimate_leak(model, gram, column_order, rows, is_learned)
+            _estimate_leak(model, gram, column_order, n_equations, is_learned)
             for model, gram, column_order in zip(self._models, block.gram[0], self._column_orders, strict=True)
         ]
         return tuple(sum(values) for values in zip(*results, strict=True))

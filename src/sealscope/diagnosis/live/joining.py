@@ -118,14 +118,15 @@ class SampleJoiner:
     def runs(self, samples: Recording) -> Iterator[SampleRun]:
         """Divide samples into runs without a gap.
 
-        Samples that are late or cannot be used are dropped. They are counted, and so are gaps and changes of the
-        sampling rate or of the set of channels.
+        Samples that are late or cannot be used are dropped and counted. Gaps, and changes of the sampling rate or of
+        the set of channels, are counted, too.
         """
         names = self._choose_names(samples)
-        if lack := _find_lack(samples, names):
-            self.count(lack if names else f"samples without {format_ways(self.ways)}", len(samples))
+        if reason := _find_lack(samples, names):
+            self.count(reason if names else f"samples without {format_ways(self.ways)}", len(samples))
             return
         if names != self.names:
+            # `changed` is not set: for another set of channels the caller begins with a new estimator
             if self.names:
                 self.count("began anew: a position is recorded, too")
             self.names, self.rate = names, samples.rate

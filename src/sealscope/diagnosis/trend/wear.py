@@ -279,14 +279,18 @@ def _evaluate_grid(levels: Levels, profiles: Array, *, may_grow: bool = False) -
 
     Here `shared` is due to the priors on the level of each group, the growth and the covariate's coefficient. C is the
     correlation over the time between recordings, and `error` are the standard errors that the recordings state.
-    Multiplied by L^-1, the levels become z and the profiles G; the covariances of the levels with the mean level of the
-    last group become u. `_Node` stores a = sum G^2 and b = sum G z up to each recording.
+    Multiplied by L^-1,
+
+    - the levels, without their outlying parts (`outlier_excess`), become z;
+    - the profiles become G;
+    - the covariances of the levels with the mean level of the last group become u.
     """
     from scipy.linalg import solve_triangular
 
     between, prior = TREND.between, levels.prior
-    excess_as_last, excess = outlier_excess(levels)
-    values = levels.value - levels.value[0] - excess
+    # outlying part of each level: while its recording is the last one, and in the whole series
+    outlying_as_last, outlying = outlier_excess(levels)
+    values = levels.value - levels.value[0] - outlying
     max_scatter = max(prior.scale, 0.3 * float(np.ptp(levels.value)))
     wide_variance = (_WIDE * max_scatter) ** 2
     mean_covariance = wide_variance * (levels.group == levels.group[-1])  # with the mean level of the last group
@@ -306,11 +310,12 @@ def _evaluate_grid(levels: Levels, profiles: Array, *, may_grow: bool = False) -
             covariance[np.diag_indices(len(levels))] += tau**2 * (1.0 - r + _JITTER) + levels.error**2
             L = np.linalg.cholesky(covariance)
             z, u, G = np.split(solve_triangular(L, right_sides, lower=True, check_finite=False), [1, 2], axis=1)
-            # `_as_last`: as long as a recording is the last, more of its level is ignored as an outlier; this changes
-            # only the row of this recording
-            z_as_last = z - ((excess_as_last - excess) / L.diagonal())[:, None]
+            # while a recording is the last one, more of its level may be outlying, which changes only its own row of z
+            z_as_last = z - ((outlying_as_last - outlying) / L.diagonal())[:, None]
+            # sum of z^2 up to each recording, with the last term as for the last recording; the same for b
             square = np.cumsum(z**2) - (z**2 - z_as_last**2)[:, 0]
             log_null = log_prior - np.cumsum(np.log(L.diagonal())) - 0.5 * square
+            # a change of size delta has the likelihood ratio exp(b delta - a delta^2/2)
             a, b = np.cumsum(G**2, axis=0), np.cumsum(G * z, axis=0) - G * (z - z_as_last)
             level = float(levels.value[0] + u[:-1, 0] @ z[:-1, 0] + u[-1, 0] * z_as_last[-1, 0])
             variance = wide_variance - float(u[:, 0] @ u[:, 0])

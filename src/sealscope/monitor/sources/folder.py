@@ -196,11 +196,14 @@ class WatchedFolder:
     def _judge_block(self, block: SourceBlock, recording: Recording, path: Path) -> SourceBlock:
         """Add a recording's samples to a block, and the verdict on the recording if its machine is commissioned.
 
-        The samples are corrected as `diagnose` does, and their times converted to seconds since 1970; a recording
-        that is dated without a time of day follows those of the same day. An oil temperature in the file's header
-        becomes the channel `T_oil`. Raises PartAway if the machine's file cannot be read.
+        The samples are corrected for the defects of loggers, and their times converted to seconds since 1970. A
+        recording with a date only, without a time of day, begins `_GAP_S` after the previous recording of this day.
+        An oil temperature in the file's header becomes the channel `T_oil`. If no samples remain, there is no verdict.
+        Raises PartAway if the file of the machine cannot be read; the recording is then tried again later.
         """
-        start, corrected_samples = file_seconds(recording, path), remove_holes(correct_samples(recording).recording)
+        start = file_seconds(recording, path)
+        # long gaps, which the correction fills in, become NaN again
+        corrected_samples = remove_holes(correct_samples(recording).recording)
         if not len(corrected_samples):
             return replace(block, samples=corrected_samples)
         machine = self._read_machine()

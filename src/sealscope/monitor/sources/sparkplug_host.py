@@ -309,17 +309,21 @@ def _simultaneous_samples(
 ) -> dict[str, Array]:
     """Collect the samples (n,) of the metrics that have the same timestamp, by channel.
 
-    `group`: metric by channel; `birth`: the last value of each metric, which is updated with single numbers;
-    `channel_of`: channel by name of its metric. If all values are single numbers, n is 1, and a channel that is left
-    out repeats its last value. Raises RefusedMessage if the values are not numbers, or arrays of different lengths.
+    `group`: the metrics by channel; `channel_of`: channel by name of its metric; `birth`: last value of each metric.
+
+    - If a value is an array, only the channels with a value are returned, all of one length n.
+    - If no value is an array, n is 1. `birth` is updated with the values, and a fast channel that is left out repeats
+      its last value, unless that is an array. A value None becomes NaN.
+
+    Raises RefusedMessage if the values are not numbers, or arrays of different lengths.
     """
     if any(isinstance(metric.value, np.ndarray) for metric in group.values()):
-        piece = {name: np.atleast_1d(metric.value) for name, metric in group.items() if metric.value is not None}
+        piece = {channel: np.atleast_1d(metric.value) for channel, metric in group.items() if metric.value is not None}
         sizes = {values.size for values in piece.values()}
         if len(sizes) != 1 or 0 in sizes or any(values.dtype != np.float64 for values in piece.values()):
             raise RefusedMessage(blocks.NO_SAMPLES, "metrics of one time must be arrays of equally many numbers")
         return piece
-    birth.metrics.update({metric.name: metric for metric in group.values()})  # the last values
+    birth.metrics.update({metric.name: metric for metric in group.values()})
     last_values = {channel: birth.metrics[name].value for name, channel in channel_of.items() if channel not in SLOW}
     numbers = {channel: value for channel, value in last_values.items() if not isinstance(value, np.ndarray)}
     if not all(isinstance(value, (int, float, type(None))) for value in numbers.values()):

@@ -274,9 +274,9 @@ def nominal_rate(t: Array) -> float:
     """Estimate the nominal sampling rate [Hz] of times `t` (n,) [s].
 
     The estimate is the decimal number with the fewest digits that agrees with the reciprocal of the mean interval, to
-    within the rounding of the times. If the times do not increase throughout, or deviate from an even spacing by 0.6
-    intervals or more, the median of the positive intervals is used instead of the mean. Raises InputError if no
-    interval is positive.
+    within the rounding of the times. If the times do not increase throughout, or deviate from an even spacing by
+    `_MAX_ROUNDING` intervals or more, the median of the positive intervals is used instead of the mean. Raises
+    InputError if no interval is positive.
     """
     steps = np.diff(t)
     span = float(t[-1] - t[0])

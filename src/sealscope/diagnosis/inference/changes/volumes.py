@@ -23,7 +23,7 @@ from sealscope.diagnosis.inference.blocks import (
 )
 from sealscope.diagnosis.inference.changes.charge_pressure import ChargeTrend
 from sealscope.diagnosis.inference.differences import size_penalty
-from sealscope.diagnosis.inference.leak_law import law_shapes
+from sealscope.diagnosis.inference.leak_law import apparent_conductances
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.inference.onset import Information, StepTest, step_tests
 from sealscope.diagnosis.inference.terms import (
@@ -157,11 +157,11 @@ def _step_hypotheses(
             yield _Hypothesis(_observable_name(term), signs, information(blocks, columns, index))
     # from blocks with the offset of p_A - p_B, since an offset has the same effect as another law
     leak = information(recorded, columns, first.leak)
-    for exponent, shape in law_shapes(recorded, columns).items():
+    for exponent, shape in apparent_conductances(recorded, columns).items():
         if exponent < 1.0:
             yield _Hypothesis(f"{LEAK} of exponent {exponent:g}", (1.0,), leak, shape)
     scale = first.names.index(ORIFICE)  # the column of the orifice, no longer needed, takes the motion's volume
-    yield _Hypothesis(SCALE, (1.0, -1.0), information(_with_scale(recorded, columns, scale), columns, scale))
+    yield _Hypothesis(SCALE, (1.0, -1.0), information(_with_fitted_motion(recorded, columns, scale), columns, scale))
 
 
 def _is_tested(term: Term, roles: ColumnRoles, has_accumulator: bool) -> bool:
@@ -210,12 +210,12 @@ def _accumulator_support(balance_test: StepTest, accumulator_test: StepTest) -> 
     return float(measured**2 - (measured - expected) ** 2)
 
 
-def _with_scale(blocks: Blocks, columns: Sequence[ColumnRoles], index: int) -> Blocks:
-    """Return the blocks with column `index` replaced by the fitted volume that the piston's motion takes.
+def _with_fitted_motion(blocks: Blocks, columns: Sequence[ColumnRoles], index: int) -> Blocks:
+    """Return the blocks with column `index` replaced by the volume that the piston's motion takes, as fitted.
 
-    The new column is the sum of the columns of motion, each times its coefficient over the whole recording. A step of
-    its coefficient by s is a relative change of the scale of position or speed by s. `columns`: for each equation the
-    indices of its columns by role (leak, motion, left side).
+    The new column tests for a change of the scale of position or speed: a relative change by s is a step of the
+    column's coefficient by s. The column is the sum of the columns of motion, each times its coefficient in a fit to
+    the whole recording. `columns`: for each equation the indices of its columns by role (leak, motion, left side).
     """
     gram = blocks.gram.copy()
     for e, (roles, total) in enumerate(zip(columns, sum_blocks(blocks, columns), strict=True)):

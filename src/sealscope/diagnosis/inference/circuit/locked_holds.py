@@ -98,12 +98,15 @@ class LockedHold(NamedTuple):
     def offset_in_hold(self, offset: float) -> tuple[float, float]:
         """Estimate the sensor offset of p_A - p_B [Pa] in this hold, given the recording's `offset` [Pa].
 
-        Different gains of the two sensors make the offset vary with the pressure: in a hold it differs from `offset`
-        with the standard deviation s = `held_oil.gain` (`priors.toml`) times the pressure. If a leak has equalised the
-        pressures by the end of the hold, p_A - p_B there is the offset of the hold. Otherwise p_A - p_B is due to a
-        load, of which all up to the higher pressure are equally probable; the offset is then `offset`. The more
-        probable case is assumed. Returns the offset of the hold, and ((offset of the hold - `offset`) / s)^2, which is
-        -2 log of a relative probability density.
+        The offset varies with the pressure if the two sensors differ in gain. The offset of a hold is therefore normal
+        about `offset`; its standard deviation s is `held_oil.gain` (`priors.toml`) times the higher pressure at the end
+        of the hold. The more probable of two cases is assumed:
+
+        - A leak has equalised the pressures. The recorded p_A - p_B at the end is then the offset of the hold.
+        - A load causes p_A - p_B at the end, and all values up to the higher pressure are equally probable. The offset
+          of the hold is then `offset`.
+
+        Returns the offset of the hold, and ((offset of the hold - `offset`) / s)^2.
         """
         last = self.mean(np.stack([self.p_A, self.p_B]))[:, -1]
         pressure, difference = float(last.max()), float(last[0] - last[1])

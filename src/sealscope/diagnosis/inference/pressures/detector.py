@@ -33,7 +33,7 @@ class PressureResponse:
         self.rig = rig
 
     def usable(self, recording: Recording) -> str | None:
-        """Return the reason why a recording cannot be used by this detector; None if it can."""
+        """Return the reason why this detector cannot use a recording; None means that the recording is usable."""
         return find_unmet_requirement(recording, self.rig)
 
     def reading(self, recording: Recording) -> ResponseLeak | None:
@@ -54,7 +54,9 @@ class PressureResponse:
     def observe(self, recording: Recording, baseline: Sequence[Healthy] = ()) -> Observed:
         """Report on a recording: tests of the response's parameters for a step, and the leakage.
 
-        The leakage is compared with that of the healthy recordings in `baseline`.
+        The leakage is compared with the leakage of the healthy recordings in `baseline`. The report also states how
+        much of the recording is judged: the fraction of samples that do not fill a gap, and how far these extend. If
+        the leakage cannot be measured or a leak would not show, the report states only the reason (`lack`).
         """
         leak = self.reading(recording)
         if leak is None:

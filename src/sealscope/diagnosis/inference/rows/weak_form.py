@@ -96,22 +96,26 @@ OVERLAP = _variance_inflation()
 def weak_form_rows(increments: Sequence[Array], rate: float) -> Rows:
     """Compute the rows of a regression: integrals of each test function times the increments of c columns.
 
-    `increments`: an array (n,) for each column, with NaN for missing samples; `rate`: sampling rate [Hz]. There are
-    n // stride - SPAN + 1 rows, one for each test function that lies within the samples. Strides with a missing sample,
-    or with integrals beyond `MAX_READING`, count as zeros, and their rows are not flagged as `whole`.
+    `increments`: an array (n,) for each of the c columns, with NaN for missing samples; `rate`: sampling rate [Hz].
+
+    The samples are divided into pieces whose length is the distance of neighbouring test functions (`stride_samples`).
+    A test function spans `SPAN` pieces; there is one row for each test function that lies within the samples. A piece
+    with a missing sample, or with integrals beyond `MAX_READING`, counts as zeros, and the rows that contain it are not
+    flagged as `whole`.
     """
     stride = stride_samples(rate)
     n_pieces = len(increments[0]) // stride
     n_rows = max(0, n_pieces - SPAN + 1)
-    strides = np.concatenate([increment[: n_pieces * stride] for increment in increments]).reshape(-1, stride)
-    integrals: Array = (strides @ _transposed_test_function(rate)).reshape(len(increments), n_pieces, SPAN)
-    is_reading = np.asarray((np.abs(integrals) < MAX_READING).all(axis=(0, 2)))  # False for NaN
-    integrals[:, ~is_reading] = 0.0
+    pieces = np.concatenate([increment[: n_pieces * stride] for increment in increments]).reshape(-1, stride)
+    # of each column, over each piece, times each of the SPAN parts of the test function
+    integrals: Array = (pieces @ _transposed_test_function(rate)).reshape(len(increments), n_pieces, SPAN)
+    is_usable = np.asarray((np.abs(integrals) < MAX_READING).all(axis=(0, 2)))  # False for NaN
+    integrals[:, ~is_usable] = 0.0
     values: Array = np.zeros((n_rows, len(increments)))
     is_whole = np.ones(n_rows, dtype=bool)
-    for part in range(SPAN):  # part of a test function that lies over one stride of the samples
+    for part in range(SPAN):  # row i is the sum over the pieces i + part
         values += integrals[:, part : part + n_rows, part].T
-        is_whole &= is_reading[part : part + n_rows]
+        is_whole &= is_usable[part : part + n_rows]
     time = (np.arange(n_rows, dtype=float) + 0.5 * SPAN) * stride / rate
     return Rows(time, values, is_whole)
 

@@ -70,8 +70,9 @@ MIN_STRIDE = 2
 def compensates_leakage(balance: RecordedBalance) -> bool:
     """Return True if the pump replaces the oil that leaks, so that the volume balance shows the leakage.
 
-    Every pump leaks at least a fraction of its mean flow (`held.share` in `priors.toml`), which the lower end of the
-    leakage's 95 % interval must exceed. Otherwise no control loop returns or holds the piston.
+    The pump does so if a control loop holds the piston or returns it. The balance then shows at least the leakage of
+    the pump itself, which is at least a fraction of the pump's mean flow (`held.share` in `priors.toml`). The lower end
+    of the 95 % interval of the leakage must exceed this flow.
     """
     min_fraction: float = INFERENCE.held.share
     return balance.conductance.low * balance.mean_pressure() > min_fraction * balance.mean_flow
