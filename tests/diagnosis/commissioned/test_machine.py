@@ -95,7 +95,7 @@ def test_a_recording_that_is_not_like_the_others_is_named(folder, tmp_path):
 def test_a_zero_below_vacuum_and_glitches_are_named(folder, tmp_path):
     recording = ss.read(folder / "run1.nc")
     omega = recording["omega"].copy()
-    omega[::500] += 3e4
+    omega[::100] += 3e4  # more than single spikes, which are left out
     wrong = ss.Recording(
         recording.t,
         {**recording.channels, "p_B": recording["p_B"] - 8e5, "omega": omega},
