@@ -15,6 +15,7 @@ from sealscope.diagnosis.verdict.evidence import LEAKS, Cause
 from sealscope.diagnosis.verdict.severity import RepairLimit
 from sealscope.diagnosis.verdict.states import joint_causes, state_of
 
+from ..refusals import refusal
 from .balance_machine import machine, step
 
 #: DeviceHealthEnumeration of OPC 10000-100.
@@ -81,3 +82,10 @@ def test_a_recording_has_the_state_of_its_leak_against_the_limit():
     assert diagnose(machine(1)).state.name == "good"
     noisy = diagnose(machine(4, p_noise=2.0e6, x_step=2.0e-3))
     assert (noisy.verdict, noisy.state.name) == ("cannot tell", "out of specification")
+
+
+@pytest.mark.parametrize("limit", ["5", "5e-6", "5,3", "inf"])
+def test_a_repair_limit_has_a_unit(limit: str) -> None:
+    with refusal("limit", limit):
+        RepairLimit.parse(limit)
+    assert RepairLimit.parse("5e-6 m^3/s").flow_lpm(None) == pytest.approx(0.3)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -21,13 +22,8 @@ Level = Literal["repair", "plan", "monitor"]
 _Figure = tuple[float, float, float] | None
 
 
-def _is_number(text: str) -> bool:
-    """Return True if a text is a number without a unit, such as "5e-6"."""
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
+#: Power of ten of a number such as 5e-6, whose letter is no unit.
+_EXPONENT = re.compile(r"(?<=[\d.])[eE](?=[+-]?\d)")
 
 
 @dataclass(frozen=True)
@@ -57,7 +53,7 @@ class RepairLimit:
         """
         if text is None:
             return cls(VERDICT.repair.creep * MM_PER_MINUTE, "creep", stated=False)
-        has_unit = isinstance(text, str) and not _is_number(text)
+        has_unit = isinstance(text, str) and any(character.isalpha() for character in _EXPONENT.sub("", text))
         for kind, unit in (("flow", "m^3/s"), ("creep", "m/s")):
             try:
                 value = parse_quantity(text, unit, name="limit")
