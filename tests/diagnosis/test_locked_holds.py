@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from sealscope.diagnosis.inference.circuit.locked_holds import (
+    NEITHER,
     CylinderSides,
     HeldChambers,
+    LeakLaw,
+    PistonFit,
     find_charge_pressure,
     find_locked_holds,
 )
+from sealscope.diagnosis.inference.volumes.recorded import log_area_ratio
+from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Array
 from sealscope.units import P_ATM
 
@@ -37,12 +43,13 @@ def held_press(
     loads: tuple[float, float, float, float] = (1.0, 1.0, 1.0, 1.0),
     noise_level: float = 3e3,
     charge: float = CHARGE,
+    growth: float = 0.0,
 ) -> HeldChambers:
     """Record four cycles of a press whose frame gives and whose valves shut for twelve seconds of each.
 
     A_A dx + V_A kappa dp_A = -q - e p_A and -A_B dx + V_B kappa dp_B = q, x as the frame gives; check valves keep both
     chambers at the pressure `charge` at least. `gain` is that of the sensor of p_B, `loads` the load of each cycle,
-    `noise_level` the standard deviation of the sensors' noise [Pa].
+    `noise_level` the standard deviation of the sensors' noise [Pa], `growth` the piston leak's from `since` to the end.
     """
     random, count = np.random.default_rng(seed), round(4 * CYCLE * RATE)
     t = np.arange(count) / RATE
@@ -61,7 +68,8 @@ def held_press(
             x[k] = middle + (p_A[k] * AREA_A - p_B[k] * AREA_B) / FRAME if phase[k] < HELD[1] else 0.05 * STROKE
             continue
         a, b = float(p_A[k - 1]), float(p_B[k - 1])
-        seal, lost = (piston * 1e7 ** (1.0 - exponent), outside) if t[k] >= since else (0.0, 0.0)
+        grown = 1.0 + growth * (t[k] - since) / (t[-1] - since)
+        seal, lost = (piston * grown * 1e7 ** (1.0 - exponent), outside) if t[k] >= since else (0.0, 0.0)
         for _ in range(20 if seal or lost else 0):
             flow = math.copysign(seal * abs(a - b) ** exponent, a - b)
             into_A = -flow - lost * a
@@ -116,9 +124,9 @@ def test_a_rod_seal_takes_from_one_side_alone(charge: float, noise_level: float)
 
 def test_a_leak_that_begins_within_the_recording_is_dated_by_the_holds() -> None:
     chambers = held_press(piston=SEAL, since=47.0)
-    onset, _ = chambers.piston_fit
-    assert onset == pytest.approx(47.0, abs=3.0)
-    assert chambers.fit_piston_leak(onset, 0.0).value == pytest.approx(SEAL, rel=0.3)
+    found = chambers.piston_fit
+    assert found.onset == pytest.approx(47.0, abs=3.0)
+    assert chambers.fit_piston_leak(found).value == pytest.approx(SEAL, rel=0.3)
 
 
 def test_a_large_leak_that_equalises_the_pressures_at_once_is_found() -> None:
@@ -133,15 +141,89 @@ def test_a_large_leak_that_equalises_the_pressures_at_once_is_found() -> None:
 def test_equalised_pressures_tell_a_leak_though_the_gains_of_the_sensors_differ(gain: float) -> None:
     """A difference of gains of half a percent is another zero in each hold, as the load falls from cycle to cycle."""
     chambers = held_press(piston=10.0 * SEAL, gain=gain, loads=(1.0, 0.8, 0.6, 0.4))
-    assert chambers.leaks.piston == pytest.approx(10.0 * SEAL, rel=0.1)
+    assert chambers.leaks.piston == pytest.approx(10.0 * SEAL, rel=0.2)
     assert chambers.piston_leak.probability > 0.99
 
 
 def test_pressures_that_decay_tell_the_law_of_the_leak() -> None:
     for exponent, other in ((1.0, 0.5), (0.5, 1.0)):
         chambers = held_press(piston=SEAL, exponent=exponent)
-        likelihoods = {tried: chambers.fit_piston_leak(0.0, 0.0, tried).likelihood for tried in (1.0, 0.5)}
+        found = PistonFit(0.0, 0.0, NEITHER)
+        likelihoods = {e: chambers.fit_piston_leak(found, LeakLaw(e)).likelihood for e in (1.0, 0.5)}
         assert likelihoods[exponent] > likelihoods[other] + 5.0
+
+
+def test_holds_tell_how_a_leak_grows() -> None:
+    """The conductance of each hold is that of its time; one conductance for all holds fits worse by far."""
+    growth = 2.0 * INFERENCE.growth.most / 3.0
+    chambers = held_press(piston=5.0 * SEAL, growth=growth)
+    best = max(chambers.law_fits, key=lambda fit: fit.log_weight)
+    assert (best.law.exponent, best.law.growth) == (1.0, pytest.approx(growth, rel=0.3))
+    assert best.fit.value == pytest.approx(5.0 * SEAL, rel=0.2)
+    steady = next(fit for fit in chambers.law_fits if fit.law == LeakLaw(1.0, 0.0, best.law.onset))
+    assert best.log_weight > steady.log_weight + 5.0
+
+
+def test_a_leak_that_equalises_the_pressures_while_the_valves_shut_shows_on_the_side_it_fills() -> None:
+    """Within 0.1 s p_B rises to p_A: the loaded side, which valves may still connect with the pump, tells nothing."""
+    chambers = held_press(piston=100.0 * SEAL)
+    hold = chambers.holds[0]
+    equal = float((hold.p_A - hold.p_B)[hold.edges[1] :].max())
+    assert hold.carries(True) and not hold.carries(False)
+    assert equal < 0.1 * LOADED
+    assert chambers.piston_leak.probability > 0.99
+    without_settling = [hold._replace(edges=hold.edges[1:]) for hold in chambers.holds]
+    assert replace(chambers, holds=without_settling).leaks.piston < chambers.leaks.piston
+
+
+def test_a_check_valve_feeds_the_larger_side_that_a_leak_does_not_fill() -> None:
+    """A weight on B creeps down by a leak into A, whose area is larger: oil from the charge pressure fills the rest."""
+    t = np.arange(3000) / RATE
+    rests = (t > 2.0) & (t < 28.0)
+    below = 7e5  # p_B - p_A [Pa]
+    leak = 1e-11
+    x = 0.05 + leak * below / AREA_B * np.clip(t - 2.0, 0.0, 26.0)
+    noise = np.random.default_rng(1).standard_normal((3, t.size))
+    p_A = CHARGE + P_ATM + 3e3 * noise[0]
+    channels = t, p_A, CHARGE + below + P_ATM + 3e3 * noise[1], x + 2e-6 * noise[2]
+    sides = CylinderSides(AREA_A, AREA_B, 0.0, STROKE)
+    chambers = HeldChambers(find_locked_holds(channels, rests[1:], RATE), sides, 0.0, float(t[-1]), CHARGE + P_ATM)
+    assert chambers.piston_fit.refilled == (True, False)
+    assert chambers.fit_piston_leak(chambers.piston_fit).value == pytest.approx(leak, rel=0.1)
+
+
+def test_an_area_that_is_not_measured_is_varied() -> None:
+    chambers = held_press(piston=SEAL)
+    assert chambers.with_areas() == [(1.0, chambers)]
+    unknown = replace(chambers, sides=chambers.sides._replace(area_A=0.8 * AREA_A, deviation_A=0.25))
+    variants = unknown.with_areas()
+    assert sum(probability for probability, _ in variants) == pytest.approx(1.0)
+    logs = np.array([np.log(variant.sides.area_A / AREA_A) for _, variant in variants])
+    probabilities = np.array([probability for probability, _ in variants])
+    mean = probabilities @ logs
+    assert (mean, probabilities @ (logs - mean) ** 2) == pytest.approx((np.log(0.8), 0.25**2))
+    leaks = [variant.leaks.piston for _, variant in variants]
+    assert min(leaks) < SEAL < max(leaks)
+
+
+@pytest.mark.parametrize(
+    ("measured", "share", "is_larger", "ratio"),
+    [(0.6, 0.9, False, 0.6), (1.0, 0.95, True, 1.0), (1.3, 1.0, True, 1.3)],
+)
+def test_the_ratio_of_the_areas_is_that_of_a_side_that_surely_carries(measured, share, is_larger, ratio) -> None:
+    estimate = log_area_ratio(measured, share, is_larger=is_larger)
+    assert np.exp(estimate.value) == pytest.approx(ratio, rel=0.05)
+    assert estimate.deviation < 0.05
+
+
+def test_motion_that_may_be_of_the_other_side_says_little_of_the_ratio_of_the_areas() -> None:
+    """A press that moves at a bar or two: zeros of the sensors decide which side seems to carry."""
+    unsure, unknown = log_area_ratio(1.0, 0.002, is_larger=True), log_area_ratio(0.0, 0.0, is_larger=True)
+    prior = INFERENCE.held_oil
+    assert (unknown.value, unknown.deviation) == pytest.approx((prior.sides, prior.sides_deviation), rel=0.02)
+    assert 0.0 < unsure.value < prior.sides
+    assert unsure.deviation > 0.5 * prior.sides_deviation
+    assert log_area_ratio(0.0, 0.0, is_larger=False).value == pytest.approx(-prior.sides, rel=0.02)
 
 
 def test_a_hold_with_a_missing_sample_and_one_that_is_short_are_left_out() -> None:
@@ -174,7 +256,7 @@ def test_what_passes_an_open_valve_and_the_resting_pump_is_no_oil_that_does_not_
     chambers = HeldChambers(find_locked_holds(channels, rests[1:], RATE), sides, 0.0, float(t[-1]), CHARGE + P_ATM)
     usual_slip = AREA_B * (STROKE - after + 0.3 * STROKE) * 8e-10 / tau  # oil as the priors expect it, no air
     total = chambers.total_leak()
-    assert 0.5 * usual_slip < total.value < 4.0 * usual_slip
+    assert 0.4 * usual_slip < total.value < 4.0 * usual_slip
     assert total.value > 5.0 * total.deviation
 
 

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.inference.balance import recorded_blocks
+from sealscope.diagnosis.inference.balance import max_rest_rate, recorded_blocks
 from sealscope.diagnosis.inference.scatter import Rise
-from sealscope.diagnosis.inference.terms import TURNING, find_rests
+from sealscope.diagnosis.inference.terms import AVERAGING_TIME, TURNING, find_rests
 from sealscope.diagnosis.inference.volumes.balance_leak import BalanceLeak
 from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
 from sealscope.diagnosis.inference.volumes.detector import _sums_from_summary as learnt_sums
@@ -236,6 +236,15 @@ def test_a_rise_that_began_within_the_recording_is_dated_by_the_holds() -> None:
         onset = BalanceLeak(VolumeBalance.name, judged, healthy).rise_onset
         assert (onset is None) == (since == 0.0)
         assert onset is None or onset.low <= since <= onset.high
+
+
+def test_means_of_neighbouring_samples_do_not_hide_the_noise_of_a_resting_pump() -> None:
+    """The volume of an interval is the mean of two samples of the speed, and half of its noise the next one's."""
+    rate, random = 50.0, np.random.default_rng(2)
+    speed = np.where(np.arange(6000) < 600, 1.0, 0.0) + 0.1 * random.standard_normal(6000)
+    limit = max_rest_rate(0.5 * (speed[1:] + speed[:-1]) / rate, rate, fraction=0.0)
+    averaged = np.convolve(speed[600:], np.ones(round(AVERAGING_TIME * rate)) / round(AVERAGING_TIME * rate), "valid")
+    assert 2.0 * averaged.std() < limit < 5.0 * averaged.std()
 
 
 def test_a_reversal_is_no_rest_and_a_missing_sample_neither() -> None:

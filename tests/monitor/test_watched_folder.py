@@ -58,7 +58,7 @@ def log(path: Path, recording: Recording) -> Path:
 def commissioned(tmp_path_factory):
     """A machine's file of which areas, map and rate alone are stated."""
     folder = tmp_path_factory.mktemp("machine")
-    days = ((seed, folder / f"healthy/run_2026-03-{10 + seed}_0600.csv") for seed in range(1, 5))
+    days = ((seed, folder / f"healthy/run_2026-03-{10 + seed}_0600.csv") for seed in range(1, 6))
     files = [log(path, machine(seed, rate=100.0, duration=60.0)) for seed, path in days]
     rig = unstated_rig()
     areas = rig.cylinder.A_A, rig.cylinder.A_B

@@ -391,10 +391,13 @@ def max_rest_rate(increments: Array, rate: float, fraction: float = INFERENCE.re
     velocity = increments[np.isfinite(increments)] * rate
     speed = np.abs(velocity)
     mean_speed = float(speed @ speed) / max(float(speed.sum()), np.finfo(float).tiny)
-    differences = np.abs(np.diff(velocity, 6))  # sixth differences of white noise have 924 times its variance
+    # sixth differences of white noise have 924 times its variance; every second value only, since neighbouring
+    # increments share a sample
+    differences = np.abs(np.diff(velocity[::2], 6))
     # 1.4826: standard deviation of normal values over the median of their magnitudes
     noise = 1.4826 * float(np.median(differences)) / math.sqrt(924.0) if len(differences) else 0.0
-    return max(fraction * mean_speed, 3.0 * noise / math.sqrt(max(1.0, AVERAGING_TIME * rate)))
+    # 2: variance of a sum of means of neighbouring samples, as of a speed, over that of independent values
+    return max(fraction * mean_speed, 3.0 * noise * math.sqrt(2.0 / max(1.0, AVERAGING_TIME * rate)))
 
 
 def _absolute_offset(pressure: Array) -> float:

@@ -628,8 +628,13 @@ def offset_cost(offset: float) -> float:
 
         cost = min((offset / s)^2, (offset / w)^2 + 2 log(w / (s o))).
     """
+    return float(offset_costs(np.asarray(offset)))
+
+
+def offset_costs(offsets: Array) -> Array:
+    """Compute `offset_cost` for an array of sensor offsets [Pa]."""
     usual, far, odds = INFERENCE.zero.pressure, INFERENCE.zero.far, INFERENCE.zero.odds
-    return float(min((offset / usual) ** 2, (offset / far) ** 2 + 2.0 * np.log(far / usual / odds)))
+    return np.asarray(np.minimum((offsets / usual) ** 2, (offsets / far) ** 2 + 2.0 * np.log(far / usual / odds)))
 
 
 def estimate_offset(blocks: Blocks, columns: Sequence[ColumnRoles]) -> float:

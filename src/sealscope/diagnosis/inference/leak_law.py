@@ -97,7 +97,7 @@ def find_leak_step(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Informa
     return min(tests, key=lambda test: (test.chance, -test.score), default=None)
 
 
-def _growth_priors() -> list[tuple[float, float]]:
+def growth_priors() -> list[tuple[float, float]]:
     """List possible relative growths of a leak, from its onset to the recording's end, each with its probability."""
     prior = INFERENCE.growth
     growths = prior.most * (np.arange(N_GROWTHS) + 1.0) / N_GROWTHS  # evenly spaced up to the largest
@@ -131,7 +131,7 @@ def estimate_step_flow(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Inf
     n_rows_after = np.maximum(rows @ step_shapes(len(blocks), positions), _TINY)
     shapes, unit_flows = apparent_conductances(blocks, columns), law_flows(blocks)
     log_weights, flows, standard_errors = [], [], []
-    for growth, probability in _growth_priors():
+    for growth, probability in growth_priors():
         steps = step_shapes(len(blocks), positions, growth)
         for exponent in EXPONENTS:
             sizes = step_sizes(leak, onsets, shapes[exponent], growth)

@@ -44,7 +44,7 @@ import numpy as np
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, solve, sum_blocks
 from sealscope.diagnosis.inference.onset import BOUND_PROBABILITY
 from sealscope.diagnosis.inference.rows.weak_form import MAX_READING
-from sealscope.diagnosis.inference.terms import LAG, LEAK, ORIFICE
+from sealscope.diagnosis.inference.terms import AIR, LAG, LEAK, ORIFICE
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.evaluation.scalar_search import find_near_root, find_root
 from sealscope.recordings.recording import Array
@@ -887,8 +887,9 @@ def compare_with_leak(
         -log(residual sum of squares with the rival / the same with the leak) / 2.
 
     A recording counts as `size.readings` independent residuals (`priors.toml`). While the rival (for example an
-    external leak) is fitted, the leak may differ as it does between healthy recordings. A negative coefficient of leak
-    or rival is not fitted. `columns`: for each equation the indices of its columns by role (leak, motion, left side).
+    external leak) is fitted, the leak may differ as it does between healthy recordings. A negative coefficient is not
+    fitted, except that of free air, of which there may be less. `columns`: for each equation the indices of its columns
+    by role (leak, motion, left side).
     Return None if the balance has no column named `rival`, or if the recording has no information on the leak or on the
     rival.
     """
@@ -909,7 +910,7 @@ def compare_with_leak(
             left_square += float(residual[-1] - residual[nuisance] @ solved[:, 1])
         if not energy > 0.0:
             return None
-        gain = max(moment, 0.0) ** 2 / energy  # oil only leaves
+        gain = (moment if is_rival and rival == AIR else max(moment, 0.0)) ** 2 / energy  # oil only leaves
         residual_squares.append(max(left_square - gain, 1e-9 * abs(left_square) + TINY))
     with_leak, with_rival = residual_squares
     return float(-0.5 * np.log(with_rival / with_leak))

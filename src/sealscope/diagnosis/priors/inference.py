@@ -203,8 +203,11 @@ class HeldOilPriors(PriorTable):
 
     - `compressibility` [1/Pa], `deviation`: relative compression per pressure, and the standard deviation of its
       logarithm.
-    - `dead`, `dead_deviation`: dead volume over the recorded stroke's volume, and the standard deviation of its
-      logarithm.
+    - `dead`, `dead_deviation`, `least_dead`: dead volume over the recorded stroke's volume, its relative standard
+      deviation, and the smallest one.
+    - `sides`, `sides_deviation`: logarithm of the ratio of the piston areas, of the side with the highest pressure over
+      the other, and its standard deviation.
+    - `sides_told`: probability that the pressures tell which side carries, whatever the offsets of the sensors.
     - `unlike`: largest ratio of the two piston areas.
     - `right`: probability that the holds are right about a leak's flow if they disagree with the whole recording.
     - `agrees`: standard deviation of the logarithm of the ratio of the conductances from holds and whole recording.
@@ -229,7 +232,11 @@ class HeldOilPriors(PriorTable):
     compressibility: float
     deviation: float
     dead: float
+    least_dead: float
     dead_deviation: float
+    sides: float
+    sides_deviation: float
+    sides_told: float
     unlike: float
     right: float
     agrees: float

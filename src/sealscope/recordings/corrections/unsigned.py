@@ -4,8 +4,9 @@ If a speed is never negative while the piston moves both ways, either it has no 
 valve chooses the side. In both cases the flow into chamber A is about a v + c (p_A - p_B), with the piston speed v;
 the pressure term is the flow that replaces leakage while the piston stands. The formula is fitted to the signed
 magnitude, in turn with a search for the signs. A sign changes only where the magnitude passes zero: the signs are the
-most likely path of a hidden Markov chain with two states. Without a position the sign is that of the command. Called
-by the inspection.
+most likely path of a hidden Markov chain with two states. Without a position the sign is that of the command. At rest
+the magnitude is that of noise, whose mean is not zero; the signs of that noise are drawn at random. Called by the
+inspection.
 
 Source: A. J. Viterbi, IEEE Trans. Inf. Theory 13 (1967) 260 (most likely path).
 """
@@ -24,6 +25,8 @@ from sealscope.recordings.recording import Recording
 _PRIORS = RECORDINGS.unsigned
 #: Most iterations of the fit; each uses the signs of the previous one.
 _MAX_ITERATIONS = 10
+#: Mean of the magnitude of normal noise over its standard deviation; tolerance of that ratio [standard deviations].
+_FOLDED_RATIO, _TOLERANCE = float(np.sqrt(2.0 / (np.pi - 2.0))), 3.0
 _NAMES = {"omega": "speed", "q_pump": "flow"}
 
 
@@ -40,7 +43,9 @@ def restore_speed_sign(recording: Recording) -> tuple[Recording, list[Finding]]:
         sign, source = _find_sign(recording, np.abs(recording[name]))
         if sign is None:
             continue
-        channels[name] = np.abs(recording[name]) * sign
+        values = recording[name]
+        main_side = 1.0 if np.nanmax(values) >= -np.nanmin(values) else -1.0
+        channels[name] = _draw_noise_signs(main_side * values, recording.rate) * sign
         text = f"{name}: the {quantity} has no sign while the piston moves both ways: taken from {source}"
         findings.append(Finding("unsigned_speed", "note", name, len(recording), float(recording.t[0]), text))
     return (replace(recording, channels=channels) if findings else recording), findings
@@ -173,6 +178,28 @@ def _average_nearby(values: Array, rate: float) -> Array:
     first = np.maximum(np.arange(values.size) - n_half, 0)
     after = np.minimum(np.arange(values.size) + n_half + 1, values.size)
     return np.asarray((sums[after] - sums[first]) / (after - first))
+
+
+def _draw_noise_signs(values: Array, rate: float) -> Array:
+    """Restore the zero mean of noise that is recorded without its sign, by random signs; return values (n,).
+
+    Noise alone is recorded where the local mean of the `values` (n,), sampled at `rate` [Hz], is at most sqrt(2 / (pi -
+    2)) = 1.32 times their local standard deviation, as for the magnitude of normal noise, plus the error of that ratio
+    for so few samples. The standard deviation is that of second differences, which hardly contain the motion. Elsewhere
+    the values are returned as they are. The signs are the same in every call.
+    """
+    if values.size < 3:
+        return values
+    known = np.isfinite(values)
+    values = np.where(known, values, 0.0)
+    mean = _average_nearby(values, rate)
+    squares = np.pad(np.diff(values, 2) ** 2, 1, mode="edge") / 6.0  # white noise: six times its variance
+    deviation = np.sqrt(_average_nearby(squares, rate))
+    n_nearby = 2 * max(1, round(_PRIORS.nearby * rate)) + 1
+    max_ratio = _FOLDED_RATIO + _TOLERANCE * np.sqrt((1.0 + 0.5 * _FOLDED_RATIO**2) / n_nearby)
+    is_noise = mean <= max_ratio * deviation
+    signs = np.where(np.random.default_rng(0).random(values.size) < 0.5, -1.0, 1.0)
+    return np.where(known, np.where(is_noise, signs * values, values), np.nan)
 
 
 def _most_likely_signs(log_odds: Array, cost_of_change: Array) -> Array:

@@ -13,12 +13,15 @@ with
 - I: time integral of a power of p_A - p_B - z, where z is the sensor offset; I_A, I_B: those of the gauge pressures;
 - p_0: atmospheric pressure.
 
-A leaking piston moves oil from A to B. A leaking rod seal drains one side only: the piston gives way, while a check
-valve may fill the other side. A reading is the mean of neighbouring samples of a hold (`LockedHold.edges`). The
-readings of all holds form one regression, each side of a hold about its mean. The logarithms of K, alpha and the dead
-volumes have normal priors (`held_oil` in `priors.toml`); the regression is linearised about the estimate, iteratively.
-The onset of the leak and the offset z are those with the highest posterior; a leak that has equalised the pressures
-determines z. The three leaks are hypotheses, each with its probability.
+A leaking piston moves oil from A to B. A leaking rod seal drains one side only: the piston gives way. A check valve may
+fill a side that is at the charge pressure; no balance holds for that side then. A reading is the mean of neighbouring
+samples of a hold (`LockedHold.edges`). The first is of the time in which the valves may still shut; it counts only on
+the side of the lower pressure, whose oil comes through a leak alone: a large leak equalises the pressures within that
+time. The readings of all holds form one regression, each side of a hold about its mean. The dead volumes and the
+logarithms of K and alpha have normal priors (`held_oil` in `priors.toml`); the regression is linearised about the
+estimate, iteratively. Uncertain areas are varied (`with_areas`). The onset of the leak and the offset z are those with
+the highest posterior; a leak that has equalised the pressures determines z. The three leaks are hypotheses, each with
+its probability. A leak past the piston may grow from its onset on.
 
 Source: Merritt, Hydraulic Control Systems, 1967, section 6.3 (continuity of the chambers).
 """
@@ -34,7 +37,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.diagnosis.inference.blocks import offset_cost
-from sealscope.diagnosis.inference.leak_law import mixture_flow
+from sealscope.diagnosis.inference.leak_law import EXPONENTS, growth_priors, law_priors, mixture_flow
 from sealscope.diagnosis.inference.observable import Flow
 from sealscope.diagnosis.inference.onset import Interval
 from sealscope.diagnosis.priors.inference import INFERENCE
@@ -49,6 +52,8 @@ FIRST_READING, GROWTH, MIN_READINGS = 0.05, 1.2, 8
 MAX_RATE = 100.0
 #: Coarse grid of offsets of p_A - p_B [standard deviations of the prior], and number of points of the refined grid.
 OFFSET_GRID, N_REFINED = np.array([0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0]), 17
+#: Values of a normal variable of mean 0 and variance 1, and their weights, of Gauss-Hermite quadrature.
+AREA_NODES, AREA_WEIGHTS = (0.0, 3.0**0.5, -(3.0**0.5)), (2.0 / 3.0, 1.0 / 6.0, 1.0 / 6.0)
 #: Number of evenly spaced onsets within a hold.
 N_ONSETS = 4
 #: Standard deviation of a leak without information.
@@ -57,7 +62,7 @@ UNKNOWN = 1e30
 MAX_ITERATIONS, TOLERANCE = 20, 1e-3
 #: Ridge that is added to the unit diagonal of a scaled matrix.
 RIDGE = 1e-12
-#: Largest change of the logarithm of a property of the oil in one iteration.
+#: Largest change of a property of the oil in one iteration.
 MAX_STEP = 0.5
 #: Quantile of the lower chamber pressure that counts as charge pressure.
 LOWEST = 0.02
@@ -69,19 +74,23 @@ class CylinderSides(NamedTuple):
     """Piston areas of both sides [m^2], and ends `low` and `high` of the recorded stroke [m].
 
     The areas are measured with the pump's assumed displacement; they are negative if the position x is reversed.
+    `deviation_A`, `deviation_B`: standard deviations of the logarithms of their magnitudes.
     """
 
     area_A: float
     area_B: float
     low: float
     high: float
+    deviation_A: float = 0.0
+    deviation_B: float = 0.0
 
 
 class LockedHold(NamedTuple):
     """Samples of one hold, in which shut valves hold the load.
 
     `t`: time [s]; `p_A`, `p_B`: absolute pressures [Pa]; `x`: position [m], (n,) each. `edges` (k + 1,): indices of the
-    samples that bound k intervals; the mean of the samples of an interval is a reading.
+    samples that bound k intervals; the mean of the samples of an interval is a reading. In the first interval the
+    valves may still be shutting.
     """
 
     t: Array
@@ -94,6 +103,22 @@ class LockedHold(NamedTuple):
         """Average samples (..., n) of the hold over the intervals between `edges`, to k readings, shape (..., k)."""
         sums = np.add.reduceat(values, self.edges[:-1], axis=-1)
         return np.asarray(sums / np.diff(self.edges))
+
+    def carries(self, is_A: bool) -> bool:
+        """Return True if A has the higher pressure when the hold begins, or, for `is_A` False, if B has it."""
+        settling = slice(self.edges[0], self.edges[1])
+        is_A_higher = float(self.p_A[settling].mean()) > float(self.p_B[settling].mean())
+        return is_A_higher == is_A
+
+    def centre(self, readings: Array, is_A: bool) -> Array:
+        """Subtract the mean over the hold from `readings` (k, ...) of side A, or of B; return an array of this shape.
+
+        The first reading of the side of the higher pressure does not count, and becomes 0.
+        """
+        first = int(self.carries(is_A))
+        centred = np.asarray(readings - readings[first:].mean(axis=0))
+        centred[:first] = 0.0
+        return centred
 
     def offset_in_hold(self, offset: float) -> tuple[float, float]:
         """Estimate the sensor offset of p_A - p_B [Pa] in this hold, given the recording's `offset` [Pa].
@@ -108,8 +133,9 @@ class LockedHold(NamedTuple):
 
         Returns the offset of the hold, and ((offset of the hold - `offset`) / s)^2.
         """
-        last = self.mean(np.stack([self.p_A, self.p_B]))[:, -1]
-        pressure, difference = float(last.max()), float(last[0] - last[1])
+        last = slice(self.edges[-2], None)
+        last_A, last_B = float(self.p_A[last].mean()), float(self.p_B[last].mean())
+        pressure, difference = max(last_A, last_B), last_A - last_B
         deviation = INFERENCE.held_oil.gain * pressure
         cost = ((difference - offset) / deviation) ** 2
         is_equalised = -0.5 * cost - np.log(deviation * np.sqrt(2.0 * np.pi)) > -np.log(pressure)
@@ -129,37 +155,43 @@ class LockedHold(NamedTuple):
 def find_charge_pressure(lower_pressure: Array, rests: NDArray[np.bool_], rate: float) -> float:
     """Find the pressure [Pa] that check valves maintain in a chamber without load: the lowest while the pump rests.
 
-    If the pump never rests, it is the lowest pressure of the recording. This may be too low, since a moving piston
-    draws oil through lines and check valves, which drop pressure. `lower_pressure` (n,): the lower chamber pressure
-    [Pa]; `rests` (n - 1,): flags of the sampling intervals in which the pump rests; `rate`: sampling rate [Hz].
+    It is at most the median while the pump turns, since a leak may equalise the pressures in every rest. If the pump
+    never rests, it is the lowest pressure of the recording. This may be too low, since a moving piston draws oil
+    through lines and check valves, which drop pressure. `lower_pressure` (n,): the lower chamber pressure [Pa]; `rests`
+    (n - 1,): flags of the sampling intervals in which the pump rests; `rate`: sampling rate [Hz].
     """
     steady_pressure = average_over(INFERENCE.held_oil.steady, lower_pressure, rate)
-    return float(np.nanquantile(steady_pressure[:-1][rests] if rests.any() else steady_pressure, LOWEST))
+    if not rests.any():
+        return float(np.nanquantile(steady_pressure, LOWEST))
+    lowest, turning = float(np.nanquantile(steady_pressure[:-1][rests], LOWEST)), steady_pressure[:-1][~rests]
+    return min(lowest, float(np.nanmedian(turning))) if np.isfinite(turning).any() else lowest
 
 
 def find_locked_holds(channels: Sequence[Array], rests: NDArray[np.bool_], rate: float) -> list[LockedHold]:
     """Find the holds of a recording, i.e. the rests of the pump during which shut valves hold the load.
 
-    The times in which the valves shut or open are left out. Holds that are too short, or have missing samples, are
-    omitted. `channels`: time [s], absolute pressures of A and B [Pa], and position [m], (n,) each; `rests` (n - 1,):
-    flags of the sampling intervals in which the pump rests; `rate`: sampling rate [Hz], which is reduced to about
-    `MAX_RATE`.
+    The time in which the valves shut is the first interval of a hold; that in which they open is left out. Holds that
+    are too short, or have missing samples, are omitted. `channels`: time [s], absolute pressures of A and B [Pa], and
+    position [m], (n,) each; `rests` (n - 1,): flags of the sampling intervals in which the pump rests; `rate`: sampling
+    rate [Hz], which is reduced to about `MAX_RATE`.
     """
     prior, holds = INFERENCE.held_oil, list[LockedHold]()
     decimation = max(1, int(rate / MAX_RATE))  # number of samples that are averaged to one
-    # samples to omit; the end of a rest is uncertain by the time over which the flow was averaged to find it
+    # samples of the first interval, and samples to omit at the end; the end of a rest is uncertain by the time over
+    # which the flow was averaged to find it
     settling, opening = (max(1, round(s * rate)) for s in (prior.settles, prior.settles + INFERENCE.rest.averaged))
     for first, n_intervals in find_runs(rests).tolist():
         if n_intervals + 1 < prior.shortest * rate:
             continue
-        begin, end = first + settling, first + n_intervals + 1 - opening
+        begin, end = first, first + n_intervals + 1 - opening
         n_samples = (end - begin) // decimation
         t, p_A, p_B, x = (
             values[begin : begin + n_samples * decimation].reshape(n_samples, decimation).mean(axis=1)
             for values in channels
         )
-        edges = _reading_edges(n_samples, FIRST_READING * rate / decimation)
-        if len(edges) > MIN_READINGS and np.isfinite([p_A, p_B, x]).all():
+        n_settling = max(1, settling // decimation)
+        edges = np.append(0, n_settling + _reading_edges(n_samples - n_settling, FIRST_READING * rate / decimation))
+        if len(edges) > MIN_READINGS + 1 and np.isfinite([p_A, p_B, x]).all():
             holds.append(LockedHold(t, p_A, p_B, x, edges))
     return holds
 
@@ -177,24 +209,48 @@ def _reading_edges(n_samples: int, width: float) -> NDArray[np.intp]:
     return np.array([*edges[:-1], n_samples])
 
 
+class LeakLaw(NamedTuple):
+    """Law of a leak past the piston: its flow is a coefficient times |p_A - p_B|^`exponent`, and grows from its onset.
+
+    `growth`: increase of the coefficient from the `onset` [s] to the end of the recording, relative to that at the
+    onset.
+    """
+
+    exponent: float = 1.0
+    growth: float = 0.0
+    onset: float = 0.0
+
+    def growth_factor(self, t: Array, end: float) -> Array:
+        """Compute the coefficient at times `t` (n,) [s] over that at the onset; `end`: end of the recording [s]."""
+        return 1.0 + self.growth * np.clip((t - self.onset) / max(end - self.onset, np.finfo(float).tiny), 0.0, 1.0)
+
+
+#: A laminar leak that does not grow.
+LAMINAR = LeakLaw()
+
+
+#: Sides, A and B, whose displaced oil check valves replace.
+NEITHER, BOTH = (False, False), (True, True)
+
+
 class UnitLeak(NamedTuple):
     """Flow of a leak with a coefficient of 1 while shut valves hold the load.
 
-    `flows`: flow at the samples (n,) of each hold, over the coefficient, in Pa^e for the exponent e of the law
-    (laminar: 1); `signs`: sign of this flow in the balances of sides A and B, or 0; `is_refilled`: true if check valves
-    replace displaced oil once a chamber is at the charge pressure.
+    `flows`: for each hold of n samples the flow out of A (first row) and out of B, over the coefficient, (2, n), in
+    Pa^e for the exponent e of the law (laminar: 1); `refilled`: true for A, and for B, if a check valve replaces the
+    oil of that side that the piston displaces, once it is at the charge pressure, so that no flow counts there.
     """
 
     flows: Sequence[Array]
-    signs: tuple[float, float]
-    is_refilled: bool = False
+    refilled: tuple[bool, bool] = NEITHER
 
 
 class _OilRegression(NamedTuple):
     """Regression of displaced volumes on the properties of the oil, over r readings (sample means) of all holds.
 
     The properties are compressibility, dead volume of A, dead volume of B, and free air, each divided by its usual
-    value. The unknowns are their logarithms (4,), which have a normal prior with the mean 0.
+    value. The unknowns are their `changes` (4,), which have a normal prior with the mean 0: relative changes of the
+    dead volumes, and logarithms of the other two.
 
     - `displaced` (r,): volume displaced by the piston [m^3].
     - `strained`, `aired` (r, 3): volumes [m^3] taken up by the compression of the oil and of the free air, with the
@@ -210,42 +266,42 @@ class _OilRegression(NamedTuple):
     inflation: float
     misfit_variance: float
 
-    def leaked(self, logs: Array) -> Array:
+    def leaked(self, changes: Array) -> Array:
         """Compute the volume [m^3] that left each chamber by each reading (r,): the displaced minus the compressed one.
 
-        `logs` (4,): logarithms of the oil's properties (`_oil_factors`).
+        `changes` (4,): changes of the oil's properties (`_oil_factors`).
         """
-        oil, air, volumes = _oil_factors(logs)
+        oil, air, volumes = _oil_factors(changes)
         return self.displaced - (oil * self.strained + air * self.aired) @ volumes
 
-    def slopes(self, logs: Array) -> Array:
-        """Compute the derivatives (r, 4) of the compressed volumes [m^3] by the logarithms of the oil's properties.
+    def slopes(self, changes: Array) -> Array:
+        """Compute the derivatives (r, 4) of the compressed volumes [m^3] by the changes of the oil's properties.
 
         A compressed volume is the part of the displaced volume that the compression of oil and free air takes up.
-        `logs` (4,): the logarithms at which the derivatives are taken.
+        `changes` (4,): the changes at which the derivatives are taken.
         """
-        oil, air, volumes = _oil_factors(logs)
-        strained, aired = oil * self.strained * volumes, air * self.aired * volumes
+        oil, air, volumes = _oil_factors(changes)
+        strained, aired = oil * self.strained, air * self.aired
         dead = strained[:, 1:] + aired[:, 1:]
-        return np.column_stack([strained.sum(axis=1), dead, aired.sum(axis=1)])
+        return np.column_stack([strained @ volumes, dead, aired @ volumes])
 
 
-def _oil_factors(logs: Array) -> tuple[float, float, Array]:
-    """Convert log factors of the oil's properties to factors, in the order in which compressed volumes are computed.
+def _oil_factors(changes: Array) -> tuple[float, float, Array]:
+    """Convert changes of the oil's properties to factors, in the order in which compressed volumes are computed.
 
-    `logs` (4,): log(property / usual value) of compressibility, dead volume of A, dead volume of B, and free air.
-    Returns three items:
+    `changes` (4,): log of the factor on the compressibility, relative changes of the dead volumes of A and of B, and
+    log of the factor on the free air. Returns three items:
 
     - factor on the compressibility;
     - factor on the free air;
     - factors (3,) on the volume of the stroke (always 1, as it is not estimated) and on the dead volumes of A and B.
     """
-    compressibility, dead_A, dead_B, air = np.exp(logs)
-    return float(compressibility), float(air), np.array([1.0, dead_A, dead_B])
+    compressibility, dead_A, dead_B, air = changes
+    return float(np.exp(compressibility)), float(np.exp(air)), np.array([1.0, 1.0 + dead_A, 1.0 + dead_B])
 
 
 def _oil_deviations() -> Array:
-    """Return prior standard deviations (4,) of the logs of compressibility, dead volumes of A and B, and free air."""
+    """Return prior standard deviations (4,) of the changes of compressibility, dead volumes of A, of B, and air."""
     prior = INFERENCE.held_oil
     return np.array([prior.deviation, prior.dead_deviation, prior.dead_deviation, prior.air_deviation])
 
@@ -279,10 +335,14 @@ class HeldLeaks(NamedTuple):
 
 
 class PistonFit(NamedTuple):
-    """Most probable `onset` of a leak past the piston [s], and sensor `offset` of p_A - p_B [Pa]."""
+    """Most probable `onset` of a leak past the piston [s], and sensor `offset` of p_A - p_B [Pa].
+
+    `refilled`: true for A, and for B, if a check valve probably replaces oil of that side at the charge pressure.
+    """
 
     onset: float
     offset: float
+    refilled: tuple[bool, bool]
 
 
 class LeakFit(NamedTuple):
@@ -296,6 +356,27 @@ class LeakFit(NamedTuple):
     deviation: float
     by_oil: float
     likelihood: float
+
+    def scale(self, factor: float, likelihood: float) -> LeakFit:
+        """Multiply coefficient and standard deviations by a factor, and replace the log likelihood.
+
+        The deviation `UNKNOWN` of a leak without information is kept.
+        """
+        deviation = factor * self.deviation if self.deviation < UNKNOWN else UNKNOWN
+        return LeakFit(factor * self.value, deviation, factor * self.by_oil, likelihood)
+
+
+class LawFit(NamedTuple):
+    """Fit of a leak past the piston under one `law`.
+
+    `conditions`: onset, sensor offset, and effect of check valves; `fit`: fitted coefficient; `log_weight`: log
+    likelihood of the fit plus the log prior probability of the law.
+    """
+
+    law: LeakLaw
+    conditions: PistonFit
+    fit: LeakFit
+    log_weight: float
 
 
 class LeakHypothesis(NamedTuple):
@@ -320,6 +401,25 @@ class HeldChambers:
     end: float
     charge: float
 
+    def with_areas(self) -> list[tuple[float, HeldChambers]]:
+        """Return variants of this estimator with other areas of the less certain side, each with its probability.
+
+        The logarithm of the area takes the three values of the Gauss-Hermite quadrature of its normal distribution. The
+        holds do not choose between them, since what the balances leave, by delays of the sensors, repeats from hold to
+        hold. The only variant is this estimator itself if both areas are known to within `size.area` (`priors.toml`).
+        """
+        sides = self.sides
+        if max(sides.deviation_A, sides.deviation_B) <= INFERENCE.size.area:
+            return [(1.0, self)]
+        variants = []
+        for node, probability in zip(AREA_NODES, AREA_WEIGHTS, strict=True):
+            if sides.deviation_A > sides.deviation_B:
+                varied = sides._replace(area_A=sides.area_A * float(np.exp(node * sides.deviation_A)))
+            else:
+                varied = sides._replace(area_B=sides.area_B * float(np.exp(node * sides.deviation_B)))
+            variants.append((probability, replace(self, sides=varied)))
+        return variants
+
     @property
     def n_readings(self) -> float:
         """Effective number of independent readings (means of neighbouring samples) in all holds.
@@ -330,33 +430,42 @@ class HeldChambers:
         return independent * 2.0 * len(self.holds)
 
     @cached_property
-    def _regressions(self) -> tuple[_OilRegression, _OilRegression]:
-        """Regressions on the oil's properties: without check valves, and with check valves that refill a chamber."""
-        return self._build_regression(is_refilled=False), self._build_regression(is_refilled=True)
+    def _regressions(self) -> dict[tuple[bool, bool], _OilRegression]:
+        """Regressions on the oil's properties, by the sides that check valves refill."""
+        return {refilled: self._build_regression(refilled) for refilled in (NEITHER, self._larger_side, BOTH)}
 
-    def _build_regression(self, is_refilled: bool) -> _OilRegression:
+    @property
+    def _larger_side(self) -> tuple[bool, bool]:
+        """Flags of A and B: true for the side of the larger area, if the areas differ.
+
+        It is the side that a check valve may refill while the piston leaks: the leak fills a side by as much as it
+        takes from the other, whose area moves the piston, so that only a larger side can want for oil.
+        """
+        area_A, area_B = abs(self.sides.area_A), abs(self.sides.area_B)
+        return area_A > area_B, area_B > area_A
+
+    def _build_regression(self, refilled: tuple[bool, bool]) -> _OilRegression:
         """Build the regression of displaced volumes on the oil's properties from all holds (`_OilRegression`).
 
         The rows are the readings (sample means) of each hold, side A before side B, relative to their mean over the
-        hold. With `is_refilled`, check valves keep a chamber at the charge pressure, so displacement counts only while
-        the chamber's pressure is higher.
+        hold. `refilled`: true for A, and for B, if a check valve keeps that chamber at the charge pressure at least;
+        displacement then counts only while the chamber's pressure is higher.
         """
         prior, stroke = INFERENCE.held_oil, self.sides.high - self.sides.low
         displaced, strained, aired = list[Array](), list[Array](), list[Array]()
-        for hold in self.holds:
+        for hold, flags in zip(self.holds, self._closed_flags(refilled), strict=True):
             for index, area, p in ((0, self.sides.area_A, hold.p_A), (1, -self.sides.area_B, hold.p_B)):
                 stroke_end = self.sides.low if area > 0.0 else self.sides.high  # where the chamber is smallest
                 volumes = np.zeros(3)  # in the stroke, and the dead volumes of A and B
                 volumes[0] = abs(area) * abs(float(hold.x.mean()) - stroke_end)
                 volumes[1 + index] = abs(area) * prior.dead * stroke
                 increments = -area * np.diff(hold.x, prepend=hold.x[0])
-                counted = increments * self._is_closed(hold, p) if is_refilled else increments
                 for columns, values in (
-                    (displaced, hold.mean(np.cumsum(counted))),
+                    (displaced, hold.mean(np.cumsum(increments * flags[index]))),
                     (strained, np.outer(hold.mean(p), prior.compressibility * volumes)),
                     (aired, np.outer(hold.mean(1.0 / p), -prior.air * P_ATM * volumes)),
                 ):
-                    columns.append(values - values.mean(axis=0))
+                    columns.append(hold.centre(values, is_A=index == 0))
         strained_volumes, aired_volumes = np.vstack(strained), np.vstack(aired)
         compressed = (strained_volumes + aired_volumes).sum(axis=1)
         misfit_variance = prior.misfit**2 * float(compressed @ compressed) / len(compressed)
@@ -378,14 +487,56 @@ class HeldChambers:
         steady_pressure = average_over(prior.steady, p, 1.0 / float(np.diff(hold.t).mean()))
         return np.asarray(steady_pressure > self.charge * (1.0 + prior.charge) + prior.resolved)
 
-    def _unit_piston_leak(self, offset: float, exponent: float = 1.0) -> UnitLeak:
-        """Compute the flow past the piston in each hold for a leak with a coefficient of 1, in Pa^`exponent`.
+    @cached_property
+    def _above_charge(self) -> list[NDArray[np.bool_]]:
+        """Flags (2, n), for each hold of n samples, of the samples in which A and B are above the charge pressure."""
+        return [np.array([self._is_closed(hold, p) for p in (hold.p_A, hold.p_B)]) for hold in self.holds]
 
-        The flow is sign(dp) |dp|^`exponent` with dp = p_A - p_B - z, where z is the sensor offset in the hold. It may
-        differ a little from the `offset` [Pa] of the recording (`LockedHold.offset_in_hold`).
+    def _closed_flags(self, refilled: tuple[bool, bool]) -> list[NDArray[np.bool_]]:
+        """Flag the samples (2, n), for each hold of n samples, in which no check valve refills A, and B.
+
+        `refilled`: true for A, and for B, if a check valve refills that side once it is at the charge pressure.
         """
-        differences = [hold.p_A - hold.p_B - hold.offset_in_hold(offset)[0] for hold in self.holds]
-        return UnitLeak([np.sign(values) * np.abs(values) ** exponent for values in differences], (1.0, -1.0))
+        return [flags | ~np.array(refilled)[:, None] for flags in self._above_charge]
+
+    def _closed_share(self, refilled: tuple[bool, bool]) -> float:
+        """Compute the fraction of the samples of both sides in all holds in which no check valve refills the chamber.
+
+        The others follow from any leak if check valves replace displaced oil, and say nothing of it. The variance of
+        all readings is then smaller by this fraction than that of the readings that do.
+        """
+        return max(float(np.concatenate(self._closed_flags(refilled), axis=1).mean()), 1.0 / self.n_readings)
+
+    def _unit_piston_leak(
+        self, offset: float, refilled: tuple[bool, bool] = NEITHER, law: LeakLaw = LAMINAR
+    ) -> UnitLeak:
+        """Compute the flow past the piston in each hold for a leak with a coefficient of 1, in Pa^e.
+
+        The flow is sign(dp) |dp|^e with dp = p_A - p_B - z, where z is the sensor offset in the hold, times the growth
+        of the leak since its onset. z may differ a little from the `offset` [Pa] of the recording
+        (`LockedHold.offset_in_hold`). `refilled`: true for A, and for B, if check valves replace displaced oil of that
+        side; `law`: exponent e, and growth.
+        """
+        flows = []
+        for hold in self.holds:
+            difference = hold.p_A - hold.p_B - hold.offset_in_hold(offset)[0]
+            flow = np.sign(difference) * np.abs(difference) ** law.exponent * law.growth_factor(hold.t, self.end)
+            sides = np.array([flow, -flow])
+            flows.append(sides)
+        flows = [sides * flags for sides, flags in zip(flows, self._closed_flags(refilled), strict=True)]
+        return UnitLeak(flows, refilled)
+
+    def pressure_difference(self, t: Array, difference: Array, offset: float) -> Array:
+        """Subtract the sensor offset from p_A - p_B = `difference` (n,) [Pa] at times `t` (n,) [s] of the recording.
+
+        In a hold its own offset is subtracted (`LockedHold.offset_in_hold`), so that pressures which a leak has
+        equalised differ by 0; otherwise the `offset` [Pa] of the recording.
+        """
+        prior, offsets = INFERENCE.held_oil, np.full(len(t), offset)
+        for hold in self.holds:
+            begin, end = hold.t[0], hold.t[-1] + prior.settles + INFERENCE.rest.averaged
+            offsets[(t >= begin) & (t <= end)] = hold.offset_in_hold(offset)[0]
+        return np.asarray(difference - offsets)
 
     def _unit_outside_leak(self, is_A: bool) -> UnitLeak:
         """Compute the flow of a laminar leak with a conductance of 1 from one chamber to the outside.
@@ -395,7 +546,7 @@ class HeldChambers:
         """
         pressures = [(hold, hold.p_A if is_A else hold.p_B) for hold in self.holds]
         flows = [np.maximum(p - P_ATM, 0.0) * self._is_closed(hold, p) for hold, p in pressures]
-        return UnitLeak(flows, (1.0, 0.0) if is_A else (0.0, 1.0), is_refilled=True)
+        return UnitLeak([_flow_of_side(flow, is_A) for flow in flows], BOTH)
 
     def _unit_pump_leak(self, is_A: bool) -> UnitLeak:
         """Compute the flow with a conductance of 1 out of one chamber through open valves and the pump into the other.
@@ -405,38 +556,47 @@ class HeldChambers:
         """
         sign = 1.0 if is_A else -1.0
         differences = [sign * (hold.p_A - hold.p_B - hold.offset_in_hold(0.0)[0]) for hold in self.holds]
-        flows = [np.maximum(difference, 0.0) for difference in differences]
-        return UnitLeak(flows, (1.0, 0.0) if is_A else (0.0, 1.0))
+        return UnitLeak([_flow_of_side(np.maximum(difference, 0.0), is_A) for difference in differences])
 
-    def _fit(self, columns: Array, is_refilled: bool) -> _LeakRegression:
+    def _fit(self, columns: Array, refilled: tuple[bool, bool]) -> _LeakRegression:
         """Fit the coefficients of c leaks together with the properties of the oil.
 
-        `columns` (r, c): volumes leaked with coefficients of 1, at each reading (mean of samples); `is_refilled`: true
-        if check valves replace displaced oil. The properties, and the variance of a reading, which weights the priors
-        of the properties against the readings, are found by iteration.
+        `columns` (r, c): volumes leaked with coefficients of 1, at each reading (mean of samples); `refilled`: true for
+        A, and for B, if check valves replace displaced oil of that side. The properties, and the variance of a reading,
+        which weights the priors of the properties against the readings, are found by iteration.
         """
-        regression, n_leaks = self._regressions[is_refilled], columns.shape[1]
-        logs = np.zeros(4)  # of the oil's properties
-        left, misfit_variance = regression.leaked(logs), regression.misfit_variance
+        regression, n_leaks = self._regressions[refilled], columns.shape[1]
+        changes = np.zeros(4)  # of the oil's properties
+        left, misfit_variance = regression.leaked(changes), regression.misfit_variance
         degrees_of_freedom = max(self.n_readings - n_leaks, 1.0)
         variance = max(float(left @ left) / len(left), misfit_variance)
         precisions = np.append(np.zeros(n_leaks), regression.inflation / _oil_deviations() ** 2)
-        for _ in range(MAX_ITERATIONS):  # of a linear fit of the leaks and of changes of `logs`
-            left, design = regression.leaked(logs), np.column_stack([columns, regression.slopes(logs)])
+        lowest = np.array([-np.inf, *[INFERENCE.held_oil.least_dead / INFERENCE.held_oil.dead - 1.0] * 2, -np.inf])
+        is_lowest = np.zeros(4, dtype=bool)  # properties that stay at their lower limit
+        for _ in range(MAX_ITERATIONS):  # of a linear fit of the leaks and of corrections of `changes`
+            slopes = np.where(is_lowest, 0.0, regression.slopes(changes))
+            left, design = regression.leaked(changes), np.column_stack([columns, slopes])
             scale = np.sqrt((design**2).sum(axis=0))
             scale[~(scale > 0.0)] = 1.0
             scales = np.outer(scale, scale)
-            prior, means = variance * precisions, np.append(np.zeros(n_leaks), -logs)  # precisions and means
+            prior = variance * precisions
+            means = np.append(np.zeros(n_leaks), np.where(is_lowest, 0.0, -changes))
             matrix = (design.T @ design + np.diag(prior)) / scales
             matrix.flat[:: len(scale) + 1] += RIDGE
             inverse = np.linalg.inv(matrix) / scales
             solution = inverse @ (design.T @ left + prior * means)
             residual = left - design @ solution
-            cost = float(residual @ residual) + float(prior @ (solution - means) ** 2)
+            distances = np.append(np.zeros(n_leaks), changes) + solution  # from the mean of the priors
+            cost = float(residual @ residual) + float(prior[n_leaks:] @ distances[n_leaks:] ** 2)
             previous, variance = variance, cost / len(left) * self.n_readings / degrees_of_freedom + misfit_variance
             steps = np.clip(solution[n_leaks:], -MAX_STEP, MAX_STEP)
-            logs = logs + steps
-            if abs(variance - previous) <= TOLERANCE * previous and np.abs(steps).max() <= TOLERANCE:
+            was_lowest, is_lowest = is_lowest, is_lowest | (changes + steps < lowest)
+            changes = np.maximum(changes + steps, lowest)
+            if (
+                np.array_equal(was_lowest, is_lowest)
+                and abs(variance - previous) <= TOLERANCE * previous
+                and np.abs(steps).max() <= TOLERANCE
+            ):
                 break
         covariance = variance * regression.inflation * inverse
         # part of the covariance that would vanish if the properties of the oil were known
@@ -445,20 +605,20 @@ class HeldChambers:
         return _LeakRegression(solution[:n_leaks], covariance[:n_leaks, :n_leaks] - by_oil, by_oil, variance)
 
     @cached_property
-    def _fits_without_leak(self) -> tuple[_LeakRegression, _LeakRegression]:
-        """Fits of the oil's properties without any leak, first without and then with check valves."""
-        n_readings = len(self._regressions[0].displaced)  # as many with check valves as without
-        no_leaks = np.empty((n_readings, 0))
-        return self._fit(no_leaks, is_refilled=False), self._fit(no_leaks, is_refilled=True)
+    def _fits_without_leak(self) -> dict[tuple[bool, bool], _LeakRegression]:
+        """Fits of the oil's properties without any leak, by the sides that check valves refill."""
+        n_readings = len(self._regressions[NEITHER].displaced)  # as many with check valves as without
+        return {refilled: self._fit(np.empty((n_readings, 0)), refilled) for refilled in self._regressions}
 
-    def fit_piston_leak(self, onset: float, offset: float, exponent: float = 1.0) -> LeakFit:
-        """Fit a leak past the piston that begins at `onset` [s] to the times in which shut valves hold the load.
+    def fit_piston_leak(self, fit: PistonFit, law: LeakLaw = LAMINAR) -> LeakFit:
+        """Fit a leak past the piston to the times in which shut valves hold the load.
 
-        `offset`: sensor offset of p_A - p_B in the recording [Pa]; `exponent`: exponent of the leak's law
-        (`_unit_piston_leak`). The likelihood includes the prior on the offset.
+        `fit`: onset of the leak, sensor offset of p_A - p_B, and whether check valves replace displaced oil; `law`: law
+        of the leak (`_unit_piston_leak`). The likelihood includes the prior on the offset.
         """
-        fit = self._fit_leak(self._unit_piston_leak(offset, exponent), onset)
-        return fit._replace(likelihood=fit.likelihood - 0.5 * self._offset_cost(offset))
+        unit_leak = self._unit_piston_leak(fit.offset, fit.refilled, law)
+        result = self._fit_leak(unit_leak, fit.onset)
+        return result._replace(likelihood=result.likelihood - 0.5 * self._offset_cost(fit.offset))
 
     def _offset_cost(self, offset: float) -> float:
         """Compute -2 log of the prior density of a sensor offset [Pa] and of the deviations of all holds from it."""
@@ -484,7 +644,10 @@ class HeldChambers:
 
         The offset is varied since at small pressure differences the fitted leak depends strongly on it.
         """
-        fits = [self.fit_piston_leak(onset, float(offset)) for offset in (*self._offset_grid, self.piston_fit.offset)]
+        best = self.piston_fit._replace(onset=onset)
+        fits = [
+            self.fit_piston_leak(best._replace(offset=float(offset))) for offset in (*self._offset_grid, best.offset)
+        ]
         return [fit for fit in fits if fit.deviation < UNKNOWN]
 
     def _fit_leak(self, leak: UnitLeak, onset: float) -> LeakFit:
@@ -494,10 +657,10 @@ class HeldChambers:
         coefficient is 0 with the standard deviation `UNKNOWN`.
         """
         column = self._leak_columns(leak, np.array([onset]))
-        fit_without_leak = self._fits_without_leak[leak.is_refilled]
+        fit_without_leak = self._fits_without_leak[leak.refilled]
         value, deviation, by_oil, variance = 0.0, UNKNOWN, 0.0, fit_without_leak.variance
         if column.any():
-            fit = self._fit(column, leak.is_refilled)
+            fit = self._fit(column, leak.refilled)
             deviation, by_oil = float(fit.by_noise[0, 0]) ** 0.5, float(max(fit.by_oil[0, 0], 0.0)) ** 0.5
             if not fit.coefficients[0] < 0.0:  # a leak flows from the higher to the lower pressure only
                 value, variance = float(fit.coefficients[0]), fit.variance
@@ -533,13 +696,17 @@ class HeldChambers:
         are relative to their mean over the hold.
         """
         columns = []
-        for hold, flow in zip(self.holds, leak.flows, strict=True):
-            increments = 0.5 * (flow[1:] + flow[:-1]) * np.diff(hold.t)
-            volume = np.concatenate([[0.0], np.cumsum(increments)])
-            volume_before = np.interp(onsets, hold.t, volume)
-            readings = hold.mean((hold.t >= onsets[:, None]) * (volume - volume_before[:, None])).T
-            readings -= readings.mean(axis=0)
-            columns += [sign * readings for sign in leak.signs]
+        for hold, sides in zip(self.holds, leak.flows, strict=True):
+            for is_A, flow in zip((True, False), sides, strict=True):
+                increments = 0.5 * (flow[1:] + flow[:-1]) * np.diff(hold.t)
+                volume = np.concatenate([[0.0], np.cumsum(increments)])
+                volume_before = np.interp(onsets, hold.t, volume)
+                # sums over the samples of each reading from the onset on, from their cumulative sums
+                sums = np.concatenate([[0.0], np.cumsum(volume)])
+                last = hold.edges[1:, None]
+                first = np.minimum(np.maximum(hold.edges[:-1, None], np.searchsorted(hold.t, onsets)), last)
+                readings = (sums[last] - sums[first] - (last - first) * volume_before) / np.diff(hold.edges)[:, None]
+                columns.append(hold.centre(readings, is_A))
         return np.vstack(columns)
 
     def _onset_posteriors(self, leak: UnitLeak) -> Array:
@@ -547,21 +714,16 @@ class HeldChambers:
 
         The result is log prior - N/2 log(residual sum of squares), up to a constant, for N independent readings and a
         coefficient >= 0, with the properties of the oil eliminated. `leak`: flow of the leak with a coefficient of 1.
+        The priors of the properties count by the variance of the readings without a leak at first, then by that with
+        the most probable onset.
         """
-        regression, usual = self._regressions[leak.is_refilled], np.zeros(4)
-        left, oil, misfit_variance = regression.leaked(usual), regression.slopes(usual), regression.misfit_variance
-        design = np.column_stack([left, self._leak_columns(leak, self.onsets)])
-        variance = self._fits_without_leak[leak.is_refilled].variance
-        precision = oil.T @ oil + np.diag(variance * regression.inflation / _oil_deviations() ** 2)
-        scale = np.sqrt(np.diag(precision))
-        coupling = (oil / scale).T @ design
-        # products of the left side (first) and of the leak for each onset, without the oil (Schur complement)
-        gram = design.T @ design - coupling.T @ np.linalg.solve(precision / np.outer(scale, scale), coupling)
-        total, energies, moments = gram[0, 0], np.diag(gram)[1:], np.maximum(gram[0, 1:], 0.0)
-        is_informative = energies > RIDGE * max(float(energies.max()), np.finfo(float).tiny)
-        gain = np.where(is_informative, moments**2 / np.where(is_informative, energies, 1.0), 0.0)
-        residual_squares = np.maximum(total - gain, 0.0) + misfit_variance * len(left)
-        return np.asarray(self._onset_log_priors - 0.5 * self.n_readings * np.log(residual_squares))
+        regression = self._regressions[leak.refilled]
+        variance, n_rows = self._fits_without_leak[leak.refilled].variance, len(regression.displaced)
+        columns = self._leak_columns(leak, self.onsets)
+        for _ in range(2):
+            squares = _residual_squares(regression, columns, variance) + regression.misfit_variance * n_rows
+            variance = float(squares.min()) / n_rows
+        return np.asarray(self._onset_log_priors - 0.5 * self.n_readings * np.log(squares))
 
     @cached_property
     def _offset_grid(self) -> Array:
@@ -574,27 +736,80 @@ class HeldChambers:
         return np.unique(np.concatenate([np.append(-OFFSET_GRID, OFFSET_GRID) * INFERENCE.zero.pressure, ends]))
 
     @cached_property
+    def piston_fits(self) -> dict[float, PistonFit]:
+        """Most probable onset of a leak past the piston, sensor offset and effect of check valves, by its exponent.
+
+        The exponents are those of `EXPONENTS`.
+        """
+        return {exponent: self._find_piston_fit(exponent) for exponent in EXPONENTS}
+
+    @property
     def piston_fit(self) -> PistonFit:
-        """Most probable onset [s] of a leak past the piston, and most probable sensor offset of p_A - p_B [Pa].
+        """Most probable onset of a laminar leak past the piston, sensor offset, and effect of check valves."""
+        return self.piston_fits[1.0]
+
+    def _find_piston_fit(self, exponent: float) -> PistonFit:
+        """Find the most probable onset of a leak past the piston, sensor offset, and effect of check valves.
 
         They have the highest joint posterior probability, on a grid of onsets and a grid of offsets that is refined
-        once.
+        once, with and without check valves that replace displaced oil (equally probable). `exponent`: exponent of the
+        leak's law (`LeakLaw`).
         """
-        grid = self._offset_grid
-        best = int(np.argmax([self._find_onset(float(offset))[1] for offset in grid]))
-        refined = np.linspace(grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)], N_REFINED)
-        fits = [(*self._find_onset(float(offset)), float(offset)) for offset in (*refined, grid[best])]
-        onset, _, offset = max(fits, key=lambda fit: fit[1])  # with the highest posterior
-        return PistonFit(float(self.onsets[onset]), offset)
+        grid, fits = self._offset_grid, list[tuple[float, PistonFit]]()
+        is_never_open = self._closed_share(self._larger_side) == 1.0
+        for refilled in (NEITHER,) if is_never_open else (NEITHER, self._larger_side):
+            posteriors = [self._find_onset(float(offset), refilled, exponent)[0] for offset in grid]
+            best = int(np.argmax(posteriors))
+            refined = np.linspace(grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)], N_REFINED)
+            fits += [self._find_onset(float(offset), refilled, exponent) for offset in (*refined, grid[best])]
+        return max(fits, key=lambda fit: fit[0])[1]  # with the highest posterior
 
-    def _find_onset(self, offset: float) -> tuple[int, float]:
+    @cached_property
+    def law_fits(self) -> list[LawFit]:
+        """Fits of a leak past the piston for each exponent of `EXPONENTS` and each growth of `growth_priors`."""
+        fits = []
+        for growth, growth_prior in growth_priors():
+            for (exponent, conditions), law_prior in zip(self.piston_fits.items(), law_priors(), strict=True):
+                law = LeakLaw(exponent, growth, conditions.onset)
+                fit = self.fit_piston_leak(conditions, law)
+                fits.append(LawFit(law, conditions, fit, fit.likelihood + float(np.log(growth_prior * law_prior))))
+        return fits
+
+    def _fit_growing_leak(self, leak: UnitLeak, onset: float) -> LeakFit:
+        """Fit a leak that may grow from its `onset` [s] on; its coefficient is the mean from the onset to the end.
+
+        The coefficient is that of the most probable growth, the likelihood a mean over the growths of `growth_priors`.
+        `leak`: flow of the leak with a coefficient of 1, without growth.
+        """
+        fits, log_weights = list[LeakFit](), list[float]()
+        for growth, probability in growth_priors():
+            law = LeakLaw(1.0, growth, onset)
+            flows = [
+                flow * law.growth_factor(hold.t, self.end) for flow, hold in zip(leak.flows, self.holds, strict=True)
+            ]
+            fit = self._fit_leak(leak._replace(flows=flows), onset)
+            fits.append(fit.scale(1.0 + 0.5 * growth, fit.likelihood))
+            log_weights.append(fit.likelihood + float(np.log(probability)))
+        return fits[int(np.argmax(log_weights))]._replace(likelihood=float(np.logaddexp.reduce(log_weights)))
+
+    def _mean_unit_flow(self, conditions: PistonFit, law: LeakLaw) -> float:
+        """Compute the mean magnitude of the flow of a leak with a coefficient of 1 in the holds, after its onset."""
+        leak = self._unit_piston_leak(conditions.offset, law=law)
+        flows = [np.abs(flow[0])[hold.t >= conditions.onset] for hold, flow in zip(self.holds, leak.flows, strict=True)]
+        after_onset = np.concatenate(flows)
+        return max(float(after_onset.mean()) if after_onset.size else 0.0, float(np.finfo(float).tiny))
+
+    def _find_onset(self, offset: float, refilled: tuple[bool, bool], exponent: float) -> tuple[float, PistonFit]:
         """Find the most probable onset of a leak past the piston, given the sensor offset of p_A - p_B [Pa].
 
-        Return its index in `onsets`, and the log posterior of onset and offset.
+        `refilled`: true for A, and for B, if check valves replace displaced oil of that side; `exponent`: exponent of
+        the leak's law. Return the log posterior of onset and offset, and the fit with this onset.
         """
-        posteriors = self._onset_posteriors(self._unit_piston_leak(offset))
+        posteriors = self._onset_posteriors(self._unit_piston_leak(offset, refilled, LeakLaw(exponent)))
         onset = int(posteriors.argmax())
-        return onset, float(posteriors[onset]) - 0.5 * self._offset_cost(offset)
+        log_posterior = float(posteriors[onset]) - 0.5 * self._offset_cost(offset)
+        log_posterior += 0.5 * self.n_readings * float(np.log(self._closed_share(refilled)))
+        return log_posterior, PistonFit(float(self.onsets[onset]), offset, refilled)
 
     @cached_property
     def _leak_hypotheses(self) -> list[LeakHypothesis]:
@@ -602,13 +817,22 @@ class HeldChambers:
         return self._weigh_hypotheses([self._unit_outside_leak(is_A) for is_A in (True, False)])
 
     def _weigh_hypotheses(self, leaks: Sequence[UnitLeak]) -> list[LeakHypothesis]:
-        """Fit a leak past the piston and each of the other `leaks`, and compute their probabilities, in this order."""
-        piston_onset, offset = self.piston_fit
+        """Fit a leak past the piston and each of the other `leaks`, and compute their probabilities, in this order.
+
+        Each may grow from its onset on. The coefficient of the leak past the piston is that of its most probable law,
+        converted to the conductance of a laminar leak with the same mean flow in the holds; those of the others are
+        means from the onset to the end. The likelihood of a leak is a mean over its laws and growths, weighted by their
+        prior probabilities.
+        """
+        best = max(self.law_fits, key=lambda fit: fit.log_weight)
+        unit_ratio = self._mean_unit_flow(best.conditions, best.law) / self._mean_unit_flow(best.conditions, LAMINAR)
+        log_weights = [fit.log_weight for fit in self.law_fits]
         # each fit with the index of its onset
-        fits = [(self.fit_piston_leak(piston_onset, offset), int(np.abs(self.onsets - piston_onset).argmin()))]
+        onset = int(np.abs(self.onsets - best.conditions.onset).argmin())
+        fits = [(best.fit.scale(unit_ratio, float(np.logaddexp.reduce(log_weights))), onset)]
         for leak in leaks:
             onset = int(self._onset_posteriors(leak).argmax())
-            fits.append((self._fit_leak(leak, float(self.onsets[onset])), onset))
+            fits.append((self._fit_growing_leak(leak, float(self.onsets[onset])), onset))
         log_posteriors = np.array([fit.likelihood + self._onset_log_priors[onset] for fit, onset in fits])
         probabilities = np.exp(log_posteriors - log_posteriors.max())
         probabilities /= probabilities.sum()
@@ -672,13 +896,41 @@ class HeldChambers:
 
         The interval is widened to the next possible onsets (`onsets`) on either side.
         """
-        posteriors = self._onset_posteriors(self._unit_piston_leak(self.piston_fit.offset))
+        fit = self.piston_fit
+        posteriors = self._onset_posteriors(self._unit_piston_leak(fit.offset, fit.refilled))
         weights = np.exp(posteriors - posteriors.max())
         first, best, last = np.searchsorted(np.cumsum(weights) / weights.sum(), [0.5 * TAIL, 0.5, 1.0 - 0.5 * TAIL])
         if first < 2:  # it may be the beginning of the recording or the first onset within a hold
             return None
         ends = np.append(self.onsets, self.end)
         return Interval(float(self.onsets[best]), float(ends[first - 1]), float(ends[last + 1]))
+
+
+def _residual_squares(regression: _OilRegression, columns: Array, variance: float) -> Array:
+    """Compute the residual sum of squares (o,) of a fit of a leak for each of o onsets, with a coefficient >= 0.
+
+    `regression`: regression on the properties of the oil, linearised at their usual values; `columns` (r, o): volume
+    leaked with a coefficient of 1 since each onset, at each reading; `variance`: variance of a reading, by which the
+    priors of the properties count.
+    """
+    usual = np.zeros(4)
+    left, oil = regression.leaked(usual), regression.slopes(usual)
+    design = np.column_stack([left, columns])
+    precision = oil.T @ oil + np.diag(variance * regression.inflation / _oil_deviations() ** 2)
+    scale = np.sqrt(np.diag(precision))
+    coupling = (oil / scale).T @ design
+    # products of the left side (first) and of the leak for each onset, without the oil (Schur complement)
+    gram = design.T @ design - coupling.T @ np.linalg.solve(precision / np.outer(scale, scale), coupling)
+    total, energies, moments = gram[0, 0], np.diag(gram)[1:], np.maximum(gram[0, 1:], 0.0)
+    is_informative = energies > RIDGE * max(float(energies.max()), np.finfo(float).tiny)
+    gain = np.where(is_informative, moments**2 / np.where(is_informative, energies, 1.0), 0.0)
+    return np.asarray(np.maximum(total - gain, 0.0))
+
+
+def _flow_of_side(flow: Array, is_A: bool) -> Array:
+    """Arrange a flow (n,) out of side A, or out of B if `is_A` is False, as the flows out of both sides, (2, n)."""
+    none = np.zeros_like(flow)
+    return np.array([flow, none] if is_A else [none, flow])
 
 
 def _average_fits(fits: Sequence[LeakFit]) -> Flow:

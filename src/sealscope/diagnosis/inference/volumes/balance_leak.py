@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sealscope.diagnosis.inference.circuit.locked_holds import HeldChambers
 from sealscope.diagnosis.inference.leak_law import (
     EXPONENTS,
     LawWeight,
@@ -39,9 +40,9 @@ from sealscope.units import BAR, LITRE_PER_MINUTE
 class _HoldLaws(NamedTuple):
     """Leak past the piston, fitted to the times in which shut valves hold the load, under k laws of flow.
 
-    The laws have the exponents `EXPONENTS` (1 laminar, 0.5 orifice). All fields have the shape (k,). `weights`:
-    relative likelihood of each law, with the sum 1; `units`: mean flow [m^3/s] for a coefficient of 1; `flows`,
-    `deviations`: fitted mean flows and their standard deviations [m^3/s].
+    A law is an exponent of `EXPONENTS` (1 laminar, 0.5 orifice) with a growth of the leak; the first law is laminar
+    without growth. All fields have the shape (k,). `weights`: probability of each law, with the sum 1; `units`: mean
+    flow [m^3/s] for a coefficient of 1; `flows`, `deviations`: fitted mean flows and their standard deviations [m^3/s].
     """
 
     weights: Array
@@ -204,27 +205,43 @@ class BalanceLeak:
         The flow is averaged over the laws of the leak, weighted by their likelihoods. `hold_rise`: rise of the leakage
         over healthy recordings in these times, whose variance is added to the variance of the fits.
         """
-        laws = self._hold_laws()
+        laws = self._hold_laws
         low, high = hold_rise.interval()
         laminar_unit = laws.units[0]  # the rise is that of a laminar leak
         rise_flow_deviation = (high - low) / (2.0 * WITHIN_95) * laminar_unit
         return mixture_flow(laws.weights, laws.flows, np.hypot(rise_flow_deviation, laws.deviations))
 
+    @cached_property
     def _hold_laws(self) -> _HoldLaws:
-        """Fit a leak past the piston to the times in which shut valves hold the load, for each exponent of `EXPONENTS`.
+        """Fit a leak past the piston to the times in which shut valves hold the load, for each law and piston area.
 
-        The flow is the coefficient times abs(p_A - p_B)^exponent: 1 laminar, 0.5 orifice.
+        The flow is the coefficient times abs(p_A - p_B)^exponent for each exponent of `EXPONENTS`, with each growth of
+        `growth_priors` since the onset, and with each area of `HeldChambers.with_areas`. The weight of a law is the
+        likelihood of its fit times the prior probability of its growth; the sum of the weights for one area is the
+        probability of that area.
         """
-        balance, chambers = self.balance, self.balance.chambers
+        chambers = self.balance.chambers
         assert chambers is not None
-        recording, (onset, offset) = balance.recording, chambers.piston_fit
-        difference = np.abs(recording["p_A"] - recording["p_B"] - offset)[recording.t >= onset]
-        units = np.array([float(np.nanmean(difference**exponent)) for exponent in EXPONENTS])
-        fits = [chambers.fit_piston_leak(onset, offset, exponent) for exponent in EXPONENTS]
-        values, noise_deviations, oil_deviations, likelihoods = np.array(fits).T
-        weights = np.exp(likelihoods - likelihoods.max())
+        parts = []
+        for probability, variant in chambers.with_areas():
+            laws = self._fit_hold_laws(variant)
+            parts.append(laws._replace(weights=probability * laws.weights))
+        return _HoldLaws(*(np.concatenate(values) for values in zip(*parts, strict=True)))
+
+    def _fit_hold_laws(self, chambers: HeldChambers) -> _HoldLaws:
+        """Fit a leak past the piston for each exponent and growth (`_hold_laws`), with the areas of `chambers`."""
+        recording, units = self.balance.recording, list[float]()
+        for law, conditions, _, _ in chambers.law_fits:
+            after_onset = recording.t >= conditions.onset
+            t = recording.t[after_onset]
+            difference = (recording["p_A"] - recording["p_B"])[after_onset]
+            pressure = np.abs(chambers.pressure_difference(t, difference, conditions.offset))
+            units.append(float(np.nanmean(pressure**law.exponent * law.growth_factor(t, chambers.end))))
+        values, noise_deviations, oil_deviations, _ = np.array([law_fit.fit for law_fit in chambers.law_fits]).T
+        log_weights = np.array([law_fit.log_weight for law_fit in chambers.law_fits])
+        weights = np.exp(log_weights - log_weights.max())
         deviations = np.hypot(noise_deviations, oil_deviations)
-        return _HoldLaws(weights / weights.sum(), units, values * units, deviations * units)
+        return _HoldLaws(weights / weights.sum(), np.array(units), values * units, deviations * units)
 
     def _rise_laws(self) -> list[LawWeight]:
         """Weigh the laws of a leak's flow, such as laminar, by their fit to the rise over healthy recordings.
@@ -294,7 +311,7 @@ class BalanceLeak:
         motion_rise, hold_rise, chambers = self._motion_rise, self._hold_rise, self.balance.chambers
         assert motion_rise is not None and hold_rise is not None and chambers is not None
         piston_probability, fraction_after, fit = chambers.piston_leak
-        mean_leak, pressure, laws = fraction_after * fit.value, self.balance.mean_pressure(), self._hold_laws()
+        mean_leak, pressure, laws = fraction_after * fit.value, self.balance.mean_pressure(), self._hold_laws
         relative_deviations = laws.deviations / max(float(laws.deviations[0]), np.finfo(float).tiny)
         # mean flow per conductance of a leak past the piston, larger by the uncertainty of its law
         unit = pressure * max(float(laws.weights @ relative_deviations), 1.0)

@@ -16,7 +16,7 @@ from sealscope.diagnosis.inference.blocks import (
     estimate_offset,
     estimate_weighted_mean,
     information,
-    offset_cost,
+    offset_costs,
     solve,
 )
 from sealscope.diagnosis.inference.changes.charge_pressure import estimate_charge_trend
@@ -67,6 +67,8 @@ if TYPE_CHECKING:
 
 #: Fraction of the samples beyond each end of the stroke, and beyond the largest load.
 END_QUANTILE = 0.02
+#: Number of ratios of the two piston areas, and of shares of a side's motion, that are compared; the smallest share.
+N_RATIOS, N_SHARES, MIN_SHARE = 801, 51, 1e-3
 
 
 class Size(NamedTuple):
@@ -224,7 +226,7 @@ class RecordedBalance:
         volumes that the pump delivers between the samples of the recording [m^3].
         """
         recording = self.recording
-        begin, end = np.searchsorted(recording.t, hold.t[[0, -1]])
+        begin, end = np.searchsorted(recording.t, hold.t[[hold.edges[1], -1]])  # with the valves shut
         flow = pumped[begin:end] * recording.rate
         flow = flow[np.isfinite(flow)]
         variance = float(flow.var()) / max(flow.size, 1)  # of the mean
@@ -235,19 +237,26 @@ class RecordedBalance:
         """Return True if p_A - p_B in a hold almost certainly is a load, not the sensors' offset at equal pressures.
 
         At equal pressures a leak has no flow, so that the hold would not show it. The largest p_A - p_B counts, in the
-        hold or just before it, since a large leak equalises the pressures while the valves are still shutting. In the
-        comparison all loads up to the largest pressure difference of the recording are equally probable.
+        hold or just before it, since a large leak equalises the pressures while the valves are still shutting.
         """
-        prior, oil, t = INFERENCE.zero, INFERENCE.held_oil, self.recording.t
+        oil, t = INFERENCE.held_oil, self.recording.t
         difference = np.abs(self.recording["p_A"] - self.recording["p_B"])
         # just before the hold the pump stops and the valves shut
         first, last = np.searchsorted(t, hold.t[0] - np.array([oil.equalises + oil.settles, 0.0]))
         difference_before = np.nanmedian(difference[first : last + 1])
         pressure = float(np.nanmax([np.abs(hold.mean(hold.p_A - hold.p_B)).max(), difference_before]))
-        log_offset_density = -0.5 * offset_cost(pressure) - float(np.log(prior.pressure * np.sqrt(2.0 * np.pi)))
+        return float(self._load_log_odds(np.array([pressure]))[0]) > oil.loaded
+
+    def _load_log_odds(self, pressure: Array) -> Array:
+        """Compute the log odds that magnitudes of p_A - p_B (n,) [Pa] are loads, not the sensors' offset.
+
+        All loads up to the largest pressure difference of the recording are equally probable.
+        """
+        log_offset_norm = float(np.log(INFERENCE.zero.pressure * np.sqrt(2.0 * np.pi)))
+        difference = np.abs(self.recording["p_A"] - self.recording["p_B"])
         max_load = float(np.nanquantile(difference, 1.0 - END_QUANTILE))
         log_load_density = -float(np.log(max(max_load, np.finfo(float).tiny)))
-        return log_load_density - log_offset_density > INFERENCE.held_oil.loaded
+        return np.asarray(log_load_density + 0.5 * offset_costs(pressure) + log_offset_norm)
 
     def locked_log_odds(self) -> float | None:
         """Compute the log odds that valves are shut in holds, and not open; None without holds.
@@ -270,7 +279,7 @@ class RecordedBalance:
 
         They are not determined if nothing moves, or if the ratio of the areas is implausible.
         """
-        area_A, area_B = self._signed_areas()
+        area_A, area_B, deviation_A, deviation_B = self._signed_areas()
         x = self.recording["x"][np.isfinite(self.recording["x"])]
         if not x.size:
             return None
@@ -278,15 +287,17 @@ class RecordedBalance:
         max_area_ratio: float = INFERENCE.held_oil.unlike
         if not (area_A and high > low and 1.0 / max_area_ratio < area_A / area_B < max_area_ratio):
             return None
-        return CylinderSides(area_A, area_B, low, high)
+        return CylinderSides(area_A, area_B, low, high, deviation_A, deviation_B)
 
-    def _signed_areas(self) -> tuple[float, float]:
+    def _signed_areas(self) -> tuple[float, float, float, float]:
         """Estimate the piston areas of A and B [m^2], as measured with the assumed displacement of the pump.
 
-        They are negative if the position x is reversed. The area of a side is the mean of its coefficients of motion in
-        the volume balance, weighted by the sums of squares of their columns. If the rig's file states the areas, these
-        are used instead, scaled to the flows of the volume balance. A side that never carries the load takes the area
-        of the other side, as does the side with less motion if the signs differ. Both areas are zero if nothing moves.
+        They are followed by the standard deviations of the logarithms of their magnitudes. They are negative if the
+        position x is reversed. The area of a side is the mean of its coefficients of motion in the volume balance,
+        weighted by the sums of squares of their columns, where the side surely carries the load. That of the side with
+        less such motion is corrected for motion that may belong to the other side (`log_area_ratio`). If the rig's
+        file states the areas, these are used instead, scaled to the flows of the volume balance. All are zero if
+        nothing moves.
         """
         roles, total = self.columns[0], self.blocks.gram[:, 0].sum(axis=0)
         nuisance = list(roles.nuisance)
@@ -298,14 +309,37 @@ class RecordedBalance:
             squares = np.diag(total)[motion]
             energies.append(float(squares.sum()))
             areas.append(float(squares @ [coefficients[k] for k in motion]) / max(energies[-1], np.finfo(float).tiny))
-        main = int(np.argmax(energies))
+        shares = self._loaded_shares()
+        main = int(np.argmax(np.array(energies) * shares))
+        deviation: float = INFERENCE.size.area
         if self.rig.states("cylinder.A_A", "cylinder.A_B") and self.size.stated:
-            sign = np.sign(areas[main])
-            areas = [sign * area / self.size.scale for area in (self.rig.cylinder.A_A, self.rig.cylinder.A_B)]
-        area_A, area_B = areas
-        if area_A * area_B <= 0.0:
-            return areas[main], areas[main]
-        return area_A, area_B
+            sign = float(np.sign(areas[main]))
+            area_A, area_B = (sign * area / self.size.scale for area in (self.rig.cylinder.A_A, self.rig.cylinder.A_B))
+            return area_A, area_B, deviation, deviation
+        recording, measured = self.recording, areas[1 - main] / areas[main] if areas[main] else 0.0
+        # the side that carries the largest load is more probably the one without a rod
+        highest = [float(np.nanquantile(recording[name], 1.0 - END_QUANTILE)) for name in ("p_A", "p_B")]
+        log_ratio = log_area_ratio(measured, shares[1 - main], is_larger=highest[1 - main] > highest[main])
+        other_area, other_deviation = areas[main] * np.exp(log_ratio.value), np.hypot(deviation, log_ratio.deviation)
+        sides = [(areas[main], deviation), (float(other_area), float(other_deviation))]
+        (area_A, deviation_A), (area_B, deviation_B) = sides if main == 0 else sides[::-1]
+        return area_A, area_B, deviation_A, deviation_B
+
+    def _loaded_shares(self) -> tuple[float, float]:
+        """Compute the fraction of the motion of A and of B, as sums of squared speeds, in which they surely carry.
+
+        A sample counts if its p_A - p_B almost certainly is a load, and not an offset of the sensors
+        (`_load_log_odds`). A side that never carries has the fraction 0.
+        """
+        recording = self.recording
+        difference = recording["p_A"] - recording["p_B"] - self.pressure_offset
+        speed = Signals(dict(recording.channels), recording.rate).speed
+        is_load = self._load_log_odds(np.abs(difference)) > INFERENCE.held_oil.loaded
+        shares = []
+        for carries in (difference > 0.0, difference <= 0.0):
+            squares = np.where(carries & np.isfinite(speed * difference), speed**2, 0.0)
+            shares.append(float(squares[is_load].sum()) / max(float(squares.sum()), np.finfo(float).tiny))
+        return shares[0], shares[1]
 
     @cached_property
     def pressure_offset(self) -> float:
@@ -412,6 +446,32 @@ class RecordedBalance:
         The blocks are those from the first motion on (`running_blocks`).
         """
         return fit_history(self.leak, self.test, with_step=with_step)
+
+
+def log_area_ratio(measured: float, loaded_share: float, *, is_larger: bool) -> Estimate:
+    """Estimate the logarithm r of the piston area of one side over that of the other, with its standard deviation.
+
+    `measured`: ratio as fitted, in which a part w of the motion of the first side belongs to it, and the rest to the
+    other side, whose area is well known: log `measured` = w r. The unknown w is 1 with the probability
+    `held_oil.sides_told` (`priors.toml`). Otherwise its logarithm is uniform from that of `loaded_share`, the fraction
+    of the motion in which the side surely carries the load, to 0. r has a normal prior (`held_oil.sides` and
+    `sides_deviation`), with a positive mean if `is_larger`, else a negative one. A ratio that is not positive says
+    nothing.
+    """
+    prior = INFERENCE.held_oil
+    mean, deviation = prior.sides if is_larger else -prior.sides, prior.sides_deviation
+    ratios = mean + np.linspace(-4.0, 4.0, N_RATIOS) * deviation
+    log_weights = np.broadcast_to(-0.5 * ((ratios - mean) / deviation) ** 2, (N_SHARES, N_RATIOS))
+    if measured > 0.0:
+        shares = np.geomspace(max(loaded_share, MIN_SHARE), 1.0, N_SHARES)
+        share_weights = np.full(N_SHARES, (1.0 - prior.sides_told) / N_SHARES)
+        share_weights[-1] += prior.sides_told
+        misfit = (np.log(measured) - np.outer(shares, ratios)) / INFERENCE.size.area
+        log_weights = log_weights + np.log(share_weights)[:, None] - 0.5 * misfit**2
+    weights = np.exp(log_weights - log_weights.max()).sum(axis=0)
+    weights /= weights.sum()
+    value = float(weights @ ratios)
+    return Estimate(value, float(np.sqrt(weights @ (ratios - value) ** 2)))
 
 
 def _flow_scale(balance: RecordedBalance) -> Size:

@@ -95,12 +95,12 @@ def rival_rises(
             pump_rise = rise(judged, healthy, [roles.replace_leak(TURNING) for roles in columns])
             # a rise that warmer oil explains does not count
             observable = replace(observable, chance=max(observable.chance, pump_rise.chance))
-        elif not is_air:
+        else:
             log_ratio = compare_with_leak(judged, healthy, columns, names[k])  # for one independent residual
             if log_ratio is not None and laws is not None:
                 log_ratio -= max(laws.log_ratio, 0.0)  # of the leak by the better law, laminar or an orifice
             log_ratio_to_leak = None if log_ratio is None else INFERENCE.size.readings * log_ratio
-            observable = _penalise_size(observable, judged, unit_flows)
+            observable = observable if is_air else _penalise_size(observable, judged, unit_flows)
             observable = replace(observable, log_ratio_to_leak=log_ratio_to_leak)
         observables.append(observable)
     return (*observables, *(hold_rivals or ()))
