@@ -10,7 +10,9 @@ import pytest
 from sealscope.campaigns import held
 from sealscope.campaigns.held import BEFORE, N_HEALTHY, PlannedHold, has_shut_off, plan_hold
 from sealscope.campaigns.smallest import DetectableLeak, PlannedDuty, RecordingPlan
-from sealscope.diagnosis.inference.circuit.locked_holds import MAX_RATE, CylinderSides, HeldChambers, find_locked_holds
+from sealscope.diagnosis.inference.circuit.holds.chambers import HeldChambers
+from sealscope.diagnosis.inference.circuit.holds.hold import MAX_RATE, find_locked_holds
+from sealscope.diagnosis.inference.circuit.holds.oil import CylinderSides
 from sealscope.diagnosis.inference.scatter import RecordingSums, held_rise
 from sealscope.errors import InputError
 from sealscope.parameters import Rig, load_rig

@@ -8,15 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.inference.circuit.locked_holds import (
-    NEITHER,
-    CylinderSides,
-    HeldChambers,
-    LeakLaw,
-    PistonFit,
-    find_charge_pressure,
-    find_locked_holds,
-)
+from sealscope.diagnosis.inference.circuit.holds.chambers import HeldChambers
+from sealscope.diagnosis.inference.circuit.holds.hold import find_charge_pressure, find_locked_holds
+from sealscope.diagnosis.inference.circuit.holds.leaks import NEITHER, LeakLaw, PistonFit
+from sealscope.diagnosis.inference.circuit.holds.oil import CylinderSides
 from sealscope.diagnosis.inference.volumes.recorded import log_area_ratio
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Array

@@ -21,12 +21,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.inference.circuit.locked_holds import (
-    MAX_RATE,
-    CylinderSides,
-    HeldChambers,
-    find_locked_holds,
-)
+from sealscope.diagnosis.inference.circuit.holds.chambers import HeldChambers
+from sealscope.diagnosis.inference.circuit.holds.hold import MAX_RATE, find_locked_holds
+from sealscope.diagnosis.inference.circuit.holds.oil import CylinderSides
 from sealscope.diagnosis.inference.scatter import RecordingSums, held_rise
 from sealscope.diagnosis.priors.decision import DECISION
 from sealscope.diagnosis.priors.inference import INFERENCE

@@ -24,7 +24,7 @@ from pydantic import AfterValidator, BeforeValidator, ConfigDict, FailFast, Fiel
 from sealscope.diagnosis.healthy import SummarisedRecording, Summary
 from sealscope.diagnosis.inference.changes.pressure_bands import MIN_OCTAVES, PAIRS, Octaves
 from sealscope.diagnosis.inference.changes.signals import SIGNALS
-from sealscope.diagnosis.inference.circuit.locked_holds import HeldLeaks
+from sealscope.diagnosis.inference.circuit.holds.leaks import HeldLeaks
 from sealscope.diagnosis.inference.terms import LEAK
 from sealscope.diagnosis.rms_change.blocks import DUTY
 from sealscope.diagnosis.verdict.evidence import PRESSURE_RESPONSE, RMS_CHANGE, VOLUME_BALANCE

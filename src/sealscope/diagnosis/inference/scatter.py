@@ -256,7 +256,7 @@ class RecordingSums(NamedTuple):
       with the coefficients eliminated that recordings do not share (`eliminate_unshared`);
     - `flow`, `pressure`: mean magnitudes of the pump's flow [m^3/s] and of p_A - p_B [Pa];
     - `start_s`, `oil_degC`: date [s since 1970] and temperature of the oil, None if unknown;
-    - `held` (6,): leaks while shut valves hold the load, in the order of `locked_holds.HeldLeaks`, or None;
+    - `held` (6,): leaks while shut valves hold the load, in the order of `holds.leaks.HeldLeaks`, or None;
     - `viscous_drop` (2,): logarithm of (pressure drop due to motion / speed) and its standard error, or None.
     """
 

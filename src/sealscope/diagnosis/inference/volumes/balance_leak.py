@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.inference.circuit.locked_holds import HeldChambers
+from sealscope.diagnosis.inference.circuit.holds.chambers import HeldChambers
 from sealscope.diagnosis.inference.leak_law import (
     EXPONENTS,
     LawWeight,

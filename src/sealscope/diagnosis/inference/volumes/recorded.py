@@ -22,13 +22,9 @@ from sealscope.diagnosis.inference.blocks import (
 from sealscope.diagnosis.inference.changes.charge_pressure import estimate_charge_trend
 from sealscope.diagnosis.inference.changes.viscous_drop import estimate_viscous_drop
 from sealscope.diagnosis.inference.changes.volumes import volume_observables
-from sealscope.diagnosis.inference.circuit.locked_holds import (
-    CylinderSides,
-    HeldChambers,
-    LockedHold,
-    find_charge_pressure,
-    find_locked_holds,
-)
+from sealscope.diagnosis.inference.circuit.holds.chambers import HeldChambers
+from sealscope.diagnosis.inference.circuit.holds.hold import LockedHold, find_charge_pressure, find_locked_holds
+from sealscope.diagnosis.inference.circuit.holds.oil import CylinderSides
 from sealscope.diagnosis.inference.differences import Estimate
 from sealscope.diagnosis.inference.leak_law import find_leak_step
 from sealscope.diagnosis.inference.observable import Observable

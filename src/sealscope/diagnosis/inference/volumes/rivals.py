@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from sealscope.diagnosis.inference.blocks import ColumnRoles, solve
-from sealscope.diagnosis.inference.circuit.locked_holds import HeldLeaks
+from sealscope.diagnosis.inference.circuit.holds.leaks import HeldLeaks
 from sealscope.diagnosis.inference.differences import compare_with_healthy, excess_error, size_penalty
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.inference.scatter import (

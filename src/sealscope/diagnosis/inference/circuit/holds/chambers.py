@@ -19,9 +19,9 @@ samples of a hold (`LockedHold.edges`). The first is of the time in which the va
 the side of the lower pressure, whose oil comes through a leak alone: a large leak equalises the pressures within that
 time. The readings of all holds form one regression, each side of a hold about its mean. The dead volumes and the
 logarithms of K and alpha have normal priors (`held_oil` in `priors.toml`); the regression is linearised about the
-estimate, iteratively. Uncertain areas are varied (`with_areas`). The onset of the leak and the offset z are those with
-the highest posterior; a leak that has equalised the pressures determines z. The three leaks are hypotheses, each with
-its probability. A leak past the piston may grow from its onset on.
+estimate, iteratively. Uncertain areas are varied (`HeldChambers.with_areas`). The onset of the leak and the offset z
+are those with the highest posterior; a leak that has equalised the pressures determines z. The three leaks are
+hypotheses, each with its probability. A leak past the piston may grow from its onset on.
 
 Source: Merritt, Hydraulic Control Systems, 1967, section 6.3 (continuity of the chambers).
 """
@@ -31,360 +31,51 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.diagnosis.inference.blocks import offset_cost
-from sealscope.diagnosis.inference.leak_law import EXPONENTS, growth_priors, law_priors, mixture_flow
+from sealscope.diagnosis.inference.circuit.holds.hold import LockedHold
+from sealscope.diagnosis.inference.circuit.holds.leaks import (
+    BOTH,
+    LAMINAR,
+    NEITHER,
+    UNKNOWN,
+    HeldLeaks,
+    LawFit,
+    LeakFit,
+    LeakHypothesis,
+    LeakLaw,
+    PistonFit,
+    UnitLeak,
+    average_fits,
+    flow_of_side,
+)
+from sealscope.diagnosis.inference.circuit.holds.oil import (
+    CylinderSides,
+    LeakRegression,
+    OilRegression,
+    build_regression,
+    fit_leaks,
+    residual_squares,
+)
+from sealscope.diagnosis.inference.leak_law import EXPONENTS, growth_priors, law_priors
 from sealscope.diagnosis.inference.observable import Flow
 from sealscope.diagnosis.inference.onset import Interval
 from sealscope.diagnosis.priors.inference import INFERENCE
-from sealscope.recordings.motion import find_runs
 from sealscope.recordings.recording import Array
 from sealscope.signals.smoothing import average_over
 from sealscope.units import P_ATM
 
-#: Length of a hold's first reading [s], ratio of the lengths of successive readings, minimum number of readings.
-FIRST_READING, GROWTH, MIN_READINGS = 0.05, 1.2, 8
-#: Maximum sampling rate [Hz]; enough for pressures in shut chambers.
-MAX_RATE = 100.0
 #: Coarse grid of offsets of p_A - p_B [standard deviations of the prior], and number of points of the refined grid.
 OFFSET_GRID, N_REFINED = np.array([0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0]), 17
 #: Values of a normal variable of mean 0 and variance 1, and their weights, of Gauss-Hermite quadrature.
 AREA_NODES, AREA_WEIGHTS = (0.0, 3.0**0.5, -(3.0**0.5)), (2.0 / 3.0, 1.0 / 6.0, 1.0 / 6.0)
 #: Number of evenly spaced onsets within a hold.
 N_ONSETS = 4
-#: Standard deviation of a leak without information.
-UNKNOWN = 1e30
-#: Maximum number of iterations of a fit; largest relative change of variance and properties in the last iteration.
-MAX_ITERATIONS, TOLERANCE = 20, 1e-3
-#: Ridge that is added to the unit diagonal of a scaled matrix.
-RIDGE = 1e-12
-#: Largest change of a property of the oil in one iteration.
-MAX_STEP = 0.5
-#: Quantile of the lower chamber pressure that counts as charge pressure.
-LOWEST = 0.02
 #: Probability outside of the interval of an onset.
 TAIL = 0.05
-
-
-class CylinderSides(NamedTuple):
-    """Piston areas of both sides [m^2], and ends `low` and `high` of the recorded stroke [m].
-
-    The areas are measured with the pump's assumed displacement; they are negative if the position x is reversed.
-    `deviation_A`, `deviation_B`: standard deviations of the logarithms of their magnitudes.
-    """
-
-    area_A: float
-    area_B: float
-    low: float
-    high: float
-    deviation_A: float = 0.0
-    deviation_B: float = 0.0
-
-
-class LockedHold(NamedTuple):
-    """Samples of one hold, in which shut valves hold the load.
-
-    `t`: time [s]; `p_A`, `p_B`: absolute pressures [Pa]; `x`: position [m], (n,) each. `edges` (k + 1,): indices of the
-    samples that bound k intervals; the mean of the samples of an interval is a reading. In the first interval the
-    valves may still be shutting.
-    """
-
-    t: Array
-    p_A: Array
-    p_B: Array
-    x: Array
-    edges: NDArray[np.intp]
-
-    def mean(self, values: Array) -> Array:
-        """Average samples (..., n) of the hold over the intervals between `edges`, to k readings, shape (..., k)."""
-        sums = np.add.reduceat(values, self.edges[:-1], axis=-1)
-        return np.asarray(sums / np.diff(self.edges))
-
-    def carries(self, is_A: bool) -> bool:
-        """Return True if A has the higher pressure when the hold begins, or, for `is_A` False, if B has it."""
-        settling = slice(self.edges[0], self.edges[1])
-        is_A_higher = float(self.p_A[settling].mean()) > float(self.p_B[settling].mean())
-        return is_A_higher == is_A
-
-    def centre(self, readings: Array, is_A: bool) -> Array:
-        """Subtract the mean over the hold from `readings` (k, ...) of side A, or of B; return an array of this shape.
-
-        The first reading of the side of the higher pressure does not count, and becomes 0.
-        """
-        first = int(self.carries(is_A))
-        centred = np.asarray(readings - readings[first:].mean(axis=0))
-        centred[:first] = 0.0
-        return centred
-
-    def offset_in_hold(self, offset: float) -> tuple[float, float]:
-        """Estimate the sensor offset of p_A - p_B [Pa] in this hold, given the recording's `offset` [Pa].
-
-        The offset varies with the pressure if the two sensors differ in gain. The offset of a hold is therefore normal
-        about `offset`; its standard deviation s is `held_oil.gain` (`priors.toml`) times the higher pressure at the end
-        of the hold. The more probable of two cases is assumed:
-
-        - A leak has equalised the pressures. The recorded p_A - p_B at the end is then the offset of the hold.
-        - A load causes p_A - p_B at the end, and all values up to the higher pressure are equally probable. The offset
-          of the hold is then `offset`.
-
-        Returns the offset of the hold, and ((offset of the hold - `offset`) / s)^2.
-        """
-        last = slice(self.edges[-2], None)
-        last_A, last_B = float(self.p_A[last].mean()), float(self.p_B[last].mean())
-        pressure, difference = max(last_A, last_B), last_A - last_B
-        deviation = INFERENCE.held_oil.gain * pressure
-        cost = ((difference - offset) / deviation) ** 2
-        is_equalised = -0.5 * cost - np.log(deviation * np.sqrt(2.0 * np.pi)) > -np.log(pressure)
-        return (difference, cost) if is_equalised else (offset, 0.0)
-
-    def steepest_time(self) -> float:
-        """Find the time [s] at which the largest change of p_A - p_B in the hold begins.
-
-        Changes are taken over `held_oil.equalises` of `priors.toml`, the time in which a large leak equalises the
-        pressures.
-        """
-        n_equalising = int(np.searchsorted(self.t, self.t[0] + INFERENCE.held_oil.equalises))  # [samples]
-        difference = self.p_A - self.p_B
-        return float(self.t[np.abs(difference[n_equalising:] - difference[:-n_equalising]).argmax()])
-
-
-def find_charge_pressure(lower_pressure: Array, rests: NDArray[np.bool_], rate: float) -> float:
-    """Find the pressure [Pa] that check valves maintain in a chamber without load: the lowest while the pump rests.
-
-    It is at most the median while the pump turns, since a leak may equalise the pressures in every rest. If the pump
-    never rests, it is the lowest pressure of the recording. This may be too low, since a moving piston draws oil
-    through lines and check valves, which drop pressure. `lower_pressure` (n,): the lower chamber pressure [Pa]; `rests`
-    (n - 1,): flags of the sampling intervals in which the pump rests; `rate`: sampling rate [Hz].
-    """
-    steady_pressure = average_over(INFERENCE.held_oil.steady, lower_pressure, rate)
-    if not rests.any():
-        return float(np.nanquantile(steady_pressure, LOWEST))
-    lowest, turning = float(np.nanquantile(steady_pressure[:-1][rests], LOWEST)), steady_pressure[:-1][~rests]
-    return min(lowest, float(np.nanmedian(turning))) if np.isfinite(turning).any() else lowest
-
-
-def find_locked_holds(channels: Sequence[Array], rests: NDArray[np.bool_], rate: float) -> list[LockedHold]:
-    """Find the holds of a recording, i.e. the rests of the pump during which shut valves hold the load.
-
-    The time in which the valves shut is the first interval of a hold; that in which they open is left out. Holds that
-    are too short, or have missing samples, are omitted. `channels`: time [s], absolute pressures of A and B [Pa], and
-    position [m], (n,) each; `rests` (n - 1,): flags of the sampling intervals in which the pump rests; `rate`: sampling
-    rate [Hz], which is reduced to about `MAX_RATE`.
-    """
-    prior, holds = INFERENCE.held_oil, list[LockedHold]()
-    decimation = max(1, int(rate / MAX_RATE))  # number of samples that are averaged to one
-    # samples of the first interval, and samples to omit at the end; the end of a rest is uncertain by the time over
-    # which the flow was averaged to find it
-    settling, opening = (max(1, round(s * rate)) for s in (prior.settles, prior.settles + INFERENCE.rest.averaged))
-    for first, n_intervals in find_runs(rests).tolist():
-        if n_intervals + 1 < prior.shortest * rate:
-            continue
-        begin, end = first, first + n_intervals + 1 - opening
-        n_samples = (end - begin) // decimation
-        t, p_A, p_B, x = (
-            values[begin : begin + n_samples * decimation].reshape(n_samples, decimation).mean(axis=1)
-            for values in channels
-        )
-        n_settling = max(1, settling // decimation)
-        edges = np.append(0, n_settling + _reading_edges(n_samples - n_settling, FIRST_READING * rate / decimation))
-        if len(edges) > MIN_READINGS + 1 and np.isfinite([p_A, p_B, x]).all():
-            holds.append(LockedHold(t, p_A, p_B, x, edges))
-    return holds
-
-
-def _reading_edges(n_samples: int, width: float) -> NDArray[np.intp]:
-    """Divide the samples of a hold into k intervals that lengthen geometrically; return their bounds, shape (k + 1,).
-
-    The samples of an interval will be averaged to one reading. The first interval has `width` samples, and each later
-    interval `GROWTH` times as many as its predecessor. The last interval extends to the end of the hold.
-    """
-    edges = [0]
-    while edges[-1] + max(round(width), 1) < n_samples:
-        edges.append(edges[-1] + max(round(width), 1))
-        width *= GROWTH
-    return np.array([*edges[:-1], n_samples])
-
-
-class LeakLaw(NamedTuple):
-    """Law of a leak past the piston: its flow is a coefficient times |p_A - p_B|^`exponent`, and grows from its onset.
-
-    `growth`: increase of the coefficient from the `onset` [s] to the end of the recording, relative to that at the
-    onset.
-    """
-
-    exponent: float = 1.0
-    growth: float = 0.0
-    onset: float = 0.0
-
-    def growth_factor(self, t: Array, end: float) -> Array:
-        """Compute the coefficient at times `t` (n,) [s] over that at the onset; `end`: end of the recording [s]."""
-        return 1.0 + self.growth * np.clip((t - self.onset) / max(end - self.onset, np.finfo(float).tiny), 0.0, 1.0)
-
-
-#: A laminar leak that does not grow.
-LAMINAR = LeakLaw()
-
-
-#: Sides, A and B, whose displaced oil check valves replace.
-NEITHER, BOTH = (False, False), (True, True)
-
-
-class UnitLeak(NamedTuple):
-    """Flow of a leak with a coefficient of 1 while shut valves hold the load.
-
-    `flows`: for each hold of n samples the flow out of A (first row) and out of B, over the coefficient, (2, n), in
-    Pa^e for the exponent e of the law (laminar: 1); `refilled`: true for A, and for B, if a check valve replaces the
-    oil of that side that the piston displaces, once it is at the charge pressure, so that no flow counts there.
-    """
-
-    flows: Sequence[Array]
-    refilled: tuple[bool, bool] = NEITHER
-
-
-class _OilRegression(NamedTuple):
-    """Regression of displaced volumes on the properties of the oil, over r readings (sample means) of all holds.
-
-    The properties are compressibility, dead volume of A, dead volume of B, and free air, each divided by its usual
-    value. The unknowns are their `changes` (4,), which have a normal prior with the mean 0: relative changes of the
-    dead volumes, and logarithms of the other two.
-
-    - `displaced` (r,): volume displaced by the piston [m^3].
-    - `strained`, `aired` (r, 3): volumes [m^3] taken up by the compression of the oil and of the free air, with the
-      usual properties, in the stroke, in the dead volume of A, and in that of B.
-    - `inflation`: number of readings over the number of independent readings.
-    - `misfit_variance`: variance of a reading [m^6] in addition to the variance of the noise, since the model describes
-      the compressed volume only to within a fraction.
-    """
-
-    displaced: Array
-    strained: Array
-    aired: Array
-    inflation: float
-    misfit_variance: float
-
-    def leaked(self, changes: Array) -> Array:
-        """Compute the volume [m^3] that left each chamber by each reading (r,): the displaced minus the compressed one.
-
-        `changes` (4,): changes of the oil's properties (`_oil_factors`).
-        """
-        oil, air, volumes = _oil_factors(changes)
-        return self.displaced - (oil * self.strained + air * self.aired) @ volumes
-
-    def slopes(self, changes: Array) -> Array:
-        """Compute the derivatives (r, 4) of the compressed volumes [m^3] by the changes of the oil's properties.
-
-        A compressed volume is the part of the displaced volume that the compression of oil and free air takes up.
-        `changes` (4,): the changes at which the derivatives are taken.
-        """
-        oil, air, volumes = _oil_factors(changes)
-        strained, aired = oil * self.strained, air * self.aired
-        dead = strained[:, 1:] + aired[:, 1:]
-        return np.column_stack([strained @ volumes, dead, aired @ volumes])
-
-
-def _oil_factors(changes: Array) -> tuple[float, float, Array]:
-    """Convert changes of the oil's properties to factors, in the order in which compressed volumes are computed.
-
-    `changes` (4,): log of the factor on the compressibility, relative changes of the dead volumes of A and of B, and
-    log of the factor on the free air. Returns three items:
-
-    - factor on the compressibility;
-    - factor on the free air;
-    - factors (3,) on the volume of the stroke (always 1, as it is not estimated) and on the dead volumes of A and B.
-    """
-    compressibility, dead_A, dead_B, air = changes
-    return float(np.exp(compressibility)), float(np.exp(air)), np.array([1.0, 1.0 + dead_A, 1.0 + dead_B])
-
-
-def _oil_deviations() -> Array:
-    """Return prior standard deviations (4,) of the changes of compressibility, dead volumes of A, of B, and air."""
-    prior = INFERENCE.held_oil
-    return np.array([prior.deviation, prior.dead_deviation, prior.dead_deviation, prior.air_deviation])
-
-
-class _LeakRegression(NamedTuple):
-    """Fit of c leaks to the holds: `coefficients` (c,), their covariance (c, c), and `variance` of a reading [m^6].
-
-    A reading is a mean of samples. The covariance is the sum of two parts: `by_noise`, due to the noise of the
-    readings, and `by_oil`, due to the uncertain properties of the oil.
-    """
-
-    coefficients: Array
-    by_noise: Array
-    by_oil: Array
-    variance: float
-
-
-class HeldLeaks(NamedTuple):
-    """Mean conductances of three leaks over a recording with holds, each with its standard deviation [m^3/(s Pa)].
-
-    The leaks are past the `piston`, and to the outside from A and from B. They are measured with the pump's assumed
-    displacement.
-    """
-
-    piston: float
-    deviation: float
-    outside_A: float
-    deviation_A: float
-    outside_B: float
-    deviation_B: float
-
-
-class PistonFit(NamedTuple):
-    """Most probable `onset` of a leak past the piston [s], and sensor `offset` of p_A - p_B [Pa].
-
-    `refilled`: true for A, and for B, if a check valve probably replaces oil of that side at the charge pressure.
-    """
-
-    onset: float
-    offset: float
-    refilled: tuple[bool, bool]
-
-
-class LeakFit(NamedTuple):
-    """Fitted coefficient of a leak: `value` [m^3/(s Pa^e)], and log `likelihood` of the fit.
-
-    e is the exponent of the leak's law. The coefficient has two standard deviations in the same unit: `deviation` due
-    to noise, and `by_oil` due to the uncertain properties of the oil.
-    """
-
-    value: float
-    deviation: float
-    by_oil: float
-    likelihood: float
-
-    def scale(self, factor: float, likelihood: float) -> LeakFit:
-        """Multiply coefficient and standard deviations by a factor, and replace the log likelihood.
-
-        The deviation `UNKNOWN` of a leak without information is kept.
-        """
-        deviation = factor * self.deviation if self.deviation < UNKNOWN else UNKNOWN
-        return LeakFit(factor * self.value, deviation, factor * self.by_oil, likelihood)
-
-
-class LawFit(NamedTuple):
-    """Fit of a leak past the piston under one `law`.
-
-    `conditions`: onset, sensor offset, and effect of check valves; `fit`: fitted coefficient; `log_weight`: log
-    likelihood of the fit plus the log prior probability of the law.
-    """
-
-    law: LeakLaw
-    conditions: PistonFit
-    fit: LeakFit
-    log_weight: float
-
-
-class LeakHypothesis(NamedTuple):
-    """A possible leak: its `probability`, the fraction of the recording's time after its onset, and its `fit`."""
-
-    probability: float
-    fraction_after: float
-    fit: LeakFit
 
 
 @dataclass(frozen=True, eq=False)
@@ -430,9 +121,12 @@ class HeldChambers:
         return independent * 2.0 * len(self.holds)
 
     @cached_property
-    def _regressions(self) -> dict[tuple[bool, bool], _OilRegression]:
+    def _regressions(self) -> dict[tuple[bool, bool], OilRegression]:
         """Regressions on the oil's properties, by the sides that check valves refill."""
-        return {refilled: self._build_regression(refilled) for refilled in (NEITHER, self._larger_side, BOTH)}
+        return {
+            refilled: build_regression(self.holds, self._closed_flags(refilled), self.sides, self.n_readings)
+            for refilled in (NEITHER, self._larger_side, BOTH)
+        }
 
     @property
     def _larger_side(self) -> tuple[bool, bool]:
@@ -443,39 +137,6 @@ class HeldChambers:
         """
         area_A, area_B = abs(self.sides.area_A), abs(self.sides.area_B)
         return area_A > area_B, area_B > area_A
-
-    def _build_regression(self, refilled: tuple[bool, bool]) -> _OilRegression:
-        """Build the regression of displaced volumes on the oil's properties from all holds (`_OilRegression`).
-
-        The rows are the readings (sample means) of each hold, side A before side B, relative to their mean over the
-        hold. `refilled`: true for A, and for B, if a check valve keeps that chamber at the charge pressure at least;
-        displacement then counts only while the chamber's pressure is higher.
-        """
-        prior, stroke = INFERENCE.held_oil, self.sides.high - self.sides.low
-        displaced, strained, aired = list[Array](), list[Array](), list[Array]()
-        for hold, flags in zip(self.holds, self._closed_flags(refilled), strict=True):
-            for index, area, p in ((0, self.sides.area_A, hold.p_A), (1, -self.sides.area_B, hold.p_B)):
-                stroke_end = self.sides.low if area > 0.0 else self.sides.high  # where the chamber is smallest
-                volumes = np.zeros(3)  # in the stroke, and the dead volumes of A and B
-                volumes[0] = abs(area) * abs(float(hold.x.mean()) - stroke_end)
-                volumes[1 + index] = abs(area) * prior.dead * stroke
-                increments = -area * np.diff(hold.x, prepend=hold.x[0])
-                for columns, values in (
-                    (displaced, hold.mean(np.cumsum(increments * flags[index]))),
-                    (strained, np.outer(hold.mean(p), prior.compressibility * volumes)),
-                    (aired, np.outer(hold.mean(1.0 / p), -prior.air * P_ATM * volumes)),
-                ):
-                    columns.append(hold.centre(values, is_A=index == 0))
-        strained_volumes, aired_volumes = np.vstack(strained), np.vstack(aired)
-        compressed = (strained_volumes + aired_volumes).sum(axis=1)
-        misfit_variance = prior.misfit**2 * float(compressed @ compressed) / len(compressed)
-        return _OilRegression(
-            np.concatenate(displaced),
-            strained_volumes,
-            aired_volumes,
-            inflation=max(len(compressed) / self.n_readings, 1.0),
-            misfit_variance=max(misfit_variance, float(np.finfo(float).tiny)),
-        )
 
     def _is_closed(self, hold: LockedHold, p: Array) -> NDArray[np.bool_]:
         """Flag the samples (n,) of a hold in which the check valve of a chamber is closed and does not refill it.
@@ -546,7 +207,7 @@ class HeldChambers:
         """
         pressures = [(hold, hold.p_A if is_A else hold.p_B) for hold in self.holds]
         flows = [np.maximum(p - P_ATM, 0.0) * self._is_closed(hold, p) for hold, p in pressures]
-        return UnitLeak([_flow_of_side(flow, is_A) for flow in flows], BOTH)
+        return UnitLeak([flow_of_side(flow, is_A) for flow in flows], BOTH)
 
     def _unit_pump_leak(self, is_A: bool) -> UnitLeak:
         """Compute the flow with a conductance of 1 out of one chamber through open valves and the pump into the other.
@@ -556,59 +217,18 @@ class HeldChambers:
         """
         sign = 1.0 if is_A else -1.0
         differences = [sign * (hold.p_A - hold.p_B - hold.offset_in_hold(0.0)[0]) for hold in self.holds]
-        return UnitLeak([_flow_of_side(np.maximum(difference, 0.0), is_A) for difference in differences])
-
-    def _fit(self, columns: Array, refilled: tuple[bool, bool]) -> _LeakRegression:
-        """Fit the coefficients of c leaks together with the properties of the oil.
-
-        `columns` (r, c): volumes leaked with coefficients of 1, at each reading (mean of samples); `refilled`: true for
-        A, and for B, if check valves replace displaced oil of that side. The properties, and the variance of a reading,
-        which weights the priors of the properties against the readings, are found by iteration.
-        """
-        regression, n_leaks = self._regressions[refilled], columns.shape[1]
-        changes = np.zeros(4)  # of the oil's properties
-        left, misfit_variance = regression.leaked(changes), regression.misfit_variance
-        degrees_of_freedom = max(self.n_readings - n_leaks, 1.0)
-        variance = max(float(left @ left) / len(left), misfit_variance)
-        precisions = np.append(np.zeros(n_leaks), regression.inflation / _oil_deviations() ** 2)
-        lowest = np.array([-np.inf, *[INFERENCE.held_oil.least_dead / INFERENCE.held_oil.dead - 1.0] * 2, -np.inf])
-        is_lowest = np.zeros(4, dtype=bool)  # properties that stay at their lower limit
-        for _ in range(MAX_ITERATIONS):  # of a linear fit of the leaks and of corrections of `changes`
-            slopes = np.where(is_lowest, 0.0, regression.slopes(changes))
-            left, design = regression.leaked(changes), np.column_stack([columns, slopes])
-            scale = np.sqrt((design**2).sum(axis=0))
-            scale[~(scale > 0.0)] = 1.0
-            scales = np.outer(scale, scale)
-            prior = variance * precisions
-            means = np.append(np.zeros(n_leaks), np.where(is_lowest, 0.0, -changes))
-            matrix = (design.T @ design + np.diag(prior)) / scales
-            matrix.flat[:: len(scale) + 1] += RIDGE
-            inverse = np.linalg.inv(matrix) / scales
-            solution = inverse @ (design.T @ left + prior * means)
-            residual = left - design @ solution
-            distances = np.append(np.zeros(n_leaks), changes) + solution  # from the mean of the priors
-            cost = float(residual @ residual) + float(prior[n_leaks:] @ distances[n_leaks:] ** 2)
-            previous, variance = variance, cost / len(left) * self.n_readings / degrees_of_freedom + misfit_variance
-            steps = np.clip(solution[n_leaks:], -MAX_STEP, MAX_STEP)
-            was_lowest, is_lowest = is_lowest, is_lowest | (changes + steps < lowest)
-            changes = np.maximum(changes + steps, lowest)
-            if (
-                np.array_equal(was_lowest, is_lowest)
-                and abs(variance - previous) <= TOLERANCE * previous
-                and np.abs(steps).max() <= TOLERANCE
-            ):
-                break
-        covariance = variance * regression.inflation * inverse
-        # part of the covariance that would vanish if the properties of the oil were known
-        gain = covariance[:n_leaks, n_leaks:] @ np.linalg.pinv(covariance[n_leaks:, n_leaks:])
-        by_oil = gain @ covariance[n_leaks:, :n_leaks]
-        return _LeakRegression(solution[:n_leaks], covariance[:n_leaks, :n_leaks] - by_oil, by_oil, variance)
+        return UnitLeak([flow_of_side(np.maximum(difference, 0.0), is_A) for difference in differences])
 
     @cached_property
-    def _fits_without_leak(self) -> dict[tuple[bool, bool], _LeakRegression]:
+    def _fits_without_leak(self) -> dict[tuple[bool, bool], LeakRegression]:
         """Fits of the oil's properties without any leak, by the sides that check valves refill."""
-        n_readings = len(self._regressions[NEITHER].displaced)  # as many with check valves as without
-        return {refilled: self._fit(np.empty((n_readings, 0)), refilled) for refilled in self._regressions}
+        no_columns = np.empty(
+            (len(self._regressions[NEITHER].displaced), 0)
+        )  # as many rows with check valves as without
+        return {
+            refilled: fit_leaks(regression, no_columns, self.n_readings)
+            for refilled, regression in self._regressions.items()
+        }
 
     def fit_piston_leak(self, fit: PistonFit, law: LeakLaw = LAMINAR) -> LeakFit:
         """Fit a leak past the piston to the times in which shut valves hold the load.
@@ -635,7 +255,7 @@ class HeldChambers:
         fits = self._fits_over_offsets(onset)
         if not fits:
             return None
-        leak = _average_fits(fits)
+        leak = average_fits(fits)
         probable = self.piston_leak.probability * leak.value
         return np.array(self.leaks._replace(piston=probable, deviation=leak.deviation))
 
@@ -660,7 +280,7 @@ class HeldChambers:
         fit_without_leak = self._fits_without_leak[leak.refilled]
         value, deviation, by_oil, variance = 0.0, UNKNOWN, 0.0, fit_without_leak.variance
         if column.any():
-            fit = self._fit(column, leak.refilled)
+            fit = fit_leaks(self._regressions[leak.refilled], column, self.n_readings)
             deviation, by_oil = float(fit.by_noise[0, 0]) ** 0.5, float(max(fit.by_oil[0, 0], 0.0)) ** 0.5
             if not fit.coefficients[0] < 0.0:  # a leak flows from the higher to the lower pressure only
                 value, variance = float(fit.coefficients[0]), fit.variance
@@ -721,7 +341,7 @@ class HeldChambers:
         variance, n_rows = self._fits_without_leak[leak.refilled].variance, len(regression.displaced)
         columns = self._leak_columns(leak, self.onsets)
         for _ in range(2):
-            squares = _residual_squares(regression, columns, variance) + regression.misfit_variance * n_rows
+            squares = residual_squares(regression, columns, variance) + regression.misfit_variance * n_rows
             variance = float(squares.min()) / n_rows
         return np.asarray(self._onset_log_priors - 0.5 * self.n_readings * np.log(squares))
 
@@ -872,7 +492,7 @@ class HeldChambers:
             values_and_deviations += [leak.probability * mean, leak.fraction_after * leak.fit.deviation]
         # the standard deviation of the piston's leak includes the uncertainty of the offset of p_A - p_B
         fits = [fit._replace(by_oil=0.0) for fit in self._fits_over_offsets(self.piston_fit.onset)]
-        deviation = _average_fits(fits).deviation if fits else UNKNOWN
+        deviation = average_fits(fits).deviation if fits else UNKNOWN
         return HeldLeaks(*values_and_deviations)._replace(deviation=self.piston_leak.fraction_after * deviation)
 
     @property
@@ -904,39 +524,3 @@ class HeldChambers:
             return None
         ends = np.append(self.onsets, self.end)
         return Interval(float(self.onsets[best]), float(ends[first - 1]), float(ends[last + 1]))
-
-
-def _residual_squares(regression: _OilRegression, columns: Array, variance: float) -> Array:
-    """Compute the residual sum of squares (o,) of a fit of a leak for each of o onsets, with a coefficient >= 0.
-
-    `regression`: regression on the properties of the oil, linearised at their usual values; `columns` (r, o): volume
-    leaked with a coefficient of 1 since each onset, at each reading; `variance`: variance of a reading, by which the
-    priors of the properties count.
-    """
-    usual = np.zeros(4)
-    left, oil = regression.leaked(usual), regression.slopes(usual)
-    design = np.column_stack([left, columns])
-    precision = oil.T @ oil + np.diag(variance * regression.inflation / _oil_deviations() ** 2)
-    scale = np.sqrt(np.diag(precision))
-    coupling = (oil / scale).T @ design
-    # products of the left side (first) and of the leak for each onset, without the oil (Schur complement)
-    gram = design.T @ design - coupling.T @ np.linalg.solve(precision / np.outer(scale, scale), coupling)
-    total, energies, moments = gram[0, 0], np.diag(gram)[1:], np.maximum(gram[0, 1:], 0.0)
-    is_informative = energies > RIDGE * max(float(energies.max()), np.finfo(float).tiny)
-    gain = np.where(is_informative, moments**2 / np.where(is_informative, energies, 1.0), 0.0)
-    return np.asarray(np.maximum(total - gain, 0.0))
-
-
-def _flow_of_side(flow: Array, is_A: bool) -> Array:
-    """Arrange a flow (n,) out of side A, or out of B if `is_A` is False, as the flows out of both sides, (2, n)."""
-    none = np.zeros_like(flow)
-    return np.array([flow, none] if is_A else [none, flow])
-
-
-def _average_fits(fits: Sequence[LeakFit]) -> Flow:
-    """Average the coefficients of alternative fits of a leak, weighted by their likelihoods.
-
-    Returns the mean and the standard deviation, due to noise and to the uncertain properties of the oil.
-    """
-    values, deviations, by_oil, likelihoods = np.array(fits).T
-    return mixture_flow(np.exp(likelihoods - likelihoods.max()), values, np.hypot(deviations, by_oil))

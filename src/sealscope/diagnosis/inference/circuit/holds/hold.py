@@ -1,0 +1,145 @@
+"""Samples of the times in which shut valves hold the load of a cylinder, and the charge pressure of its circuit."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sealscope.diagnosis.priors.inference import INFERENCE
+from sealscope.recordings.motion import find_runs
+from sealscope.recordings.recording import Array
+from sealscope.signals.smoothing import average_over
+
+#: Length of a hold's first reading [s], ratio of the lengths of successive readings, minimum number of readings.
+FIRST_READING, GROWTH, MIN_READINGS = 0.05, 1.2, 8
+#: Maximum sampling rate [Hz]; enough for pressures in shut chambers.
+MAX_RATE = 100.0
+#: Quantile of the lower chamber pressure that counts as charge pressure.
+LOWEST = 0.02
+
+
+class LockedHold(NamedTuple):
+    """Samples of one hold, in which shut valves hold the load.
+
+    `t`: time [s]; `p_A`, `p_B`: absolute pressures [Pa]; `x`: position [m], (n,) each. `edges` (k + 1,): indices of the
+    samples that bound k intervals; the mean of the samples of an interval is a reading. In the first interval the
+    valves may still be shutting.
+    """
+
+    t: Array
+    p_A: Array
+    p_B: Array
+    x: Array
+    edges: NDArray[np.intp]
+
+    def mean(self, values: Array) -> Array:
+        """Average samples (..., n) of the hold over the intervals between `edges`, to k readings, shape (..., k)."""
+        sums = np.add.reduceat(values, self.edges[:-1], axis=-1)
+        return np.asarray(sums / np.diff(self.edges))
+
+    def carries(self, is_A: bool) -> bool:
+        """Return True if A has the higher pressure when the hold begins, or, for `is_A` False, if B has it."""
+        settling = slice(self.edges[0], self.edges[1])
+        is_A_higher = float(self.p_A[settling].mean()) > float(self.p_B[settling].mean())
+        return is_A_higher == is_A
+
+    def centre(self, readings: Array, is_A: bool) -> Array:
+        """Subtract the mean over the hold from `readings` (k, ...) of side A, or of B; return an array of this shape.
+
+        The first reading of the side of the higher pressure does not count, and becomes 0.
+        """
+        first = int(self.carries(is_A))
+        centred = np.asarray(readings - readings[first:].mean(axis=0))
+        centred[:first] = 0.0
+        return centred
+
+    def offset_in_hold(self, offset: float) -> tuple[float, float]:
+        """Estimate the sensor offset of p_A - p_B [Pa] in this hold, given the recording's `offset` [Pa].
+
+        The offset varies with the pressure if the two sensors differ in gain. The offset of a hold is therefore normal
+        about `offset`; its standard deviation s is `held_oil.gain` (`priors.toml`) times the higher pressure at the end
+        of the hold. The more probable of two cases is assumed:
+
+        - A leak has equalised the pressures. The recorded p_A - p_B at the end is then the offset of the hold.
+        - A load causes p_A - p_B at the end, and all values up to the higher pressure are equally probable. The offset
+          of the hold is then `offset`.
+
+        Returns the offset of the hold, and ((offset of the hold - `offset`) / s)^2.
+        """
+        last = slice(self.edges[-2], None)
+        last_A, last_B = float(self.p_A[last].mean()), float(self.p_B[last].mean())
+        pressure, difference = max(last_A, last_B), last_A - last_B
+        deviation = INFERENCE.held_oil.gain * pressure
+        cost = ((difference - offset) / deviation) ** 2
+        is_equalised = -0.5 * cost - np.log(deviation * np.sqrt(2.0 * np.pi)) > -np.log(pressure)
+        return (difference, cost) if is_equalised else (offset, 0.0)
+
+    def steepest_time(self) -> float:
+        """Find the time [s] at which the largest change of p_A - p_B in the hold begins.
+
+        Changes are taken over `held_oil.equalises` of `priors.toml`, the time in which a large leak equalises the
+        pressures.
+        """
+        n_equalising = int(np.searchsorted(self.t, self.t[0] + INFERENCE.held_oil.equalises))  # [samples]
+        difference = self.p_A - self.p_B
+        return float(self.t[np.abs(difference[n_equalising:] - difference[:-n_equalising]).argmax()])
+
+
+def find_charge_pressure(lower_pressure: Array, rests: NDArray[np.bool_], rate: float) -> float:
+    """Find the pressure [Pa] that check valves maintain in a chamber without load: the lowest while the pump rests.
+
+    It is at most the median while the pump turns, since a leak may equalise the pressures in every rest. If the pump
+    never rests, it is the lowest pressure of the recording. This may be too low, since a moving piston draws oil
+    through lines and check valves, which drop pressure. `lower_pressure` (n,): the lower chamber pressure [Pa]; `rests`
+    (n - 1,): flags of the sampling intervals in which the pump rests; `rate`: sampling rate [Hz].
+    """
+    steady_pressure = average_over(INFERENCE.held_oil.steady, lower_pressure, rate)
+    if not rests.any():
+        return float(np.nanquantile(steady_pressure, LOWEST))
+    lowest, turning = float(np.nanquantile(steady_pressure[:-1][rests], LOWEST)), steady_pressure[:-1][~rests]
+    return min(lowest, float(np.nanmedian(turning))) if np.isfinite(turning).any() else lowest
+
+
+def find_locked_holds(channels: Sequence[Array], rests: NDArray[np.bool_], rate: float) -> list[LockedHold]:
+    """Find the holds of a recording, i.e. the rests of the pump during which shut valves hold the load.
+
+    The time in which the valves shut is the first interval of a hold; that in which they open is left out. Holds that
+    are too short, or have missing samples, are omitted. `channels`: time [s], absolute pressures of A and B [Pa], and
+    position [m], (n,) each; `rests` (n - 1,): flags of the sampling intervals in which the pump rests; `rate`: sampling
+    rate [Hz], which is reduced to about `MAX_RATE`.
+    """
+    prior, holds = INFERENCE.held_oil, list[LockedHold]()
+    decimation = max(1, int(rate / MAX_RATE))  # number of samples that are averaged to one
+    # samples of the first interval, and samples to omit at the end; the end of a rest is uncertain by the time over
+    # which the flow was averaged to find it
+    settling, opening = (max(1, round(s * rate)) for s in (prior.settles, prior.settles + INFERENCE.rest.averaged))
+    for first, n_intervals in find_runs(rests).tolist():
+        if n_intervals + 1 < prior.shortest * rate:
+            continue
+        begin, end = first, first + n_intervals + 1 - opening
+        n_samples = (end - begin) // decimation
+        t, p_A, p_B, x = (
+            values[begin : begin + n_samples * decimation].reshape(n_samples, decimation).mean(axis=1)
+            for values in channels
+        )
+        n_settling = max(1, settling // decimation)
+        edges = np.append(0, n_settling + _reading_edges(n_samples - n_settling, FIRST_READING * rate / decimation))
+        if len(edges) > MIN_READINGS + 1 and np.isfinite([p_A, p_B, x]).all():
+            holds.append(LockedHold(t, p_A, p_B, x, edges))
+    return holds
+
+
+def _reading_edges(n_samples: int, width: float) -> NDArray[np.intp]:
+    """Divide the samples of a hold into k intervals that lengthen geometrically; return their bounds, shape (k + 1,).
+
+    The samples of an interval will be averaged to one reading. The first interval has `width` samples, and each later
+    interval `GROWTH` times as many as its predecessor. The last interval extends to the end of the hold.
+    """
+    edges = [0]
+    while edges[-1] + max(round(width), 1) < n_samples:
+        edges.append(edges[-1] + max(round(width), 1))
+        width *= GROWTH
+    return np.array([*edges[:-1], n_samples])

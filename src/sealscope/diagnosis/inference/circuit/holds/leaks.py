@@ -1,0 +1,134 @@
+"""Leaks of closed chambers: their laws, their flow with a coefficient of 1, and the results of fits."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from sealscope.diagnosis.inference.leak_law import mixture_flow
+from sealscope.diagnosis.inference.observable import Flow
+from sealscope.recordings.recording import Array
+
+#: Standard deviation of a leak without information.
+UNKNOWN = 1e30
+
+
+class LeakLaw(NamedTuple):
+    """Law of a leak past the piston: its flow is a coefficient times |p_A - p_B|^`exponent`, and grows from its onset.
+
+    `growth`: increase of the coefficient from the `onset` [s] to the end of the recording, relative to that at the
+    onset.
+    """
+
+    exponent: float = 1.0
+    growth: float = 0.0
+    onset: float = 0.0
+
+    def growth_factor(self, t: Array, end: float) -> Array:
+        """Compute the coefficient at times `t` (n,) [s] over that at the onset; `end`: end of the recording [s]."""
+        return 1.0 + self.growth * np.clip((t - self.onset) / max(end - self.onset, np.finfo(float).tiny), 0.0, 1.0)
+
+
+#: A laminar leak that does not grow.
+LAMINAR = LeakLaw()
+
+
+#: Sides, A and B, whose displaced oil check valves replace.
+NEITHER, BOTH = (False, False), (True, True)
+
+
+class UnitLeak(NamedTuple):
+    """Flow of a leak with a coefficient of 1 while shut valves hold the load.
+
+    `flows`: for each hold of n samples the flow out of A (first row) and out of B, over the coefficient, (2, n), in
+    Pa^e for the exponent e of the law (laminar: 1); `refilled`: true for A, and for B, if a check valve replaces the
+    oil of that side that the piston displaces, once it is at the charge pressure, so that no flow counts there.
+    """
+
+    flows: Sequence[Array]
+    refilled: tuple[bool, bool] = NEITHER
+
+
+class HeldLeaks(NamedTuple):
+    """Mean conductances of three leaks over a recording with holds, each with its standard deviation [m^3/(s Pa)].
+
+    The leaks are past the `piston`, and to the outside from A and from B. They are measured with the pump's assumed
+    displacement.
+    """
+
+    piston: float
+    deviation: float
+    outside_A: float
+    deviation_A: float
+    outside_B: float
+    deviation_B: float
+
+
+class PistonFit(NamedTuple):
+    """Most probable `onset` of a leak past the piston [s], and sensor `offset` of p_A - p_B [Pa].
+
+    `refilled`: true for A, and for B, if a check valve probably replaces oil of that side at the charge pressure.
+    """
+
+    onset: float
+    offset: float
+    refilled: tuple[bool, bool]
+
+
+class LeakFit(NamedTuple):
+    """Fitted coefficient of a leak: `value` [m^3/(s Pa^e)], and log `likelihood` of the fit.
+
+    e is the exponent of the leak's law. The coefficient has two standard deviations in the same unit: `deviation` due
+    to noise, and `by_oil` due to the uncertain properties of the oil.
+    """
+
+    value: float
+    deviation: float
+    by_oil: float
+    likelihood: float
+
+    def scale(self, factor: float, likelihood: float) -> LeakFit:
+        """Multiply coefficient and standard deviations by a factor, and replace the log likelihood.
+
+        The deviation `UNKNOWN` of a leak without information is kept.
+        """
+        deviation = factor * self.deviation if self.deviation < UNKNOWN else UNKNOWN
+        return LeakFit(factor * self.value, deviation, factor * self.by_oil, likelihood)
+
+
+class LawFit(NamedTuple):
+    """Fit of a leak past the piston under one `law`.
+
+    `conditions`: onset, sensor offset, and effect of check valves; `fit`: fitted coefficient; `log_weight`: log
+    likelihood of the fit plus the log prior probability of the law.
+    """
+
+    law: LeakLaw
+    conditions: PistonFit
+    fit: LeakFit
+    log_weight: float
+
+
+class LeakHypothesis(NamedTuple):
+    """A possible leak: its `probability`, the fraction of the recording's time after its onset, and its `fit`."""
+
+    probability: float
+    fraction_after: float
+    fit: LeakFit
+
+
+def flow_of_side(flow: Array, is_A: bool) -> Array:
+    """Arrange a flow (n,) out of side A, or out of B if `is_A` is False, as the flows out of both sides, (2, n)."""
+    none = np.zeros_like(flow)
+    return np.array([flow, none] if is_A else [none, flow])
+
+
+def average_fits(fits: Sequence[LeakFit]) -> Flow:
+    """Average the coefficients of alternative fits of a leak, weighted by their likelihoods.
+
+    Returns the mean and the standard deviation, due to noise and to the uncertain properties of the oil.
+    """
+    values, deviations, by_oil, likelihoods = np.array(fits).T
+    return mixture_flow(np.exp(likelihoods - likelihoods.max()), values, np.hypot(deviations, by_oil))

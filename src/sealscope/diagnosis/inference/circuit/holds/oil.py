@@ -1,0 +1,220 @@
+"""Regression of the volumes in closed chambers on the properties of their oil, and on leaks.
+
+The compressed oil and the free air of the stroke and of the dead volumes take up what the piston displaces; the rest
+has leaked. The compressibility, the free air and the dead volumes have priors (`held_oil` in `priors.toml`); the
+regression is linearised about the estimate, iteratively.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sealscope.diagnosis.inference.circuit.holds.hold import LockedHold
+from sealscope.diagnosis.priors.inference import INFERENCE
+from sealscope.recordings.recording import Array
+from sealscope.units import P_ATM
+
+#: Maximum number of iterations of a fit; largest relative change of variance and properties in the last iteration.
+MAX_ITERATIONS, TOLERANCE = 20, 1e-3
+#: Ridge that is added to the unit diagonal of a scaled matrix.
+RIDGE = 1e-12
+#: Largest change of a property of the oil in one iteration.
+MAX_STEP = 0.5
+
+
+class CylinderSides(NamedTuple):
+    """Piston areas of both sides [m^2], and ends `low` and `high` of the recorded stroke [m].
+
+    The areas are measured with the pump's assumed displacement; they are negative if the position x is reversed.
+    `deviation_A`, `deviation_B`: standard deviations of the logarithms of their magnitudes.
+    """
+
+    area_A: float
+    area_B: float
+    low: float
+    high: float
+    deviation_A: float = 0.0
+    deviation_B: float = 0.0
+
+
+class OilRegression(NamedTuple):
+    """Regression of displaced volumes on the properties of the oil, over r readings (sample means) of all holds.
+
+    The properties are compressibility, dead volume of A, dead volume of B, and free air, each divided by its usual
+    value. The unknowns are their `changes` (4,), which have a normal prior with the mean 0: relative changes of the
+    dead volumes, and logarithms of the other two.
+
+    - `displaced` (r,): volume displaced by the piston [m^3].
+    - `strained`, `aired` (r, 3): volumes [m^3] taken up by the compression of the oil and of the free air, with the
+      usual properties, in the stroke, in the dead volume of A, and in that of B.
+    - `inflation`: number of readings over the number of independent readings.
+    - `misfit_variance`: variance of a reading [m^6] in addition to the variance of the noise, since the model describes
+      the compressed volume only to within a fraction.
+    """
+
+    displaced: Array
+    strained: Array
+    aired: Array
+    inflation: float
+    misfit_variance: float
+
+    def leaked(self, changes: Array) -> Array:
+        """Compute the volume [m^3] that left each chamber by each reading (r,): the displaced minus the compressed one.
+
+        `changes` (4,): changes of the oil's properties (`_oil_factors`).
+        """
+        oil, air, volumes = _oil_factors(changes)
+        return self.displaced - (oil * self.strained + air * self.aired) @ volumes
+
+    def slopes(self, changes: Array) -> Array:
+        """Compute the derivatives (r, 4) of the compressed volumes [m^3] by the changes of the oil's properties.
+
+        A compressed volume is the part of the displaced volume that the compression of oil and free air takes up.
+        `changes` (4,): the changes at which the derivatives are taken.
+        """
+        oil, air, volumes = _oil_factors(changes)
+        strained, aired = oil * self.strained, air * self.aired
+        dead = strained[:, 1:] + aired[:, 1:]
+        return np.column_stack([strained @ volumes, dead, aired @ volumes])
+
+
+def _oil_factors(changes: Array) -> tuple[float, float, Array]:
+    """Convert changes of the oil's properties to factors, in the order in which compressed volumes are computed.
+
+    `changes` (4,): log of the factor on the compressibility, relative changes of the dead volumes of A and of B, and
+    log of the factor on the free air. Returns three items:
+
+    - factor on the compressibility;
+    - factor on the free air;
+    - factors (3,) on the volume of the stroke (always 1, as it is not estimated) and on the dead volumes of A and B.
+    """
+    compressibility, dead_A, dead_B, air = changes
+    return float(np.exp(compressibility)), float(np.exp(air)), np.array([1.0, 1.0 + dead_A, 1.0 + dead_B])
+
+
+def _oil_deviations() -> Array:
+    """Return prior standard deviations (4,) of the changes of compressibility, dead volumes of A, of B, and air."""
+    prior = INFERENCE.held_oil
+    return np.array([prior.deviation, prior.dead_deviation, prior.dead_deviation, prior.air_deviation])
+
+
+class LeakRegression(NamedTuple):
+    """Fit of c leaks to the holds: `coefficients` (c,), their covariance (c, c), and `variance` of a reading [m^6].
+
+    A reading is a mean of samples. The covariance is the sum of two parts: `by_noise`, due to the noise of the
+    readings, and `by_oil`, due to the uncertain properties of the oil.
+    """
+
+    coefficients: Array
+    by_noise: Array
+    by_oil: Array
+    variance: float
+
+
+def build_regression(
+    holds: Sequence[LockedHold], flags: Sequence[NDArray[np.bool_]], sides: CylinderSides, n_readings: float
+) -> OilRegression:
+    """Build the regression of displaced volumes on the oil's properties from all holds (`OilRegression`).
+
+    The rows are the readings (sample means) of each hold, side A before side B, relative to their mean over the
+    hold. `flags`: for each hold of n samples, flags (2, n) of the samples in which the displacement of A, and of B,
+    counts, since no check valve refills that chamber; `sides`: areas and stroke of the cylinder; `n_readings`:
+    effective number of independent readings.
+    """
+    prior, stroke = INFERENCE.held_oil, sides.high - sides.low
+    displaced, strained, aired = list[Array](), list[Array](), list[Array]()
+    for hold, is_closed in zip(holds, flags, strict=True):
+        for index, area, p in ((0, sides.area_A, hold.p_A), (1, -sides.area_B, hold.p_B)):
+            stroke_end = sides.low if area > 0.0 else sides.high  # where the chamber is smallest
+            volumes = np.zeros(3)  # in the stroke, and the dead volumes of A and B
+            volumes[0] = abs(area) * abs(float(hold.x.mean()) - stroke_end)
+            volumes[1 + index] = abs(area) * prior.dead * stroke
+            increments = -area * np.diff(hold.x, prepend=hold.x[0])
+            for columns, values in (
+                (displaced, hold.mean(np.cumsum(increments * is_closed[index]))),
+                (strained, np.outer(hold.mean(p), prior.compressibility * volumes)),
+                (aired, np.outer(hold.mean(1.0 / p), -prior.air * P_ATM * volumes)),
+            ):
+                columns.append(hold.centre(values, is_A=index == 0))
+    strained_volumes, aired_volumes = np.vstack(strained), np.vstack(aired)
+    compressed = (strained_volumes + aired_volumes).sum(axis=1)
+    misfit_variance = prior.misfit**2 * float(compressed @ compressed) / len(compressed)
+    return OilRegression(
+        np.concatenate(displaced),
+        strained_volumes,
+        aired_volumes,
+        inflation=max(len(compressed) / n_readings, 1.0),
+        misfit_variance=max(misfit_variance, float(np.finfo(float).tiny)),
+    )
+
+
+def fit_leaks(regression: OilRegression, columns: Array, n_readings: float) -> LeakRegression:
+    """Fit the coefficients of c leaks together with the properties of the oil.
+
+    `columns` (r, c): volumes leaked with coefficients of 1, at each reading (mean of samples); `n_readings`: effective
+    number of independent readings. The properties, and the variance of a reading, which weights the priors of the
+    properties against the readings, are found by iteration. A dead volume that reaches its lower limit stays there.
+    """
+    n_leaks = columns.shape[1]
+    changes = np.zeros(4)  # of the oil's properties
+    left, misfit_variance = regression.leaked(changes), regression.misfit_variance
+    degrees_of_freedom = max(n_readings - n_leaks, 1.0)
+    variance = max(float(left @ left) / len(left), misfit_variance)
+    precisions = np.append(np.zeros(n_leaks), regression.inflation / _oil_deviations() ** 2)
+    lowest = np.array([-np.inf, *[INFERENCE.held_oil.least_dead / INFERENCE.held_oil.dead - 1.0] * 2, -np.inf])
+    is_lowest = np.zeros(4, dtype=bool)  # properties that stay at their lower limit
+    for _ in range(MAX_ITERATIONS):  # of a linear fit of the leaks and of corrections of `changes`
+        slopes = np.where(is_lowest, 0.0, regression.slopes(changes))
+        left, design = regression.leaked(changes), np.column_stack([columns, slopes])
+        scale = np.sqrt((design**2).sum(axis=0))
+        scale[~(scale > 0.0)] = 1.0
+        scales = np.outer(scale, scale)
+        prior = variance * precisions
+        means = np.append(np.zeros(n_leaks), np.where(is_lowest, 0.0, -changes))
+        matrix = (design.T @ design + np.diag(prior)) / scales
+        matrix.flat[:: len(scale) + 1] += RIDGE
+        inverse = np.linalg.inv(matrix) / scales
+        solution = inverse @ (design.T @ left + prior * means)
+        residual = left - design @ solution
+        distances = np.append(np.zeros(n_leaks), changes) + solution  # from the mean of the priors
+        cost = float(residual @ residual) + float(prior[n_leaks:] @ distances[n_leaks:] ** 2)
+        previous, variance = variance, cost / len(left) * n_readings / degrees_of_freedom + misfit_variance
+        steps = np.clip(solution[n_leaks:], -MAX_STEP, MAX_STEP)
+        was_lowest, is_lowest = is_lowest, is_lowest | (changes + steps < lowest)
+        changes = np.maximum(changes + steps, lowest)
+        if (
+            np.array_equal(was_lowest, is_lowest)
+            and abs(variance - previous) <= TOLERANCE * previous
+            and np.abs(steps).max() <= TOLERANCE
+        ):
+            break
+    covariance = variance * regression.inflation * inverse
+    # part of the covariance that would vanish if the properties of the oil were known
+    gain = covariance[:n_leaks, n_leaks:] @ np.linalg.pinv(covariance[n_leaks:, n_leaks:])
+    by_oil = gain @ covariance[n_leaks:, :n_leaks]
+    return LeakRegression(solution[:n_leaks], covariance[:n_leaks, :n_leaks] - by_oil, by_oil, variance)
+
+
+def residual_squares(regression: OilRegression, columns: Array, variance: float) -> Array:
+    """Compute the residual sum of squares (o,) of a fit of a leak for each of o onsets, with a coefficient >= 0.
+
+    `regression`: regression on the properties of the oil, linearised at their usual values; `columns` (r, o): volume
+    leaked with a coefficient of 1 since each onset, at each reading; `variance`: variance of a reading, by which the
+    priors of the properties count.
+    """
+    usual = np.zeros(4)
+    left, oil = regression.leaked(usual), regression.slopes(usual)
+    design = np.column_stack([left, columns])
+    precision = oil.T @ oil + np.diag(variance * regression.inflation / _oil_deviations() ** 2)
+    scale = np.sqrt(np.diag(precision))
+    coupling = (oil / scale).T @ design
+    # products of the left side (first) and of the leak for each onset, without the oil (Schur complement)
+    gram = design.T @ design - coupling.T @ np.linalg.solve(precision / np.outer(scale, scale), coupling)
+    total, energies, moments = gram[0, 0], np.diag(gram)[1:], np.maximum(gram[0, 1:], 0.0)
+    is_informative = energies > RIDGE * max(float(energies.max()), np.finfo(float).tiny)
+    gain = np.where(is_informative, moments**2 / np.where(is_informative, energies, 1.0), 0.0)
+    return np.asarray(np.maximum(total - gain, 0.0))
