@@ -73,13 +73,16 @@ class PlannedHold(NamedTuple):
         }
 
     def text(self, stated_pressure: float) -> str:
-        """Format the hold as text, with the leak as a flow at the pressure difference `stated_pressure` [Pa]."""
+        """Format the hold as text, with the leak as a flow at the pressure difference `stated_pressure` [Pa].
+
+        A is the loaded side, which is pressed against the stop.
+        """
         flow = self.conductance * stated_pressure / LITRE_PER_MINUTE
         high, low = self.pressure_A / 1e6, self.pressure_B / 1e6
         return (
-            "  or a locked hold: press it against a stop, shut the valves, stop the motor; "
+            "  or a locked hold: press the piston against a stop, shut the valves, stop the motor; "
             f"{self.duration:g} s from {high:.2g} and {low:.2g} MPa\n"
-            f"    finds {flow:.2g} L/min by the noise of its sensors, against {N_HEALTHY} healthy days; it "
+            f"    finds {flow:.2g} L/min, limited by the sensors' noise, against {N_HEALTHY} healthy days; it "
             "separates piston from pump and rod seals"
         )
 

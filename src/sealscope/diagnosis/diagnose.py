@@ -139,7 +139,8 @@ class Examination:
         decision; all other detectors always run. The verdict cannot be "no leak" if a measuring detector failed, or if
         no recording of the given baseline can be compared (`refusal`).
         """
-        names = sorted(detectors(), key=rank)
+        names = sorted(detectors(), key=rank)  # the detectors of `ORDER` first
+        # their observables may explain a change otherwise than by a leak, whichever detector decides
         reports = [self.signals, *(self.report(name) for name in names if name not in ORDER)]
         decisions = dict[str, Evidence]()
         for name in names:

@@ -162,8 +162,12 @@ class _Lengths(NamedTuple):
 
     @classmethod
     def from_rate(cls, rate: float) -> _Lengths:
-        """Compute a soft sensor's numbers of samples and strides, rounded to whole ones, for a sampling rate [Hz]."""
-        return cls(stride_samples(rate), round(BLOCK_SECONDS / STRIDE), max(1, round(HALF_DIFFERENCE * rate)))
+        """Convert the times of a stride, a block and half a difference to these numbers, at a sampling rate [Hz]."""
+        return cls(
+            stride_samples=stride_samples(rate),
+            block_strides=round(BLOCK_SECONDS / STRIDE),
+            half_difference=max(1, round(HALF_DIFFERENCE * rate)),
+        )
 
 
 def memory_layout(choice: SensorChoice) -> np.dtype[Any]:

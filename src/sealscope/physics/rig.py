@@ -427,14 +427,14 @@ def density_ratio(pressure: float, reference: float, p: RigNumbers) -> float:
     Air in the oil and boiling are taken into account if the rig has them. The ratio also holds for states below the
     vapour pressure, so that mass is conserved (`vapour_floor`).
     """
-    if len(p.aerated) == 0:
+    if len(p.aerated) == 0:  # no air in the oil
         return oil_density_ratio(pressure - reference, p.K_oil)
     p_a, p_b = vapour_floor(pressure, p), vapour_floor(reference, p)
     ratio = mixture_density_ratio(p_a, p_b, p.K_oil, p.air, p.n_air)
     if len(p.boiling) == 0:
         return ratio
     boiling_modulus = effective_bulk_modulus(p.p_vap - P_ATM, p.K_oil, p.air, p.n_air)
-    # below the vapour pressure the pressure states continue by that modulus (`vapour_floor`)
+    # below the vapour pressure, a pressure of the simulation stands for a density by this modulus (`vapour_floor`)
     return ratio * oil_density_ratio((pressure - p_a) - (reference - p_b), boiling_modulus)
 
 

@@ -160,10 +160,10 @@ def details(
 
 
 def mean_squares(transformed: Details, bounds: ArrayLike) -> Array:
-    """Compute the mean squares of d1, d2, d3, d4 and d3d4 in each of k segments of a signal, (k, 5).
+    """Compute the mean squares of the wavelet details d1, d2, d3, d4 and of d3 times d4 in k segments of a signal.
 
-    `transformed`: details of the signal, with four levels; `bounds` (k + 1,): segment i has the samples bounds[i] to
-    bounds[i + 1] - 1.
+    The result has the shape (k, 5). `transformed`: details of the signal, with four levels; `bounds` (k + 1,): segment
+    i has the samples bounds[i] to bounds[i + 1] - 1.
     """
     return segment_means(np.square(transformed.quantities()), bounds).T
 

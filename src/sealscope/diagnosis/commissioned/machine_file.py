@@ -391,8 +391,9 @@ def _build_tree(machine: CommissionedMachine, path: Path) -> dict[str, Any]:
 
 
 def _format_table(tree: Mapping[str, Any], path: str = "", heading: str = "") -> list[str]:
-    """Format a table as lines of TOML: first plain values and short tables in one line, then the other inner tables.
+    """Format a table as lines of TOML: first plain values, then inner tables.
 
+    An inner table of plain values only is formatted as one of the values, on one line, except in the outermost table.
     `path` is the dotted name of the table, or "" for the whole file, in which a list becomes an array of tables.
     `heading` is the first line of the table; it is left out for a table without plain values.
     """
@@ -401,7 +402,7 @@ def _format_table(tree: Mapping[str, Any], path: str = "", heading: str = "") ->
         inner_path = f"{path}.{_format_key(name)}" if path else _format_key(name)
         is_table = isinstance(value, Mapping)
         is_plain = is_table and all(isinstance(member, str | float | int | None) for member in value.values())
-        is_inline = path and value and is_plain
+        is_inline = is_plain and bool(path) and len(value) > 0
         if is_table and not is_inline:
             inner_lines += _format_table(value, inner_path, f"[{inner_path}]")
         elif isinstance(value, list) and not path:

@@ -28,7 +28,8 @@ _MIN_RINGING_RATE: float = RMS_PRIORS.rate.ringing
 def reason_of(case: Case, evidence: Evidence, alarm: LeakTest | None, bound: float, other: OtherEvent | None) -> str:
     """Compose the reason of a verdict in words: the leak or the bound of an undetected leak, then remarks.
 
-    Between the bound and the remarks comes another explanation of the change, if there is one.
+    Between the bound and the remarks comes the event `other` that explains the change; without it, after an alarm, the
+    events that may explain the change as well as a leak does.
 
     `alarm`: test that raised the alarm, None if no test did; `bound`: 95 % upper bound of the leak's flow [m^3/s], used
     only without the verdict `leak`; `other`: event other than a leak that explains a change, or None.

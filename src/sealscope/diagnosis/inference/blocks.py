@@ -543,9 +543,9 @@ class _EquationFit(NamedTuple):
 def _fit_equation(gram: Array, blocks: Blocks, roles: ColumnRoles, test: int, nuisance: list[int]) -> _EquationFit:
     """Fit the nuisance coefficients of one equation and the sensor offset z of p_A - p_B, by Gauss-Newton steps.
 
-    The tested coefficient g is free in each block. The leakage is g (p_A - p_B - z), so a change of g between blocks
-    also changes the constant flow, by -g z. z is small, since a first estimate of the offset is already removed from
-    the Gram matrices (`pressure_offset.remove_pressure_offset`).
+    The tested coefficient g is free in each block. The leakage is g (p_A - p_B - z) = g (p_A - p_B) - g z: where g
+    differs between blocks, so does the constant flow -g z, which shows z. z is small, since a first estimate of the
+    offset is already removed from the Gram matrices (`pressure_offset.remove_pressure_offset`).
 
     `gram` (K, m, m): Gram matrices of the equation in K blocks; `roles`: indices of its columns by role (leak, motion,
     left side); `test`: index of the column of g; `nuisance`: indices of the nuisance columns.
@@ -555,6 +555,7 @@ def _fit_equation(gram: Array, blocks: Blocks, roles: ColumnRoles, test: int, nu
     total = gram.sum(axis=0)
     constants = solve(total[np.ix_(nuisance, nuisance)], total[nuisance, roles.left])  # without drifts
     magnitudes = np.minimum(np.abs(constants), roles.level_deviation[nuisance])
+    # standard deviations of the drifts over the recording; the offset does not drift
     drift = np.append(magnitudes * roles.drift_rate[nuisance] * minutes, 0.0)
     offset_deviation = roles.offset_deviation(test, blocks)
     prior = _Prior(np.append(roles.level_deviation[nuisance], np.inf), drift, offset_deviation)
@@ -566,6 +567,7 @@ def _fit_equation(gram: Array, blocks: Blocks, roles: ColumnRoles, test: int, nu
         fit = _fit_nuisance(normal, prior._replace(current_offset=offset), n_polynomials, n_rows)
         step = float(fit.coefficients[-n_polynomials])  # constant part of the last coefficient, the offset's error
         is_last = iteration == _MAX_OFFSET_STEPS or not offset_deviation > 0.0
+        # in the first iteration g is 0, so that the offset has no effect
         if is_last or (iteration > 0 and abs(step) <= TOLERANCE * offset_deviation):
             break
         offset += step

@@ -155,10 +155,10 @@ class StepTest:
         return np.asarray(weights / weights.sum())
 
     def onset(self, probability: float = BOUND_PROBABILITY) -> Interval:
-        """Return the most likely onset of the step [s] and the interval that contains it with a probability.
+        """Return the most likely onset of the step [s] and the interval that contains it with `probability`.
 
         The interval is widened by half a block at both ends, since the rows within the block of the onset are
-        weighted as if the whole block leaked or none of it.
+        weighted as if the whole block leaked or none of it. A block has `PARTS` evenly spaced onsets.
         """
         tail = 0.5 - 0.5 * probability
         low, high = np.interp([tail, 1.0 - tail], np.cumsum(self.weights), self.onsets)

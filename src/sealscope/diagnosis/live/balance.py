@@ -327,8 +327,10 @@ class LiveBalance:
     def _estimate_block(self, block: Blocks, is_learned: bool = True) -> BlockConductance | NotJudged:
         """Estimate the leakage conductance in a block.
 
-        Returns a NotJudged if the machine stands still and the estimate is therefore too uncertain. With `is_learned`,
-        the block also updates the other coefficients of the volume balance.
+        The estimate is that of the total leakage, if the other coefficients of the volume balance were as learnt, less
+        a shift by what they are in this block. Its error has a part `sd` of this block, and a part `offset` that all
+        blocks have in common. Returns a NotJudged if the machine stands still and the estimate is therefore too
+        uncertain. With `is_learned`, the block also updates the other coefficients.
         """
         begin, end = self._sample_times(block)
         at_standstill = self._relative_motion(block) < STANDSTILL

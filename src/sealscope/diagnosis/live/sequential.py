@@ -187,7 +187,8 @@ class StepDetector:
         """Compute the logarithm of the evidence M that the coefficient has risen.
 
         M is the sum over all possible onsets of the likelihood ratio of a step to no step. It is averaged over the
-        random walks, the prior variances of the step and the fractions of its first block (`PARTS`). In a healthy
+        possible random walks of the healthy coefficient (`WALKS`), the prior variances of the step and the fractions of
+        its first block (`PARTS`). In a healthy
         machine the mean number of blocks until M exceeds A is at least A. The result is minus infinity if no rise can
         have begun yet, or if a quick upper bound of log M is at most `min_log_e`.
         """

@@ -155,9 +155,10 @@ class Diagnosis(Evidence):
 
     @property
     def measured_ratio(self) -> tuple[float, tuple[float, float]] | None:
-        """Measured over assumed ratio of displacement to piston area, and the (low, high) ends of its 95 % interval.
+        """Ratio of pump displacement to piston area, as measured over as assumed, and its 95 % interval (low, high).
 
-        It is that of the first detector which has measured the ratio, the deciding one before others; None without one.
+        The deciding detector gives it if it has measured the ratio, otherwise the first other detector that has; None
+        if no detector has.
         """
         for decision in (self, *self.parts):
             if decision.ratio is not None and decision.ratio_interval is not None:

@@ -207,34 +207,35 @@ def _envelope_error(time: Array, residual: Array) -> float:
 
 
 def compare_low_drifts(judged: LowDrifts, healthy: Sequence[LowDrifts]) -> Iterator[Observable]:
-    """Compare the drifts of p_A and p_B near the charge pressure with those of healthy recordings.
+    """Compare the drifts of the lowest readings of p_A and p_B with those of healthy recordings.
 
-    Yields a test for each of three explanations, if enough healthy recordings have the drift: the sensor of p_A drifts,
-    the sensor of p_B drifts, or the charge pressure falls, which lowers both pressures alike. A fall does not explain a
-    difference between the two drifts. If both drifts are known, the p-value (`chance`) of a fall is therefore
+    Without drifts the lowest readings stay at the charge pressure. Yields a test for each of three explanations, if
+    enough healthy recordings have the drift: the sensor of p_A drifts, the sensor of p_B drifts, or the charge pressure
+    falls, which lowers both pressures alike. A fall does not explain a difference between the two drifts. If both
+    drifts are known, the p-value (`chance`) of a fall is therefore
 
         chance = min(1, chance of the weighted mean of both drifts / chance of their difference).
     """
     prior = CHANGES.charge
     scatter = PriorScatter(prior.scatter, prior.recordings)
-    sides = {side: drift for side in "AB" if (drift := judged.estimate(side)) is not None}
-    known = {side: [drift for day in healthy if (drift := day.estimate(side)) is not None] for side in sides}
-    for side, drift in sides.items():
+    drifts = {side: drift for side in "AB" if (drift := judged.estimate(side)) is not None}
+    known = {side: [drift for day in healthy if (drift := day.estimate(side)) is not None] for side in drifts}
+    for side, drift in drifts.items():
         change = compare_estimates(LOW.format(side), DRIFT, drift, known[side], scatter)
         if change is not None:
             yield _with_size(change, CHANGES.zero_drift)
     # variance of each side's drift, including the scatter between the healthy recordings
     variances = {
         side: prior.scatter**2 + drift.deviation**2 + float(np.var([day.value for day in known[side]] or [0.0]))
-        for side, drift in sides.items()
+        for side, drift in drifts.items()
     }
     falls = [mean for day in healthy if (mean := _mean_fall(day, variances)) is not None]
     judged_fall = _mean_fall(judged, variances)
     assert judged_fall is not None  # at least one of its drifts is known
-    fall = compare_estimates(FALL, DRIFT, judged_fall, falls, scatter, above=True)
+    fall = compare_estimates(FALL, DRIFT, judged_fall, falls, scatter, above=True)  # a fall is positive
     if fall is None:
         return
-    if len(sides) > 1:
+    if len(drifts) > 1:
         days = [day for day in healthy if np.isfinite(day).all()]
         difference = compare_estimates(FALL, DRIFT, _difference(judged), [_difference(day) for day in days], scatter)
         chance = 1.0 if difference is None else min(1.0, fall.chance / max(difference.chance, TINY))

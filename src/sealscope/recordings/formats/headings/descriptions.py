@@ -54,11 +54,14 @@ def _column_key(label: Label) -> str:
     return _fold(label.name.rpartition(" ")[2] or label.name)
 
 
-def _rename_label(label: Label, name: str) -> Label:
-    """Replace the name of a column by a description, unless that is empty, too long or the column's own name."""
-    if not name or len(name) > _MAX_NAME or _fold(name) == _column_key(label):
+def _rename_label(label: Label, description: str) -> Label:
+    """Replace the name of a column by its description, unless that is empty, too long or the same as the name.
+
+    The last word of the old name, the column's short name, is kept in `called`.
+    """
+    if not description or len(description) > _MAX_NAME or _fold(description) == _column_key(label):
         return label
-    renamed = Label.parse(name)  # the description may end in a unit
+    renamed = Label.parse(description)  # it may end in a unit
     last_word = label.name.rpartition(" ")[2]
     return replace(label, name=renamed.name, unit=label.unit or renamed.unit, called=last_word)
 

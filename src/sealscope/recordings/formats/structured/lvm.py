@@ -42,7 +42,7 @@ class _Packet:
         return cells[index] if index < len(cells) else ""
 
     def number(self, name: str, index: int) -> float:
-        """Return the number of channel `index` in the row `name` of the packet's header; NaN if there is none."""
+        """Convert the entry of channel `index` in the row `name` of the packet's header; NaN if it is not a number."""
         try:
             return float(self.entry(name, index).replace(",", "."))
         except ValueError:

@@ -122,7 +122,7 @@ class HeldChambers:
 
     @cached_property
     def _regressions(self) -> dict[tuple[bool, bool], OilRegression]:
-        """Regressions on the oil's properties, by the sides that check valves refill."""
+        """Regressions that estimate the oil's properties, one for each choice of the sides that check valves refill."""
         return {
             refilled: build_regression(self.holds, self._closed_flags(refilled), self.sides, self.n_readings)
             for refilled in (NEITHER, self._larger_side, BOTH)
