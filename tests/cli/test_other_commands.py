@@ -240,7 +240,7 @@ def test_parts_of_a_run_are_joined(call, parts):
     assert "joined from 2 files: part_1.csv, part_2.csv" in done.out
     done = call("diagnose", "--join", parts[0], parts[0])
     assert (done.status, done.err.count("\n")) == (2, 1)
-    assert "must go on from file to file" in done.err
+    assert "must not overlap in time" in done.err
 
 
 @pytest.mark.slow

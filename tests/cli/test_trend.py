@@ -107,7 +107,7 @@ def test_wrong_options_are_refused_in_a_line(call, days: Path, words: tuple[str,
 def test_diagnose_offers_the_trend_of_days_and_of_nothing_else(call, days: Path) -> None:
     files = [days / f"day_{k}.nc" for k in (1, 2, 3)]
     assert call("diagnose", *files).err == (
-        "sealscope: these 3 files are ordered in time: `sealscope trend` shows how the leakage went\n"
+        "sealscope: these 3 files are ordered in time: `sealscope trend` shows how the leakage developed\n"
     )
     assert call("diagnose", *files[:2]).err == ""
     assert call("diagnose", *files, "--format", "jsonl").err == ""

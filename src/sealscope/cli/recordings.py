@@ -64,7 +64,8 @@ def diagnose(
 ) -> None:
     """State for each file whether oil bypasses the piston; with -v the verdicts of all methods.
 
-    With --machine folders are accepted, with a line per recording. The exit status is 1 if a file could not be read.
+    Folders are accepted if --machine is given; each recording then gets a line. The exit status is 1 if a file could
+    not be read.
     """
     from sealscope.diagnosis.diagnose import check_probability
 
@@ -101,7 +102,7 @@ def diagnose(
             starts.append(start)
             opt.say(_format_diagnosis(diagnosis, form, start))
     if form in ("short", "whole") and _is_time_series(files, starts):
-        opt.complain(f"these {len(files)} files are ordered in time: `sealscope trend` shows how the leakage went")
+        opt.complain(f"these {len(files)} files are ordered in time: `sealscope trend` shows how the leakage developed")
     if not is_complete or is_failure:
         raise Exit(opt.FAILED_ON if is_failure else 1)
 
@@ -112,8 +113,8 @@ def _diagnose_in_parallel(
     """Diagnose files in parallel processes, and yield the results in the order of the files.
 
     `work`: function that yields the dated diagnoses of some files, with None for an unreadable file. Each result is a
-    pair of the messages for standard error and the dated diagnoses of one file; if the process died, these are one
-    None. On a single core this process diagnoses all files, and yields one pair for all of them.
+    pair of the messages for standard error and the dated diagnoses of one file; if the process died, they are [None].
+    On a single core this process diagnoses all files, and yields one pair for all of them.
     """
     from sealscope.campaigns.execution.workers import cores, iter_results_in_order
 

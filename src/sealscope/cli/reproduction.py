@@ -29,15 +29,18 @@ def reproduce(
     ids: Annotated[
         list[str] | None, Argument(metavar="[ID...]", help=_ID, autocompletion=opt.make_completion(_item_names))
     ] = None,
-    listing: Annotated[bool, Option("--list", help="List what there is, and what it needs.")] = False,
+    listing: Annotated[bool, Option("--list", help="List the items, and what each needs.")] = False,
     quick: Annotated[bool, Option("--quick", help="Fewer and shorter simulations.")] = False,
-    output: Annotated[
-        Path, Option("--output", "-o", help="Folder of the results; a second call goes on there.")
-    ] = Path("sealscope-thesis"),
+    output: Annotated[Path, Option("--output", "-o", help="Folder of the results; a later call resumes there.")] = Path(
+        "sealscope-thesis"
+    ),
     sheet: opt.SheetOption = None,
     jobs: opt.JobsOption = None,
 ) -> None:
-    """Reproduce the thesis's tables and figures, with a verdict on each claim. The exit status is 1 if one failed."""
+    """Reproduce the thesis's tables and figures, with a verdict on each claim.
+
+    The exit status is 1 if a table or figure could not be made.
+    """
     if listing:
         _list_items(ids or ["all"], sheet)
         return

@@ -390,8 +390,12 @@ def _lower_store(context: Any, builder: Any, arg_types: Any, values: Any) -> Any
 
 
 def _stored_type(arg_types: Any) -> Any:
-    """Return numba's type `none`, the result of `store`, or None if the array cannot contain vectors of this type."""
-    return types.none if _loaded_type(arg_types) == arg_types[2] else None
+    """Return numba's type `none`, the result of `store`, or None if the array cannot contain such a vector.
+
+    `arg_types`: types of the arguments of `store`: array, row and vector.
+    """
+    _, _, vector_type = arg_types
+    return types.none if _loaded_type(arg_types) == vector_type else None
 
 
 register_lowering(store, 3, _stored_type, _lower_store)

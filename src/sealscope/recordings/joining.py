@@ -116,7 +116,7 @@ def join(recordings: Sequence[Recording], *, names: Sequence[str] | None = None)
     Raises
     ------
     InputError
-        If channels, units or rates differ, or the clocks do not fit.
+        If channels, units or rates differ, or two recordings overlap in time.
 
     Examples
     --------
@@ -142,10 +142,10 @@ def join(recordings: Sequence[Recording], *, names: Sequence[str] | None = None)
     for earlier, later in pairwise(order):
         begin, end = float(np.nanmin(times[later])), float(np.nanmax(times[earlier]))
         if begin <= end:
-            clocks = "the moments of the files" if is_dated else "their times, as no moment of the files is known"
+            clock = "the start times in the files" if is_dated else "their columns of time"
             raise InputError(
-                f"the clocks of recordings to join must go on from file to file, got {end:g} s at the end of "
-                f"{names[earlier]} and {begin:g} s at the beginning of {names[later]}, by {clocks}"
+                f"recordings to join must not overlap in time, got {end:g} s at the end of {names[earlier]} and "
+                f"{begin:g} s at the beginning of {names[later]}, according to {clock}"
             )
     parts = [recordings[number] for number in order]
     files = [names[number] for number in order]

@@ -111,8 +111,9 @@ def write_page(path: str | os.PathLike[str], recording: Recording, diagnosis: Di
 def _choose_rig(diagnosis: Diagnosis, rig: Rig | str | os.PathLike[str] | None) -> Rig | None:
     """Choose the rig whose values the page shows: `rig` if given, else the packaged rig stated for the diagnosis.
 
-    `rig`: a Rig, the name of a packaged rig or the path of a TOML file. Returns None if this is the default rig,
-    which nobody stated (`states_rig`), or without `rig`, if the rig of the diagnosis is not stated or not packaged.
+    `rig`: a Rig, the name of a packaged rig or the path of a TOML file. Returns None if `rig` is the
+    default rig, which nobody stated (`states_rig`). If `rig` is not given, returns None if the rig of the diagnosis was
+    not stated by anybody or is not packaged.
     """
     from sealscope.parameters import load_rig, rig_names
 

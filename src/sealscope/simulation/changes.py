@@ -257,7 +257,7 @@ class Wander:
     def value_at(self, t: Array) -> Array:
         """Compute the random walk, which is the change of a drifting parameter, at times t [s]; 0 before t = 0."""
         phase = np.pi / self.duration * np.maximum(t, 0.0)
-        change = np.asarray(self.slope / np.pi * phase)
+        change = np.asarray(self.slope / np.pi * phase)  # slope t / T
         if self.weights:
             sine, twice_cosine = np.sin(0.5 * phase), 2.0 * np.cos(phase)  # sin((k - 1/2) phase) for k = 1
             previous_sine = -sine  # k = 0

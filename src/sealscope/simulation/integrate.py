@@ -416,8 +416,9 @@ class _Integration:
         """Integrate the state `y` (14,) in place from output `start` to output `stop`; write the outputs to `rows`.
 
         Output k is written to rows[k - origin]. `n_steps`: number of solver steps from one output to the next.
-        Raises SimulationFailed if a state is not finite. Unless the experiment allows unresolved runs, it is also
-        raised if the step is too long for a leak or an end stop, or if a pressure is below vacuum.
+        Raises SimulationFailed if a state is not finite. Unless the experiment allows steps that are too long
+        (`allow_unresolved`), it is also raised if the step is too long for a leak or an end stop, or if a pressure is
+        below vacuum.
         """
         from sealscope.physics.rig import pack_numbers
         from sealscope.physics.solvers.advance import EXPLICIT, IMPLICIT, advance, advance_closed, step_nodes
@@ -431,8 +432,9 @@ class _Integration:
         for first in range(start, stop, max_outputs):
             last = min(first + max_outputs, stop)
             step_numbers = np.arange(first * n_steps, last * n_steps, dtype=np.float64)
+            # command, conductance of a laminar leak and coefficient of an orifice
             u, G, C = map(np.ascontiguousarray, self.inputs.at_nodes(step_numbers * h, nodes))
-            F = unloaded
+            F = unloaded  # force of the load
             if self.load is not None:
                 F = np.ascontiguousarray(self.load.value_at(step_numbers[:, None] * h + nodes))
             max_G, max_C = float(G.max()), float(C.max())

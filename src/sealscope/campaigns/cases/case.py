@@ -81,7 +81,7 @@ def profile_key(name: str) -> str:
     It does not depend on the path of the profile's file.
     """
     profile = load_profile(name)
-    # `seeds` names the profile whose draws this one shares
+    # the name seeds the draws of machines; a profile with `seeds` shares the draws of that profile
     return digest(repr(replace(profile, name=profile.seeds or profile.name, place="")))
 
 

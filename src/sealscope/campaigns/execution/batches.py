@@ -185,7 +185,9 @@ def make_step_chooser(
     A search for each case would take too long, so the cases of a cell, i.e. a combination of the factors' levels, share
     the result. `N_SCOUT_MACHINES` scout machines are drawn for the cell. On a short run of each, `integrate_run`
     chooses the longest step that passes its check of the error. A case gets the shortest of the steps chosen with the
-    case's solver, limited to the longest stable step of the case's machine. It does not depend on the other cases.
+    case's solver, limited to the longest stable step of the case's machine, but not refined further than by
+    `MAX_STEP_REFINEMENT`. It does not depend on the other cases. `profile`: distribution from which machines are drawn,
+    by default the plan's.
     """
     shared = digest(shared_inputs(plan))
 

@@ -135,6 +135,7 @@ def _whiten_steps(blocks: Blocks, roles: ColumnRoles) -> _WhitenedSteps | None:
     quadratic drift of the constant flow (F and B of the module).
     """
     count = len(blocks)
+    # the constant flow is that at the mean pressure difference, to which a leak g adds g times this pressure
     precision, vector, pressure = estimate_leak_and_bias(blocks, roles)
     energies = np.diag(precision).reshape(2, count)  # of leak and constant flow; zero in some blocks at rest
     floors = np.maximum(np.finfo(float).eps * energies.max(axis=1), np.finfo(float).tiny)
@@ -144,7 +145,7 @@ def _whiten_steps(blocks: Blocks, roles: ColumnRoles) -> _WhitenedSteps | None:
     position = np.linspace(-1.0, 1.0, count)  # of each block in the recording
     trend, drift = (np.polynomial.legendre.legvander(position, degree) for degree in (1, 2))
     trend_and_drift = np.block([[trend, np.zeros_like(drift)], [pressure[:, None] * trend, drift]])
-    # `MIN_BLOCKS` counts level and slope as well, which are two of the columns of trend and drift
+    # `MIN_BLOCKS` already includes level and slope, two of the columns of trend and drift
     if np.count_nonzero(is_informative) < trend_and_drift.shape[1] + MIN_BLOCKS - 2:
         return None
     root_eigenvalues = np.sqrt(eigenvalues[is_informative])

@@ -293,9 +293,9 @@ class Watch:
     def judge(self, result: BlockResult) -> BlockEstimate:
         """Test the conductances of a block for a leak, and return the estimate of the block.
 
-        `result` contains the conductances. If it is the reason why there are none, the returned estimate states this
-        reason. The blocks of the first fit arrive together in one result and count as one block; the estimate is of the
-        last of them.
+        `result`: the conductances, or a `NotJudged` with the reason why there are none, which the returned estimate
+        then states. The blocks to which the volume balance is fitted first arrive together in one result and count as
+        one block; the estimate is of the last of them.
         """
         self.blocks += 1
         if isinstance(result, NotJudged):

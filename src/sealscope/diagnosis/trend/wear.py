@@ -600,7 +600,7 @@ def _find_repair(levels: Levels, rise: ChangeScores, n_healthy: int, days: float
 
     A repair is a fall of the leakage level that the sequential test detects. `rise` is the result of the test for a
     rise, and `days` the mean time to a false alarm [days]. The first `n_healthy` recordings are known to be healthy. If
-    the rise is detected before a fall, only falls below the worn level since that rise count.
+    the rise is detected first, the worn level since that rise replaces the healthy level: a repair falls below it.
     """
     first = 0  # index of the first recording that is tested for a fall
     fall = score_changes(levels, n_healthy, falls=True)

@@ -51,9 +51,9 @@ def find_spikes(values: Array) -> NDArray[np.intp]:
     """Find the indices of the samples at which a channel (n,) leaps and returns at once.
 
     Such a sample lies above both neighbours, or below both. The smaller of the two changes must be several times
-    (`spike.times` of `priors.toml`) larger than usual changes, other leaps nearby and the local slope. The number of a
-    logger's errors has a Poisson distribution, with the fraction `spike.share` of the samples as its mean. If there are
-    many more such samples, the signal itself leaps, and the result is empty.
+    (`spike.times` of `priors.toml`) larger than usual changes, other leaps nearby and the local slope. Such samples are
+    taken for errors of the data logger, whose number has a Poisson distribution with the fraction `spike.share` of the
+    samples as its mean. If they are more than this makes plausible, the signal itself leaps, and the result is empty.
     """
     known = np.flatnonzero(np.isfinite(values))
     if known.size < _MIN_SAMPLES:

@@ -68,9 +68,9 @@ def headline(trend: Trend) -> str:
 
 def verdict_sentence(trend: Trend) -> str:
     """Format the verdict of a trend as a sentence for the heading of its page."""
-    if trend.decision.summary != trend.verdict:
+    if trend.decision.summary != trend.verdict:  # it names another cause than a leak
         return trend.decision.summary.capitalize()
-    key = "ringing"
+    key = "ringing"  # an alarm by pressure oscillations, whose leak has no size
     if trend.verdict == "no leak":
         key = "fell" if trend.repairs else "no leak"
     elif trend.alarm is None or trend.wear is None:

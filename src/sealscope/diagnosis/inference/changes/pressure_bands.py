@@ -216,11 +216,12 @@ class _Filters(NamedTuple):
 
 
 def _filter_effects(healthy: Sequence[Octaves], sides: Sequence[int]) -> _Filters:
-    """Compute how a low-pass filter of one channel changes the spectra of healthy recordings.
+    """Compute how a low-pass filter of one channel changes log amplitude ratio and phase of channel A to channel B.
 
-    `sides`: channels that may be filtered, 0 for channel A and 1 for channel B. Each is combined with several cut-off
-    frequencies and levels of noise. The sensor's white noise is not filtered. Its power per frequency is a fraction
-    (`filtered.noises` in `priors.toml`) of the power per frequency of the octave where this is least.
+    The first entry of the result is without a filter. `sides`: channels that may be filtered, 0 for channel A and 1 for
+    channel B. Each is combined with several cut-off frequencies and levels of noise. The sensor's white noise is not
+    filtered; its power density is a fraction (`filtered.noises` in `priors.toml`) of the lowest power density of any
+    octave in the `healthy` recordings.
     """
     from itertools import product
 

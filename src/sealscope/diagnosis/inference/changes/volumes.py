@@ -187,9 +187,10 @@ def _is_tested(term: Term, roles: ColumnRoles, has_accumulator: bool) -> bool:
 
 
 def _observable_name(term: Term) -> str:
-    """Return the name of the observable of a term: its own name, except for the flow offset.
+    """Return the name under which a change of a term is reported: its own name, except for the constant flow.
 
-    A step of the flow offset is an external leak if the flow's sensor has no offset, else a zero error of the sensor.
+    A step of the constant flow is reported by the term's cause: as an external leak, or as an offset of the flow's
+    sensor.
     """
     if term.name != BIAS:
         return term.name

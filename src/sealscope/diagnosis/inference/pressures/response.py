@@ -307,24 +307,26 @@ class Follower:
         better.
         """
         u, dp = recording["u"], recording["p_A"] - recording["p_B"]
+        # 1 or -1: whether a positive command raises or lowers p_A - p_B
         sense = float(np.sign(np.mean(u * (dp - dp.mean())))) or 1.0
         beginning = recording.samples(slice(0, math.ceil(_FOLLOW.window * recording.rate)))
         total = beginning["p_A"] + beginning["p_B"]
         # the squared coefficients (1, -3, 3, -1) of a third difference have the sum 20
-        noise = max(float(np.var(np.diff(total, 3))) / 20.0, 1.0)
+        noise_variance = max(float(np.var(np.diff(total, 3))) / 20.0, 1.0)
         follower = Follower(Machine.from_rig(rig, recording.rate), response_priors(rig), sense)
         segment = follower.next_segment(beginning)
-        fit = fit_from_priors(segment, total, noise)
-        cost = fit.cost(noise, follower.priors.normal)
+        fit = fit_from_priors(segment, total, noise_variance)
+        cost = fit.cost(noise_variance, follower.priors.normal)
         if not segment.is_explained(cost):  # try LuGre's friction in place of Stribeck's
             bristles = Follower(Machine.from_rig(rig, recording.rate, BRISTLES), response_priors(rig, BRISTLES), sense)
             starts = np.array([fit.theta, bristles.priors.centre])
             # the fit with Stribeck's friction says nothing about the compliance
             starts[:, COMPLIANCE] = bristles.priors.centre[COMPLIANCE]
-            bristles_fit = fit_from_starts(bristles.next_segment(beginning), starts, noise, n_best=1)
-            if bristles_fit.cost(noise, bristles.priors.normal) < cost:
+            bristles_fit = fit_from_starts(bristles.next_segment(beginning), starts, noise_variance, n_best=1)
+            if bristles_fit.cost(noise_variance, bristles.priors.normal) < cost:
                 follower, fit = bristles, bristles_fit
-        follower.theta, follower.variance = fit.theta, segment.residual_variance(float(fit.gram[0, 0]))
+        residual_squares = float(fit.gram[0, 0])
+        follower.theta, follower.variance = fit.theta, segment.residual_variance(residual_squares)
         follower._converge_on_beginning(recording)
         return follower
 
