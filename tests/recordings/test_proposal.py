@@ -157,3 +157,18 @@ def test_any_names_give_a_map_of_these_columns(names: list[str]) -> None:
 )
 def test_an_ending_that_may_be_no_unit_is_one_behind_a_word_of_its_kind(heading, parts):
     assert split_unit(heading) == parts
+
+
+@pytest.mark.parametrize(
+    ("heading", "parts"),
+    [
+        ("Pump / side (bar)", ("Pump / side", "bar")),
+        ("Pressure A / bar", ("Pressure A", "bar")),
+        ("v / m/s", ("v", "m/s")),
+        ("gain (m/(s V))", ("gain", "m/(s V)")),
+        ("pressure (port A)", ("pressure", None)),
+    ],
+)
+def test_of_two_endings_the_known_unit_is_the_unit(heading, parts):
+    label = Label.parse(heading)
+    assert (label.name, label.unit) == parts

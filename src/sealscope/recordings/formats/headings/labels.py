@@ -69,24 +69,22 @@ def split_square_brackets(text: str) -> tuple[str, str | None]:
 def _split_brackets_or_slash(text: str) -> tuple[str, str | None]:
     """Split `name (unit)` or `name / unit` into name and unit; return (text, None) for any other text.
 
-    Of several possible splits, that with the shortest name is used.
+    Of several possible splits, one with a known unit is preferred, and of these that with the shortest name.
     """
-    splits: list[tuple[int, int]] = []  # end of the name, beginning of the unit
+    splits: list[tuple[str, str]] = []  # name and unit
     parts = text.split("/")
     for count in (2, 1):  # `name / m/s`, `name / s`
         unit = "/".join(parts[-count:])
         end = len(text) - len(unit) - 1
         if end > 1 and text[end - 1].isspace() and unit[:1].isspace() and all(unit[1:].split("/")):
-            splits.append((end - 1, end + 1))
+            splits.append((text[: end - 1].rstrip(), unit.strip()))
     depth = n_opened = 0
     for index in range(len(text) - 1, -1, -1) if text.endswith(")") else ():
         depth += {")": 1, "(": -1}.get(text[index], 0)
         n_opened += text[index] == "("
         if depth == 0:
             if n_opened <= 2:  # `name (m/(s V))`; deeper brackets do not contain a unit
-                splits.append((len(text[:index].rstrip()), index))
+                splits.append((text[:index].rstrip(), text[index + 1 : -1].strip()))
             break
-    end, begin = min(splits, default=(0, 0))
-    if not end:
-        return text, None
-    return text[:end].rstrip(), (text[begin + 1 : -1] if text[begin] == "(" else text[begin:]).strip()
+    splits = [(name, unit) for name, unit in splits if name]
+    return min(splits, key=lambda split: (not is_unit(split[1]), len(split[0])), default=(text, None))
