@@ -136,7 +136,9 @@ def test_a_large_leak_that_equalises_the_pressures_at_once_is_found() -> None:
 def test_equalised_pressures_tell_a_leak_though_the_gains_of_the_sensors_differ(gain: float) -> None:
     """A difference of gains of half a percent is another zero in each hold, as the load falls from cycle to cycle."""
     chambers = held_press(piston=10.0 * SEAL, gain=gain, loads=(1.0, 0.8, 0.6, 0.4))
-    assert chambers.leaks.piston == pytest.approx(10.0 * SEAL, rel=0.2)
+    fit = chambers.piston_leak.fit
+    assert chambers.leaks.piston == pytest.approx(10.0 * SEAL, rel=0.15)  # the dead volume is half the usual one
+    assert abs(fit.value - 10.0 * SEAL) < 2.0 * math.hypot(fit.deviation, fit.by_oil)
     assert chambers.piston_leak.probability > 0.99
 
 
@@ -189,9 +191,9 @@ def test_a_check_valve_feeds_the_larger_side_that_a_leak_does_not_fill() -> None
 
 def test_an_area_that_is_not_measured_is_varied() -> None:
     chambers = held_press(piston=SEAL)
-    assert chambers.with_areas() == [(1.0, chambers)]
+    assert chambers.area_variants() == [(1.0, chambers)]
     unknown = replace(chambers, sides=chambers.sides._replace(area_A=0.8 * AREA_A, deviation_A=0.25))
-    variants = unknown.with_areas()
+    variants = unknown.area_variants()
     assert sum(probability for probability, _ in variants) == pytest.approx(1.0)
     logs = np.array([np.log(variant.sides.area_A / AREA_A) for _, variant in variants])
     probabilities = np.array([probability for probability, _ in variants])
@@ -251,7 +253,7 @@ def test_what_passes_an_open_valve_and_the_resting_pump_is_no_oil_that_does_not_
     chambers = HeldChambers(find_locked_holds(channels, rests[1:], RATE), sides, 0.0, float(t[-1]), CHARGE + P_ATM)
     usual_slip = AREA_B * (STROKE - after + 0.3 * STROKE) * 8e-10 / tau  # oil as the priors expect it, no air
     total = chambers.total_leak()
-    assert 0.4 * usual_slip < total.value < 4.0 * usual_slip
+    assert 0.5 * usual_slip < total.value < 4.0 * usual_slip
     assert total.value > 5.0 * total.deviation
 
 

@@ -216,14 +216,14 @@ class BalanceLeak:
         """Fit a leak past the piston to the times in which shut valves hold the load, for each law and piston area.
 
         The flow is the coefficient times abs(p_A - p_B)^exponent for each exponent of `EXPONENTS`, with each growth of
-        `growth_priors` since the onset, and with each area of `HeldChambers.with_areas`. The weight of a law is the
+        `growth_priors` since the onset, and with each area of `HeldChambers.area_variants`. The weight of a law is the
         likelihood of its fit times the prior probability of its growth; the sum of the weights for one area is the
         probability of that area.
         """
         chambers = self.balance.chambers
         assert chambers is not None
         parts = []
-        for probability, variant in chambers.with_areas():
+        for probability, variant in chambers.area_variants():
             laws = self._fit_hold_laws(variant)
             parts.append(laws._replace(weights=probability * laws.weights))
         return _HoldLaws(*(np.concatenate(values) for values in zip(*parts, strict=True)))

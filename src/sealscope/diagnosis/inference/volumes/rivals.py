@@ -100,7 +100,8 @@ def rival_rises(
             if log_ratio is not None and laws is not None:
                 log_ratio -= max(laws.log_ratio, 0.0)  # of the leak by the better law, laminar or an orifice
             log_ratio_to_leak = None if log_ratio is None else INFERENCE.size.readings * log_ratio
-            observable = observable if is_air else _penalise_size(observable, judged, unit_flows)
+            if not is_air:
+                observable = _penalise_size(observable, judged, unit_flows)
             observable = replace(observable, log_ratio_to_leak=log_ratio_to_leak)
         observables.append(observable)
     return (*observables, *(hold_rivals or ()))

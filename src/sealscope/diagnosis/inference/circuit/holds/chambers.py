@@ -19,7 +19,7 @@ samples of a hold (`LockedHold.edges`). The first is of the time in which the va
 the side of the lower pressure, whose oil comes through a leak alone: a large leak equalises the pressures within that
 time. The readings of all holds form one regression, each side of a hold about its mean. The dead volumes and the
 logarithms of K and alpha have normal priors (`held_oil` in `priors.toml`); the regression is linearised about the
-estimate, iteratively. Uncertain areas are varied (`HeldChambers.with_areas`). The onset of the leak and the offset z
+estimate, iteratively. Uncertain areas are varied (`HeldChambers.area_variants`). The onset of the leak and the offset z
 are those with the highest posterior; a leak that has equalised the pressures determines z. The three leaks are
 hypotheses, each with its probability. A leak past the piston may grow from its onset on.
 
@@ -92,7 +92,7 @@ class HeldChambers:
     end: float
     charge: float
 
-    def with_areas(self) -> list[tuple[float, HeldChambers]]:
+    def area_variants(self) -> list[tuple[float, HeldChambers]]:
         """Return variants of this estimator with other areas of the less certain side, each with its probability.
 
         The logarithm of the area takes the three values of the Gauss-Hermite quadrature of its normal distribution. The
@@ -133,7 +133,7 @@ class HeldChambers:
         """Flags of A and B: true for the side of the larger area, if the areas differ.
 
         It is the side that a check valve may refill while the piston leaks: the leak fills a side by as much as it
-        takes from the other, whose area moves the piston, so that only a larger side can want for oil.
+        takes from the other, whose area moves the piston, so that only a larger side can lack oil.
         """
         area_A, area_B = abs(self.sides.area_A), abs(self.sides.area_B)
         return area_A > area_B, area_B > area_A
@@ -182,10 +182,9 @@ class HeldChambers:
         for hold in self.holds:
             difference = hold.p_A - hold.p_B - hold.offset_in_hold(offset)[0]
             flow = np.sign(difference) * np.abs(difference) ** law.exponent * law.growth_factor(hold.t, self.end)
-            sides = np.array([flow, -flow])
-            flows.append(sides)
-        flows = [sides * flags for sides, flags in zip(flows, self._closed_flags(refilled), strict=True)]
-        return UnitLeak(flows, refilled)
+            flows.append(np.array([flow, -flow]))
+        is_closed = self._closed_flags(refilled)
+        return UnitLeak([sides * flags for sides, flags in zip(flows, is_closed, strict=True)], refilled)
 
     def pressure_difference(self, t: Array, difference: Array, offset: float) -> Array:
         """Subtract the sensor offset from p_A - p_B = `difference` (n,) [Pa] at times `t` (n,) [s] of the recording.
@@ -222,9 +221,8 @@ class HeldChambers:
     @cached_property
     def _fits_without_leak(self) -> dict[tuple[bool, bool], LeakRegression]:
         """Fits of the oil's properties without any leak, by the sides that check valves refill."""
-        no_columns = np.empty(
-            (len(self._regressions[NEITHER].displaced), 0)
-        )  # as many rows with check valves as without
+        n_rows = len(self._regressions[NEITHER].displaced)  # as many with check valves as without
+        no_columns = np.empty((n_rows, 0))
         return {
             refilled: fit_leaks(regression, no_columns, self.n_readings)
             for refilled, regression in self._regressions.items()
