@@ -67,6 +67,8 @@ def test_each_change_shows_in_its_number_alone() -> None:
         ({"filter_B": 1.0}, "filter of p_B"),
     ):
         found = chances(record(**change, seed=9))
+        loads = found.pop("friction beside changing loads")
+        assert (loads < 1e-3) == (name == "friction")
         assert min(found, key=lambda known: found[known]) == name
         assert found[name] < 1e-3
         if name != "drift of both":  # which both pressures show

@@ -1,11 +1,23 @@
-"""The least-squares solution by a triangular factor, beside that of all rows' singular values."""
+"""The fit of pressures in motion: its solution, standard errors, and what the motion does not determine."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.inference.changes.motion_fit import solve_weighted, stack_equations
+from sealscope.diagnosis.inference.changes.healthy_levels import HealthyLevels
+from sealscope.diagnosis.inference.changes.motion_fit import (
+    GROUPS,
+    equal_parts,
+    fit_difference,
+    jackknife_errors,
+    select_motion,
+    solve_weighted,
+    stack_equations,
+)
+from sealscope.recordings.recording import Recording
+
+RATE = 50.0
 
 
 @pytest.mark.parametrize("rank", ["full", "too low"])
@@ -20,3 +32,92 @@ def test_the_factor_solves_as_all_rows_do(rank: str) -> None:
     expected = np.linalg.lstsq(design * weight[:, None], values * weight, rcond=None)[0]
     found = solve_weighted(stack_equations(design, values), weight)
     assert found == pytest.approx(expected, rel=1e-11, abs=1e-11 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("n_groups", [3, GROUPS, 3 * GROUPS])
+def test_errors_are_those_of_fits_without_one_group_each(n_groups: int) -> None:
+    rng = np.random.default_rng(1)
+    design, values = rng.normal(size=(600, 4)), rng.normal(size=600)
+    groups = np.sort(np.concatenate([np.arange(n_groups), rng.integers(0, n_groups, 600 - n_groups)]))
+    merged = groups * min(n_groups, GROUPS) // n_groups
+    whole = np.linalg.lstsq(design, values, rcond=None)[0]
+    others = [np.linalg.lstsq(design[merged != k], values[merged != k], rcond=None)[0] for k in range(merged[-1] + 1)]
+    expected = np.sqrt((1.0 - 1.0 / len(others)) * ((np.array(others) - whole) ** 2).sum(axis=0))
+    assert jackknife_errors(design, values, [2, 0], groups) == pytest.approx(expected[[2, 0]])
+
+
+def test_a_coefficient_that_one_group_alone_determines_has_no_error() -> None:
+    design, values = np.random.default_rng(2).normal(size=(2, 200, 3))
+    parts = equal_parts(200)
+    design[parts > 0, 2] = 0.0
+    assert np.isfinite(jackknife_errors(design, values[:, 0], [0, 1, 2], parts)).tolist() == [True, True, False]
+    assert np.isinf(jackknife_errors(design, values[:, 0], [0], np.zeros(200, dtype=int))).all()
+
+
+def record(position: np.ndarray, drift_A: float = 0.0, way: np.ndarray | None = None) -> Recording:
+    """Record a lift with a friction of 2 bar that a position-dependent load pushes down; `drift_A` [Pa].
+
+    `way`: sign of the friction, by default that of the speed.
+    """
+    rng, t = np.random.default_rng(0), np.arange(len(position)) / RATE
+    way = np.sign(np.gradient(position)) if way is None else way
+    p_A = 80e5 + 2e6 * np.cos(3.0 * position) + 2e5 * way + drift_A * t / t[-1]
+    noise = 3e3 * rng.standard_normal((2, len(t)))
+    x = position + 1e-4 * rng.standard_normal(len(t))
+    channels = {"p_A": p_A + noise[0], "p_B": 6e5 + noise[1], "x": x}
+    return Recording(t, channels, {"p_A": "Pa", "p_B": "Pa", "x": "m"}, RATE)
+
+
+def strokes(*ends: float, hold: float = 8.0, stroke: float = 6.0) -> np.ndarray:
+    """Move from 0 m to each of the positions `ends` [m] in turn, in smooth strokes, and hold each [s]."""
+    ramp = 0.5 - 0.5 * np.cos(np.pi * np.arange(round(stroke * RATE)) / (stroke * RATE))
+    pieces, last = list[np.ndarray](), 0.0
+    for end in ends:
+        pieces += [last + (end - last) * ramp, np.full(round(hold * RATE), end)]
+        last = end
+    return np.concatenate(pieces)
+
+
+def test_a_piston_that_a_servo_holds_does_not_move() -> None:
+    """While it is held, the seals bear any part of the load: such pressures would halve the friction."""
+    position = strokes(0.3, 0.1, 0.4, 0.0, 0.2)
+    held = np.gradient(position) == 0.0
+    way = np.where(held, np.random.default_rng(1).uniform(-1.0, 1.0), np.sign(np.gradient(position)))
+    recording = record(position, way=way)
+    motion, fit = select_motion(recording), fit_difference(recording)
+    assert motion is not None and fit is not None
+    assert not held[motion.rows].any()
+    assert fit.friction == pytest.approx(2e5, abs=max(3.0 * fit.friction_error, 2e3))
+    assert fit.friction_error < 1e4
+
+
+def test_one_stroke_up_tells_neither_friction_nor_a_drift() -> None:
+    learnt = HealthyLevels().learn(record(strokes(0.4), drift_A=4e5)) or {}
+    assert not {"friction_pressure", "drift_A"} & set(learnt)
+
+
+def test_one_stroke_each_way_tells_friction_and_hardly_a_drift() -> None:
+    learnt = HealthyLevels().learn(record(strokes(0.4, 0.0)))
+    assert learnt is not None
+    assert learnt["friction_pressure"] == pytest.approx(2e5, rel=0.02)
+    assert learnt.get("drift_A_error", np.inf) > 1e5
+
+
+def test_strokes_that_pass_the_same_places_tell_a_drift() -> None:
+    learnt = HealthyLevels().learn(record(strokes(0.4, 0.0, 0.3, 0.1, 0.4, 0.0), drift_A=4e5))
+    assert learnt is not None
+    assert learnt["drift_A"] == pytest.approx(4e5, abs=3.0 * learnt["drift_A_error"])
+    assert learnt["drift_A_error"] < 2e4
+
+
+def test_friction_shows_beside_a_load_that_wanders() -> None:
+    position = strokes(*[0.3, 0.1, 0.4, 0.0, 0.35, 0.05] * 3, hold=1.0, stroke=2.0)
+    steps = np.random.default_rng(3).standard_normal(len(position))
+    load = 4e4 * np.cumsum(steps)  # 3 bar in a second, 10 bar in ten
+    recording = record(position)
+    channels = {**recording.channels, "p_A": recording["p_A"] + load}
+    recording = Recording(recording.t, channels, recording.units, RATE)
+    level, change = fit_difference(recording), fit_difference(recording, without_slow_changes=True)
+    assert level is not None and change is not None
+    assert change.friction == pytest.approx(2e5, abs=3.0 * change.friction_error)
+    assert change.friction_error < 0.5 * level.friction_error

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.inference.changes.viscous_drop import estimate_viscous_drop
+from sealscope.diagnosis.inference.changes.motion_fit import estimate_viscous_drop
 from sealscope.recordings.recording import Recording
 
 RATE, SECONDS = 100.0, 60.0

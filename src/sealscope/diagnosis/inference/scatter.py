@@ -23,7 +23,7 @@ mean. These effects contribute to their covariance:
   Sessions are separated by date; undated recordings form one session.
 - Oil: if its temperature T is known for all recordings, z has a slope in T with a prior, and a recording with oil
   outside of the known range is less certain. Otherwise the viscous pressure drop of the motion
-  (`changes.viscous_drop`) may show the oil's viscosity, or tau covers its effect.
+  (`changes.motion_fit`) may show the oil's viscosity, or tau covers its effect.
 - Conditions: load and speed outside of the known range make a recording less certain.
 
 The rise follows the mixture over all of these. The priors are in `priors.toml`.

@@ -47,14 +47,20 @@ class HealthyLevelPriors(PriorTable):
     - `friction_error`: standard error of the logarithm of a recording's friction.
     - `friction_scatter`: standard deviation of this logarithm between days.
     - `recordings`: the prior on the scatter weighs as much as this number of recordings.
+    - `load_seconds` [s]: time in which the load of a machine at work changes.
     - `drift` [Pa]: standard deviation of the drift of a pressure sensor's zero within a recording.
+    - `drift_recordings`: the prior on this scatter weighs as much as this number of recordings.
+    - `drift_inflation`: largest factor by which the standard errors of drifts may be too small.
     """
 
     slowest: float
     friction_error: float
     friction_scatter: float
     recordings: float
+    load_seconds: float
     drift: float
+    drift_recordings: float
+    drift_inflation: float
 
 
 class OctavePriors(PriorTable):

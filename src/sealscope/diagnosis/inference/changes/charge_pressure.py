@@ -10,8 +10,8 @@ near its lowest values, the "low pressure" of the chamber, are fitted by
 with the position x, whose rod volume moves oil into the accumulator, and the flow q of the pump, which drops pressure
 in lines and check valves; without the pump's angle or speed there is no fit, as behind a valve. The fit is robust
 (Cauchy weights) and gives samples above it less weight than those below: where valves shut a chamber off, its
-pressure lies above the charge pressure. Standard errors are cluster-robust. Called for healthy and judged recordings
-by `healthy_levels`.
+pressure lies above the charge pressure. Standard errors are those of a jackknife. Called for healthy and judged
+recordings by `healthy_levels`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.diagnosis.inference.changes.motion_fit import PARTS, cluster_errors, solve_weighted, stack_equations
+from sealscope.diagnosis.inference.changes.motion_fit import (
+    GROUPS,
+    equal_parts,
+    jackknife_errors,
+    solve_weighted,
+    stack_equations,
+)
 from sealscope.diagnosis.inference.differences import Estimate, PriorScatter, compare_estimates, size_penalty
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.priors.changes import CHANGES
@@ -179,7 +185,7 @@ def _fit_drift(t: Array, pressure: Array, regressors: Array, rows: NDArray[np.in
     design = np.column_stack([time, np.ones(len(rows)), varying])
     equations = stack_equations(design, values)
     weight = np.zeros(len(rows))  # at first 1 for the lowest samples of each part of the recording, else 0
-    for part in np.array_split(np.arange(len(rows)), PARTS):
+    for part in np.array_split(np.arange(len(rows)), GROUPS):
         weight[part] = values[part] <= np.quantile(values[part], BEGIN)
     for _ in range(ITERATIONS):
         coefficients = solve_weighted(equations, weight)
@@ -188,8 +194,9 @@ def _fit_drift(t: Array, pressure: Array, regressors: Array, rows: NDArray[np.in
         scale = WEIGHT_SCALE * float(np.median(below) if below.size else 0.0) + MIN_SCALE
         weight = np.where(residual > 0.0, ABOVE, 1.0) / np.hypot(1.0, residual / scale)
     slope = 0  # column of the time
-    (cluster_error,) = cluster_errors(design * weight[:, None], residual * weight, [slope])
-    return float(coefficients[slope]), float(np.hypot(cluster_error, _envelope_error(time, residual)))
+    parts = equal_parts(len(rows))
+    (jackknife_error,) = jackknife_errors(design * weight[:, None], values * weight, [slope], parts)
+    return float(coefficients[slope]), float(np.hypot(jackknife_error, _envelope_error(time, residual)))
 
 
 def _envelope_error(time: Array, residual: Array) -> float:
@@ -200,7 +207,7 @@ def _envelope_error(time: Array, residual: Array) -> float:
 
         error^2 = (sum (r_k - mean of r)^2 / (n - 2)) / sum (t_k - mean of t)^2.
     """
-    parts = [part for part in np.array_split(np.arange(len(residual)), PARTS) if part.size]
+    parts = [part for part in np.array_split(np.arange(len(residual)), GROUPS) if part.size]
     levels = np.array([np.quantile(residual[part], BEGIN) for part in parts])
     times = np.array([time[part].mean() for part in parts])
     return float(levels.std() / np.sqrt(len(parts) - 2) / max(float(times.std()), TINY))

@@ -25,24 +25,36 @@ from sealscope.diagnosis.inference.changes.charge_pressure import (
     compare_low_drifts,
     estimate_low_drifts,
 )
-from sealscope.diagnosis.inference.changes.motion_fit import TIME, fit_difference, fit_robustly, select_motion
+from sealscope.diagnosis.inference.changes.motion_fit import (
+    TIME,
+    Motion,
+    fit_difference,
+    fit_robustly,
+    jackknife_errors,
+    select_motion,
+)
 from sealscope.diagnosis.inference.changes.pressure_bands import PAIRS, Octaves, compare_spectra, compute_octaves
 from sealscope.diagnosis.inference.changes.signals import SIGNALS
 from sealscope.diagnosis.inference.differences import (
     Estimate,
     PriorScatter,
     compare_estimates,
-    compare_with_healthy,
 )
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.chambers import CHAMBERS
-from sealscope.recordings.recording import Recording, compute_once
+from sealscope.recordings.recording import Array, Recording, compute_once
 
 #: Smallest number that is divided by.
 TINY = 1e-300
 #: Names of the observables: of friction, and of drifts, which are rival descriptions of the same data.
 FRICTION, DRIFTS = "friction", ("drift of p_A", "drift of p_B", "drift of both")
+#: Key of a friction in a recording's summary, with that of its standard error, by the name of the observable. The
+#: second one is estimated without loads that change slowly.
+FRICTIONS = {
+    FRICTION: ("friction_pressure", "friction_error"),
+    "friction beside changing loads": ("friction_beside_loads", "friction_beside_loads_error"),
+}
 
 
 class HealthyLevels:
@@ -74,20 +86,9 @@ class HealthyLevels:
             yield from compare_low_drifts(low_drifts, healthy_drifts)
         if (spectra := compare_spectra(_octaves(judged), [_octaves(summary) for summary in healthy])) is not None:
             yield spectra
-        if "drift_A" not in judged:  # friction and drifts in motion are known together or not at all
-            return
-        healthy = [summary for summary in healthy if "drift_A" in summary]
-        if (friction := _compare_friction(judged, healthy)) is not None:
-            yield friction
-        drift_A, drift_B = (
-            np.array([float(summary[name]) for summary in (*healthy, judged)]) for name in ("drift_A", "drift_B")
-        )
-        tests = [
-            compare_with_healthy(name, DRIFT, float(drift[-1]), drift[:-1].tolist(), CHANGES.healthy.drift)
-            for name, drift in zip(DRIFTS, (drift_A, drift_B, drift_A - drift_B), strict=True)
-        ]
-        if None not in tests:
-            yield from _describe_drifts(*tests)  # type: ignore[arg-type]
+        frictions = (_compare_friction(name, judged, healthy) for name in FRICTIONS)
+        yield from (friction for friction in frictions if friction is not None)
+        yield from _compare_drifts(judged, healthy)
 
 
 def _octaves(summary: Summary) -> dict[str, Octaves]:
@@ -102,20 +103,20 @@ def _low_drifts(summary: Summary) -> LowDrifts | None:
     return LowDrifts(*(float(summary.get(name, np.nan)) for name in LowDrifts._fields))
 
 
-def _compare_friction(judged: Summary, healthy: Sequence[Summary]) -> Observable | None:
+def _compare_friction(name: str, judged: Summary, healthy: Sequence[Summary]) -> Observable | None:
     """Test whether the friction of a recording, as a pressure difference, is higher than in healthy recordings.
+
+    `name`: one of `FRICTIONS`, the two ways in which a friction is estimated.
 
     Logarithms are compared. The sign of the friction depends on the sign of the motion's channel, so it is taken from
     the sum over the healthy recordings of friction / standard error. A friction that does not exceed its standard error
     with this sign is not used. Return None if the recording, or too many of the healthy recordings, have no usable
     value.
     """
-    prior = CHANGES.healthy
-    pressures = [
-        (float(summary["friction_pressure"]), float(summary["friction_error"]))
-        for summary in healthy
-        if {"friction_pressure", "friction_error"} <= set(summary)
-    ]
+    prior, keys = CHANGES.healthy, FRICTIONS[name]
+    if not set(keys) <= set(judged):
+        return None
+    pressures = [(float(summary[keys[0]]), float(summary[keys[1]])) for summary in healthy if set(keys) <= set(summary)]
     sign = np.sign(sum(pressure / max(error, TINY) for pressure, error in pressures))
 
     def log_friction(pressure: float, error: float) -> Estimate:
@@ -123,11 +124,42 @@ def _compare_friction(judged: Summary, healthy: Sequence[Summary]) -> Observable
         return Estimate(float(np.log(pressure)), float(np.hypot(prior.friction_error, error / pressure)))
 
     usable = [log_friction(sign * pressure, error) for pressure, error in pressures if sign * pressure > error]
-    pressure, error = sign * float(judged["friction_pressure"]), float(judged["friction_error"])
+    pressure, error = sign * float(judged[keys[0]]), float(judged[keys[1]])
     if not pressure > error:
         return None
     scatter = PriorScatter(prior.friction_scatter, prior.recordings)
-    return compare_estimates(FRICTION, FRICTION, log_friction(pressure, error), usable, scatter, above=True)
+    return compare_estimates(name, FRICTION, log_friction(pressure, error), usable, scatter, above=True)
+
+
+def _compare_drifts(judged: Summary, healthy: Sequence[Summary]) -> Iterator[Observable]:
+    """Compare the drifts of p_A and p_B in motion with those of healthy recordings, each with its standard error.
+
+    Yields a test for each of three explanations, if the recording and enough healthy recordings have both drifts: p_A
+    drifts, p_B drifts, both drift alike (`_describe_drifts`).
+    """
+    days = [drifts for summary in (*healthy, judged) if (drifts := _drifts(summary)) is not None]
+    if "drift_A_error" not in judged or not days:
+        return
+    *healthy_days, judged_drifts = days
+    prior = CHANGES.healthy
+    scatter = PriorScatter(prior.drift, prior.drift_recordings, prior.drift_inflation)
+    tests = [
+        compare_estimates(name, DRIFT, judged_drifts[k], [day[k] for day in healthy_days], scatter)
+        for k, name in enumerate(DRIFTS)
+    ]
+    if None not in tests:
+        yield from _describe_drifts(*tests)  # type: ignore[arg-type]
+
+
+def _drifts(summary: Summary) -> tuple[Estimate, Estimate, Estimate] | None:
+    """Read the drifts of p_A, p_B and p_A - p_B in motion from a recording's summary [Pa]; None if it has none."""
+    if "drift_A_error" not in summary:
+        return None
+    drift_A, drift_B = (
+        Estimate(float(summary[name]), float(summary[f"{name}_error"])) for name in ("drift_A", "drift_B")
+    )
+    difference = Estimate(drift_A.value - drift_B.value, float(np.hypot(drift_A.deviation, drift_B.deviation)))
+    return drift_A, drift_B, difference
 
 
 def _describe_drifts(drift_A: Observable, drift_B: Observable, difference_AB: Observable) -> Iterator[Observable]:
@@ -149,23 +181,18 @@ def _describe_drifts(drift_A: Observable, drift_B: Observable, difference_AB: Ob
 def _estimate_levels(recording: Recording) -> Summary | None:
     """Estimate friction, drifts and spectra in a recording, as numbers or arrays by their names.
 
-    Values that the recording does not allow are left out. Friction and drifts in motion are all left out if one of them
-    is not finite. The result is None if no value is left.
+    Values that the recording does not allow are left out. The result is None if no value is left.
     """
-    motion, fit = select_motion(recording), fit_difference(recording)
     levels = dict[str, float]()
-    if motion is not None and fit is not None:
-        drift_A, drift_B = (
-            float(fit_robustly(motion.design, recording[name][motion.rows])[0][TIME]) for name in CHAMBERS
-        )
-        levels |= {
-            "friction_pressure": fit.friction,
-            "friction_error": fit.friction_error,
-            "drift_A": drift_A,
-            "drift_B": drift_B,
-        }
-    if not np.isfinite(list(levels.values())).all():
-        levels = {}
+    for name, keys in FRICTIONS.items():
+        fit = fit_difference(recording, without_slow_changes=name != FRICTION)
+        if fit is not None:
+            levels |= dict(zip(keys, (fit.friction, fit.friction_error), strict=True))
+    if (motion := select_motion(recording)) is not None:
+        drifts = [_estimate_drift(motion, recording[name]) for name in CHAMBERS]
+        if np.isfinite(drifts).all():
+            names = ("drift_A", "drift_A_error", "drift_B", "drift_B_error")
+            levels |= dict(zip(names, np.ravel(drifts).tolist(), strict=True))
     if (low_drifts := estimate_low_drifts(recording)) is not None:
         levels |= {name: value for name, value in low_drifts._asdict().items() if np.isfinite(value)}
     spectra = {
@@ -174,3 +201,15 @@ def _estimate_levels(recording: Recording) -> Summary | None:
         if (octaves := compute_octaves(recording, pair)) is not None
     }
     return {**levels, **spectra} or None
+
+
+def _estimate_drift(motion: Motion, pressure: Array) -> Estimate:
+    """Estimate the drift [Pa] of a `pressure` (n,) over the recording, from the samples in motion.
+
+    Residuals may be correlated within a stroke. The standard error is infinite if the motion does not determine the
+    drift.
+    """
+    values = pressure[motion.rows]
+    coefficients, weight = fit_robustly(motion.design, values)
+    (error,) = jackknife_errors(motion.design * weight[:, None], values * weight, [TIME], motion.strokes)
+    return Estimate(float(coefficients[TIME]), float(error))

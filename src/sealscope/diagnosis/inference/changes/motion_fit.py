@@ -2,19 +2,23 @@
 
 A pressure, or p_A - p_B, is fitted by
 
-    p = level(x) + half sign(v) + b v + c dv/dt + drift t/T,
+    p = level(x) + half sign(v) + b v + c dv/dt [+ drift t/T],
 
-with position x, speed v, and the time t over the recording's duration T. The level is free in each of `BINS` bins of
-the position. The fit is iteratively reweighted least squares with Cauchy weights, so that contact with a workpiece
-hardly counts. Standard errors allow for residuals that are correlated within each of `PARTS` parts of the recording
-(cluster-robust). Called for friction and drifts (`healthy_levels`) and for the viscous drop (`viscous_drop`).
+with position x, speed v, and the time t over the recording's duration T. The level is linear in the position between
+`KNOTS` values. The drift is fitted only where it is asked for: few strokes do not tell it from friction. Loads that
+change slowly, as work does, are removed on request (`remove_slow_changes`), and friction reverses faster. The fit is
+iteratively reweighted least squares with redescending weights, so that contact with a workpiece hardly counts. Standard
+errors are those of a jackknife, which leaves out groups of rows in turn: strokes for a drift, else equal parts of the
+rows. They are infinite for a coefficient that the motion does not determine, such as the friction of a piston that
+moves in one direction only. Called for friction and drifts (`healthy_levels`) and for the oil's viscosity (`volumes`).
 
-Sources: P. W. Holland, R. E. Welsch, Communications in Statistics A6 (1977) 813 (the weights); K.-Y. Liang, S. L.
-Zeger, Biometrika 73 (1986) 13 (the standard error).
+Sources: S. Geman, D. E. McClure, Bull. Int. Stat. Inst. 52 (1987) 5 (the weights); B. Efron, C. Stein,
+Ann. Statist. 9 (1981) 586 (the jackknife).
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -22,66 +26,95 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import qr
 
-from sealscope.diagnosis.inference.changes.levels import motion_columns, motion_scales
+from sealscope.diagnosis.inference.balance import max_rest_rate
+from sealscope.diagnosis.inference.terms import AVERAGING_TIME, MIN_REST
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array, Recording, compute_once
+from sealscope.signals.smoothing import average_over
 
-#: Number of bins of the position.
-BINS = 24
+#: Maximum number of positions between which the level is linear, and minimum number of rows for each.
+KNOTS, ROWS_PER_KNOT = 24, 10
 #: Maximum and minimum number of rows of a fit, and its number of iterations.
-MAX_ROWS, MIN_ROWS, ITERATIONS = 4000, 200, 8
+MAX_ROWS, MIN_ROWS, ITERATIONS = 4000, 60, 8
 #: Scale of the weights' decrease with the residual, over the median residual.
 WEIGHT_SCALE = 2.0
 #: Smallest length that is divided by, and smallest scale of residuals [Pa].
 TINY, MIN_RESIDUAL = 1e-300, 1.0
 #: Relative rounding error of a double; a singular value below it times the number of rows counts as zero.
 ROUNDING = float(np.finfo(float).eps)
-#: Number of parts of a recording whose residuals count as independent.
-PARTS = 20
-#: Indices of the columns sign(v), t/T and v in a design matrix.
-DIRECTION, TIME, SPEED = 0, 1, 2
+#: Maximum number of groups of rows whose residuals count as independent.
+GROUPS = 20
+#: Eigenvalue of a normalised normal matrix, over the largest one, below which a combination of coefficients is free.
+FREE = 1e-10
+#: Index of the column t/T in the design matrix of a motion, and of sign(v) and v in that without t/T.
+TIME, DIRECTION, SPEED = 1, 0, 1
 
 
 class Motion(NamedTuple):
     """Samples in which the piston moves, with the design matrix of their fit.
 
-    `rows` (n,): indices of the samples; `design` (n, m): sign of the speed, time, speed, acceleration, and a column of
-    0 and 1 for each bin of the position; `top_speed`: speed that counts as 1 in the column of the speed.
+    `rows` (n,): indices of the samples; `design` (n, m): sign of the speed, time, speed, acceleration, and a hat
+    function of the position for each knot: 1 at the knot and, linearly, 0 at its neighbours; `strokes` (n,): number of
+    the stroke, a motion in one direction without a rest; `top_speed`: speed that counts as 1 in the column of the
+    speed.
     """
 
     rows: NDArray[np.intp]
     design: Array
+    strokes: NDArray[np.intp]
     top_speed: float
 
 
 def select_motion(recording: Recording) -> Motion | None:
     """Select the samples in which the piston moves, and build the design matrix of their fit (`Motion`).
 
-    The piston moves if its speed exceeds a fraction (`healthy.slowest` in `priors.toml`) of the 99 % quantile of its
-    speed. Samples in motion are thinned out if they are many. Return None if a chamber pressure or a signal of the
-    motion is not recorded, or if the piston moves in fewer than `MIN_ROWS` samples.
+    The piston moves if its speed, averaged over `AVERAGING_TIME`, exceeds both its noise and a fraction
+    (`healthy.slowest` in `priors.toml`) of its mean (`max_rest_rate`): the pressures of a piston that a servo holds
+    are any between those of both directions. Samples in motion are thinned out if they are many. Return None if a
+    chamber pressure or a signal of the motion is not recorded, or if the piston moves in fewer than `MIN_ROWS` samples.
     """
-    if len(recording) < MIN_ROWS or not set(CHAMBERS) <= set(recording.channels):
+    name = next((channel for channel in ("x", "theta", "omega", "u") if channel in recording.channels), None)
+    if name is None or len(recording) < MIN_ROWS or not set(CHAMBERS) <= set(recording.channels):
         return None
-    motion = motion_columns(recording.channels, recording.rate)
-    if motion is None:
-        return None
-    scales = motion_scales(motion)
-    motion = motion / scales
-    is_known = np.isfinite(motion).all(axis=1) & np.isfinite(recording["p_A"]) & np.isfinite(recording["p_B"])
-    rows = np.flatnonzero(is_known & (np.abs(motion[:, 0]) > CHANGES.healthy.slowest))
+    values, rate = recording[name], recording.rate
+    is_position = name in ("x", "theta")
+    raw_speed = rate * np.gradient(values) if is_position else values
+    speed = average_over(AVERAGING_TIME, raw_speed, rate)
+    acceleration = average_over(AVERAGING_TIME, rate * np.gradient(speed), rate)
+    is_known = np.isfinite(speed) & np.isfinite(acceleration)
+    is_known &= np.isfinite(recording["p_A"]) & np.isfinite(recording["p_B"])
+    slowest = max_rest_rate(np.diff(values) if is_position else values / rate, rate, CHANGES.healthy.slowest)
+    rows = np.flatnonzero(is_known & (np.abs(speed) > slowest))
     if len(rows) < MIN_ROWS:
         return None
     rows = rows[:: max(1, len(rows) // MAX_ROWS)]
-    speed = motion[rows, 0]
     time = (recording.t[rows] - recording.t[rows].mean()) / recording.duration
-    position = motion[rows, 2] if motion.shape[1] > 2 else np.zeros(len(rows))
-    bins = np.minimum(BINS * (position - position.min()) / max(float(np.ptp(position)), TINY), BINS - 1).astype(int)
-    is_in_bin = np.eye(BINS)[bins]
-    is_used = is_in_bin.any(axis=0)
-    design = np.column_stack([np.sign(speed), time, motion[rows, :2], is_in_bin[:, is_used]])
-    return Motion(rows, design, top_speed=float(scales[0]))
+    top_speed, top_acceleration = (
+        max(float(np.percentile(np.abs(signal[rows]), 99.0)), TINY) for signal in (speed, acceleration)
+    )
+    position = values[rows] if name == "x" else np.zeros(len(rows))
+    design = np.column_stack(
+        [
+            np.sign(speed[rows]),
+            time,
+            speed[rows] / top_speed,
+            acceleration[rows] / top_acceleration,
+            _hat_functions(position, min(KNOTS, len(rows) // ROWS_PER_KNOT)),
+        ]
+    )
+    is_new = (np.diff(np.sign(speed[rows])) != 0) | (np.diff(recording.t[rows]) > MIN_REST)
+    return Motion(rows, design, np.concatenate([[0], np.cumsum(is_new)]), top_speed)
+
+
+def _hat_functions(position: Array, n_knots: int) -> Array:
+    """Evaluate the hat functions (n, k) of `n_knots` equally spaced knots at positions (n,), those that are not zero.
+
+    The first knot is the least position and the last one the largest.
+    """
+    distance = (n_knots - 1) * (position - position.min()) / max(float(np.ptp(position)), TINY)
+    hats = np.maximum(1.0 - np.abs(distance[:, None] - np.arange(n_knots)), 0.0)
+    return np.asarray(hats[:, hats.any(axis=0)])
 
 
 def stack_equations(design: Array, values: Array) -> Array:
@@ -104,32 +137,78 @@ def solve_weighted(equations: Array, weight: Array) -> Array:
 def fit_robustly(design: Array, values: Array) -> tuple[Array, Array]:
     """Fit coefficients c (m,) of `design` (n, m) to `values` (n,), values = design c, by reweighted least squares.
 
-    The weights are 1/sqrt(1 + (residual/scale)^2), where the scale is `WEIGHT_SCALE` times the median of abs(residual),
-    plus `MIN_RESIDUAL`. Returns the coefficients and the weights (n,).
+    The weights are 1/(1 + (residual/scale)^2), where the scale is `WEIGHT_SCALE` times the median of abs(residual),
+    plus `MIN_RESIDUAL`. At first the residuals are those from the median of the values, so that the high pressure of a
+    contact counts little from the start. Returns the coefficients and the weights (n,).
     """
-    equations, weight = stack_equations(design, values), np.ones(len(values))
+    equations, residual = stack_equations(design, values), np.abs(values - np.median(values))
     for _ in range(ITERATIONS):
+        weight = _robust_weight(residual)
         coefficients = solve_weighted(equations, weight)
         residual = np.abs(values - design @ coefficients)
-        scale = WEIGHT_SCALE * float(np.median(residual)) + MIN_RESIDUAL
-        weight = 1.0 / np.hypot(1.0, residual / scale)
-    return coefficients, weight
+    return coefficients, _robust_weight(residual)
 
 
-def cluster_errors(design: Array, residual: Array, columns: Sequence[int]) -> Array:
-    """Compute standard errors of some coefficients of a weighted least-squares fit.
+def _robust_weight(residual: Array) -> Array:
+    """Compute the weights (n,) of rows with these magnitudes of residuals (n,) [Pa], as in `fit_robustly`."""
+    scale = WEIGHT_SCALE * float(np.median(residual)) + MIN_RESIDUAL
+    return np.asarray(1.0 / (1.0 + (residual / scale) ** 2))
 
-    The residuals may be correlated within each of P = `PARTS` parts of the recording:
 
-        error^2 = P / (P - 1) sum over parts of influence^2,    influence = (X' X)^-1 (X' residual of the part).
+def equal_parts(n_rows: int) -> NDArray[np.intp]:
+    """Assign rows (n,) to `GROUPS` parts of equal size in the order of time, as groups for `jackknife_errors`."""
+    return np.arange(n_rows) * GROUPS // n_rows
 
-    `design` (n, m): the matrix X; `residual` (n,): residuals in the order of time; both are multiplied by the weights
-    of the fit. `columns`: indices of the coefficients.
+
+def jackknife_errors(design: Array, values: Array, columns: Sequence[int], groups: NDArray[np.intp]) -> Array:
+    """Compute standard errors of some coefficients of a weighted least-squares fit by leaving out groups of rows.
+
+    With the coefficient c_k from all rows but those of group k, of at most `GROUPS` groups P,
+
+        error^2 = (P - 1) / P sum over groups of (c_k - c)^2,
+
+    where c is the coefficient from all rows. Residuals may be correlated within a group. An error is infinite if the
+    rows, or all but those of one group, do not determine the coefficient. `design` (n, m), `values` (n,): the rows in
+    the order of time, multiplied by the weights of the fit; `columns`: indices of the coefficients; `groups` (n,):
+    number of each row's group, in increasing order. Neighbouring groups are merged if there are too many.
     """
-    edges = np.linspace(0, len(residual), PARTS + 1).astype(int)[:-1]
-    scores = np.add.reduceat(design * residual[:, None], edges, axis=0)
-    influences = np.linalg.pinv(design.T @ design)[list(columns)] @ scores.T
-    return np.asarray(np.sqrt(PARTS / (PARTS - 1.0) * (influences**2).sum(axis=1)))
+    n_groups = min(int(groups[-1]) + 1, GROUPS)
+    if n_groups < 2:
+        return np.full(len(columns), np.inf)
+    edges = np.searchsorted(groups * n_groups // (groups[-1] + 1), np.arange(n_groups + 1))
+    parts = [slice(*ends) for ends in itertools.pairwise(edges)]
+    scale = np.maximum(np.sqrt((design**2).sum(axis=0)), TINY)
+    normalised = design / scale
+    matrices = np.array([normalised[part].T @ normalised[part] for part in parts])
+    moments = np.array([normalised[part].T @ values[part] for part in parts])
+    # the last problem has all rows
+    matrices = np.concatenate([matrices.sum(axis=0) - matrices, matrices.sum(axis=0)[None]])
+    moments = np.concatenate([moments.sum(axis=0) - moments, moments.sum(axis=0)[None]])
+    eigenvalues, vectors = np.linalg.eigh(matrices)
+    is_free = eigenvalues < FREE * eigenvalues[:, -1:]
+    inverse = np.where(is_free, 0.0, 1.0 / np.where(is_free, 1.0, eigenvalues))
+    coefficients = np.einsum("kij,kj,klj,kl->ki", vectors, inverse, vectors, moments, optimize=True) / scale
+    is_undetermined = np.einsum("kij,kj->ki", vectors**2, is_free.astype(float)).max(axis=0) > np.sqrt(FREE)
+    errors = np.sqrt((n_groups - 1.0) / n_groups * ((coefficients[:-1] - coefficients[-1]) ** 2).sum(axis=0))
+    return np.asarray(np.where(is_undetermined, np.inf, errors)[list(columns)])
+
+
+def remove_slow_changes(motion: Motion, design: Array, values: Array, t: Array) -> tuple[Array, Array]:
+    """Remove changes slower than the time tau from the columns of a design matrix and from the values.
+
+    With the samples k in motion at the times t_k, each column y becomes
+
+        (y_k - r_k y_(k-1)) / sqrt(1 - r_k^2),    r_k = exp(-(t_k - t_(k-1)) / tau),
+
+    as if the residuals were an Ornstein-Uhlenbeck process, whose innovations are independent. `design` (n, m), `values`
+    (n,): rows of the samples `motion.rows`; `t`: times of all samples of the recording [s]. The results have n - 1
+    rows. tau is `healthy.load_seconds` of `priors.toml`.
+    """
+    correlation = np.exp(-np.diff(t[motion.rows]) / CHANGES.healthy.load_seconds)
+    scale = 1.0 / np.sqrt(1.0 - correlation**2)
+    rows = np.column_stack([design, values])
+    innovations = (rows[1:] - correlation[:, None] * rows[:-1]) * scale[:, None]
+    return innovations[:, :-1], innovations[:, -1]
 
 
 class DifferenceFit(NamedTuple):
@@ -145,33 +224,56 @@ class DifferenceFit(NamedTuple):
     drop_error: float
 
 
-def fit_difference(recording: Recording) -> DifferenceFit | None:
+def fit_difference(recording: Recording, *, without_slow_changes: bool = False) -> DifferenceFit | None:
     """Fit p_A - p_B of a recording by friction, which reverses with the motion, and a viscous drop.
 
-    The result is None without enough motion. It is computed only once for a recording.
+    `without_slow_changes`: first remove loads that change slowly (`remove_slow_changes`); the drop then contains
+    little of the steady motion. The result is None without enough motion. It is computed only once for a recording.
     """
-    return compute_once(recording, ("motion fit of p_A - p_B",), _fit_difference)
+    key = ("motion fit of p_A - p_B", without_slow_changes)
+    return compute_once(recording, key, lambda moved: _fit_difference(moved, without_slow_changes))
 
 
 @np.errstate(all="ignore")
-def _fit_difference(recording: Recording) -> DifferenceFit | None:
+def _fit_difference(recording: Recording, without_slow_changes: bool) -> DifferenceFit | None:
     """Fit friction and viscous drop to p_A - p_B in motion, with their standard errors; None without enough motion.
 
-    The standard errors allow for residuals that are correlated within parts of the recording (`cluster_errors`).
+    The result is None also if the motion does not determine both. The standard errors allow for residuals that are
+    correlated within parts of the recording (`equal_parts`).
     """
     motion = select_motion(recording)
     if motion is None:
         return None
-    rows, design, top_speed = motion
-    difference = recording["p_A"][rows] - recording["p_B"][rows]
+    difference = recording["p_A"][motion.rows] - recording["p_B"][motion.rows]
+    design = np.delete(motion.design, TIME, axis=1)
+    if without_slow_changes:
+        design, difference = remove_slow_changes(motion, design, difference, recording.t)
     coefficients, weight = fit_robustly(design, difference)
-    weighted = design * weight[:, None]
-    residual = (difference - design @ coefficients) * weight
-    friction_error, speed_error = cluster_errors(weighted, residual, [DIRECTION, SPEED])
+    columns = [DIRECTION, SPEED]
+    friction_error, speed_error = jackknife_errors(
+        design * weight[:, None], difference * weight, columns, equal_parts(len(weight))
+    )
     fit = DifferenceFit(
         friction=float(coefficients[DIRECTION]),
         friction_error=float(friction_error),
-        drop=float(coefficients[SPEED] / top_speed),
-        drop_error=float(speed_error / top_speed),
+        drop=float(coefficients[SPEED] / motion.top_speed),
+        drop_error=float(speed_error / motion.top_speed),
     )
     return fit if np.isfinite(fit).all() else None
+
+
+def estimate_viscous_drop(recording: Recording) -> Array | None:
+    """Estimate the logarithm of the viscous pressure drop [Pa] per speed, and its standard error, shape (2,).
+
+    The drop in lines and the friction of seals rise with the speed and with the viscosity of the oil: the drop stands
+    for the temperature of the oil where none is logged. A drop below its standard error is replaced by this error, so
+    that the logarithm exists. Return None without enough motion.
+    """
+    fit = fit_difference(recording)
+    if fit is None:
+        return None
+    # friction and viscous drop both resist the motion: a drop with the sign of the friction counts as positive
+    drop = max(fit.drop * np.sign(fit.friction), fit.drop_error)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        log_drop = np.array([np.log(drop), fit.drop_error / drop])
+    return log_drop if np.isfinite(log_drop).all() else None

@@ -20,7 +20,7 @@ from sealscope.diagnosis.inference.blocks import (
     solve,
 )
 from sealscope.diagnosis.inference.changes.charge_pressure import estimate_charge_trend
-from sealscope.diagnosis.inference.changes.viscous_drop import estimate_viscous_drop
+from sealscope.diagnosis.inference.changes.motion_fit import estimate_viscous_drop
 from sealscope.diagnosis.inference.changes.volumes import volume_observables
 from sealscope.diagnosis.inference.circuit.holds.chambers import HeldChambers
 from sealscope.diagnosis.inference.circuit.holds.hold import LockedHold, find_charge_pressure, find_locked_holds
