@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from html import escape
 from threading import Lock
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -174,8 +175,6 @@ class Recording:
 
     def _repr_html_(self) -> str:
         """Render minimum, mean, maximum and missing samples of each channel as a table for notebooks."""
-        from html import escape
-
         rows = []
         for name, values in self.channels.items():
             finite = values[np.isfinite(values)]

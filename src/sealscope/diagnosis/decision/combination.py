@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from sealscope.diagnosis.decision.texts import text_of
+from sealscope.diagnosis.decision.reasons import text_of
 from sealscope.diagnosis.priors.decision import DECISION
 from sealscope.diagnosis.verdict.evidence import (
     CANNOT_TELL,

@@ -13,13 +13,14 @@ The verdict is `leak` if both conditions hold for one test of the leakage:
 These three numbers are `[false_alarm] probability`, `[questions] within` and `[explanation] leak` of `priors.toml`.
 
 Otherwise the verdict is `no leak` if the 95 % upper bound of a leak is small enough, i.e. at most the fraction `[worth]
-share` of the pump's flow (`verdicts.bound_worth_stating`). It is `cannot tell` if the bound is larger, and the reason
+share` of the pump's flow (`_bound_worth_stating`). It is `cannot tell` if the bound is larger, and the reason
 states the bound and the most probable other explanation. No other module states a verdict; `combination.combine`
 chooses among the decisions of several detectors.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -30,12 +31,21 @@ from sealscope.diagnosis.decision.case import Case, LeakTest, step_key
 from sealscope.diagnosis.decision.explanations import probability_of
 from sealscope.diagnosis.decision.null import HealthyNull
 from sealscope.diagnosis.decision.reasons import reason_of
-from sealscope.diagnosis.decision.verdicts import bound_worth_stating, decide_without_leak
 from sealscope.diagnosis.inference.observable import Flow, LeakMeasure, Observed
 from sealscope.diagnosis.inference.onset import WITHIN_95
 from sealscope.diagnosis.priors.decision import DECISION
 from sealscope.diagnosis.priors.rms_change import RMS_PRIORS
-from sealscope.diagnosis.verdict.evidence import AGAINST, CANNOT_TELL, LEAK, NO_LEAK, RAREST, WITHIN, Cause, Evidence
+from sealscope.diagnosis.verdict.evidence import (
+    AGAINST,
+    CANNOT_TELL,
+    LEAK,
+    NO_LEAK,
+    RAREST,
+    WITHIN,
+    Cause,
+    Evidence,
+    Verdict,
+)
 
 
 def decide(
@@ -81,14 +91,14 @@ def decide(
 def _evidence_without_leak(case: Case) -> Evidence:
     """Make the evidence of a recording in which no test found a leak, with the verdict `no leak` or `cannot tell`.
 
-    The verdict is `no leak` if the upper bound of an undetected leak is small enough (`decide_without_leak`). If
+    The verdict is `no leak` if the upper bound of an undetected leak is small enough (`_decide_without_leak`). If
     leakage is measured, the evidence states this bound. If another event than a leak explains a rare change, the
     evidence states the cause of this event.
     """
     alarm = next(iter(case.alarms), None)
     leak, other = case.leak, case.other_event
     bound = _leak_bound(case, alarm)
-    verdict = decide_without_leak(*_bound_and_limit(case, bound))
+    verdict = _decide_without_leak(*_bound_and_limit(case, bound))
     evidence = Evidence(verdict, reason="", cause=None if other is None else other.cause)
     evidence = _add_tests(case, evidence, case.tests[0] if case.tests else None)
     if leak is not None:
@@ -180,6 +190,26 @@ def _leak_bound(case: Case, alarm: LeakTest | None) -> float:
     return np.inf if mean_pump_flow > 0.0 and not bound < mean_pump_flow else bound
 
 
+def _decide_without_leak(bound: float, max_bound: float) -> Verdict:
+    """Return the verdict on a recording in which no test found a leak: `no leak` or `cannot tell`.
+
+    It is `no leak` if `bound`, the 95 % upper bound of an undetected leak, is finite and at most `max_bound`. Both are
+    in the same unit.
+    """
+    is_small = math.isfinite(bound) and bound <= max_bound
+    verdict: Verdict = NO_LEAK if is_small else CANNOT_TELL
+    return verdict
+
+
+def _bound_worth_stating(flow: float) -> float:
+    """Compute the largest upper bound of an undetected leak that still allows the verdict `no leak`.
+
+    `flow`: mean flow of the pump while it delivers. The result is a fraction of this flow (`worth.share` in
+    `priors.toml`), or 0 if `flow` is not positive.
+    """
+    return float(DECISION.worth.share) * flow if flow > 0.0 else 0.0
+
+
 def _bound_and_limit(case: Case, bound: float) -> tuple[float, float]:
     """Return the 95 % upper bound of a leak, and the largest bound that still allows the verdict `no leak`.
 
@@ -189,7 +219,7 @@ def _bound_and_limit(case: Case, bound: float) -> tuple[float, float]:
     """
     if case.leak is not None:
         _, delivered_flow = case.leak.pump_flow  # mean over the time in which the pump delivers
-        return bound, bound_worth_stating(delivered_flow)
+        return bound, _bound_worth_stating(delivered_flow)
     ringing = case.judge.ringing
     if ringing is None or case.alarms or ringing.rate < RMS_PRIORS.rate.ringing:
         return np.inf, 0.0

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import tomllib
+from collections.abc import Mapping
+from functools import cache
+from importlib.resources import files
+from typing import Any
+
 import numpy as np
 
 from sealscope.diagnosis.decision.case import Case, LeakTest, OtherEvent
 from sealscope.diagnosis.decision.explanations import LEAK_EVENTS
-from sealscope.diagnosis.decision.texts import text_of
 from sealscope.diagnosis.inference.observable import Observable, Ringing
 from sealscope.diagnosis.priors.rms_change import RMS_PRIORS
 from sealscope.diagnosis.verdict.evidence import (
@@ -23,6 +28,17 @@ from sealscope.paragraphs import join_names
 
 #: Minimum sampling rate at which the ringing can be judged [Hz].
 _MIN_RINGING_RATE: float = RMS_PRIORS.rate.ringing
+
+
+@cache
+def _texts() -> Mapping[str, Mapping[str, str]]:
+    """Read `texts.toml` once: its tables by name, each a mapping from key to text."""
+    return tomllib.loads((files("sealscope.diagnosis.decision") / "texts.toml").read_text("utf-8"))
+
+
+def text_of(table: str, key: str, **values: Any) -> str:
+    """Return the text with a given `key` in a `table` of `texts.toml`, with `values` filled in for its fields."""
+    return _texts()[table][key].format(**values)
 
 
 def reason_of(case: Case, evidence: Evidence, alarm: LeakTest | None, bound: float, other: OtherEvent | None) -> str:
