@@ -723,9 +723,10 @@ class _Oil(NamedTuple):
 def _oil_hypotheses(recordings: Sequence[RecordingSums]) -> list[_Oil]:
     """List the hypotheses on how the oil changed the leakage of `recordings`, the judged one last.
 
-    If all recordings have an oil temperature, the temperature predicts the effect. Otherwise, if all have a viscous
-    pressure drop, there are two hypotheses: the drop shows the viscosity, or the oil is unknown. In all other cases
-    only the second remains.
+    If all recordings have an oil temperature, the temperature predicts the effect. Otherwise, if the judged recording
+    and at least one healthy one have a viscous pressure drop, there are two hypotheses: the drop shows the viscosity,
+    or the oil is unknown; a recording without a drop then has the mean viscosity, with the error of unknown oil. In all
+    other cases only the second hypothesis remains.
     """
     prior, zeros = INFERENCE.oil, np.zeros(len(recordings))
     temperatures = [recording.oil_degC for recording in recordings if recording.oil_degC is not None]
@@ -735,15 +736,18 @@ def _oil_hypotheses(recordings: Sequence[RecordingSums]) -> list[_Oil]:
         return [_Oil(prior.per_kelvin * warmer, zeros, slope_deviation=slope_deviation)]
     # half the log range is the standard deviation between two sessions, which is sqrt(2) times that of one session
     unknown = _Oil(zeros, zeros, session_deviation=float(np.sqrt(0.125) * np.log(prior.warmest)))
-    drops = [recording.viscous_drop for recording in recordings if recording.viscous_drop is not None]
-    if len(drops) < len(recordings):
+    no_drop = np.full(2, np.nan)
+    drop, error = np.array([no_drop if r.viscous_drop is None else r.viscous_drop for r in recordings]).T
+    is_known = np.isfinite(drop)
+    if not (is_known[-1] and is_known[:-1].any()):
         return [unknown]
-    drop, error = np.array(drops).T
+    drop = np.where(is_known, drop, drop[:-1][is_known[:-1]].mean())
     variance, error_variance = unknown.session_deviation**2, (prior.per_drop * error) ** 2
-    reliability = variance / (variance + error_variance)  # variance of the true drop over that of the measured one
+    # variance of the true drop over that of the measured one
+    reliability = np.where(is_known, variance / (variance + error_variance), 0.0)
     by_drop = _Oil(
         thinning=-prior.per_drop * reliability * (drop - drop[:-1].mean()),
-        variances=reliability * error_variance,
+        variances=(1.0 - reliability) * variance,
         log_probability=float(np.log(prior.drop_tells)),
         slope_deviation=prior.per_drop_deviation / prior.per_drop,
     )

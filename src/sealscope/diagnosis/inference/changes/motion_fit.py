@@ -138,15 +138,20 @@ def fit_robustly(design: Array, values: Array) -> tuple[Array, Array]:
     """Fit coefficients c (m,) of `design` (n, m) to `values` (n,), values = design c, by reweighted least squares.
 
     The weights are 1/(1 + (residual/scale)^2), where the scale is `WEIGHT_SCALE` times the median of abs(residual),
-    plus `MIN_RESIDUAL`. At first the residuals are those from the median of the values, so that the high pressure of a
-    contact counts little from the start. Returns the coefficients and the weights (n,).
+    plus `MIN_RESIDUAL`. The iteration starts with equal weights, and a second time with the residuals from the median
+    of the values, by which the high pressure of a contact counts little; the fit with the smaller scale is taken.
+    Returns the coefficients and the weights (n,).
     """
-    equations, residual = stack_equations(design, values), np.abs(values - np.median(values))
-    for _ in range(ITERATIONS):
-        weight = _robust_weight(residual)
-        coefficients = solve_weighted(equations, weight)
-        residual = np.abs(values - design @ coefficients)
-    return coefficients, _robust_weight(residual)
+    equations = stack_equations(design, values)
+    fits = list[tuple[float, Array, Array]]()
+    for first_residual in (np.ones(len(values)), np.abs(values - np.median(values))):
+        residual = first_residual
+        for _ in range(ITERATIONS):
+            coefficients = solve_weighted(equations, _robust_weight(residual))
+            residual = np.abs(values - design @ coefficients)
+        fits.append((float(np.median(residual)), coefficients, _robust_weight(residual)))
+    _, coefficients, weight = min(fits, key=lambda fit: fit[0])
+    return coefficients, weight
 
 
 def _robust_weight(residual: Array) -> Array:

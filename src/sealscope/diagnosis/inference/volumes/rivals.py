@@ -93,8 +93,8 @@ def rival_rises(
             continue
         if names[k] == TURNING:
             pump_rise = rise(judged, healthy, [roles.replace_leak(TURNING) for roles in columns])
-            # a rise that warmer oil explains does not count
-            observable = replace(observable, chance=max(observable.chance, pump_rise.chance))
+            # a rise that warmer oil explains does not count, and oil that explains the healthy scatter sharpens the test
+            observable = replace(observable, chance=pump_rise.chance)
         else:
             log_ratio = compare_with_leak(judged, healthy, columns, names[k])  # for one independent residual
             if log_ratio is not None and laws is not None:
