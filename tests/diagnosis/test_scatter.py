@@ -395,7 +395,7 @@ def oily_days(random: np.random.Generator, leak: float, error: float, *, shows: 
         level = 20.0 * PRIORS * np.exp(thinner) + (leak if number == 6 else 0.0)
         drop = -thinner / INFERENCE.oil.per_drop if shows else random.normal(0.0, 0.3)
         sums = RecordingSums.from_blocks(recording(random, level), (COLUMNS,), DAY * number)
-        return sums._replace(viscous_drop=np.array([drop + error * random.standard_normal(), error]))
+        return sums._replace(drop_per_speed=np.array([drop + error * random.standard_normal(), error]))
 
     *healthy, judged = (day(number, thinner) for number, thinner in enumerate(thinning))
     return rise(judged, healthy, (COLUMNS,))

@@ -139,9 +139,9 @@ def _check_sums(summary: Any) -> Any:
         raise ValueError(f"shut_sums must be of the shape (1, {size + 2}, {size + 2}), got {shut.shape}")
     if summary.held is not None and summary.held.shape != (len(HeldLeaks._fields),):
         raise ValueError(f"held must hold {len(HeldLeaks._fields)} numbers, got the shape {summary.held.shape}")
-    drop = summary.viscous_drop
+    drop = summary.drop_per_speed
     if drop is not None and (drop.shape != (2,) or not np.abs(drop).max() < _MAX_LOGARITHM or drop[1] < 0.0):
-        raise ValueError("viscous_drop must hold a logarithm and its standard error")
+        raise ValueError("drop_per_speed must hold a logarithm and its standard error")
     if LEAK not in summary.terms:
         raise ValueError(f"terms must have {LEAK!r}, got {', '.join(summary.terms)}")
     leak = summary.terms.index(LEAK)
@@ -203,7 +203,7 @@ _BALANCE = table_type(
     pressure=_Magnitude,
     start_s=(_Time, None),
     oil_degC=(_Number, None),
-    viscous_drop=(_Array, None),
+    drop_per_speed=(_Array, None),
 )
 _RMS = table_type(
     "allow",

@@ -257,7 +257,7 @@ class RecordingSums(NamedTuple):
     - `flow`, `pressure`: mean magnitudes of the pump's flow [m^3/s] and of p_A - p_B [Pa];
     - `start_s`, `oil_degC`: date [s since 1970] and temperature of the oil, None if unknown;
     - `held` (6,): leaks while shut valves hold the load, in the order of `holds.leaks.HeldLeaks`, or None;
-    - `viscous_drop` (2,): logarithm of (pressure drop due to motion / speed) and its standard error, or None.
+    - `drop_per_speed` (2,): logarithm of (pressure drop due to motion / speed) and its standard error, or None.
     """
 
     sums: Array
@@ -266,7 +266,7 @@ class RecordingSums(NamedTuple):
     start_s: float | None = None
     oil_degC: float | None = None
     held: Array | None = None
-    viscous_drop: Array | None = None
+    drop_per_speed: Array | None = None
 
     @classmethod
     def from_blocks(
@@ -737,7 +737,7 @@ def _oil_hypotheses(recordings: Sequence[RecordingSums]) -> list[_Oil]:
     # half the log range is the standard deviation between two sessions, which is sqrt(2) times that of one session
     unknown = _Oil(zeros, zeros, session_deviation=float(np.sqrt(0.125) * np.log(prior.warmest)))
     no_drop = np.full(2, np.nan)
-    drop, error = np.array([no_drop if r.viscous_drop is None else r.viscous_drop for r in recordings]).T
+    drop, error = np.array([no_drop if r.drop_per_speed is None else r.drop_per_speed for r in recordings]).T
     is_known = np.isfinite(drop)
     if not (is_known[-1] and is_known[:-1].any()):
         return [unknown]

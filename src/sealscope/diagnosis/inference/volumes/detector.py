@@ -380,6 +380,6 @@ def _sums_from_summary(summary: Summary, shut: bool = False, locked: bool = Fals
     if shut:
         sums = np.asarray(summary["shut_sums"]) if "shut_sums" in summary else add_pump_columns(sums, summary["terms"])
     held = np.asarray(summary["held"], dtype=float) if locked and "held" in summary else None
-    drop = np.asarray(summary["viscous_drop"], dtype=float) if "viscous_drop" in summary else None
+    drop = np.asarray(summary["drop_per_speed"], dtype=float) if "drop_per_speed" in summary else None
     start_s, oil_degC = summary.get("start_s"), summary.get("oil_degC")
-    return RecordingSums(sums, summary["flow"], summary["pressure"], start_s, oil_degC, held=held, viscous_drop=drop)
+    return RecordingSums(sums, summary["flow"], summary["pressure"], start_s, oil_degC, held=held, drop_per_speed=drop)

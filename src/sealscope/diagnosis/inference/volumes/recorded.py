@@ -186,7 +186,7 @@ class RecordedBalance:
         if self.is_creep:
             sums = sums._replace(flow=self.mean_flow)
         hold_leaks = None if self.chambers is None else np.array(self.chambers.leaks)
-        return sums._replace(held=hold_leaks, viscous_drop=estimate_viscous_drop(self.recording))
+        return sums._replace(held=hold_leaks, drop_per_speed=estimate_viscous_drop(self.recording))
 
     @cached_property
     def chambers(self) -> HeldChambers | None:

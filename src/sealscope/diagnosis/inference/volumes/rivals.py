@@ -93,7 +93,7 @@ def rival_rises(
             continue
         if names[k] == TURNING:
             pump_rise = rise(judged, healthy, [roles.replace_leak(TURNING) for roles in columns])
-            # a rise that warmer oil explains does not count, and oil that explains the healthy scatter sharpens the test
+            # beside the oil, which may explain the rise or the scatter of the healthy recordings
             observable = replace(observable, chance=pump_rise.chance)
         else:
             log_ratio = compare_with_leak(judged, healthy, columns, names[k])  # for one independent residual
