@@ -720,6 +720,14 @@ class _Oil(NamedTuple):
     session_deviation: float = 0.0
 
 
+def predict_thinning(recordings: Sequence[RecordingSums]) -> Array:
+    """Predict how much thinner oil raised the logarithm of the leakage of each recording (n + 1,), the judged one last.
+
+    It is relative to the mean over the n healthy recordings, and 0 for all if nothing shows the oil's viscosity.
+    """
+    return _oil_hypotheses(recordings)[0].thinning
+
+
 def _oil_hypotheses(recordings: Sequence[RecordingSums]) -> list[_Oil]:
     """List the hypotheses on how the oil changed the leakage of `recordings`, the judged one last.
 
