@@ -36,6 +36,7 @@ from sealscope.diagnosis.inference.changes.motion_fit import (
 from sealscope.diagnosis.inference.changes.pressure_bands import PAIRS, Octaves, compare_spectra, compute_octaves
 from sealscope.diagnosis.inference.changes.signals import SIGNALS
 from sealscope.diagnosis.inference.differences import (
+    MIN_HEALTHY,
     Estimate,
     PriorScatter,
     compare_estimates,
@@ -49,12 +50,9 @@ from sealscope.recordings.recording import Array, Recording, compute_once
 TINY = 1e-300
 #: Names of the observables: of friction, and of drifts, which are rival descriptions of the same data.
 FRICTION, DRIFTS = "friction", ("drift of p_A", "drift of p_B", "drift of both")
-#: Key of a friction in a recording's summary, with that of its standard error, by the name of the observable. The
-#: second one is estimated without loads that change slowly.
-FRICTIONS = {
-    FRICTION: ("friction_pressure", "friction_error"),
-    "friction beside changing loads": ("friction_beside_loads", "friction_beside_loads_error"),
-}
+#: Keys of two estimates of the friction in a recording's summary, each with the key of its standard error. The second
+#: one is made without loads that change slowly.
+FRICTION_KEYS = (("friction_pressure", "friction_error"), ("friction_beside_loads", "friction_beside_loads_error"))
 
 
 class HealthyLevels:
@@ -86,8 +84,8 @@ class HealthyLevels:
             yield from compare_low_drifts(low_drifts, healthy_drifts)
         if (spectra := compare_spectra(_octaves(judged), [_octaves(summary) for summary in healthy])) is not None:
             yield spectra
-        frictions = (_compare_friction(name, judged, healthy) for name in FRICTIONS)
-        yield from (friction for friction in frictions if friction is not None)
+        if (friction := _compare_friction(judged, healthy)) is not None:
+            yield friction
         yield from _compare_drifts(judged, healthy)
 
 
@@ -103,32 +101,49 @@ def _low_drifts(summary: Summary) -> LowDrifts | None:
     return LowDrifts(*(float(summary.get(name, np.nan)) for name in LowDrifts._fields))
 
 
-def _compare_friction(name: str, judged: Summary, healthy: Sequence[Summary]) -> Observable | None:
+def _compare_friction(judged: Summary, healthy: Sequence[Summary]) -> Observable | None:
     """Test whether the friction of a recording, as a pressure difference, is higher than in healthy recordings.
 
-    `name`: one of `FRICTIONS`, the two ways in which a friction is estimated.
-
-    Logarithms are compared. The sign of the friction depends on the sign of the motion's channel, so it is taken from
-    the sum over the healthy recordings of friction / standard error. A friction that does not exceed its standard error
-    with this sign is not used. Return None if the recording, or too many of the healthy recordings, have no usable
-    value.
+    Logarithms are compared, by that of the two estimates (`FRICTION_KEYS`) which scatters less between the healthy
+    recordings. Return None if the recording, or too many of the healthy recordings, have no usable value.
     """
-    prior, keys = CHANGES.healthy, FRICTIONS[name]
-    if not set(keys) <= set(judged):
+    prior = CHANGES.healthy
+    choices = [
+        (float(np.std([friction.value for friction in healthy_logs], ddof=1)), judged_log, healthy_logs)
+        for judged_log, healthy_logs in (_log_frictions(judged, healthy, *keys) for keys in FRICTION_KEYS)
+        if len(healthy_logs) >= MIN_HEALTHY
+    ]
+    if not choices:
         return None
-    pressures = [(float(summary[keys[0]]), float(summary[keys[1]])) for summary in healthy if set(keys) <= set(summary)]
-    sign = np.sign(sum(pressure / max(error, TINY) for pressure, error in pressures))
-
-    def log_friction(pressure: float, error: float) -> Estimate:
-        """Compute the logarithm of a positive friction `pressure` [Pa], with the standard error of the logarithm."""
-        return Estimate(float(np.log(pressure)), float(np.hypot(prior.friction_error, error / pressure)))
-
-    usable = [log_friction(sign * pressure, error) for pressure, error in pressures if sign * pressure > error]
-    pressure, error = sign * float(judged[keys[0]]), float(judged[keys[1]])
-    if not pressure > error:
+    _, judged_log, healthy_logs = min(choices, key=lambda choice: choice[0])
+    if judged_log is None:
         return None
     scatter = PriorScatter(prior.friction_scatter, prior.recordings)
-    return compare_estimates(name, FRICTION, log_friction(pressure, error), usable, scatter, above=True)
+    return compare_estimates(FRICTION, FRICTION, judged_log, healthy_logs, scatter, above=True)
+
+
+def _log_frictions(
+    judged: Summary, healthy: Sequence[Summary], key: str, error_key: str
+) -> tuple[Estimate | None, list[Estimate]]:
+    """Return logarithms of the friction of the judged recording and of the healthy ones, with their standard errors.
+
+    The sign of the friction depends on the sign of the motion's channel, so it is taken from the sum over the healthy
+    recordings of friction / standard error. A friction that does not exceed its standard error with this sign is not
+    usable: the judged one is then None, a healthy one is left out. `key`, `error_key`: keys of friction and standard
+    error [Pa] in the summaries.
+    """
+
+    def log_friction(summary: Summary, sign: float) -> Estimate | None:
+        """Return the logarithm of a recording's friction, or None if it is not usable."""
+        pressure, error = sign * float(summary.get(key, 0.0)), float(summary.get(error_key, 0.0))
+        if not pressure > error:
+            return None
+        return Estimate(float(np.log(pressure)), float(np.hypot(CHANGES.healthy.friction_error, error / pressure)))
+
+    known = [summary for summary in healthy if error_key in summary]
+    sign = float(np.sign(sum(float(summary[key]) / max(float(summary[error_key]), TINY) for summary in known)))
+    healthy_logs = [friction for summary in known if (friction := log_friction(summary, sign)) is not None]
+    return log_friction(judged, sign), healthy_logs
 
 
 def _compare_drifts(judged: Summary, healthy: Sequence[Summary]) -> Iterator[Observable]:
@@ -184,8 +199,8 @@ def _estimate_levels(recording: Recording) -> Summary | None:
     Values that the recording does not allow are left out. The result is None if no value is left.
     """
     levels = dict[str, float]()
-    for name, keys in FRICTIONS.items():
-        fit = fit_difference(recording, without_slow_changes=name != FRICTION)
+    for keys, without_slow_changes in zip(FRICTION_KEYS, (False, True), strict=True):
+        fit = fit_difference(recording, without_slow_changes=without_slow_changes)
         if fit is not None:
             levels |= dict(zip(keys, (fit.friction, fit.friction_error), strict=True))
     if (motion := select_motion(recording)) is not None:
