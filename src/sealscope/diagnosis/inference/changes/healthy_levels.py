@@ -50,6 +50,8 @@ from sealscope.recordings.recording import Array, Recording, compute_once
 TINY = 1e-300
 #: Names of the observables: of friction, and of drifts, which are rival descriptions of the same data.
 FRICTION, DRIFTS = "friction", ("drift of p_A", "drift of p_B", "drift of both")
+#: Probability of the quantile of the healthy recordings' errors of sign.
+UPPER_QUARTILE = 0.75
 #: Keys of two estimates of the friction in a recording's summary, each with the key of its standard error. The second
 #: one is made without loads that change slowly.
 FRICTION_KEYS = (("friction_pressure", "friction_error"), ("friction_beside_loads", "friction_beside_loads_error"))
@@ -128,22 +130,27 @@ def _log_frictions(
     """Return logarithms of the friction of the judged recording and of the healthy ones, with their standard errors.
 
     The sign of the friction depends on the sign of the motion's channel, so it is taken from the sum over the healthy
-    recordings of friction / standard error. A friction that does not exceed its standard error with this sign is not
-    usable: the judged one is then None, a healthy one is left out. `key`, `error_key`: keys of friction and standard
-    error [Pa] in the summaries.
+    recordings of friction / standard error. Since friction resists the motion, healthy frictions of the other sign show
+    that the standard errors are too small: all are multiplied by the upper quartile of abs(friction) / error, which
+    counts as 0 for the right sign, so that a single odd recording changes nothing. A friction that does not exceed its
+    error with the right sign is not usable: the judged one is then None, a healthy one is left out. `key`,
+    `error_key`: keys of friction and standard error [Pa] in the summaries.
     """
+    known = [summary for summary in healthy if error_key in summary]
+    if not known or error_key not in judged:
+        return None, []
+    ratios = np.array([float(summary[key]) / max(float(summary[error_key]), TINY) for summary in known])
+    sign = float(np.sign(ratios.sum()))
+    inflation = max(1.0, float(np.quantile(np.maximum(-sign * ratios, 0.0), UPPER_QUARTILE)))
 
-    def log_friction(summary: Summary, sign: float) -> Estimate | None:
+    def log_friction(summary: Summary) -> Estimate | None:
         """Return the logarithm of a recording's friction, or None if it is not usable."""
-        pressure, error = sign * float(summary.get(key, 0.0)), float(summary.get(error_key, 0.0))
+        pressure, error = sign * float(summary[key]), inflation * float(summary[error_key])
         if not pressure > error:
             return None
         return Estimate(float(np.log(pressure)), float(np.hypot(CHANGES.healthy.friction_error, error / pressure)))
 
-    known = [summary for summary in healthy if error_key in summary]
-    sign = float(np.sign(sum(float(summary[key]) / max(float(summary[error_key]), TINY) for summary in known)))
-    healthy_logs = [friction for summary in known if (friction := log_friction(summary, sign)) is not None]
-    return log_friction(judged, sign), healthy_logs
+    return log_friction(judged), [friction for summary in known if (friction := log_friction(summary)) is not None]
 
 
 def _compare_drifts(judged: Summary, healthy: Sequence[Summary]) -> Iterator[Observable]:
