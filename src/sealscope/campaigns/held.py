@@ -126,13 +126,14 @@ class _HoldDraws:
     def __init__(
         self, rig: Rig, load: float, flow: float, duration: float, false_alarm: float, detection: float
     ) -> None:
-        """Set the pressures of the locked hold, and the limits on false alarms and missed leaks.
+        """Set the pressures of the hold, and the limits on false alarms and missed leaks (arguments: see the class).
 
         Chamber B is at the charge pressure; the pressure of chamber A is higher by load / A_A.
         """
         pressure_B = rig.fluid.p_charge + P_ATM
         self._rig, self._flow = rig, flow
-        self._hold = PlannedHold(duration, pressure_B + load / rig.cylinder.A_A, pressure_B, np.inf)
+        pressure_A = pressure_B + load / rig.cylinder.A_A
+        self._hold = PlannedHold(duration, pressure_A, pressure_B, conductance=np.inf)
         # the fraction `within` of the probability is reserved for the test for a step within a recording
         self._max_false_alarm = false_alarm * (1.0 - DECISION.questions.within)
         self._max_missed = _N_DRAWS - detection * _N_DRAWS

@@ -144,23 +144,16 @@ class Drive(_Invertible):
         """Return the mean pressure [Pa] of a rig's chambers at standstill: the charge pressure."""
         return rig.fluid.p_charge
 
-    def flow(self, u: Array, dp: Array, rate: float, settling: int = 0) -> Array:
+    def flow(self, u: Array, dp: Array, rate: float) -> Array:
         """Compute the pump's flow (n,) [m^3/s] for voltages (n,) [V] at `rate` [Hz] against p_A - p_B (n,) [Pa].
 
         The motor's speed is omega = (omega_d + shortfall (y - droop dp))/(1 + shortfall), with the commanded speed
         omega_d. The signal y is omega_d + droop dp after a first-order lag with the time constant `lag` (`filter_lag`).
-        With `settling` = 0 the run begins at standstill under the first dp. Otherwise u and dp are taken as periodic
-        with a period of `settling` samples, and y begins with the value that it has in the steady state.
+        The run begins at standstill under the first dp.
         """
         omega_d, droop_speed = self.omega_per_volt * u, self.droop * dp
         lag_input, y = omega_d + droop_speed, np.empty_like(omega_d)
-        exponent = -1.0 / (self.lag * rate)
-        y_0 = float(droop_speed[0])
-        if settling and exponent < 0.0:
-            # from 0, the lag reaches y_0 - y_0 exp(settling exponent) within a period; y_0 is its periodic value
-            filter_lag(lag_input[: settling + 1], math.exp(exponent), 0.0, y[: settling + 1])
-            y_0 = float(y[settling]) / -math.expm1(settling * exponent)
-        filter_lag(lag_input, math.exp(exponent), y_0, y)
+        filter_lag(lag_input, math.exp(-1.0 / (self.lag * rate)), float(droop_speed[0]), y)
         omega = (omega_d + self.shortfall * (y - droop_speed)) / (1.0 + self.shortfall)
         return np.asarray(self.displacement * omega)
 

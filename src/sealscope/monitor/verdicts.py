@@ -108,9 +108,10 @@ class RecordingVerdict:
 
     @property
     def decides(self) -> bool:
-        """True if the condition of the machine follows from this verdict, False if it follows from single blocks.
+        """True if the condition of the machine follows from this verdict on a whole recording.
 
-        The verdicts `leak` and `no leak` decide, and so does `cannot tell` after a person has marked the alarm.
+        Otherwise it follows from the verdicts on the blocks of the stream. The verdicts `leak` and `no leak` decide,
+        and so does `cannot tell` after a person has marked the alarm.
         """
         return self.leaks or self.clears or self.mark != ""
 

@@ -167,13 +167,13 @@ def _cylinder_parameters(base: Rig, area_A: float, area_B: float, stroke: float)
     bore_ratio = math.sqrt(max(area_A, area_B) / max(base.cylinder.A_A, base.cylinder.A_B))
     mass = base.cylinder.M_eq * volume_ratio
     friction = base.friction
-    # V is the volume of the larger side, and V_rod the volume that a rod on side B takes from that side
+    # V: volume of the larger side at half stroke; V_rod: volume that a rod on side B takes from side B at half stroke
     V_rod = max(0.5 * (area_A - area_B) * stroke, 0.0)
     return {
         "kind": "Double" if area_A == area_B else "Single",
         "base": base.name,
         "stated": _STATED,
-        "scaled": f"assumed: that of {base.name}, scaled with the",
+        "scaled": f"assumed: that of {base.name}, scaled with the",  # the template names the quantity
         "area_A": f"{1e6 * area_A:.6g}",
         "area_B": f"{1e6 * area_B:.6g}",
         "stroke": f"{1e3 * stroke:.6g}",

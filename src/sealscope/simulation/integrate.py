@@ -216,7 +216,7 @@ def integrate_run(
 
 
 def _start_of_search(leaks: Sequence[Leak]) -> tuple[Leak, ...]:
-    """Return the leaks with the coefficient 0, where the search for it starts, in place of each stated mean flow."""
+    """Replace the stated mean flow of each leak by the coefficient 0, at which the search for it starts."""
     return tuple(leak if leak.mean is None else replace(leak, mean=None, coefficient=0.0) for leak in leaks)
 
 

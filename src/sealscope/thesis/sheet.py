@@ -55,7 +55,7 @@ class Condition:
 
     @property
     def group(self) -> tuple[str, float]:
-        """Operating condition (command, closing [%]) of the test; several tests share one and differ in the leak."""
+        """Command and closing of the throttles [%]; tests of one group have both in common and differ in the leak."""
         return self.command, self.closed_pct
 
 

@@ -51,7 +51,9 @@ def combine(decisions: Sequence[Evidence], refusal: str | None) -> Evidence:
 
     All decisions become the `parts` of the result. The change of RMS decides only if no detector that measures the leak
     can use the recording. The verdict becomes `cannot tell` if no detector decides, or instead of `no leak` if the end
-    of the recording is not judged or a `refusal` is given: the reason why `no leak` must not be stated, else None.
+    of the recording is not judged or a `refusal` is given. It is the reason why `no leak` must not be stated, else
+    None: a measuring detector failed, or no recording of the given baseline can be compared
+    (`diagnose.decide_by_all`).
     """
     ranked = sorted(decisions, key=lambda decision: rank(decision.detector))
     usable = [decision for decision in ranked if decision.usable]

@@ -8,7 +8,10 @@ The verdict is `leak` if both conditions hold for one test of the leakage:
   quarter, and the comparison with them the rest. Without them, the former gets three quarters if there is a limit in
   the rig's file to test, which gets the rest, else all (`case._leak_tests`). Score and threshold are the same
   comparison, for display.
-- No better explanation: the probability that a leak caused the alarm (`Case.leak_probability`) is above 0.5.
+- No better explanation: the probability that a leak caused the alarm (`Case.leak_probability`) is above 0.5. An alarm
+  by the limit in the rig's file is judged by the alarm for a change within the recording; without one it is a leak.
+
+A detector that measures no leakage has a single test, with the whole probability of a false alarm.
 
 These three numbers are `[false_alarm] probability`, `[questions] within` and `[explanation] leak` of `priors.toml`.
 

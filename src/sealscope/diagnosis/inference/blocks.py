@@ -385,17 +385,19 @@ def _positive_definite_solver() -> Callable[[Array, Array], tuple[Array, Array, 
     return dposv  # type: ignore[no-any-return]
 
 
-def information(blocks: Blocks, columns: Sequence[ColumnRoles], test: int, replaces: int | None = None) -> Information:
-    """Compute the likelihood of one coefficient of a volume balance in each block, with all others eliminated.
+def information(blocks: Blocks, columns: Sequence[ColumnRoles], test: int, left_out: int | None = None) -> Information:
+    """Compute the joint likelihood of one coefficient's values in all blocks, with the other coefficients eliminated.
 
-    `columns`: for each equation the indices of its columns by role (leak, motion, left side); the likelihoods of the
-    equations are multiplied. `test`: index of the coefficient's column, or of the left side to test a change of the
-    left side's scale. `replaces`: index of another column to leave out of the regression, or None.
+    It is normal, and given by its precision matrix and the product of this matrix with the mean, beside the standard
+    deviation by which the coefficient, one of a volume balance, may wander. `columns`: for each equation the indices of
+    its columns by role (leak, motion, left side); the likelihoods of the equations are multiplied. `test`: index of the
+    coefficient's column, or of the left side to test a change of the left side's scale. `left_out`: index of another
+    column to leave out of the regression, or None.
     """
     count = len(blocks)
     precision, vector = np.zeros((count, count)), np.zeros(count)
     for e, roles in enumerate(columns):
-        nuisance = [k for k in roles.nuisance if k not in (test, replaces)]
+        nuisance = [k for k in roles.nuisance if k not in (test, left_out)]
         equation_precision, equation_vector = _eliminate_nuisance(blocks.gram[:, e], blocks, roles, test, nuisance)
         precision += equation_precision
         vector += equation_vector

@@ -43,7 +43,7 @@ class PressureLevelPriors(PriorTable):
 class HealthyLevelPriors(PriorTable):
     """Friction of a recording and drift of its pressures, in the comparison with healthy recordings.
 
-    - `slowest`: lowest speed that counts as motion, over the highest one.
+    - `slowest`: lowest speed that counts as motion, over the mean speed in motion, sum(v^2) / sum(abs(v)).
     - `friction_error`: standard error of the logarithm of a recording's friction.
     - `friction_scatter`: standard deviation of this logarithm between days.
     - `recordings`: the prior on the scatter weighs as much as this number of recordings.

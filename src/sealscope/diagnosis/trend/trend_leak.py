@@ -131,9 +131,10 @@ def _measure_leak(
     """Describe the increase of the leakage since the last repair as a TrendLeak.
 
     `points` are the recordings since the repair, `wear` is the estimated state of the machine, and `chance` the
-    probability of such an increase in a healthy machine. The other arguments are those of `decide_trend`. The leak may
-    be laminar or an orifice, so its flow is proportional to the pressure to one of the powers `EXPONENTS`; the stated
-    flow is the mean over these laws.
+    probability of such an increase in a healthy machine. `trend_units_per_level`: unit of the trend for a level of 1,
+    where a level is a recording's leakage over its pressure; `pressure`: pressure at which flows are stated, None if
+    they are not. The leak may be laminar or an orifice, so its flow is proportional to p^k with one of the exponents k
+    in `EXPONENTS`; the stated flow is the mean over these laws.
     """
     onset_day = -np.inf if wear.onset is None else wear.onset.value
     pressures_since = [point.pressure for point in points if point.day >= onset_day]

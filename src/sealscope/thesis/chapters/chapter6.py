@@ -221,9 +221,10 @@ def tracking(run: Trajectory, mask: Array) -> Tracking:
 
 
 def controllers_table(context: Context, item: Item) -> tuple[ThesisTable | Figure, ...]:
-    """Tabulate tracking error, bandwidth, energy, stiffness and compensated leakage over the leak, by controller.
+    """Tabulate tracking error, bandwidth, energy, stiffness and compensated flow, by controller and leak.
 
-    Error and stiffness are also drawn as a figure.
+    The compensated flow is the leakage that a controller estimates and makes up for. Error and stiffness are also drawn
+    as a figure.
     """
     rows: list[tuple[Cell, ...]] = []
     for name, lpm in itertools.product(CONTROLLERS, _leak_flows(context)):
@@ -309,7 +310,8 @@ def load_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
         heads += [load_head(loop.controller, loop.lpm, quantity) for quantity in (_ERROR, "energy a cycle [J]")]
     rows = []
     for force in (0.0, 2000.0) if context.quick else (0.0, 500.0, 1000.0, 2000.0):
-        pairs = (tracking(*loop.run_duty(f"{force - LOAD!r} N"))[:2] for loop in loops)
+        further_load = f"{force - LOAD!r} N"  # added to `LOAD`, which acts in every run
+        pairs = (tracking(*loop.run_duty(further_load))[:2] for loop in loops)
         rows.append((force, *itertools.chain.from_iterable(pairs)))
     return (item.table(rows, format_note("load"), heads),)
 

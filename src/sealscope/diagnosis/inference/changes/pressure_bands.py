@@ -182,10 +182,11 @@ class _FilterFactor(NamedTuple):
 
 
 def _compare_pair(judged: Octaves, healthy: Sequence[Octaves], pair: tuple[str, str]) -> _FilterFactor | None:
-    """Compute the Bayes factor of a filter to no filter, by the spectra of a `pair` of channels.
+    """Compute the Bayes factor of a low-pass filter of a pressure to none, by the spectra of a `pair` of channels.
 
-    The factor is averaged over possible filters of each pressure in the pair. Return None for too few healthy
-    recordings with at least as many octaves, or if the factor is not finite.
+    The factor is averaged over possible filters of each pressure in the pair; the channel and the cut-off frequency of
+    the most likely one are returned with it. Return None if too few healthy recordings have at least as many octaves
+    as the judged one, or if the factor is not finite.
     """
     from scipy.special import logsumexp
 
@@ -275,11 +276,14 @@ def _phase_log_likelihoods(judged: Octaves, healthy: Sequence[Octaves], filters:
     precisions = 1.0 / (prior.scatter**2 + np.array([octaves.phase_variance for octaves in healthy]))
     mean = np.angle((precisions * directions).sum(axis=0))
     squares = (np.angle(directions * np.exp(-1j * mean)) ** 2).sum(axis=0)
+    # the prior counts as `prior.recordings` further recordings with the variance scatter^2
     variances = (prior.recordings * prior.scatter**2 + squares) / (prior.recordings + count - 1.0)
     variances = variances * (1.0 + 1.0 / count) + judged.phase_variance
     residuals = judged.phase - mean - filters.phase
     is_filtered = np.any(filters.phase != 0.0, axis=1)[:, None]
+    # the phase that a filter causes in an octave is known only to within `prior.error`
     concentrations = 1.0 / (variances + np.where(is_filtered, prior.error**2, 0.0))
+    # von Mises densities relative to the uniform one
     densities = np.exp(concentrations * (np.cos(residuals) - 1.0)) / i0e(concentrations)
     log_likelihoods: Array = np.log((1.0 - prior.uniform) * densities + prior.uniform).sum(axis=1)
     return log_likelihoods

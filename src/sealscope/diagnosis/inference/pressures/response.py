@@ -411,13 +411,15 @@ class Follower:
     def update(self, block: Recording) -> Block:
         """Fit the next block of samples, and return its sums for a joint fit of all blocks (`fit.Joint`).
 
-        The parameters, their covariance, the simulated states, the last command and `excess` are updated.
+        The parameters, their covariance, the simulated states, the last command and `excess` (misfit of the block) are
+        updated.
         """
         segment = self.next_segment(block)
         fit, prior = self._fit_block(segment, block.duration)
         excess = fit.cost(self.variance, prior) - segment.n_samples
         self.excess = excess / math.sqrt(2.0 * max(segment.n_samples, 1.0))
-        self.covariance = np.asarray(np.linalg.inv(fit.gram[1:, 1:] / self.variance + prior.precision))
+        parameter_gram = fit.gram[1:, 1:]  # row and column 0 belong to the residual
+        self.covariance = np.asarray(np.linalg.inv(parameter_gram / self.variance + prior.precision))
         gradient = fit.gram[0, 1:] / self.variance - prior.precision @ prior.deviations(fit.theta)
         # one more Gauss-Newton step, which needs no simulation
         self.theta = np.clip(fit.theta + self.covariance @ gradient * prior.unit, *segment.bounds(fit.theta))
