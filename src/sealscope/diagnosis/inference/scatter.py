@@ -315,7 +315,7 @@ def rise(judged: RecordingSums, baseline: Sequence[RecordingSums], columns: Sequ
             np.array(estimates).T * ((count - 1) / count) for estimates in zip(*projections, strict=True)
         )
     values, error = _estimate_leak_excess(judged.sums, healthy_sums, columns, widths)
-    level, level_error = _leak_level(healthy_sums, columns)
+    level, level_error = coefficient_level(healthy_sums, columns)
     errors = prior.estimate * np.median(np.column_stack([error, rise_errors]), axis=1)
     errors = np.maximum(errors, max(prior.finest * _conductance_of_flow(judged), 1.0 / MAX_READING))
     return _compare_levels(judged, baseline, _Estimates(values, rises, errors, level, level_error))
@@ -762,7 +762,7 @@ def _oil_hypotheses(recordings: Sequence[RecordingSums]) -> list[_Oil]:
     return [by_drop, unknown._replace(log_probability=float(np.log1p(-prior.drop_tells)))]
 
 
-def _leak_level(gram: Array, columns: Sequence[ColumnRoles]) -> tuple[float, float]:
+def coefficient_level(gram: Array, columns: Sequence[ColumnRoles]) -> tuple[float, float]:
     """Estimate the leak coefficient, at least 0, and its standard error from the Gram matrices `gram` (E, m, m).
 
     `columns`: for each equation the indices of its columns by role (leak, motion, left side). The other coefficients

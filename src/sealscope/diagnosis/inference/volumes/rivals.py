@@ -22,8 +22,10 @@ from sealscope.diagnosis.inference.scatter import (
     MIN_WITH_HOLDS,
     RISE,
     RecordingSums,
+    coefficient_level,
     compare_laws,
     compare_with_leak,
+    predict_thinning,
     rise,
 )
 from sealscope.diagnosis.inference.terms import AIR, LEAK, SPEED_LOSS, TURNING
@@ -32,6 +34,8 @@ from sealscope.recordings.recording import Array
 
 #: `Observable.data` of the leakage of the turning pump, in a machine whose rests show the piston's leakage alone.
 TURNING_DATA = "turning"
+#: Smallest number that is divided by.
+TINY = float(np.finfo(float).tiny)
 
 
 def rival_rises(
@@ -80,21 +84,28 @@ def rival_rises(
         # change of each healthy recording relative to the other healthy ones
         changes = [_estimate_change(recording.sums, healthy_gram - recording.sums, columns, k) for recording in healthy]
         is_air = names[k] == AIR
+        values = np.array([*(healthy_change for healthy_change, _ in changes), change])
+        error = excess_error(error, [healthy_error for _, healthy_error in changes])
+        if names[k] == TURNING:
+            turning_columns = [roles.replace_leak(TURNING) for roles in columns]
+            level, _ = coefficient_level(healthy_gram, turning_columns)
+            values = _without_oil(level + values, predict_thinning([*healthy, judged]))
+        *healthy_values, value = values.tolist()
         observable = compare_with_healthy(
             names[k],
             TURNING_DATA if names[k] == TURNING else RISE,
-            change,
-            [healthy_change for healthy_change, _ in changes],
-            excess_error(error, [healthy_error for _, healthy_error in changes]),
+            value,
+            healthy_values,
+            error,
             above=not is_air,
             prior_change=INFERENCE.free_air.size * volume_ratio if is_air else np.inf,
         )
         if observable is None:
             continue
         if names[k] == TURNING:
-            pump_rise = rise(judged, healthy, [roles.replace_leak(TURNING) for roles in columns])
-            # beside the oil, which may explain the rise or the scatter of the healthy recordings
-            observable = replace(observable, chance=pump_rise.chance)
+            pump_rise = rise(judged, healthy, turning_columns)
+            # a rise that warmer oil explains does not count
+            observable = replace(observable, chance=max(observable.chance, pump_rise.chance))
         else:
             log_ratio = compare_with_leak(judged, healthy, columns, names[k])  # for one independent residual
             if log_ratio is not None and laws is not None:
@@ -105,6 +116,19 @@ def rival_rises(
             observable = replace(observable, log_ratio_to_leak=log_ratio_to_leak)
         observables.append(observable)
     return (*observables, *(hold_rivals or ()))
+
+
+def _without_oil(coefficients: Array, thinning: Array) -> Array:
+    """Remove the effect of the oil's viscosity from leakage coefficients (n + 1,), the judged one last.
+
+    `thinning` (n + 1,): logarithm by which thinner oil raises each coefficient. Return the coefficients themselves if
+    they scatter less among the n healthy recordings, relative to their mean: the oil does not explain their scatter.
+    """
+    corrected = coefficients * np.exp(-thinning)
+    scatters = [
+        float(np.std(values[:-1])) / max(abs(float(values[:-1].mean())), TINY) for values in (coefficients, corrected)
+    ]
+    return corrected if scatters[1] < scatters[0] else coefficients
 
 
 def held_rivals(
