@@ -20,10 +20,13 @@ VALVES, WORN = 5e-13, 3e-12
 STATIONS = (0.1, 0.4, 0.6, 0.3, 0.5, 0.2, 0.45, 0.25, 0.55, 0.15, 0.4)
 
 
-def record_boom(seed: int, leak: float = 0.0, since: float = 0.0, *, is_held: bool = False) -> Recording:
+def record_boom(
+    seed: int, leak: float = 0.0, since: float = 0.0, *, is_held: bool = False, compliance: float = 0.0
+) -> Recording:
     """Record chamber pressures and position of a boom under its load, which creeps in its holds.
 
-    A_A dx/dt = -(G_valves + G_leak) (p_A - p_B) while it is held. With `is_held`, a control loop holds it instead.
+    A_A dx/dt = -(G_valves + G_leak) (p_A - p_B) - C dp_A/dt while it is held. With `is_held`, a control loop holds it
+    instead. With a `compliance` C [m^3/Pa], p_A and p_B also rise by 2 bar/s in the holds.
     """
     random = np.random.default_rng(seed)
     t = np.arange(round(SECONDS * RATE)) / RATE
@@ -33,17 +36,19 @@ def record_boom(seed: int, leak: float = 0.0, since: float = 0.0, *, is_held: bo
     is_moving = phase < 3.0
     path = np.where(is_moving, begin + (end - begin) * (1.0 - np.cos(np.pi * phase / 3.0)) / 2.0, end)
     conductance = VALVES * random.uniform(0.8, 1.25) + np.where(t >= since, leak, 0.0)
-    creep = np.where(is_moving | is_held, 0.0, -conductance * load / AREA_A)
+    rise = np.where(is_moving, 0.0, 2e5 * (phase - 3.0)) if compliance else np.zeros(t.size)
+    lost_flow = conductance * load + compliance * np.gradient(load + rise, t)
+    creep = np.where(is_moving | is_held, 0.0, -lost_flow / AREA_A)
     x = path + np.cumsum(creep) / RATE + 2e-6 * random.standard_normal(t.size)
-    p_B = 2e6 + 1e4 * random.standard_normal(t.size)
+    p_B = 2e6 + rise + 1e4 * random.standard_normal(t.size)
     channels = {"p_A": p_B + load + 1e4 * random.standard_normal(t.size), "p_B": p_B, "x": x}
     return Recording(t, channels, {"p_A": "Pa", "p_B": "Pa", "x": "m"}, RATE)
 
 
-def commission(folder: Path, count: int = 5, *, is_held: bool = False) -> CommissionedMachine:
+def commission(folder: Path, count: int = 5, *, is_held: bool = False, compliance: float = 0.0) -> CommissionedMachine:
     """Commission the boom from healthy recordings, with its piston areas stated."""
     for seed in range(count):
-        ss.write(record_boom(seed, is_held=is_held), folder / f"healthy-{seed}.nc")
+        ss.write(record_boom(seed, is_held=is_held, compliance=compliance), folder / f"healthy-{seed}.nc")
     rig = unstated_rig().with_areas(AREA_A, AREA_B, source="data sheet")
     return ss.commission(folder, rig=rig)
 
@@ -65,6 +70,19 @@ def test_a_worn_piston_shows_in_the_creep_of_the_held_load(boom: CommissionedMac
     assert diagnosis.leak_interval_lpm is not None
     low, high = diagnosis.leak_interval_lpm
     assert low < flow_lpm(recording, WORN) < high < 1.5 * flow_lpm(recording, WORN)
+
+
+def test_oil_that_rising_pressures_compress_is_no_leak(tmp_path: Path) -> None:
+    """1.5 L of oil under a pressure that rises by 2 bar/s take as much as a leak of 0.015 L/min."""
+    compliance = 1.5e-3 / 1.2e9
+    boom = commission(tmp_path, compliance=compliance)
+    assert boom.diagnose(record_boom(25, compliance=compliance)).summary == "no leak"
+    recording = record_boom(26, WORN, compliance=compliance)
+    diagnosis = boom.diagnose(recording)
+    assert diagnosis.verdict == "leak"
+    assert diagnosis.leak_lpm == pytest.approx(flow_lpm(recording, WORN), rel=0.15)
+    assert diagnosis.leak_interval_lpm is not None
+    assert diagnosis.leak_interval_lpm[0] < flow_lpm(recording, WORN) < diagnosis.leak_interval_lpm[1]
 
 
 def test_a_leak_that_begins_in_a_hold_is_dated(boom: CommissionedMachine) -> None:

@@ -99,6 +99,7 @@ class _PythonLaw:
     def _call_voltage(self, _memory: int, measured: int) -> float:
         """Call the Python controller, and return the voltage [V] that it sets.
 
+        `_memory` is the address of the law's memory, which compiled callers pass; it is that of `self._memory`.
         `measured` is the address of the measured values, in the order of the fields of `Measured`. The leakage flow
         that the controller compensates is stored in `self._memory[0]`, NaN if the controller does not report this
         flow. If the controller raises an exception, this is stored in `self.raised`, and the result is NaN.

@@ -127,8 +127,9 @@ class Examination:
     def evidence(self, name: str) -> Evidence:
         """Decide from the observations of one detector if the machine leaks; other detectors are not asked.
 
-        A change may have other causes than a leak, such as a change of duty (`signals`). These causes compete with a
-        leak as explanations, except for the detector `rms change`, whose alarms always count as leaks.
+        `name`: name of the detector. A change may have other causes than a leak, such as a change of duty, for which
+        `self.signals` tests. These causes compete with a leak as explanations, except for the detector `rms change`,
+        whose alarms always count as leaks.
         """
         return self._decide_by(name, [self.signals], weigh_rivals=name != RMS_CHANGE)
 

@@ -250,10 +250,10 @@ class AlarmJudge:
         return self._raise_alarm(cause=verdict.cause, baseline=baseline, **findings), "raised"
 
     def _set_alarm(self, alarm: Alarm) -> Alarm:
-        """Store a changed alarm as the open alarm, or end it if it is closed or invalid; return the changed alarm.
+        """Store a changed alarm as the open alarm, or forget it if it is closed or invalid; return the changed alarm.
 
-        An alarm can end in two steps: first its cause ends, but the alarm stays open until a person has seen it; then
-        it is closed. Either step stores the time of the change in `over_s`, as does every change in between.
+        When the cause of an alarm ends, the alarm stays open until a person has seen it. `over_s` is the time of the
+        last change since then, from which the machine counts as watched again.
         """
         if not alarm.active:  # the cause has ended, or the alarm is closed or invalid
             self.over_s = alarm.updated_s

@@ -100,7 +100,7 @@ class FaultRow:
         channel_or_side = groups.get("at") or ""
         if not self.is_sensor_fault:
             channel_or_side = channel_or_side.upper()  # side A or B
-        frequency_factor = _parse_number(groups.get("pace") or "1")  # only a fault of the duty states one
+        frequency_factor = _parse_number(groups.get("frequency") or "1")  # stated only by a change of the duty
         return Fault(self.name, self._parse_value(groups), channel_or_side, parse_opening(groups), frequency_factor)
 
     def _parse_value(self, groups: Groups) -> float:

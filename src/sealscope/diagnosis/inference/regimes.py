@@ -109,7 +109,7 @@ def shut_odds(blocks: Blocks, roles: ColumnRoles) -> float:
         return 0.0
     turning, moving_bias = roles.names.index(TURNING), roles.names.index(MOVING_BIAS)
     columns = [*roles.nuisance, turning, moving_bias]
-    coefficients, covariance = _fit_with_robust_covariance(blocks.gram[:, 0], columns, roles.left)
+    coefficients, covariance = fit_with_robust_covariance(blocks.gram[:, 0], columns, roles.left)
     # the leak's coefficient holds at rest; in motion the coefficient of the turning pump is added
     rest, extra = columns.index(roles.leak), columns.index(turning)
     rest_leak, motion_leak = coefficients[rest], coefficients[rest] + coefficients[extra]
@@ -137,7 +137,7 @@ def rest_log_odds(value: float, variance: float, motion: float, difference_varia
     return shut - _normal_log_density(value - motion, difference_variance + (prior.open * motion) ** 2)
 
 
-def _fit_with_robust_covariance(gram: Array, columns: list[int], left: int) -> tuple[Array, Array]:
+def fit_with_robust_covariance(gram: Array, columns: list[int], left: int) -> tuple[Array, Array]:
     """Fit coefficients (c,) by least squares, with White's covariance (c, c) for errors that differ between K blocks.
 
     `gram` (K, m, m): Gram matrices of the columns in each block; `columns` (c,) and `left`: indices of the fitted

@@ -610,13 +610,25 @@ def locked(rig: Rig, channels: frozenset[str]) -> Equation | None:
     if flow_source(channels) is not None and not (rig.circuit.holds_load and "u" in channels):
         return None
 
-    def displaced_volume(s: Signals) -> Array:
-        """Compute minus the displaced volume [m^3] of the side that on average carries the load, shape (n - 1,)."""
-        area_A, area_B = rig.cylinder.A_A, rig.cylinder.A_B
-        area = area_A if np.nanmean(s["p_A"] * area_A - s["p_B"] * area_B) > 0.0 else area_B
-        return -area * s.step("x")
+    areas = {"A": rig.cylinder.A_A, "B": rig.cylinder.A_B}
 
-    return Equation(LOCKED, displaced_volume, _STANDSTILL)
+    def loaded_side(s: Signals) -> str:
+        """Return the side, "A" or "B", that on average carries the load."""
+        return "A" if np.nanmean(s["p_A"] * areas["A"] - s["p_B"] * areas["B"]) > 0.0 else "B"
+
+    def displaced_volume(s: Signals) -> Array:
+        """Compute minus the displaced volume [m^3] of the loaded side, shape (n - 1,)."""
+        return -areas[loaded_side(s)] * s.step("x")
+
+    compliance = Term(
+        "compliance of the loaded side",
+        "m^3/Pa",
+        lambda s: s.step(f"p_{loaded_side(s)}"),
+        "air in the oil",
+        drift="compliance",
+        needs=_PRESSURES,
+    )
+    return Equation(LOCKED, displaced_volume, (compliance, *_STANDSTILL[2:]))
 
 
 def pump_volume(rig: Rig, channels: frozenset[str]) -> Callable[[Signals], Array] | None:

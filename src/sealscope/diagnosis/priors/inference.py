@@ -138,6 +138,7 @@ class SizePriors(PriorTable):
     - `readings`: number of independent values by which a recording tells the leak's law.
     - `meter`: scale of a flow meter.
     - `area`: piston area.
+    - `creep`: flow of a leak by which a held load creeps.
     """
 
     displacement: float
@@ -146,6 +147,7 @@ class SizePriors(PriorTable):
     readings: int
     meter: float
     area: float
+    creep: float
 
 
 class RepeatPriors(PriorTable):

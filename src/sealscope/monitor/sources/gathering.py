@@ -113,7 +113,9 @@ class ValueGatherer:
     def _add_values(self, target: _Channel, first: int, values: Sequence[float]) -> None:
         """Add values to a channel from index `first` of the time axis on; drop those before the next block.
 
-        Until the first block starts, a channel keeps at most `_max_lead` values, as another channel may never arrive.
+        `_start` is the index at which the next block begins. It is None until every channel has values, and the first
+        block begins. Until then a channel keeps only its newest `_max_lead` values, so that memory stays bounded if
+        another channel never sends any.
         """
         for k, value in enumerate(values, first):
             if self._start is not None and k < self._start:

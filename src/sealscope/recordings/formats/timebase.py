@@ -363,9 +363,9 @@ def _convert_numbers(values: Array, unit: str | None, name: str, state: TimeStat
     """Convert a time column of numbers (n,) to seconds.
 
     Returns (times (n,) [s], provenance of the start, lines for the history). `unit`: unit of the column, which may also
-    state an origin, as in `days since 1899-12-30`; without one the magnitude of the numbers decides. `name`: the column
-    in messages; `state`: state of the column after the previous part of the log, which is updated. Raises InputError if
-    no row has a number.
+    state an origin, as in `days since 1899-12-30`, or None to guess the unit from the magnitude of the numbers. Only
+    then are used `name`, the column's name in messages, and `state`, the state of the column after the previous part of
+    the log, which is updated. Raises InputError if no row has a number.
     """
     finite = values[np.isfinite(values)]
     if not finite.size:

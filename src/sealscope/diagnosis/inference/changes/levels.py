@@ -200,10 +200,11 @@ def fit_pressure_levels(gram: Array, length: float, means: Array) -> Array | Non
 
 
 def level_tests(recording: Recording) -> tuple[LevelChange, ...]:
-    """Test the mean pressures in both directions of motion for a step in several patterns, the most likely first.
+    """Test the pressure levels of a recording for a step, in one pattern after another; the likeliest pattern is first.
 
-    A pattern is the combination of levels that one cause changes, such as friction or a sensor's offset. The result
-    is empty if the levels cannot be estimated.
+    The levels are the pressures' means and half their changes with the direction of motion (`PressureLevels`). A
+    pattern is the combination of levels that one cause changes, such as friction or a sensor's offset. The result is
+    empty if the levels cannot be estimated.
     """
     levels = estimate_levels(recording)
     return () if levels is None else pattern_tests(*levels)

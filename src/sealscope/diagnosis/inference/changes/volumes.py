@@ -108,9 +108,10 @@ def _size_penalty(
 ) -> float:
     """Compute how improbable the size of a step is: -2 log(prior density / largest density), 0 without a prior on it.
 
-    `name`: name of the observable; `size`: size of the step, in the unit of the coefficient; `names`: names of the
-    columns of `blocks`; `volume_ratio`: measured over assumed ratio of area to displacement; `flow_scale`: true flow
-    over the flow of the balance.
+    `name`: name of the observable, whose coefficient in the volume balance steps; `size`: change of this coefficient;
+    `names`: names of the columns of `blocks`. `volume_ratio` is the measured over the assumed ratio of the piston's
+    area to the pump's displacement, `flow_scale` the true flow over that of the volume balance: they convert `size` to
+    the quantity that the prior describes. Where the prior only limits the size, small steps have no penalty (`above`).
     """
     if name == SCALE:
         return size_penalty(INFERENCE.scale, size)

@@ -38,7 +38,7 @@ from sealscope.diagnosis.inference.onset import (
     fit_history,
     step_test,
 )
-from sealscope.diagnosis.inference.regimes import rest_log_odds
+from sealscope.diagnosis.inference.regimes import fit_with_robust_covariance, rest_log_odds
 from sealscope.diagnosis.inference.scatter import RecordingSums
 from sealscope.diagnosis.inference.terms import (
     LAG,
@@ -414,13 +414,18 @@ class RecordedBalance:
     def creep_log_odds(self) -> float:
         """Compute the log odds that a held load creeps by leakage, rather than that a control loop holds it.
 
-        A loop replaces the leakage, so that the piston hardly moves. A flow near zero in holds therefore speaks against
-        creep. A flow near the typical leakage of a machine that holds a load (a fraction of its mean flow) speaks for
-        creep. The log odds are limited to +-`rest.most` of `priors.toml`.
+        A loop replaces the leakage, so that the piston hardly moves, whatever the pressures do. A displaced volume near
+        zero in holds therefore speaks against creep. A displaced flow near the typical leakage of a machine that holds
+        a load (a fraction of its mean flow) speaks for creep. The log odds are limited to +-`rest.most` of
+        `priors.toml`.
         """
-        holding_flow, pressure = INFERENCE.rest.holding * self.mean_flow, self.mean_pressure()
-        flow, low, high = (value * pressure for value in self.conductance)
-        variance = ((high - low) / (2.0 * WITHIN_95)) ** 2
+        holding_flow, roles = INFERENCE.rest.holding * self.mean_flow, self.columns[0]
+        # the displaced volume over the integral of p_A - p_B, without the chambers' compliance
+        ratio, ratio_variance = fit_with_robust_covariance(self.blocks.gram[:, 0], [roles.leak], roles.left)
+        flow = float(ratio[0]) * self.mean_pressure()
+        variance = float(ratio_variance[0, 0]) * self.mean_pressure() ** 2
+        if not variance > 0.0:
+            return 0.0
         max_odds: float = INFERENCE.rest.most
         return float(np.clip(-rest_log_odds(flow, variance, holding_flow, variance), -max_odds, max_odds))
 
@@ -473,7 +478,8 @@ def log_area_ratio(measured: float, loaded_share: float, *, is_larger: bool) -> 
 def _flow_scale(balance: RecordedBalance) -> Size:
     """Determine the factor from computed to true flows (`Size`) and its uncertainty, from the sizes in the rig's file.
 
-    - Behind a servo valve, and for a load that shut valves hold, the areas give the flow, and the factor is 1.
+    - Behind a servo valve, and for a load that shut valves hold, the areas give the flow, and the factor is 1. Beside a
+      creeping load the oil of the loaded side also expands, in proportion to a volume that is not known.
     - The flow of a flow meter needs no factor either.
     - A stated displacement gives the factor 1. If a stated area disagrees, the difference is the uncertainty.
     - If only the area is stated, the factor follows from the ratio of displacement to area, which the balance measures.
@@ -485,7 +491,8 @@ def _flow_scale(balance: RecordedBalance) -> Size:
     states_displacement = rig.states("pump.q_b") and has_flow_unit
     states_areas = rig.states("cylinder.A_A", "cylinder.A_B")
     if len(balance.columns) > 1 or balance.is_creep:  # behind a servo valve, or of a load that shut valves hold
-        return Size(1.0, prior.area, stated=states_areas and has_pressure_unit)
+        deviation = float(np.hypot(prior.area, prior.creep)) if balance.is_creep else prior.area
+        return Size(1.0, deviation, stated=states_areas and has_pressure_unit)
     motion = [k for k in roles.motion if roles.names[k].startswith("motion")]
     area = _loaded_area(balance, motion) if motion and ("x", "m") in balance.units else None
     if area is None or not area.measured > 0.0 or not has_flow_unit:

@@ -132,8 +132,9 @@ class HeldChambers:
     def _larger_side(self) -> tuple[bool, bool]:
         """Flags of A and B: true for the side of the larger area, if the areas differ.
 
-        It is the side that a check valve may refill while the piston leaks: the leak fills a side by as much as it
-        takes from the other, whose area moves the piston, so that only a larger side can lack oil.
+        A check valve may refill this side while the piston leaks. The leak moves equal volumes from one side to the
+        other, and the piston follows the side that loses oil. If the other side has the larger area, its volume grows
+        by more than the leak supplies.
         """
         area_A, area_B = abs(self.sides.area_A), abs(self.sides.area_B)
         return area_A > area_B, area_B > area_A
