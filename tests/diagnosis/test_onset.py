@@ -274,3 +274,17 @@ def test_numbers_that_cannot_be_computed_with_show_no_step() -> None:
     precision = np.eye(20)
     precision[3, 3] = np.inf
     assert step_test(Information(np.arange(20.0), precision, np.zeros(20), slope=1.0, walk=1.0)) is None
+
+
+def test_blocks_without_information_at_either_end_change_nothing() -> None:
+    """A step there is no step of what is known: it would have any size, and made the bound 10^8 L/min."""
+    estimates = np.random.default_rng(6).standard_normal(12)
+    known = step_test(Information(np.arange(12.0), np.eye(12), estimates))
+    precision, vector = np.zeros((22, 22)), np.zeros(22)
+    precision[7:19, 7:19], vector[7:19] = np.eye(12), estimates
+    padded = step_test(Information(np.arange(22.0) - 7.0, precision, vector))
+    assert known is not None and padded is not None
+    assert padded.onsets.min() >= -0.5
+    assert padded.onsets.max() <= 11.5
+    assert padded.bound() < 3.0 * known.bound()
+    assert padded.detectable_step(1e-3) < 3.0 * known.detectable_step(1e-3)

@@ -20,11 +20,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles
 from sealscope.diagnosis.inference.observable import Flow
-from sealscope.diagnosis.inference.onset import EDGE, PARTS, Information, StepTest, step_shapes, step_sizes, step_test
+from sealscope.diagnosis.inference.onset import Information, StepTest, step_shapes, step_sizes, step_test
 from sealscope.diagnosis.inference.terms import ORIFICE
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Array
@@ -105,13 +104,13 @@ def growth_priors() -> list[tuple[float, float]]:
     return [(0.0, prior.steady), *((float(growth), probability) for growth in growths)]
 
 
-def _onset_positions(leak: Information, onsets: NDArray[np.intp]) -> Array:
-    """Convert indices of a step test's onsets to positions, counted in blocks from the start of the first block.
+def _onset_positions(leak: Information, test: StepTest) -> Array:
+    """Return the onsets (o,) of a step test, counted in blocks from the start of the first block.
 
     `leak`: likelihood on which the test was made. If it has a prior on the level, the test counts that prior as one
     block before the first.
     """
-    return EDGE + onsets / PARTS - float(np.isfinite(leak.level))
+    return test.positions - float(np.isfinite(leak.level))
 
 
 def estimate_step_flow(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Information, test: StepTest) -> Flow:
@@ -126,7 +125,7 @@ def estimate_step_flow(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Inf
     coefficient in the K blocks; `test`: step test of this coefficient, whose more probable onsets are used.
     """
     onsets = np.flatnonzero(test.weights > NEGLIGIBLE * test.weights.max())
-    positions = _onset_positions(leak, onsets)
+    positions = _onset_positions(leak, test)[onsets]
     rows = np.maximum(blocks.rows, 1e-9)
     n_rows_after = np.maximum(rows @ step_shapes(len(blocks), positions), _TINY)
     shapes, unit_flows = apparent_conductances(blocks, columns), law_flows(blocks)
@@ -204,7 +203,7 @@ def _weigh_rise_onsets(leak: Information, test: StepTest | None, value: float) -
     """
     if test is None or not value > 0.0:
         return np.zeros(1), np.ones(1)
-    positions = _onset_positions(leak, np.arange(len(test.onsets)))
+    positions = _onset_positions(leak, test)
     information = np.maximum(leak.precision.sum(axis=0), 0.0)
     fraction_after = information @ step_shapes(len(information), positions) / max(float(information.sum()), _TINY)
     step = value / np.maximum(fraction_after, MIN_FRACTION)

@@ -122,8 +122,9 @@ class StepTest:
         Probability that a coefficient without a step scores as high.
     best : int
         Index of the most likely onset.
-    onsets : array of float, shape (o,)
-        Onsets that were tried [s].
+    positions, onsets : array of float, shape (o,)
+        Onsets that were tried, counted in blocks, and as times [s]. A prior on the level counts as one block before the
+        first.
     likelihood : array of float, shape (o,)
         Log likelihood of a step at each onset, with fitted size and walk.
     size, deviation : array of float, shape (o,)
@@ -139,6 +140,7 @@ class StepTest:
     score: float
     chance: float
     best: int
+    positions: Array
     onsets: Array
     likelihood: Array
     size: Array
@@ -549,15 +551,19 @@ def _build_whitening(precision: Array, slope: float, walk: float) -> _Whitening 
     # scale of the walk's variance at which walk and noise change z equally on average
     unit = len(complement) / max(float(np.trace(covariance)), np.finfo(float).tiny)
     eigen, basis = np.linalg.eigh(unit * covariance)
+    transform = basis.T @ transform
+    positions = np.arange(EDGE, count - EDGE + 1e-9, 1.0 / PARTS)
+    # a step before or after all blocks with information changes nothing that is not level or slope
+    energies = ((transform @ step_shapes(count, positions)) ** 2).sum(axis=0)
     return _Whitening(
         root=root,
         vectors=vectors[:, is_informative],
         complement=complement,
         basis=basis,
-        transform=basis.T @ transform,
+        transform=transform,
         eigen=np.maximum(eigen, 0.0),
         unit=unit,
-        positions=np.arange(EDGE, count - EDGE + 1e-9, 1.0 / PARTS),
+        positions=positions[energies > RANK_TOLERANCE * energies.max()],
         walk_log_priors=-np.log1p(WALKS * unit * count / walk**2),
     )
 
@@ -626,6 +632,7 @@ def _test_step_up(whitened: _Whitened, steps: Array, fits: _StepFits) -> StepTes
         score=score,
         chance=law.chance(score),
         best=int(best),
+        positions=whitened.positions,
         onsets=whitened.onsets,
         likelihood=log_likelihood_with_step.max(axis=0),
         size=size,
