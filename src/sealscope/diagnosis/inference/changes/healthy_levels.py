@@ -50,6 +50,8 @@ from sealscope.recordings.recording import Array, Recording, compute_once
 TINY = 1e-300
 #: Names of the observables: of friction, and of drifts, which are rival descriptions of the same data.
 FRICTION, DRIFTS = "friction", ("drift of p_A", "drift of p_B", "drift of both")
+#: Keys of the drifts of p_A and p_B in motion, and of their standard errors.
+DRIFT_KEYS = {"drift_A", "drift_A_error", "drift_B", "drift_B_error"}
 #: Probability of the quantile of the healthy recordings' errors of sign.
 UPPER_QUARTILE = 0.75
 #: Keys of two estimates of the friction in a recording's summary, each with the key of its standard error. The second
@@ -136,8 +138,8 @@ def _log_frictions(
     error with the right sign is not usable: the judged one is then None, a healthy one is left out. `key`,
     `error_key`: keys of friction and standard error [Pa] in the summaries.
     """
-    known = [summary for summary in healthy if error_key in summary]
-    if not known or error_key not in judged:
+    known = [summary for summary in healthy if {key, error_key} <= set(summary)]
+    if not known or not {key, error_key} <= set(judged):
         return None, []
     ratios = np.array([float(summary[key]) / max(float(summary[error_key]), TINY) for summary in known])
     sign = float(np.sign(ratios.sum()))
@@ -159,10 +161,10 @@ def _compare_drifts(judged: Summary, healthy: Sequence[Summary]) -> Iterator[Obs
     Yields a test for each of three explanations, if the recording and enough healthy recordings have both drifts: p_A
     drifts, p_B drifts, both drift alike (`_describe_drifts`).
     """
-    days = [drifts for summary in (*healthy, judged) if (drifts := _drifts(summary)) is not None]
-    if "drift_A_error" not in judged or not days:
+    judged_drifts = _drifts(judged)
+    if judged_drifts is None:
         return
-    *healthy_days, judged_drifts = days
+    healthy_days = [drifts for summary in healthy if (drifts := _drifts(summary)) is not None]
     prior = CHANGES.healthy
     scatter = PriorScatter(prior.drift, prior.drift_recordings, prior.drift_inflation)
     tests = [
@@ -175,7 +177,7 @@ def _compare_drifts(judged: Summary, healthy: Sequence[Summary]) -> Iterator[Obs
 
 def _drifts(summary: Summary) -> tuple[Estimate, Estimate, Estimate] | None:
     """Read the drifts of p_A, p_B and p_A - p_B in motion from a recording's summary [Pa]; None if it has none."""
-    if "drift_A_error" not in summary:
+    if not set(summary) >= DRIFT_KEYS:
         return None
     drift_A, drift_B = (
         Estimate(float(summary[name]), float(summary[f"{name}_error"])) for name in ("drift_A", "drift_B")
