@@ -7,7 +7,6 @@ import pytest
 from scipy.stats import binom
 
 from sealscope.diagnosis.inference.differences import (
-    Driver,
     Estimate,
     PriorScatter,
     compare_estimates,
@@ -97,32 +96,3 @@ def test_days_that_differ_by_more_than_their_errors_make_an_imprecise_day_unrema
     assert believed is not None and doubted is not None and precise is not None
     assert doubted.chance > 30.0 * believed.chance
     assert precise.chance < 0.01
-
-
-@pytest.mark.parametrize(("slope", "deviation"), [(0.05, 0.05), (0.0, 0.05), (0.0, 1e-9)])
-def test_a_driver_explains_what_its_slope_allows(slope: float, deviation: float) -> None:
-    """Judged in oil far from that of the healthy days: the chances stay uniform, a change beside the oil shows."""
-    random, chances = np.random.default_rng(4), list[float]()
-    prior, errors = PriorScatter(0.01, 3.0), np.full(8, 0.003)
-    for _ in range(500):
-        oil = np.append(random.uniform(-0.3, 0.3, 7), -1.2)
-        scatter = 0.01 * np.sqrt(3.0 / random.chisquare(3.0))
-        values = random.normal(slope * random.standard_normal() * oil, np.hypot(scatter, errors))
-        healthy = [Estimate(*pair) for pair in zip(values[:-1], errors[:-1], strict=True)]
-        judged = Estimate(values[-1], errors[-1])
-        observable = compare_estimates("a", "b", judged, healthy, prior, driver=Driver(oil, deviation))
-        assert observable is not None
-        chances.append(observable.chance)
-    low, high = binom.ppf([0.0005, 0.9995], len(chances), 0.1)
-    count = np.sum(np.array(chances) < 0.1)
-    assert count <= high
-    assert count >= low or slope < deviation
-
-
-def test_a_driver_that_does_not_vary_changes_nothing() -> None:
-    healthy, prior = [Estimate(value, 0.05) for value in HEALTHY], PriorScatter(0.1, 3.0)
-    without = compare_estimates("a", "b", Estimate(1.5, 0.1), healthy, prior)
-    still = Driver(np.zeros(len(healthy) + 1), 0.05)
-    beside = compare_estimates("a", "b", Estimate(1.5, 0.1), healthy, prior, driver=still)
-    assert without is not None and beside is not None
-    assert (beside.chance, beside.size, beside.score) == pytest.approx((without.chance, without.size, without.score))

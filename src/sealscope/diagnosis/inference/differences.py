@@ -16,9 +16,7 @@ weights w_i = 1/(s^2 + (k e_i)^2) and W = sum w_i,
 
     p(s, k | y) ~ p(s) p(k) W^(-1/2) prod_i w_i^(1/2) exp(-w_i (y_i - mean)^2 / 2),    mean = sum w_i y_i / W,
 
-and the next value is a mixture of N(mean, s^2 + (k e)^2 + 1/W). If a known quantity z_i, such as the oil's viscosity,
-may drive the values, y_i ~ N(mu + b z_i, ...) with an unknown slope b ~ N(0, b_0^2); mu and b are then eliminated
-together.
+and the next value is a mixture of N(mean, s^2 + (k e)^2 + 1/W).
 
 Source: A. Gelman et al., Bayesian Data Analysis, 3rd ed. (2013), sections 3.2, 3.3 and 5.4.
 """
@@ -32,7 +30,6 @@ import numpy as np
 
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.priors.inference import StepSize
-from sealscope.recordings.recording import Array
 
 #: Minimum number of healthy recordings for a scatter.
 MIN_HEALTHY = 3
@@ -66,17 +63,6 @@ class PriorScatter(NamedTuple):
     deviation: float
     recordings: float
     inflation: float = 1.0
-
-
-class Driver(NamedTuple):
-    """Quantity z that may drive an estimate: an estimate changes by b z with an unknown slope b.
-
-    `values` (n + 1,): z of n healthy recordings and of the judged one, in this order; `slope_deviation`: prior standard
-    deviation b_0 of the slope, above 0.
-    """
-
-    values: Array
-    slope_deviation: float
 
 
 def compare_with_healthy(
@@ -146,7 +132,6 @@ def compare_estimates(
     *,
     above: bool = False,
     further_deviation: float = 0.0,
-    driver: Driver | None = None,
 ) -> Observable | None:
     """Test an estimate for a difference from the estimates of healthy recordings, each with a known standard error.
 
@@ -164,13 +149,11 @@ def compare_estimates(
         Count only an estimate above the healthy ones.
     further_deviation : float
         Standard deviation of the judged estimate from further causes, such as an unusual load.
-    driver : Driver, optional
-        Quantity that may drive the estimates.
 
     Returns
     -------
     Observable or None
-        Its size is the difference from the estimate that the healthy ones predict, its score the square of this
+        Its size is the difference from the weighted mean of the healthy estimates, its score the square of this
         difference over its variance; with `above`, the score of a negative difference is 0. None for fewer than
         `MIN_HEALTHY` healthy recordings, or if a number is not finite.
     """
@@ -179,36 +162,24 @@ def compare_estimates(
     if len(healthy) < MIN_HEALTHY or not np.isfinite([judged, *healthy]).all():
         return None
     values, errors = np.array(healthy, dtype=float).T
-    centre = float(values.mean())  # differences lose fewer digits
-    values = values - centre
     max_ratio = max(MAX_RATIO, MAX_RATIO_TO_VALUES * float(values.std()) / prior.deviation)
     ratios = np.exp(np.linspace(-np.log(MAX_RATIO), np.log(max_ratio), NODES))
     inflations = np.geomspace(1.0, prior.inflation, INFLATIONS) if prior.inflation > 1.0 else np.ones(1)
     ratios, inflations = (grid.ravel() for grid in np.meshgrid(ratios, inflations))
     scatter = prior.deviation * ratios  # at each point of the grid of scatter and inflation
     weights = 1.0 / (scatter[:, None] ** 2 + (inflations[:, None] * errors) ** 2)
-    # of each healthy estimate, and of the judged one: factors of the unknown mean and slope
-    rows, prior_precision = np.ones((len(values) + 1, 1)), np.zeros(1)
-    if driver is not None:
-        rows = np.column_stack([rows, driver.values])
-        prior_precision = np.array([0.0, driver.slope_deviation**-2])
-    healthy_rows, judged_row = rows[:-1], rows[-1]
-    precision = np.einsum("gi,ia,ib->gab", weights, healthy_rows, healthy_rows) + np.diag(prior_precision)
-    moments = (weights * values) @ healthy_rows
-    covariance = np.linalg.inv(precision)
-    coefficients = np.einsum("gab,gb->ga", covariance, moments)
-    means = coefficients @ judged_row
-    squares = (weights * values**2).sum(axis=1) - (coefficients * moments).sum(axis=1)
+    precision = weights.sum(axis=1)
+    means = weights @ values / precision
+    squares = (weights * (values - means[:, None]) ** 2).sum(axis=1)
     # density of log s: the prior's is s^-m exp(-m s_0^2 / (2 s^2))
     log_posterior = -prior.recordings * (np.log(ratios) + 0.5 / ratios**2)
-    log_posterior += 0.5 * (np.log(weights).sum(axis=1) - np.linalg.slogdet(precision).logabsdet - squares)
+    log_posterior += 0.5 * (np.log(weights).sum(axis=1) - np.log(precision) - squares)
     posterior = np.exp(log_posterior - log_posterior.max())
     posterior /= posterior.sum()
-    error_of_mean = np.einsum("a,gab,b->g", judged_row, covariance, judged_row)
-    variances = scatter**2 + (inflations * judged.deviation) ** 2 + further_deviation**2 + error_of_mean
-    z = (judged.value - centre - means) / np.sqrt(variances)
+    variances = scatter**2 + (inflations * judged.deviation) ** 2 + further_deviation**2 + 1.0 / precision
+    z = (judged.value - means) / np.sqrt(variances)
     chance = float(posterior @ (ndtr(-z) if above else 2.0 * ndtr(-np.abs(z))))
-    change = judged.value - centre - float(posterior @ means)
+    change = judged.value - float(posterior @ means)
     score = change**2 / max(float(posterior @ variances), TINY) if change > 0.0 or not above else 0.0
     return Observable(name=name, data=data, score=score, chance=min(1.0, chance), size=change)
 

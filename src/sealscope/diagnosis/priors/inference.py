@@ -156,13 +156,11 @@ class RepeatPriors(PriorTable):
     - `scatter`: scatter between days.
     - `recordings`: the prior on the scatter weighs as much as this number of recordings.
     - `inflation`: largest factor by which the standard errors of the recordings may be too small.
-    - `per_thinning`: change of the flow's logarithm per logarithm by which thinner oil raises a laminar leak.
     """
 
     scatter: float
     recordings: float
     inflation: float
-    per_thinning: float
 
 
 class GrowthPriors(PriorTable):

@@ -19,7 +19,7 @@ from sealscope.diagnosis.inference.balance import (
 from sealscope.diagnosis.inference.blocks import ColumnRoles
 from sealscope.diagnosis.inference.circuit.store import recorded_oil_loss_tests
 from sealscope.diagnosis.inference.circuit.without_position import circulations
-from sealscope.diagnosis.inference.differences import Driver, Estimate, PriorScatter, compare_estimates
+from sealscope.diagnosis.inference.differences import Estimate, PriorScatter, compare_estimates
 from sealscope.diagnosis.inference.observable import Observable, Observed
 from sealscope.diagnosis.inference.regimes import add_pump_columns
 from sealscope.diagnosis.inference.rows.weak_form import STRIDE, stride_samples
@@ -29,7 +29,6 @@ from sealscope.diagnosis.inference.scatter import (
     find_unusual_conditions,
     leak_deviations_from_mean,
     motion_change,
-    predict_thinning,
     rise,
 )
 from sealscope.diagnosis.inference.terms import (
@@ -328,8 +327,7 @@ def compare_motion(
     """Test whether the piston's motion takes more or less flow for the same speed than in healthy recordings.
 
     Yields one observable, or nothing if there are too few healthy recordings. A change means another machine or another
-    scale of a sensor. Oil may change the flow, too, since the fit may take losses of the pump for motion. Load and
-    speed outside of the range of the healthy recordings make the comparison less certain.
+    scale of a sensor. Load and speed outside of the range of the healthy recordings make the comparison less certain.
     `judged_sums`, `healthy`: summaries of the judged and of the healthy recordings; `roles`: indices of the columns of
     the volume balance by role (leak, motion, left side).
     """
@@ -347,7 +345,6 @@ def compare_motion(
         [estimate(sums) for sums in healthy],
         PriorScatter(prior.scatter, prior.recordings, prior.inflation),
         further_deviation=INFERENCE.conditions.motion * excess,
-        driver=Driver(predict_thinning([*healthy, judged_sums]), prior.per_thinning),
     )
     if observable is not None:
         yield observable
