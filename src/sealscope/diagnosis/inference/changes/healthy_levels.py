@@ -30,6 +30,7 @@ from sealscope.diagnosis.inference.changes.motion_fit import (
     Motion,
     fit_difference,
     fit_robustly,
+    influence_factor,
     jackknife_errors,
     select_motion,
 )
@@ -236,4 +237,4 @@ def _estimate_drift(motion: Motion, pressure: Array) -> Estimate:
     values = pressure[motion.rows]
     coefficients, weight = fit_robustly(motion.design, values)
     (error,) = jackknife_errors(motion.design * weight[:, None], values * weight, [TIME], motion.strokes)
-    return Estimate(float(coefficients[TIME]), float(error))
+    return Estimate(float(coefficients[TIME]), influence_factor(weight) * float(error))
