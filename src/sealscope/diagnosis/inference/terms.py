@@ -573,12 +573,10 @@ def equations(rig: Rig, channels: frozenset[str]) -> tuple[Equation, ...]:
     return (_select_recorded_terms(balance, channels | {START}),)  # START is derived, not recorded
 
 
-#: Terms of a balance without a piston in motion: the chambers' compliances, external leaks, and the leak.
-_STANDSTILL = (
-    *(_chamber_terms(side)[0] for side in "AB"),
-    *(_external_leak_term("A"), _external_leak_term("B", -1.0)),
-    *_LEAKS,
-)
+#: Leaks in a balance without a piston in motion: to the outside, and past piston and pump.
+_STANDSTILL_LEAKS = (_external_leak_term("A"), _external_leak_term("B", -1.0), *_LEAKS)
+#: Terms of such a balance of both chambers: their compliances, and the leaks.
+_STANDSTILL = (*(_chamber_terms(side)[0] for side in "AB"), *_STANDSTILL_LEAKS)
 
 
 def circulation(rig: Rig, channels: frozenset[str]) -> Equation | None:
@@ -628,7 +626,7 @@ def locked(rig: Rig, channels: frozenset[str]) -> Equation | None:
         drift="compliance",
         needs=_PRESSURES,
     )
-    return Equation(LOCKED, displaced_volume, (compliance, *_STANDSTILL[2:]))
+    return Equation(LOCKED, displaced_volume, (compliance, *_STANDSTILL_LEAKS))
 
 
 def pump_volume(rig: Rig, channels: frozenset[str]) -> Callable[[Signals], Array] | None:
