@@ -139,6 +139,8 @@ def _check_sums(summary: Any) -> Any:
         raise ValueError(f"shut_sums must be of the shape (1, {size + 2}, {size + 2}), got {shut.shape}")
     if summary.held is not None and summary.held.shape != (len(HeldLeaks._fields),):
         raise ValueError(f"held must hold {len(HeldLeaks._fields)} numbers, got the shape {summary.held.shape}")
+    if summary.held_pump is not None and summary.held_pump.shape != (2,):
+        raise ValueError(f"held_pump must hold two numbers, got the shape {summary.held_pump.shape}")
     drop = summary.drop_per_speed
     if drop is not None and (drop.shape != (2,) or not np.abs(drop).max() < _MAX_LOGARITHM or drop[1] < 0.0):
         raise ValueError("drop_per_speed must hold a logarithm and its standard error")
@@ -196,6 +198,7 @@ _BALANCE = table_type(
     sums=_Array,
     shut_sums=(_Array, None),
     held=(_Array, None),
+    held_pump=(_Array, None),
     shut_odds=(_Number, None),
     held_odds=(_Number, None),
     creep_odds=(_Number, None),

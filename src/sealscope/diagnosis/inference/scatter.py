@@ -257,6 +257,8 @@ class RecordingSums(NamedTuple):
     - `flow`, `pressure`: mean magnitudes of the pump's flow [m^3/s] and of p_A - p_B [Pa];
     - `start_s`, `oil_degC`: date [s since 1970] and temperature of the oil, None if unknown;
     - `held` (6,): leaks while shut valves hold the load, in the order of `holds.leaks.HeldLeaks`, or None;
+    - `held_pump` (2,): leakage conductance of the pump [m^3/(s Pa)] just before such holds, and its standard deviation,
+      or None;
     - `drop_per_speed` (2,): logarithm of (pressure drop due to motion / speed) and its standard error, or None.
     """
 
@@ -266,6 +268,7 @@ class RecordingSums(NamedTuple):
     start_s: float | None = None
     oil_degC: float | None = None
     held: Array | None = None
+    held_pump: Array | None = None
     drop_per_speed: Array | None = None
 
     @classmethod
@@ -332,25 +335,46 @@ def held_rise(judged: RecordingSums, baseline: Sequence[RecordingSums]) -> Rise 
     baseline = [recording for recording in baseline if recording.held is not None]
     if judged.held is None or len(baseline) < MIN_WITH_HOLDS:
         return None
-    healthy = np.array([recording.held for recording in baseline])
     # the first two values of `HeldLeaks`: leak past the piston, and its standard deviation
-    healthy_leaks, healthy_errors = healthy[:, :2].T
-    leak, leak_error = judged.held[:2]
-    level = float(healthy_leaks.mean())
-    conductance_of_flow = _conductance_of_flow(judged)
-    min_error = max(INFERENCE.scatter.finest * conductance_of_flow, 1.0 / MAX_READING)
-    error = np.maximum(np.median(np.append(healthy_errors, leak_error)), min_error)
+    leaks = np.array([recording.held[:2] for recording in (*baseline, judged) if recording.held is not None])
+    min_crossover = INFERENCE.scatter.largest * _conductance_of_flow(judged)
+    return _compare_held(judged, baseline, leaks, min_crossover=min_crossover)._replace(may_be_partial=True)
+
+
+def held_pump_rise(judged: RecordingSums, baseline: Sequence[RecordingSums]) -> Rise | None:
+    """Estimate the rise of the pump's leakage over healthy recordings, from the time just before holds.
+
+    `judged`: summary of the recording; `baseline`: summaries of the healthy recordings. Return None if the pump's
+    leakage is unknown in the judged recording, or known in fewer than `MIN_WITH_HOLDS` healthy recordings.
+    """
+    baseline = [recording for recording in baseline if recording.held_pump is not None]
+    if judged.held_pump is None or len(baseline) < MIN_WITH_HOLDS:
+        return None
+    leakages = np.array([r.held_pump for r in (*baseline, judged) if r.held_pump is not None])
+    session_deviation = INFERENCE.held_oil.pump_session * abs(float(leakages[:-1, 0].mean()))
+    return _compare_held(judged, baseline, leakages, session_deviation=session_deviation)
+
+
+def _compare_held(judged: RecordingSums, baseline: Sequence[RecordingSums], leaks: Array, **priors: float) -> Rise:
+    """Estimate the rise of a leak that holds measure over its mean in the healthy recordings.
+
+    `leaks` (n + 1, 2): conductance and standard deviation [m^3/(s Pa)] in each of the n recordings `baseline`, and last
+    in the recording `judged`; `priors`: `min_crossover` and `session_deviation` of `_Estimates`.
+    """
+    *healthy_leaks, leak = leaks[:, 0]
+    level = float(np.mean(healthy_leaks))
+    min_error = max(INFERENCE.scatter.finest * _conductance_of_flow(judged), 1.0 / MAX_READING)
+    error = np.maximum(np.median(leaks[:, 1]), min_error)
     estimates = _Estimates(
         values=np.array([leak - level]),
-        rises=(healthy_leaks - level)[None],
+        rises=(np.array(healthy_leaks) - level)[None],
         errors=error[None],
         level=max(level, 0.0),
         level_error=error / np.sqrt(len(baseline)),
-        min_crossover=INFERENCE.scatter.largest * conductance_of_flow,
+        **priors,
     )
-    held = _compare_levels(judged, baseline, estimates)
     # `error` is included already; a less precise judged recording adds the difference
-    return held.widen(float(leak_error) ** 2 - float(error) ** 2)._replace(may_be_partial=True)
+    return _compare_levels(judged, baseline, estimates).widen(float(leaks[-1, 1]) ** 2 - float(error) ** 2)
 
 
 class _Estimates(NamedTuple):
@@ -359,7 +383,9 @@ class _Estimates(NamedTuple):
     These priors are on the differences of the coefficients between recordings. `values` (s,): rises of the judged
     recording; `rises` (s, n): rises of n healthy recordings over their mean; `errors` (s,): standard error of one rise;
     `level`: mean coefficient of the healthy recordings; `level_error`: its standard error; `min_crossover`: minimum of
-    `_LevelScale.crossover`, large where healthy levels are about zero. All have the unit of the coefficient.
+    `_LevelScale.crossover`, large where healthy levels are about zero; `session_deviation`: prior standard deviation
+    between sessions with the same oil, None for that of the whole leakage (`scatter.session` of `priors.toml`). All
+    have the unit of the coefficient.
     """
 
     values: Array
@@ -368,6 +394,7 @@ class _Estimates(NamedTuple):
     level: float
     level_error: float
     min_crossover: float = 0.0
+    session_deviation: float | None = None
 
 
 def _compare_levels(judged: RecordingSums, baseline: Sequence[RecordingSums], estimates: _Estimates) -> Rise:
@@ -381,9 +408,11 @@ def _compare_levels(judged: RecordingSums, baseline: Sequence[RecordingSums], es
     subtracted. The rest is normal about an unknown mean, with an unknown standard deviation sigma of single recordings;
     sessions, oil and unusual conditions add covariances (see the module).
     """
-    values, rises, errors, level, level_error, min_crossover = estimates
+    values, rises, errors, level, level_error, min_crossover, session_deviation = estimates
     prior = INFERENCE.scatter
     conductance_of_flow = _conductance_of_flow(judged)
+    if session_deviation is None:
+        session_deviation = prior.session * conductance_of_flow
     # log width of the prior in each row, in standard deviations; estimates from holds have no such prior
     exponents = np.linspace(-MAX_SCALE, MAX_SCALE, SCALES) if len(values) == SCALES else np.zeros(len(values))
     recordings = [*baseline, judged]
@@ -409,7 +438,7 @@ def _compare_levels(judged: RecordingSums, baseline: Sequence[RecordingSums], es
             sessions,
             oil,
             relative_slope,
-            session_deviation=steepness * prior.session * conductance_of_flow,
+            session_deviation=steepness * session_deviation,
             condition_deviation=relative_slope * (log_condition_excess * INFERENCE.conditions.leak),
         )
         shifts = relative_slope * oil.thinning  # effect of the oil on z

@@ -216,6 +216,8 @@ class HeldOilPriors(PriorTable):
     - `rare`: p-value (probability in a healthy machine) of a rise of the leakage in the holds, below which the rise
       is used to estimate the flow of the leak.
     - `settles` [s]: time in which valves shut.
+    - `before` [s]: time before a hold in which the flow shows the leakage of the pump.
+    - `pump_session`: relative standard deviation of this leakage between sessions with the same oil.
     - `shortest` [s]: shortest hold.
     - `equalises` [s]: time in which a leak equalises the pressures of a hold.
     - `loaded`: log odds from which a pressure difference is surely due to a load, and not to an offset of the
@@ -244,6 +246,8 @@ class HeldOilPriors(PriorTable):
     agrees: float
     rare: float
     settles: float
+    before: float
+    pump_session: float
     shortest: float
     equalises: float
     loaded: float

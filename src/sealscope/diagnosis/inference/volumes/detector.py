@@ -180,7 +180,7 @@ class VolumeBalance:
         - `shut_sums`, `shut_odds`, if the machine rests: Gram matrices for a pump that valves cut off at rest, and log
           odds that they do, from the leakage at rest;
         - `held`, `held_odds`, if it holds a load at rest: leaks while shut valves hold the load, and log odds that the
-          valves are shut, from these leaks;
+          valves are shut, from these leaks; `held_pump`, if known: leakage of the pump just before;
         - `creep_odds`, if no pump's flow is recorded (`is_creep`): log odds that the load creeps by leakage.
         """
         has_position_balance = bool(equations(self.rig, frozenset(recording.channels)))
@@ -196,6 +196,8 @@ class VolumeBalance:
             hold_odds = replace(balance, locked=True).locked_log_odds()
             if shut_sums.held is not None and hold_odds is not None:
                 summary |= {"held": shut_sums.held, "held_odds": hold_odds}
+                if shut_sums.held_pump is not None:
+                    summary["held_pump"] = shut_sums.held_pump
         if balance.is_creep:
             summary["creep_odds"] = balance.creep_log_odds()
         return {"terms": list(balance.columns[0].names), "scale": scale, **summary}
@@ -379,7 +381,7 @@ def _sums_from_summary(summary: Summary, shut: bool = False, locked: bool = Fals
     sums = np.asarray(summary["sums"], dtype=float)
     if shut:
         sums = np.asarray(summary["shut_sums"]) if "shut_sums" in summary else add_pump_columns(sums, summary["terms"])
-    held = np.asarray(summary["held"], dtype=float) if locked and "held" in summary else None
-    drop = np.asarray(summary["drop_per_speed"], dtype=float) if "drop_per_speed" in summary else None
+    names = ["drop_per_speed", *(("held", "held_pump") if locked else ())]
+    measured = {name: np.asarray(summary[name], dtype=float) for name in names if name in summary}
     start_s, oil_degC = summary.get("start_s"), summary.get("oil_degC")
-    return RecordingSums(sums, summary["flow"], summary["pressure"], start_s, oil_degC, held=held, drop_per_speed=drop)
+    return RecordingSums(sums, summary["flow"], summary["pressure"], start_s, oil_degC, **measured)

@@ -49,6 +49,7 @@ from sealscope.diagnosis.inference.terms import (
     Signals,
     find_rests,
 )
+from sealscope.diagnosis.inference.volumes.held_pump import estimate_pump_leakage
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.diagnosis.verdict.evidence import RAREST
 from sealscope.diagnosis.verdict.machine import measures_flow
@@ -186,7 +187,9 @@ class RecordedBalance:
         if self.is_creep:
             sums = sums._replace(flow=self.mean_flow)
         hold_leaks = None if self.chambers is None else np.array(self.chambers.leaks)
-        return sums._replace(held=hold_leaks, drop_per_speed=estimate_viscous_drop(self.recording))
+        pump_leakage = None if self.held_pump_leakage is None else np.array(self.held_pump_leakage)
+        drop = estimate_viscous_drop(self.recording)
+        return sums._replace(held=hold_leaks, held_pump=pump_leakage, drop_per_speed=drop)
 
     @cached_property
     def chambers(self) -> HeldChambers | None:
@@ -198,9 +201,8 @@ class RecordedBalance:
         sides = self._cylinder_sides() if self.locked and self.recording.units["p_A"] != COUNTS else None
         if sides is None:
             return None
-        recording, balance = self.recording, self.equations[0]
+        recording, pumped = self.recording, self._pumped
         pressures = {name: recording[name] for name in ("p_A", "p_B")}
-        pumped = balance.left(Signals(dict(recording.channels), recording.rate, {}))
         rests = find_rests(pumped, recording.rate, max_rest_rate(pumped, recording.rate))
         lower_pressure = np.minimum(pressures["p_A"], pressures["p_B"])
         charge = find_charge_pressure(lower_pressure, rests, recording.rate)
@@ -210,20 +212,31 @@ class RecordedBalance:
         holds = [
             hold
             for hold in find_locked_holds(channels, rests, recording.rate)
-            if self._is_pump_off(hold, pumped) and self._is_loaded(hold)
+            if self._is_pump_off(hold) and self._is_loaded(hold)
         ]
         begin, end = float(recording.t[0]), float(recording.t[-1])
         return HeldChambers(holds, sides, begin, end, charge + to_absolute) if holds else None
 
-    def _is_pump_off(self, hold: LockedHold, pumped: Array) -> bool:
+    @cached_property
+    def held_pump_leakage(self) -> Estimate | None:
+        """Leakage conductance of the pump [m^3/(s Pa)] in the last seconds before `chambers` shut, None if unknown."""
+        if self.chambers is None:
+            return None
+        return estimate_pump_leakage(self.recording, self._pumped, self.chambers.holds, self.chambers.leaks)
+
+    @cached_property
+    def _pumped(self) -> Array:
+        """Volume that the pump delivers between the samples of the recording [m^3], shape (n - 1,)."""
+        return self.equations[0].left(Signals(dict(self.recording.channels), self.recording.rate, {}))
+
+    def _is_pump_off(self, hold: LockedHold) -> bool:
         """Return True if the pump probably rests in a hold, and does not hold the load by replacing the leakage.
 
-        The mean flow is compared with zero and with the typical flow of a pump that holds a load. `pumped` (n - 1,):
-        volumes that the pump delivers between the samples of the recording [m^3].
+        The mean flow is compared with zero and with the typical flow of a pump that holds a load.
         """
         recording = self.recording
         begin, end = np.searchsorted(recording.t, hold.t[[hold.edges[1], -1]])  # with the valves shut
-        flow = pumped[begin:end] * recording.rate
+        flow = self._pumped[begin:end] * recording.rate
         flow = flow[np.isfinite(flow)]
         variance = float(flow.var()) / max(flow.size, 1)  # of the mean
         holding_flow = INFERENCE.rest.holding * self.blocks.moving_flow
@@ -258,16 +271,21 @@ class RecordedBalance:
         """Compute the log odds that valves are shut in holds, and not open; None without holds.
 
         A hold is a time in which shut valves are supposed to hold the load. With open valves the leakage in holds would
-        be the total leakage of pump and piston; with shut valves it is smaller. The two are compared. The log odds are
-        limited to +-`rest.most` of `priors.toml`.
+        be the total leakage of pump and piston; with shut valves it is smaller. The two are compared. The total leakage
+        is that just before the holds, at the same pressures, or if this is unknown that of the whole recording. The log
+        odds are limited to +-`rest.most` of `priors.toml`.
         """
         if self.chambers is None:
             return None
-        hold_leak, total_leak = self.chambers.total_leak(), self.conductance
+        hold_leak, pump = self.chambers.total_leak(), self.held_pump_leakage
+        if pump is not None:
+            total, total_deviation = pump.value + hold_leak.value, pump.deviation
+        else:
+            conductance = self.conductance
+            total, total_deviation = conductance.value, (conductance.high - conductance.low) / (2.0 * WITHIN_95)
         variance = hold_leak.deviation**2
-        total_variance = ((total_leak.high - total_leak.low) / (2.0 * WITHIN_95)) ** 2
         max_odds: float = INFERENCE.rest.most
-        odds = rest_log_odds(hold_leak.value, variance, total_leak.value, variance + total_variance)
+        odds = rest_log_odds(hold_leak.value, variance, total, variance + total_deviation**2)
         return float(np.clip(odds, -max_odds, max_odds))
 
     def _cylinder_sides(self) -> CylinderSides | None:

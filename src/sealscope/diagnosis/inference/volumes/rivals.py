@@ -25,6 +25,7 @@ from sealscope.diagnosis.inference.scatter import (
     coefficient_level,
     compare_laws,
     compare_with_leak,
+    held_pump_rise,
     predict_thinning,
     rise,
 )
@@ -79,7 +80,19 @@ def rival_rises(
     laws = compare_laws(judged, healthy, columns)
     healthy_gram = np.sum([recording.sums for recording in healthy], axis=0)
     observables = list[Observable]()
+    pump_rise = held_pump_rise(judged, healthy)
     for k in columns_to_test:
+        if names[k] == TURNING and pump_rise is not None:
+            observables.append(
+                Observable(
+                    name=TURNING,
+                    data=TURNING_DATA,
+                    score=max(pump_rise.score, 0.0) ** 2,
+                    chance=pump_rise.chance,
+                    size=pump_rise.value,
+                )
+            )
+            continue
         change, error = _estimate_change(judged.sums, healthy_gram, columns, k)
         # change of each healthy recording relative to the other healthy ones
         changes = [_estimate_change(recording.sums, healthy_gram - recording.sums, columns, k) for recording in healthy]
@@ -103,9 +116,9 @@ def rival_rises(
         if observable is None:
             continue
         if names[k] == TURNING:
-            pump_rise = rise(judged, healthy, turning_columns)
+            turning_rise = rise(judged, healthy, turning_columns)
             # a rise that warmer oil explains does not count
-            observable = replace(observable, chance=max(observable.chance, pump_rise.chance))
+            observable = replace(observable, chance=max(observable.chance, turning_rise.chance))
         else:
             log_ratio = compare_with_leak(judged, healthy, columns, names[k])  # for one independent residual
             if log_ratio is not None and laws is not None:
