@@ -7,11 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.optimize import lsq_linear
 
 from sealscope.diagnosis.inference.circuit.holds.chambers import HeldChambers
-from sealscope.diagnosis.inference.circuit.holds.hold import find_charge_pressure, find_locked_holds
+from sealscope.diagnosis.inference.circuit.holds.hold import extend_rests, find_charge_pressure, find_locked_holds
 from sealscope.diagnosis.inference.circuit.holds.leaks import NEITHER, LeakLaw, PistonFit
-from sealscope.diagnosis.inference.circuit.holds.oil import CylinderSides
+from sealscope.diagnosis.inference.circuit.holds.oil import CylinderSides, OilRegression, residual_squares
 from sealscope.diagnosis.inference.volumes.recorded import log_area_ratio
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Array
@@ -265,3 +266,37 @@ def test_the_onset_is_stated_where_a_hold_was_tight_before(size: float) -> None:
         assert onset is not None
         assert onset.low <= since <= onset.high
         assert onset.high - onset.low < CYCLE
+
+
+@pytest.mark.parametrize("seed", few([0, 1, 2, 3, 4], 2))
+def test_the_least_squares_of_each_onset_are_those_within_the_limits_of_the_oil(seed: int) -> None:
+    """A slow oracle solves the same problem, with no negative leak, dead volume, air or compressibility."""
+    random = np.random.default_rng(seed)
+    n_rows, n_onsets = 40, 6
+    strained, aired = random.standard_normal((2, n_rows, 3))
+    regression = OilRegression(
+        random.standard_normal(n_rows) * 3.0, strained, aired, inflation=4.0, misfit_variance=0.1
+    )
+    columns = random.standard_normal((n_rows, n_onsets))
+    squares = residual_squares(regression, columns, variance=0.5)
+    prior = INFERENCE.held_oil
+    least_dead = prior.least_dead / prior.dead - 1.0
+    deviations = np.array([prior.deviation, prior.dead_deviation, prior.dead_deviation, prior.air_deviation])
+    left, oil = regression.leaked(np.zeros(4)), regression.slopes(np.zeros(4))
+    for onset in range(n_onsets):
+        rows = np.column_stack([np.vstack([oil, np.diag((0.5 * 4.0) ** 0.5 / deviations)]), np.zeros(n_rows + 4)])
+        rows[:n_rows, -1] = columns[:, onset]
+        lowest = np.array([-1.0, least_dead, least_dead, -1.0, 0.0])
+        oracle = lsq_linear(rows, np.append(left, np.zeros(4)), bounds=(lowest, np.inf), tol=1e-12)
+        assert squares[onset] == pytest.approx(2.0 * oracle.cost, rel=1e-6)
+
+
+def test_a_rest_begins_as_the_flow_has_fallen_to_half() -> None:
+    """The flow, averaged over 0.2 s, finds it 0.15 s too late."""
+    t = np.arange(0.0, 10.0, 1.0 / RATE)
+    flow = np.where(t < 3.0, 1.0, 0.5 ** ((t - 3.0) / 0.02)) * np.where(t < 1.0, 0.0, 1.0)
+    rests = (t > 3.17) | (t < 0.5)
+    extended = extend_rests(rests, flow, RATE)
+    assert t[extended & (t > 1.0)][0] == pytest.approx(3.02, abs=1.5 / RATE)
+    assert (extended[t < 1.0] == rests[t < 1.0]).all()
+    assert (extend_rests(rests, np.zeros(len(t)), RATE) >= rests).all()

@@ -23,7 +23,12 @@ from sealscope.diagnosis.inference.changes.charge_pressure import estimate_charg
 from sealscope.diagnosis.inference.changes.motion_fit import estimate_viscous_drop
 from sealscope.diagnosis.inference.changes.volumes import volume_observables
 from sealscope.diagnosis.inference.circuit.holds.chambers import HeldChambers
-from sealscope.diagnosis.inference.circuit.holds.hold import LockedHold, find_charge_pressure, find_locked_holds
+from sealscope.diagnosis.inference.circuit.holds.hold import (
+    LockedHold,
+    extend_rests,
+    find_charge_pressure,
+    find_locked_holds,
+)
 from sealscope.diagnosis.inference.circuit.holds.oil import CylinderSides
 from sealscope.diagnosis.inference.differences import Estimate
 from sealscope.diagnosis.inference.leak_law import find_leak_step
@@ -204,6 +209,7 @@ class RecordedBalance:
         recording, pumped = self.recording, self._pumped
         pressures = {name: recording[name] for name in ("p_A", "p_B")}
         rests = find_rests(pumped, recording.rate, max_rest_rate(pumped, recording.rate))
+        rests = extend_rests(rests, pumped * recording.rate, recording.rate)
         lower_pressure = np.minimum(pressures["p_A"], pressures["p_B"])
         charge = find_charge_pressure(lower_pressure, rests, recording.rate)
         # absolute minus gauge pressure; larger if sensor offsets would make the least pressure too low

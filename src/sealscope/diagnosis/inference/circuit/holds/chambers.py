@@ -174,14 +174,14 @@ class HeldChambers:
     ) -> UnitLeak:
         """Compute the flow past the piston in each hold for a leak with a coefficient of 1, in Pa^e.
 
-        The flow is sign(dp) |dp|^e with dp = p_A - p_B - z, where z is the sensor offset in the hold, times the growth
-        of the leak since its onset. z may differ a little from the `offset` [Pa] of the recording
-        (`LockedHold.offset_in_hold`). `refilled`: true for A, and for B, if check valves replace displaced oil of that
-        side; `law`: exponent e, and growth.
+        The flow is sign(dp) |dp|^e, times the growth of the leak since its onset, with dp = p_A - p_B - z. The sensor
+        offset z in a hold may differ a little from the `offset` [Pa] of the recording (`LockedHold.driving_pressure`).
+        `refilled`: true for A, and for B, if check valves replace displaced oil of that side; `law`: exponent e, and
+        growth.
         """
         flows = []
         for hold in self.holds:
-            difference = hold.p_A - hold.p_B - hold.offset_in_hold(offset)[0]
+            difference = hold.driving_pressure(offset)
             flow = np.sign(difference) * np.abs(difference) ** law.exponent * law.growth_factor(hold.t, self.end)
             flows.append(np.array([flow, -flow]))
         is_closed = self._closed_flags(refilled)

@@ -77,6 +77,19 @@ class LockedHold(NamedTuple):
         is_equalised = -0.5 * cost - np.log(deviation * np.sqrt(2.0 * np.pi)) > -np.log(pressure)
         return (difference, cost) if is_equalised else (offset, 0.0)
 
+    def driving_pressure(self, offset: float) -> Array:
+        """Compute p_A - p_B [Pa] at each sample (n,), given the recording's sensor `offset` [Pa] of this difference.
+
+        The offset of the hold itself is subtracted (`offset_in_hold`). Once a leak has equalised the pressures, small
+        differences d are errors of the sensors, whose integral over the hold may exceed that of the short flow before.
+        In such holds d is therefore multiplied by d^2 / (d^2 + `held_oil.resolved`^2).
+        """
+        offset_here, cost = self.offset_in_hold(offset)
+        difference = np.asarray(self.p_A - self.p_B - offset_here)
+        if cost > 0.0:
+            difference *= difference**2 / (difference**2 + INFERENCE.held_oil.resolved**2)
+        return difference
+
     def steepest_time(self) -> float:
         """Find the time [s] at which the largest change of p_A - p_B in the hold begins.
 
@@ -101,6 +114,23 @@ def find_charge_pressure(lower_pressure: Array, rests: NDArray[np.bool_], rate: 
         return float(np.nanquantile(steady_pressure, LOWEST))
     lowest, turning = float(np.nanquantile(steady_pressure[:-1][rests], LOWEST)), steady_pressure[:-1][~rests]
     return min(lowest, float(np.nanmedian(turning))) if np.isfinite(turning).any() else lowest
+
+
+def extend_rests(rests: NDArray[np.bool_], flow: Array, rate: float) -> NDArray[np.bool_]:
+    """Extend each rest of the pump back to the time at which its flow has fallen to half of its level before.
+
+    Rests are found by the mean flow over `rest.averaged` (`priors.toml`), and therefore begin too late, by at most this
+    time. A large leak equalises the pressures within it, once the valves shut. `rests` (n,): flags of the sampling
+    intervals in which the pump rests; `flow` (n,): flow of the pump [m^3/s]; `rate`: sampling rate [Hz].
+    """
+    window = max(1, round(INFERENCE.rest.averaged * rate))
+    speed, extended = np.nan_to_num(np.abs(flow)), rests.copy()
+    for first, _ in find_runs(rests).tolist():
+        earliest = max(first - window, 0)
+        level = float(np.median(speed[max(earliest - window, 0) : earliest + 1]))
+        fast = np.flatnonzero(speed[earliest:first] > 0.5 * level)
+        extended[earliest + (fast[-1] + 1 if fast.size else 0) : first] = True
+    return extended
 
 
 def find_locked_holds(channels: Sequence[Array], rests: NDArray[np.bool_], rate: float) -> list[LockedHold]:

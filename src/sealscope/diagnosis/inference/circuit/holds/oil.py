@@ -7,6 +7,7 @@ regression is linearised about the estimate, iteratively.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -102,6 +103,13 @@ def _oil_deviations() -> Array:
     return np.array([prior.deviation, prior.dead_deviation, prior.dead_deviation, prior.air_deviation])
 
 
+def _lowest_changes() -> Array:
+    """Return the lower limits (4,) of the changes of compressibility, dead volumes of A, of B, and air."""
+    prior = INFERENCE.held_oil
+    lowest_dead = prior.least_dead / prior.dead - 1.0
+    return np.array([-np.inf, lowest_dead, lowest_dead, -np.inf])
+
+
 class LeakRegression(NamedTuple):
     """Fit of c leaks to the holds: `coefficients` (c,), their covariance (c, c), and `variance` of a reading [m^6].
 
@@ -165,7 +173,7 @@ def fit_leaks(regression: OilRegression, columns: Array, n_readings: float) -> L
     degrees_of_freedom = max(n_readings - n_leaks, 1.0)
     variance = max(float(left @ left) / len(left), misfit_variance)
     precisions = np.append(np.zeros(n_leaks), regression.inflation / _oil_deviations() ** 2)
-    lowest = np.array([-np.inf, *[INFERENCE.held_oil.least_dead / INFERENCE.held_oil.dead - 1.0] * 2, -np.inf])
+    lowest = _lowest_changes()
     is_lowest = np.zeros(4, dtype=bool)  # properties that stay at their lower limit
     for _ in range(MAX_ITERATIONS):  # of a linear fit of the leaks and of corrections of `changes`
         slopes = np.where(is_lowest, 0.0, regression.slopes(changes))
@@ -204,17 +212,32 @@ def residual_squares(regression: OilRegression, columns: Array, variance: float)
 
     `regression`: regression on the properties of the oil, linearised at their usual values; `columns` (r, o): volume
     leaked with a coefficient of 1 since each onset, at each reading; `variance`: variance of a reading, by which the
-    priors of the properties count.
+    priors of the properties count. A property that would fall below its lower limit is at this limit; compressibility
+    and free air are limited to 0.
     """
     usual = np.zeros(4)
     left, oil = regression.leaked(usual), regression.slopes(usual)
-    design = np.column_stack([left, columns])
-    precision = oil.T @ oil + np.diag(variance * regression.inflation / _oil_deviations() ** 2)
-    scale = np.sqrt(np.diag(precision))
-    coupling = (oil / scale).T @ design
-    # products of the left side (first) and of the leak for each onset, without the oil (Schur complement)
-    gram = design.T @ design - coupling.T @ np.linalg.solve(precision / np.outer(scale, scale), coupling)
-    total, energies, moments = gram[0, 0], np.diag(gram)[1:], np.maximum(gram[0, 1:], 0.0)
-    is_informative = energies > RIDGE * max(float(energies.max()), np.finfo(float).tiny)
-    gain = np.where(is_informative, moments**2 / np.where(is_informative, energies, 1.0), 0.0)
-    return np.asarray(np.maximum(total - gain, 0.0))
+    products = oil.T @ oil + np.diag(variance * regression.inflation / _oil_deviations() ** 2)
+    with_left, with_columns = oil.T @ left, oil.T @ columns
+    energies, moments = np.einsum("ro,ro->o", columns, columns), columns.T @ left
+    lowest = np.maximum(_lowest_changes(), -1.0)  # -1: no compressibility or no air, as the regression is linear
+    squares = np.full(columns.shape[1], np.inf)
+    # the least squares within the limits are the smallest of those with some properties at their limits, and the
+    # others free and within them
+    for at_limit in itertools.product((False, True), repeat=4):
+        free = ~np.array(at_limit)
+        changes = np.where(free, 0.0, lowest)
+        rest = with_left - products @ changes  # products of the properties with what the limited ones leave
+        scale = np.sqrt(np.diag(products)[free])
+        normalised = products[np.ix_(free, free)] / np.outer(scale, scale)
+        sides = np.column_stack([rest, with_columns])[free]
+        solutions = np.linalg.solve(normalised, sides / scale[:, None]) / scale[:, None]
+        by_rest, by_leak = solutions[:, 0], solutions[:, 1:].T  # (k,), (o, k) for k free properties
+        total = left @ left - changes @ (with_left + rest) - rest[free] @ by_rest
+        energy = energies - np.einsum("ok,ko->o", by_leak, with_columns[free])
+        moment = np.maximum(moments - changes @ with_columns - by_leak @ rest[free], 0.0)
+        is_informative = energy > RIDGE * max(float(energy.max()), np.finfo(float).tiny)
+        leak = np.where(is_informative, moment / np.where(is_informative, energy, 1.0), 0.0)
+        is_within = (by_rest - leak[:, None] * by_leak >= lowest[free]).all(axis=1)
+        squares = np.where(is_within, np.minimum(squares, np.maximum(total - leak * moment, 0.0)), squares)
+    return squares
