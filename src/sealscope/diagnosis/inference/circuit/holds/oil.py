@@ -218,26 +218,29 @@ def residual_squares(regression: OilRegression, columns: Array, variance: float)
     usual = np.zeros(4)
     left, oil = regression.leaked(usual), regression.slopes(usual)
     products = oil.T @ oil + np.diag(variance * regression.inflation / _oil_deviations() ** 2)
-    with_left, with_columns = oil.T @ left, oil.T @ columns
-    energies, moments = np.einsum("ro,ro->o", columns, columns), columns.T @ left
-    lowest = np.maximum(_lowest_changes(), -1.0)  # -1: no compressibility or no air, as the regression is linear
-    squares = np.full(columns.shape[1], np.inf)
-    # the least squares within the limits are the smallest of those with some properties at their limits, and the
-    # others free and within them
-    for at_limit in itertools.product((False, True), repeat=4):
-        free = ~np.array(at_limit)
-        changes = np.where(free, 0.0, lowest)
-        rest = with_left - products @ changes  # products of the properties with what the limited ones leave
-        scale = np.sqrt(np.diag(products)[free])
-        normalised = products[np.ix_(free, free)] / np.outer(scale, scale)
-        sides = np.column_stack([rest, with_columns])[free]
-        solutions = np.linalg.solve(normalised, sides / scale[:, None]) / scale[:, None]
-        by_rest, by_leak = solutions[:, 0], solutions[:, 1:].T  # (k,), (o, k) for k free properties
-        total = left @ left - changes @ (with_left + rest) - rest[free] @ by_rest
-        energy = energies - np.einsum("ok,ko->o", by_leak, with_columns[free])
-        moment = np.maximum(moments - changes @ with_columns - by_leak @ rest[free], 0.0)
-        is_informative = energy > RIDGE * max(float(energy.max()), np.finfo(float).tiny)
-        leak = np.where(is_informative, moment / np.where(is_informative, energy, 1.0), 0.0)
-        is_within = (by_rest - leak[:, None] * by_leak >= lowest[free]).all(axis=1)
-        squares = np.where(is_within, np.minimum(squares, np.maximum(total - leak * moment, 0.0)), squares)
-    return squares
+    scale = np.sqrt(np.diag(products))  # of the properties, which are measured in 1 / scale from here on
+    products /= np.outer(scale, scale)
+    oil = oil / scale
+    with_left, with_columns = oil.T @ left, oil.T @ columns  # (4,), (4, o)
+    lowest = scale * np.maximum(_lowest_changes(), -1.0)  # -1: no compressibility or no air in the linear regression
+    # The least squares within the limits are the smallest of c = 16 cases: some properties are at their limits, and the
+    # others are free and within them.
+    is_free = np.array(list(itertools.product((True, False), repeat=4)))  # (c, 4)
+    limits = np.where(is_free, 0.0, lowest)
+    rest = with_left - limits @ products  # (c, 4): products with what the limited properties leave
+    matrices = np.where(is_free[:, :, None] & is_free[:, None, :], products, np.eye(4))
+    columns_of_rest = np.concatenate(
+        [rest[:, :, None], np.broadcast_to(with_columns, (len(rest), *with_columns.shape))], axis=2
+    )
+    solutions = np.linalg.solve(matrices, np.where(is_free[:, :, None], columns_of_rest, 0.0))
+    by_rest, by_leak = solutions[:, :, 0], solutions[:, :, 1:]  # (c, 4), (c, 4, o)
+    total = left @ left - (limits * (with_left + rest)).sum(axis=1) - (rest * by_rest).sum(axis=1)
+    energy = np.einsum("ro,ro->o", columns, columns) - np.einsum("ko,cko->co", with_columns, by_leak)
+    moment = columns.T @ left - limits @ with_columns - np.einsum("ck,cko->co", rest, by_leak)
+    moment = np.maximum(moment, 0.0)  # (c, o)
+    is_informative = energy > RIDGE * np.maximum(energy.max(axis=1, keepdims=True), np.finfo(float).tiny)
+    leak = np.where(is_informative, moment / np.where(is_informative, energy, 1.0), 0.0)
+    changes = by_rest[:, :, None] - leak[:, None] * by_leak
+    is_within = ((changes >= lowest[:, None]) | ~is_free[:, :, None]).all(axis=1)
+    squares = np.where(is_within, np.maximum(total[:, None] - leak * moment, 0.0), np.inf)
+    return np.asarray(squares.min(axis=0))
