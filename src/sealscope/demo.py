@@ -50,7 +50,8 @@ def run_demo(folder: Path, seed: int = 1, progress: Progress | None = None) -> D
     names = [*(f"healthy/run{k + 1}.nc" for k in range(N_HEALTHY)), "healthy.nc"]
     recordings = {}  # by file name
     for k, name in enumerate(names):
-        healthy_experiment = Experiment.of(command=COMMAND, duration=SECONDS, seed=len(names) * seed + k)
+        run_seed = len(names) * seed + k  # another one for each recording and each `seed`
+        healthy_experiment = Experiment.of(command=COMMAND, duration=SECONDS, seed=run_seed)
         recordings[name] = simulate_experiment(healthy_experiment).recording
         update("simulating healthy recordings", (k + 1) / len(names))
     experiment = Experiment.of(command=COMMAND, leak=LEAK, duration=60.0, seed=seed)

@@ -88,7 +88,7 @@ class _PythonLaw:
     """A controller written in Python that compiled code can call by an address."""
 
     def __init__(self, voltage: Callable[[Measured], float]) -> None:
-        """Wrap the Python function `voltage` as a C function, and make the `CompiledLaw` that holds its address."""
+        """Wrap the controller's Python function `voltage` as a C function, and make the `CompiledLaw` that calls it."""
         self._voltage, self._memory = voltage, np.full(1, math.nan)
         self.raised: BaseException | None = None
         self._function = LAW(self._call_voltage)
@@ -126,9 +126,9 @@ def start_law(controller: Controller) -> CompiledLaw:
 
 
 def reraise_python_error(law: CompiledLaw) -> None:
-    """Raise the exception of a Python controller that failed when compiled code called `law`; else do nothing.
+    """Raise the exception of a controller written in Python that failed while `law` was called; else do nothing.
 
-    A law may call the law of an inner controller, which may be the one written in Python.
+    The Python controller is `law` itself, or the inner controller whose law `law` calls.
     """
     innermost: Any = law
     while isinstance(innermost, CompiledLaw):  # `kept` is the inner law, or the Python controller

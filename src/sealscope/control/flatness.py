@@ -35,14 +35,14 @@ def _flatness_law(memory: Any, sample: Any) -> Any:
     """Compute the voltage [V] of a sample: feedback plus feed-forward by the equations of `Flatness`, within +-u_max.
 
     The feed-forward is the voltage at which the drive delivers the flow G dp + C d(dp)/dt against dp. Here dp is the
-    pressure difference that the load and the target's speed and acceleration require. `memory`, `sample`: addresses of
-    a record `_MEMORY`, which is updated, and of the numbers of a `Measured`.
+    pressure difference that the load and the target's speed v and acceleration a require. `memory`, `sample`: addresses
+    of a record `_MEMORY`, which is updated, and of the numbers of a `Measured`.
     """
     m, measured = _memory_at(memory), measured_at(sample)
     feedback, is_first = m.feedback, m.is_first > 0.0
     v = measured.target_speed if abs(measured.target_speed) <= m.v_max else 0.0  # jumps are not fed forward
     a = 0.0 if is_first else (v - m.v) / m.T
-    a = a if abs(a) * m.T < _MAX_SPEED_CHANGE * m.v_max else 0.0
+    a = a if abs(a) * m.T < _MAX_SPEED_CHANGE * m.v_max else 0.0  # a jump of the speed is no acceleration
     force = m.M * a + m.F_C * math.tanh(v / m.v_th) + m.F_v * v
     pressure_force = feedback.area_A * measured.p_A - feedback.area_B * measured.p_B
     m.load += (1.0 if is_first else m.load_gain) * (pressure_force - force - m.load)

@@ -57,7 +57,7 @@ def order_ranks(n: int, order: float, confidence: float = 0.95) -> tuple[int, in
     as_probability(order, "the order of a quantile")
     tail = (1.0 - as_probability(confidence, "confidence")) / 2.0
     k = np.arange(1, n + 1)
-    p_at_least_k = betainc(k, n + 1 - k, order)  # P(X >= k), which falls with k, so that counts are ranks
+    p_at_least_k = betainc(k, n + 1 - k, order)  # P(X >= k) falls with k: the largest k above a limit is a count
     r = int(np.count_nonzero(1.0 - p_at_least_k <= tail))
     s = int(np.count_nonzero(p_at_least_k > tail)) + 1
     return r, s
@@ -107,7 +107,7 @@ def _interval_coverage(
     """Compute the proportion of stated intervals, from `low` to `high`, that contain the true value.
 
     All arrays are (n,), one value per record. A record whose `low` or `high` is nan has no interval and is not
-    counted; None stands for no intervals at all. `confidence`: confidence of the proportion's own interval.
+    counted; None stands for no intervals at all. `confidence`: confidence level of the proportion's interval.
     """
     low = _as_matching(low, truth.size, "lower limits")
     high = _as_matching(high, truth.size, "upper limits")
@@ -117,7 +117,10 @@ def _interval_coverage(
 
 
 def _as_matching(values: npt.ArrayLike | None, n: int, what: str) -> Array:
-    """Convert `values` to an array (n,), all nan for None; raise InputError, which names `what`, for another shape."""
+    """Convert `values` to an array (n,), all nan for None; raise InputError for values of another shape.
+
+    `n`: number of true values; `what`: name of the values in the message.
+    """
     array = np.full(n, math.nan) if values is None else np.asarray(values, dtype=np.float64)
     if array.shape != (n,):
         raise InputError(f"{what} must be as many as the true values, got {array.shape} for {n}")

@@ -111,7 +111,7 @@ def _fit_coefficients(design: Array, n: Array, k: Array, *, firth: bool) -> Arra
         eta = design @ beta
         p = expit(eta)
         residual = k - n * p
-        if firth:  # leverage of each size times (1/2 - p): Firth (1993), Heinze and Schemper (2002)
+        if firth:  # adds leverage of each size times (1/2 - p): Firth (1993), Heinze and Schemper (2002)
             inverse = np.linalg.pinv(_information(design, n, eta))
             residual += n * p * (1.0 - p) * np.einsum("ij,jk,ik->i", design, inverse, design) * (0.5 - p)
         return -_log_likelihood(design, n, k, eta, firth=firth), -design.T @ residual
@@ -211,7 +211,7 @@ class HitMiss:
             raise InputError(f"confidence must be from 0.5 to 1, got {confidence}")
         log_odds = _log_odds(detection)
         allowed_drop = 0.5 * float(ndtri(confidence)) ** 2  # of the log-likelihood
-        if not self.slope > 0.0 or self.log_likelihood - self.null <= allowed_drop:
+        if not self.slope > 0.0 or self.log_likelihood - self.null <= allowed_drop:  # a curve of slope 0 is allowed
             return math.inf
 
         def excess_drop(log_size: float) -> float:

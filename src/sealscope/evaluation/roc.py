@@ -121,6 +121,7 @@ def _newcombe_interval(value: float, n: int, m: int, z: float) -> tuple[float, f
         q = (1.0 - t) / (2.0 - t) + t / (1.0 + t)
         return (t - value) ** 2 - z * z * t * (1.0 - t) * (1.0 + (mean_number - 1.0) * q) / (n * m)
 
+    # at A itself the excess is negative; 1e-9: the search ends just beside A
     low = brentq(excess, 0.0, value * (1.0 - 1e-9)) if value > 0.0 else 0.0
     high = brentq(excess, value + (1.0 - value) * 1e-9, 1.0) if value < 1.0 else 1.0
     return float(low), float(high)

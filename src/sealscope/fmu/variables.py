@@ -37,8 +37,8 @@ _VALVE_OUTPUTS = ("x_s", "v_s")
 class Variable(NamedTuple):
     """A variable of a functional mock-up unit (FMU), described in the terms of the FMI standard.
 
-    `reference`: the number by which a program addresses it; `unit`: its SI unit; `start`: its initial value, None for
-    an output.
+    `reference`: number by which a program addresses the variable; `unit`: SI unit; `start`: initial value, None for an
+    output.
     """
 
     reference: int
@@ -77,7 +77,7 @@ def rig_variable(rig: Rig, name: str, variability: Literal["tunable", "fixed"]) 
     """
     value = float(attrgetter(name)(rig))
     field = dict(iter_fields(Rig))[name]
-    if value == absent_of(field):
+    if value == absent_of(field):  # the value that stands for an absent part
         return None
     reference, description = REFERENCES["value"] + VALUES.index(name), str(field.title or name)
     return Variable(reference, name, "parameter", variability, unit_of(field), description, value)
