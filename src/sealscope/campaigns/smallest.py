@@ -306,7 +306,7 @@ def plan_recording(
         progress("duties compared", (k + 1) / len(compared_duties))
     usual_pressure = compared[0].pressure
     target = None if find is None else find / usual_pressure
-    planned = []
+    planned = []  # for detection, then for separation from a leak of the pump
     for field in ("conductance", "separable"):
         best = min(compared, key=lambda leak: float(getattr(leak, field)))
         if target is not None and np.isfinite(getattr(best, field)):

@@ -50,8 +50,8 @@ class SizeRoc:
 def iter_pods(verdicts: Verdicts, confidence: float) -> Iterator[DetectorPod]:
     """Yield each detector's probability of detection over the size of the leak.
 
-    The size is the planned mean flow, in the unit of the plan. A detector without a record that has a leak is left out.
-    `verdicts`: by detector, its verdict on each record; `confidence`: of the intervals.
+    The size is the planned mean flow, in the unit of the plan. `verdicts`: by detector, its verdict on each record;
+    `confidence`: confidence level of the intervals. If no record has a leak, nothing is yielded.
     """
     for name, records in verdicts.items():
         leaky = [record for record in records if record.size > 0]

@@ -40,7 +40,8 @@ def split_bounds(n: int, rate: float, split: int) -> IntArray:
     the other part or on padding. At the start of the record, `START_SECONDS` at the sampling rate `rate` [Hz] are
     left out, too, but at most `START_FRACTION` of the first part. A part without usable samples has end <= begin.
     """
-    before, after = (int(samples) for samples in edge_samples()[-1])  # of the last level, whose filter is longest
+    # numbers of earlier and of later samples on which a detail of the last level depends, whose filter is longest
+    before, after = (int(samples) for samples in edge_samples()[-1])
     begin = max(before, int(min(START_SECONDS * rate, START_FRACTION * split)))
     return np.array([[begin, split - after], [split + before, n - after]])
 
@@ -64,9 +65,10 @@ class SplitRms:
         """
         rate = recording.rate
         bounds = split_bounds(len(recording), rate, round((split_s - float(recording.t[0])) * rate))
+        has_samples = np.diff(bounds).min() > 0  # in both parts
         squares = {}
-        for chamber in CHAMBERS if np.diff(bounds).min() > 0 else ():
-            if chamber in recording:
+        for chamber in CHAMBERS:
+            if has_samples and chamber in recording:
                 before, _gap, after = mean_squares(details(recording[chamber]), bounds.ravel())
                 squares[chamber] = np.array([before, after])
         return cls.from_squares(squares, bounds)
@@ -79,9 +81,10 @@ class SplitRms:
         of each part (`split_bounds`). The mean over both parts is weighted by their numbers of samples.
         """
         log_rms = {}
-        with np.errstate(divide="ignore"):
+        n_samples = np.diff(bounds)[:, 0]
+        with np.errstate(divide="ignore"):  # the details of a constant pressure are 0
             for chamber, (before, after) in squares.items():
-                overall = np.average((before, after), axis=0, weights=np.diff(bounds)[:, 0])
+                overall = np.average((before, after), axis=0, weights=n_samples)
                 log_rms[chamber] = (0.5 * np.log(before), 0.5 * np.log(after), 0.5 * np.log(overall))
         return cls(log_rms)
 
