@@ -66,8 +66,8 @@ def is_known_version(version: str) -> bool:
 def _compiler() -> ModuleType:
     """Import the module that compiles functions with the installed version of numba.
 
-    This is `numba_private` for a version in `KNOWN_VERSIONS`. For other versions it is `numba_pipeline`, which
-    compiles slowly and does not cache; a warning is then logged.
+    The module is `numba_private` for a version in `KNOWN_VERSIONS`. For other versions the module is `numba_pipeline`,
+    which compiles slowly and does not cache; a warning is then logged.
     """
     if is_known_version(numba.__version__):
         return import_module("sealscope.numba_private")
@@ -96,8 +96,8 @@ def source_hash(root: Path) -> str:
 def _user_cache_folder() -> Path | None:
     """Choose the folder in which compiled code of this user is cached.
 
-    It is `SEALSCOPE_CACHE_DIR` if this environment variable is set, else a folder in the user's cache folder. None if
-    the variable is empty, which turns caching off, or if the user has no home folder.
+    The folder is `SEALSCOPE_CACHE_DIR` if this environment variable is set, else a folder in the user's cache folder.
+    None if the variable is empty, which turns caching off, or if the user has no home folder.
     """
     setting = os.environ.get("SEALSCOPE_CACHE_DIR")
     if setting is not None:
@@ -254,7 +254,7 @@ def entry(function: Callable[..., Any]) -> Entry:
 def call_at(context: Any, address: Any, memory: Any, sample: Any) -> Any:
     """Call the function double f(double *memory, double *sample) at an address, and return its result.
 
-    It is for use in compiled code only. `address` of the function, `memory` and `sample` are addresses as 64-bit
+    For use in compiled code only. `address` of the function, `memory` and `sample` are addresses as 64-bit
     integers; numba passes `context`.
     """
 

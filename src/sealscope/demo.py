@@ -44,7 +44,7 @@ def run_demo(folder: Path, seed: int = 1, progress: Progress | None = None) -> D
     """Simulate recordings, commission a machine on healthy ones, and diagnose a healthy and a leaking one.
 
     All files are written into `folder`, with a page on the leaking recording. `seed`: seed of the simulated noise;
-    `progress`: called with the name of a task and the completed fraction of it.
+    `progress`: called with the name of a task and the task's completed fraction.
     """
     update = progress or (lambda task, share: None)
     names = [*(f"healthy/run{k + 1}.nc" for k in range(N_HEALTHY)), "healthy.nc"]

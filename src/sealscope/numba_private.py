@@ -209,7 +209,8 @@ class _Law(CPUDispatcher):  # type: ignore[misc]
     def _for_python(self) -> Any:
         """Function that runs if Python calls the law.
 
-        It is the law's Python source if the law is small (inlined), else a kernel that is compiled from this source.
+        The function is the law's Python source if the law is small (inlined), else a kernel that is compiled from this
+        source.
         """
         inlined = self.targetoptions["forceinline"]
         return self.py_func if inlined else compile_kernel(self.py_func, self.targetoptions["fastmath"], self.folder)

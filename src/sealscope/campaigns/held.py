@@ -175,8 +175,8 @@ class _HoldDraws:
 def _decay_per_conductance(rig: Rig) -> float:
     """Compute the decay rate of p_A - p_B [1/s] per unit of leak conductance, in Pa/m^3, for a piston at mid-stroke.
 
-    It is K (1/V_A + 1/V_B), with the oil's usual bulk modulus K and the chambers' volumes V at mid-stroke, which
-    include an assumed dead volume.
+    The result is K (1/V_A + 1/V_B), with the oil's usual bulk modulus K and the chambers' volumes V at mid-stroke,
+    which include an assumed dead volume.
     """
     oil, cylinder = INFERENCE.held_oil, rig.cylinder
     length = cylinder.L * (0.5 + oil.dead)
@@ -188,7 +188,8 @@ def draw_hold(rig: Rig, hold: PlannedHold, conductance: float, flow: float, seed
 
     `conductance` [m^3/(s Pa)]: conductance of the leak; `flow` [m^3/s]: mean flow of the pump under the usual command
     and load; `seed`: seed of the noise. Returns the summary of a recording with this hold: the leak measured in the
-    hold, the pump's flow and the pressure difference. Its Gram matrix, for data from the motion of the piston, is 0.
+    hold, the pump's flow and the pressure difference. The summary's Gram matrix, which is for data from the motion of
+    the piston, is 0.
     """
     random = np.random.default_rng(seed)
     cylinder, sensors = rig.cylinder, rig.sensors

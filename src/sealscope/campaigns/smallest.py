@@ -194,8 +194,8 @@ def detectable_leak(
 ) -> DetectableLeak:
     """Compute the smallest leak that is detected in recordings with the command and load `duty`, of `duration` [s].
 
-    The numbers are medians of `N_RECORDS` simulated recordings. `false_alarm`: probability of an alarm without a
-    leak; `detection`: probability of an alarm with it. If a recording cannot be simulated, or its volume balance cannot
+    The numbers are medians of `N_RECORDS` simulated recordings. `false_alarm`: probability of an alarm without a leak;
+    `detection`: probability of an alarm with the leak. If a recording cannot be simulated, or its volume balance cannot
     be computed, the smallest leak is inf, with the reason in `note`.
     """
     steps = []
@@ -226,7 +226,7 @@ def _detectable_steps(recording: Recording, rig: Rig, false_alarm: float, detect
     """Compute from a leak-free recording the smallest sudden increase (step) of the leak that would be detected.
 
     Also computes the smallest step that can be told from a step of the pump's leakage. `false_alarm`: probability of
-    an alarm without a leak; `detection`: probability of an alarm with it. Raises InputError if the volume balance
+    an alarm without a leak; `detection`: probability of an alarm with the leak. Raises InputError if the volume balance
     cannot be computed from the recording.
     """
     detector = VolumeBalance(rig)

@@ -182,6 +182,6 @@ class Controller(Protocol):
         """Start a run of the controller, and return its control law.
 
         The law is a function that computes the voltage [V] of a sample from its `Measured`: time, target and
-        measurements. It is called once a sample.
+        measurements. The law is called once a sample.
         """
         ...

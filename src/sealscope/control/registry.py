@@ -53,8 +53,8 @@ def is_installed(name: str) -> bool:
 def check_controller_name(name: str) -> None:
     """Check that `name` is a built-in or installed controller, or has the form of a user's controller.
 
-    A user's controller is written ``MODULE:NAME`` or ``FILE.py:NAME``. It is not imported, so it may not exist.
-    Raises InputError for any other name.
+    A user's controller is written ``MODULE:NAME`` or ``FILE.py:NAME``. Such a controller is not imported, so that it
+    may not exist. Raises InputError for any other name.
     """
     module_or_file, _, attribute = name.rpartition(":")
     if not is_installed(name) and not (module_or_file and attribute):

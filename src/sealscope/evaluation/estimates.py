@@ -84,8 +84,8 @@ def estimate_quantile(values: npt.ArrayLike, order: float, confidence: float = 0
 def estimate_mean(values: npt.ArrayLike, confidence: float = 0.95) -> IntervalEstimate:
     """Estimate the mean of the distribution that a sample `values` comes from, with Student's confidence interval.
 
-    The interval is ``mean -+ t s/sqrt(n)``. It is infinite for a single value; without values all results are nan.
-    Raises InputError for a value that is not finite.
+    The interval is ``mean -+ t s/sqrt(n)``, and infinite for a single value; without values all results are nan. Raises
+    InputError for a value that is not finite.
     """
     from scipy.special import stdtrit
 

@@ -215,7 +215,7 @@ def build_functions(choice: SensorChoice) -> dict[str, Callable[..., Any]]:
     """Build the functions ``start``, ``advance`` and ``report`` of a soft sensor's FMU; return them by name.
 
     ``start`` clears the sensor's memory `y` (`memory_layout`), ``advance`` adds the samples of a communication step to
-    it, and ``report`` writes the outputs to `results`. They have the arguments of the functions of a rig's FMU
+    it, and ``report`` writes the outputs to `results`. The three functions have the arguments of those of a rig's FMU
     (`fmu.machine.build_functions`), pointers to arrays of doubles.
     """
     from scipy.special import stdtrit
@@ -547,8 +547,9 @@ def _mean(history: Any, newest: int, n: int, column: int) -> float:
 def _variance_of_mean(history: Any, newest: int, n: int) -> float:
     """Compute the variance of the mean conductance of n blocks, the last of which is block `newest`.
 
-    It is the larger of two variances, divided by n: the sample variance of the blocks' estimates, and the mean of the
-    variances that the fit gives these estimates. `history` (WINDOW, 5): results of the last blocks, as in `_mean`.
+    The result is the larger of two variances, divided by n: the sample variance of the blocks' estimates, and the mean
+    of the variances that the fit gives these estimates. `history` (WINDOW, 5): results of the last blocks, as in
+    `_mean`.
     """
     mean, sample_variance = _mean(history, newest, n, _COMPARABLE_G), 0.0
     for k in range(n):

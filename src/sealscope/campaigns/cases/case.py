@@ -78,7 +78,7 @@ def digest(value: Any) -> str:
 def profile_key(name: str) -> str:
     """Compute a hash (hex) of the content of a profile, the distribution from which machines are drawn.
 
-    It does not depend on the path of the profile's file.
+    The hash does not depend on the path of the profile's file.
     """
     profile = load_profile(name)
     # the name seeds the draws of machines; a profile with `seeds` shares the draws of that profile
@@ -99,8 +99,8 @@ def shared_inputs(plan: SimulatedPlan) -> dict[str, Any]:
 def _level_digests(plan: SimulatedPlan) -> dict[str, dict[str, str]]:
     """Compute hashes of the machine families and controller files of a plan's factors, by factor and level (value).
 
-    The id of a case depends on the hashes of its own levels only. Its stored row thus stays valid when another family
-    or file is edited.
+    The id of a case depends on the hashes of its own levels only. The stored row of a case thus stays valid when
+    another family or file is edited.
     """
     digests: dict[str, dict[str, str]] = {FAMILY: {}, CONTROLLER: {}}
     for level in plan.factors.get(FAMILY, ()):

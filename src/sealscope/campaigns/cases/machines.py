@@ -100,7 +100,7 @@ def size_leaks_on_short_run(experiment: Experiment) -> tuple[Leak, ...]:
     """Find the coefficients of an experiment's leaks that give their planned mean flows; return the completed leaks.
 
     The search simulates two or three times, so it uses a short run (`sizing_experiment`) and not the whole record. The
-    true mean flow of the record may therefore differ a little; the record's row states it.
+    true mean flow of the record, which the record's row states, may therefore differ a little from the planned one.
     """
     if not experiment.leaks:
         return ()

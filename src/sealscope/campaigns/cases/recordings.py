@@ -67,8 +67,8 @@ def judge_recordings(plan: RecordedPlan, folder: Path, progress: ProgressCallbac
 def _stroke_direction(recording: Recording) -> str:
     """Classify a recording as a stroke "out" or "in" by the mean of p_A - p_B, or else as "both".
 
-    It is a stroke of one direction if |mean| exceeds the fraction `_MIN_ONE_SIDEDNESS` of the RMS of p_A - p_B; "out"
-    means that p_A is higher on average. Without both pressures the result is "both".
+    The recording is a stroke of one direction if |mean| exceeds the fraction `_MIN_ONE_SIDEDNESS` of the RMS of p_A -
+    p_B; "out" means that p_A is higher on average. Without both pressures the result is "both".
     """
     if not all(name in recording for name in CHAMBERS):
         return "both"

@@ -59,7 +59,7 @@ class AlarmFractions:
     def informedness(self) -> float:
         """Youden's J of a group with a leak: fraction of alarms minus `false_alarm`, 1 if perfect, 0 for mere guesses.
 
-        It is nan if `false_alarm` is None.
+        The result is nan if `false_alarm` is None.
         """
         return self.alarms.value - self.false_alarm.value if self.false_alarm else math.nan
 

@@ -49,7 +49,8 @@ def check_controllers(plan: SimulatedPlan, trust: bool) -> None:
     """Check that every controller of a plan is trusted, and build those that are not built in.
 
     A plan may be hostile, so code that it names (`FILE.py:NAME`, `MODULE:NAME`) is run only if `trust` is True.
-    Built-in and installed controllers are always trusted. Raises InputError if one is untrusted or cannot be built.
+    Built-in and installed controllers are always trusted. Raises InputError if a controller is untrusted or cannot be
+    built.
     """
     names = [str(level) for level in plan.factors.get(CONTROLLER, ())]
     if plan.profile:

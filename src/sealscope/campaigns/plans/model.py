@@ -170,7 +170,7 @@ class _JudgedPlan(_Plan):
     def _load_assumed(self, default: Rig | None) -> Rig | None:
         """Load the rig that detectors may assume, and replace its parameters by the values in the plan's `assume_set`.
 
-        It is the rig `assume` of the plan, else `default`, else the packaged rig `thesis`. Returns None if there is
+        The rig is `assume` of the plan, else `default`, else the packaged rig `thesis`. Returns None if there is
         neither a plan's nor a default rig, and no value in `assume_set`.
         """
         rig = default if self.assume is None else load_rig(self.assume)

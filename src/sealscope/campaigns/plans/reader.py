@@ -158,7 +158,7 @@ def _complete_simulated_plan(plan: SimulatedPlan) -> SimulatedPlan:
 
 
 def _check_factors(plan: SimulatedPlan) -> None:
-    """Check the factors of a plan and their levels (values); raise InputError if one is invalid.
+    """Check the factors of a plan and their levels (values); raise InputError if one of them is invalid.
 
     Each level must be valid and occur once in its factor. There may be at most `MAX_CELLS` combinations of levels. If
     the plan varies the controller, all its commands must be targets of the piston's position, not voltages.
@@ -203,7 +203,7 @@ def _check_level(plan: SimulatedPlan, name: str, level: str | float) -> None:
 
 
 def _check_records(plan: SimulatedPlan) -> None:
-    """Check the groups of records of a plan; raise InputError if one is invalid.
+    """Check the groups of records of a plan; raise InputError if a group is invalid.
 
     No two groups may agree in use, leak, law and fault; each fault must be known; and at least one group must be
     judged. If a detector needs a threshold, there must be enough leak-free records for the plan's false-alarm

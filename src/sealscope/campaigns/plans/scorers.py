@@ -164,8 +164,8 @@ class Scorer:
 def _iter_scorers() -> Iterator[Scorer]:
     """Yield all scorers: rules on one wavelet detail of one chamber, and the thesis's rule on both chambers.
 
-    Each rule on a fall or a rise, and the thesis's rule, also occurs as a sign rule, whose threshold is 0. It raises an
-    alarm at any change in the tested direction.
+    Each rule on a fall or a rise, and the thesis's rule, also occurs as a sign rule, whose threshold is 0. A sign rule
+    raises an alarm at any change in the tested direction.
     """
     for chamber, quantity, direction in product(CHAMBERS, QUANTITIES, _DIRECTIONS):
         rule = Scorer(f"{quantity} of {chamber} {direction}", ((quantity, chamber, direction),))

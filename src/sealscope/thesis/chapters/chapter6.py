@@ -87,7 +87,7 @@ def _rig(name: str = RIG) -> Rig:
 
 
 def _amplitude_at(run: Trajectory, mask: NDArray[np.bool_], f: float) -> float:
-    """Compute the amplitude [m] of the piston's motion at the frequency `f` [Hz], over the samples of a mask."""
+    """Compute the amplitude [m] of the piston's motion at the frequency `f` [Hz], from the samples of a mask."""
     return float(np.abs(sine_fit(run.t[mask], run["x"][mask], 2 * math.pi * f).amplitudes[0]))
 
 
@@ -160,8 +160,8 @@ class ControlledRig:
         """Compute the frequency [Hz] at which the tracking error of small sines first exceeds -3 dB of the target.
 
         The error is |x/target - 1| of complex amplitudes, and its limit 0.71. The target is a sum of sines of the
-        frequencies `BANDWIDTH_FREQUENCIES`, between which the result is interpolated. Returns the lowest of them if the
-        error exceeds the limit there already, and inf if the error is below the limit at all of them.
+        frequencies `BANDWIDTH_FREQUENCIES`, between which the result is interpolated. Returns the lowest frequency if
+        the error exceeds the limit there already, and inf if the error exceeds the limit at none of them.
         """
         frequencies = BANDWIDTH_FREQUENCIES
         terms = [f"{1e3 * BANDWIDTH_SPEED / (2 * math.pi * f):.6f} mm sin({2 * math.pi * f!r}t)" for f in frequencies]
@@ -184,9 +184,9 @@ class ControlledRig:
     def efficiencies(self) -> tuple[float, float]:
         """Compute the electrical and the hydraulic efficiency of a sine motion against a damper as the only load.
 
-        They are the work in the damper over the electrical energy of the motor, and over the hydraulic energy. The pump
-        delivers the hydraulic energy at its ports or, in a valve-controlled rig, a lossless supply at the supply's
-        pressure.
+        The efficiencies are the work in the damper over the electrical energy of the motor, and over the hydraulic
+        energy. The hydraulic energy is delivered by the pump at its ports or, in a valve-controlled rig, by a lossless
+        supply at the supply's pressure.
         """
         run, mask = replace(self, values=(("F_l", 0.0), ("d_load", DAMPER))).run_duty()
         flow = supply_flow(run) if _rig(self.rig).circuit.valve_controlled else run["Q_1"]
@@ -320,7 +320,8 @@ def external_leak_table(context: Context, item: Item) -> tuple[ThesisTable, ...]
     """Tabulate tracking and stiffness of each controller with a leak past the rod seal of either side.
 
     The last column shows the loss of oil from the circuit: the change [kPa] of the mean of min(p_A, p_B) over a cycle,
-    from the third to the fifth cycle. The leak's stated flow is that at the mean pressure of its side without the leak.
+    from the third to the fifth cycle. The flow of a leak is stated for the mean pressure of the leaking side in a run
+    without leaks.
     """
     healthy, mask = ControlledRig("pi", 0.0).run_duty()
     pressure = {side: float(np.mean(healthy[f"p_{side}"][mask])) for side in ("A", "B")}
@@ -371,7 +372,7 @@ def _column_by_leak(table: ThesisTable, names: tuple[str, ...], head: str) -> di
 
 
 def judge_claims(context: Context, item: Item) -> tuple[Claim, ...]:
-    """Judge claims 6.2.1 to 6.2.4 on position control."""
+    """Judge claims 6.2.1 to 6.2.4 on position control; `item` is not used."""
     return _disturbance_claim(context), _tolerance_claim(context), _load_claim(context), _valve_claim(context)
 
 

@@ -79,7 +79,7 @@ def _wavelet_claims() -> Iterator[Claim]:
 
 
 def _percent_change(pair: tuple[float, float]) -> float:
-    """Compute the relative change [%] from the first value of a pair, without a leak, to the second, with it."""
+    """Compute the relative change [%] of a quantity from the first value of `pair`, without a leak, to the second."""
     before, after = pair
     return 100.0 * (after / before - 1.0)
 

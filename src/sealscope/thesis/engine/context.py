@@ -106,7 +106,7 @@ class Context:
 
 
 def first_table(context: Context, item: str) -> ThesisTable:
-    """Return the first table among the products of a needed item with the id `item`.
+    """Return the first table among the products of the item `item`, which the item to be made needs.
 
     Raises InputError if the needed item failed or made no table.
     """
