@@ -150,7 +150,7 @@ class _HoldDraws:
         the probability that a leak-free hold leaks as much is below the allowed false-alarm probability.
         """
         n_missed = 0
-        for seed in range(N_HEALTHY, N_HEALTHY + _N_DRAWS):
+        for seed in range(N_HEALTHY, N_HEALTHY + _N_DRAWS):  # the healthy holds have the seeds before
             rise = held_rise(draw_hold(self._rig, self._hold, conductance, self._flow, seed), self._healthy)
             n_missed += rise is None or not rise.chance < self._max_false_alarm
             if n_missed > self._max_missed:  # further draws cannot change the answer

@@ -166,7 +166,7 @@ class RecordingPlan(NamedTuple):
             for row in comparable
         ]
         notes = [row for row in self.compared if row.note]
-        lines += [paragraph(f"left out: {row.duty}: {row.note}", "  ", 4) for row in notes[:1]]
+        lines += [paragraph(f"left out: {row.duty}: {row.note}", head="  ", indent=4) for row in notes[:1]]
         return "\n".join(lines)
 
     def _format_flow(self, conductance: float) -> str:
@@ -257,7 +257,7 @@ def _separation_ratio(blocks: Blocks, columns: Sequence[ColumnRoles]) -> float:
     if PUMP not in column.names or len(columns) > 1:
         return np.inf
     middle = len(blocks) // 2
-    gram = blocks.gram[:, 0].sum(axis=0)
+    gram = blocks.gram[:, 0].sum(axis=0)  # of the only equation
     gram_after_step = blocks.gram[middle:, 0].sum(axis=0)
     constants = np.array(column.nuisance)
     steps = np.array([column.leak, column.names.index(PUMP)])

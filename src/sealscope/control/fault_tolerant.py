@@ -171,4 +171,4 @@ class FaultTolerant:
             drive=self.drive.coefficients(rate),
             observer=make_observer(self.balance, rate),
         )
-        return CompiledLaw(_tolerant_law.address, memory.view(np.float64), inner)
+        return CompiledLaw(_tolerant_law.address, memory.view(np.float64), kept=inner)

@@ -98,7 +98,7 @@ class Flatness:
             feedback=PositionPI.from_rig(rig),
             drive=drive,
             M=cylinder.M_eq,
-            F_C=friction.F_pr + 2.0 * friction.F_cfr * drive.mean_pressure(rig),
+            F_C=friction.F_pr + 2.0 * friction.F_cfr * drive.mean_pressure(rig),  # with p_A = p_B
             F_v=friction.F_v,
             v_th=friction.v_th,
             G=rig.pump.G_pump if rig.circuit.pump_feeds_chambers else 0.0,

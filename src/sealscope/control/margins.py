@@ -221,7 +221,8 @@ def _frequency_response(response: Array, z: NDArray[np.complex128]) -> NDArray[n
 def compute_margins(f: Array, L: NDArray[np.complex128], speed: float = 0.0, damped: bool = True) -> Margins:
     """Compute the stability margins of an open-loop response L (n,) at the frequencies `f` (n,) [Hz].
 
-    Between the frequencies, L is interpolated linearly. `speed`, `damped`: copied to the result.
+    Between the frequencies, L is interpolated linearly. `speed` [m/s] of the piston, and `damped`, True if the rig is
+    stable without the controller, are copied to the result.
     """
     indices = np.arange(f.size)
     unit_gain = _crossings(np.abs(L) - 1.0)  # fractional indices at which |L| = 1

@@ -138,7 +138,7 @@ def estimate_errors(
 
     `estimates` and `truth` (n,) have the same unit, and so have `low` and `high` (n,), the ends of the stated
     intervals. A missing estimate or interval is nan. The confidence interval of the rmse is the square root of
-    Student's interval of the mean square error, cut off at 0; those of the quantiles are valid for any distribution.
+    Student's interval of the mean square error, cut off at 0. The intervals of quantiles hold for any distribution.
     Raises InputError if no record has an estimate.
     """
     true_values = as_numbers(truth, "true values")

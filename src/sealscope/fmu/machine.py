@@ -192,6 +192,7 @@ def build_functions(choice: RigChoice) -> dict[str, Callable[..., Any]]:
         p, z = model_parameters(v, input_values), state_of(state)
         observe(z, input_values[_U], input_values[_G], input_values[_C], p, out)
         out[_N_OUTPUTS] = _electric(out[_VOLTAGE], z[CURRENT])
+        # without throttles the ports of the pump have the chambers' pressures
         out[_N_OUTPUTS + 1] = _hydraulic(out[_Q_1], (out[P_1] - out[P_2]) if throttled else (out[P_A] - out[P_B]))
         out[_N_OUTPUTS + 2] = _mechanical(out[P_A], out[P_B], z[VELOCITY], p.A_A, p.A_B)
         return 0
@@ -229,7 +230,7 @@ def build_functions(choice: RigChoice) -> dict[str, Callable[..., Any]]:
         has a pressure below vacuum.
         """
         v, state = carray(values, _N_VALUES), carray(y, _N_STATES)
-        a, b = carray(inputs, _N_INPUTS), carray(slopes, _N_INPUTS)
+        a, b = carray(inputs, _N_INPUTS), carray(slopes, _N_INPUTS)  # the inputs at the time t are a + b t
         p, z, h = model_parameters(v, a), state_of(state), span / steps
         for k in range(steps):
             z = step(z, h, k * h, a, b, p)

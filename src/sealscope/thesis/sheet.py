@@ -176,7 +176,7 @@ def _parse_number(row: dict[str, str], column: str, number: int, path: Path, *, 
     `allow_zero`.
     """
     try:
-        value = float(row[column] or "nan")
+        value = float(row[column] or "nan")  # an empty cell is no number > 0
     except ValueError:
         value = math.nan
     if not (0.0 < value < math.inf or (allow_zero and value == 0.0)):

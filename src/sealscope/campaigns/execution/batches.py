@@ -117,7 +117,7 @@ def iter_batch_rows(plan: SimulatedPlan, cases: Sequence[CampaignCase], threads:
             try:
                 experiment = experiment_with_flow_leak(plan, case, profile)
                 pairs.append((case, replace(experiment, step=choose_step(case, experiment))))
-            except Exception as error:
+            except Exception as error:  # a defect of one case must not end the campaign
                 rows.append(CaseRow.from_case(case, error=error_text(error)))
         rows += _run_batch(plan, pairs, threads)
         seconds = round((time.process_time() - start_time) / len(batch), 4)

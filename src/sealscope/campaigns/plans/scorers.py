@@ -77,8 +77,9 @@ class SplitRms:
     def from_squares(cls, squares: Mapping[str, Array], bounds: IntArray) -> SplitRms:
         """Compute the log RMS of the pressures' wavelet details from their mean squares in both parts of a record.
 
-        `squares`: by chamber, mean squares (2, 5) before and after the split; `bounds` (2, 2): first sample and end
-        of each part (`split_bounds`). The mean over both parts is weighted by their numbers of samples.
+        `squares`: by chamber, mean squares (2, 5) of d1 to d4 and d3d4, before and after the split; `bounds` (2, 2):
+        first sample and end of each part (`split_bounds`). The mean over both parts is weighted by their numbers of
+        samples.
         """
         log_rms = {}
         n_samples = np.diff(bounds)[:, 0]

@@ -83,7 +83,7 @@ def wavelet_spectrum(omega: Array) -> np.ndarray:
     """
 
     def response(taps: list[float], omega: Array) -> np.ndarray:
-        """Compute the frequency response of a filter at `omega` [rad per sample] from its coefficients."""
+        """Compute the frequency response of a filter with the coefficients `taps` at `omega` [rad per sample]."""
         return np.asarray(np.polynomial.polynomial.polyval(np.exp(-1j * omega), np.array(taps, dtype=np.float64)))
 
     filters = discrete_wavelet(WAVELET)
@@ -99,7 +99,7 @@ def wavelet_centre() -> WaveletCentre:
     The centre in time is weighted by |psi|^2; the centre in frequency is the peak of |Psi|.
     """
     _, psi, t = mother_wavelet()
-    omega = np.linspace(0.1, 12.0, 12000)
+    omega = np.linspace(0.1, 12.0, 12000)  # [rad per sample], around the peak
     peak = omega[np.abs(wavelet_spectrum(omega)).argmax()]
     return WaveletCentre(float(np.sum(t * psi**2) / np.sum(psi**2)), float(peak / (2.0 * np.pi)))
 
@@ -304,7 +304,7 @@ def scalogram_figure(context: Context, item: Item) -> tuple[Figure, ...]:
     run = context.run(Experiment.of(command=_COMMAND, duration=20.0, leak=f"{_LEAK} from {_ONSET:g} s"))
     t = run.recorded.t
     rate = 1.0 / float(t[1] - t[0])
-    frequencies = np.geomspace(12.0, 0.45 * rate, 64)
+    frequencies = np.geomspace(12.0, 0.45 * rate, 64)  # [Hz], to below the Nyquist frequency
     recorded, noise_free = run.recorded["p_A"] * 1e-6, run.outputs["p_A"] * 1e-6
     leak = ((_ONSET, "leak"),)
     panels = [Panel("t [s]", "p_A [MPa]", (FigureCurve(t, recorded, "p_A, recorded", "A"),), "(a) Record", leak)]

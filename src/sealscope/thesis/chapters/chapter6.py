@@ -128,7 +128,7 @@ class ControlledRig:
             controller = controller_named(self.controller, rig) if self.controller else None
         experiment = Experiment.of(
             rig=rig,
-            set={**PLANT_MISMATCH, "F_l": LOAD, **dict(self.values)},
+            set={**PLANT_MISMATCH, "F_l": LOAD, **dict(self.values)},  # the controller assumes the rig without these
             command=command,
             duration=duration,
             controller=controller,
@@ -152,8 +152,8 @@ class ControlledRig:
         this amplitude over that of the piston's motion at the same frequency.
         """
         force = f"{STIFFNESS_FORCE} N sin({2 * math.pi * STIFFNESS_FREQUENCY!r}t)"
-        run = self.run("position 0 mm sin(t)", 16.0, force)
-        is_settled = run.t >= 8.0
+        run = self.run("position 0 mm sin(t)", duration=16.0, load=force)  # amplitude 0: a constant target
+        is_settled = run.t >= 8.0  # [s]
         return STIFFNESS_FORCE / (1e3 * _amplitude_at(run, is_settled, STIFFNESS_FREQUENCY))
 
     def bandwidth(self) -> float:
@@ -276,16 +276,18 @@ def open_loop_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     def drift(run: Trajectory, first: int) -> float:
         """Compute the drift of the piston's mean position [mm/min] from cycle `first` of a run to the next cycle."""
         means = [float(np.mean(run["x"][_cycle_mask(run.t, k)])) for k in (first, first + 1)]
-        return 60e3 * (means[1] - means[0]) / CYCLE
+        return 60e3 * (means[1] - means[0]) / CYCLE  # 60e3 mm/min are 1 m/s
 
     for lpm in _leak_flows(context):
+        # a cosine of the speed makes the position swing about its start
         open_loop = ControlledRig("", lpm).run(f"{OPEN_LOOP_U} sin({OMEGA!r}t + {0.5 * math.pi!r})", 3.0 * CYCLE)
+        open_drift = drift(open_loop, first=1)
         if lpm == 0.0:  # the first of the leaks
-            healthy_drift = drift(open_loop, 1)
+            healthy_drift = open_drift
         is_settled = open_loop.t >= CYCLE
         amplitude_mm = 1e3 * _amplitude_at(open_loop, is_settled, 1 / CYCLE)
-        closed = [drift(ControlledRig(name, lpm).run(DUTY, 4.0 * CYCLE), 2) for name in ("pi", "fault-tolerant")]
-        rows.append((lpm, amplitude_mm, drift(open_loop, 1), drift(open_loop, 1) - healthy_drift, *closed))
+        closed = [drift(ControlledRig(name, lpm).run(DUTY, 4.0 * CYCLE), first=2) for name in ("pi", "fault-tolerant")]
+        rows.append((lpm, amplitude_mm, open_drift, open_drift - healthy_drift, *closed))
     return (item.table(rows, format_note("open-loop", rig=RIG, load=LOAD, u=OPEN_LOOP_U)),)
 
 
@@ -383,7 +385,7 @@ def _disturbance_claim(context: Context) -> Claim:
     """
     table = first_table(context, "sec-6.2-open-loop")
     heads = "leak [L/min]", "open: drift by the leak [mm/min]", "pi: drift [mm/min]"
-    rows = [row for row in zip(*(column(table, head) for head in heads), strict=True) if row[0] > 0]
+    rows = [row for row in zip(*(column(table, head) for head in heads), strict=True) if row[0] > 0]  # with a leak
     texts = [f"{lpm:g} L/min: {opened:.1f} open, {closed:.2f} closed" for lpm, opened, closed in rows]
     tests = [abs(closed) < NEGLIGIBLE_DRIFT for *_, closed in rows]
     return judge_claim("6.2.1", tests, drifts="; ".join(texts))
@@ -419,13 +421,13 @@ def _load_claim(context: Context) -> Claim:
     table = first_table(context, "sec-6.2-load")
     error_ranges = {}
     for name in LOAD_CONTROLLERS:
-        errors = column(table, load_head(name, 0.0, _ERROR))
+        errors = column(table, load_head(name, lpm=0.0, quantity=_ERROR))
         error_ranges[name] = float(errors.min()), float(errors.max())
     max_low = max(low for low, _ in error_ranges.values())
     highs = [high for _, high in error_ranges.values()]
     text = "; ".join(f"{name} {low:.3f} to {high:.3f} mm" for name, (low, high) in error_ranges.items())
     tests = [max(highs) > DISTINCT_RATIO * min(highs)]
-    all_below_one_percent = max(highs) < 0.01 * 1e3 * AMPLITUDE
+    all_below_one_percent = max(highs) < 0.01 * 1e3 * AMPLITUDE  # 1 % of the amplitude [mm]
     return judge_claim("6.2.3", tests, spread=text, all_below=all_below_one_percent, largest_low=max_low)
 
 

@@ -192,7 +192,7 @@ def leave_one_out_r2(columns: Array, y: Array) -> float:
     With residuals r and leverages h it is ``1 - sum (r_i/(1 - h_i))^2 / sum (y_i - mean y)^2``. Source: Allen,
     Technometrics 16 (1974) 125-127, doi 10.1080/00401706.1974.10489157.
     """
-    hat = columns @ np.linalg.pinv(columns)
+    hat = columns @ np.linalg.pinv(columns)  # with the leverages on the diagonal
     residuals = (y - hat @ y) / (1.0 - np.diag(hat))
     return float(1.0 - np.sum(residuals**2) / np.sum((y - y.mean()) ** 2))
 

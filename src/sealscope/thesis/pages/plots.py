@@ -66,7 +66,7 @@ def draw(figure: Figure) -> tuple[bytes, bytes]:
     with matplotlib.rc_context():
         matplotlib.rcdefaults()  # ignore settings in the working folder, which may be hostile and run TeX
         matplotlib.rcParams.update(matplotlib.rc_params_from_file(SETTINGS, use_default_template=False))
-        matplotlib.rcParams["svg.hashsalt"] = figure.id
+        matplotlib.rcParams["svg.hashsalt"] = figure.id  # equal figures give equal files
         mpl_figure = _draw_figure(figure)
         long_lines = [line for ax in mpl_figure.axes for line in ax.lines if np.size(line.get_xdata()) > _RASTER_POINTS]
         is_large = sum(np.size(line.get_xdata()) for line in long_lines) * _POINT_BYTES > MAX_SVG_BYTES
