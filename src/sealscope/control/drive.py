@@ -120,7 +120,8 @@ class Drive(_Invertible):
     droop: float
 
     def __post_init__(self) -> None:
-        check_numbers("the drive", self, ("displacement", "omega_per_volt"), ("shortfall", "corner", "droop"))
+        not_negative = ("shortfall", "corner", "droop")
+        check_numbers("the drive", self, positive=("displacement", "omega_per_volt"), not_negative=not_negative)
 
     @classmethod
     def from_rig(cls, rig: Rig) -> Self:
@@ -193,7 +194,7 @@ class ValveDrive(_Invertible):
     p_s: float
 
     def __post_init__(self) -> None:
-        check_numbers("the valve", self, ("Q_N", "dp_N", "u_N", "p_s"))
+        check_numbers("the valve", self, positive=("Q_N", "dp_N", "u_N", "p_s"))
 
     @classmethod
     def from_rig(cls, rig: Rig) -> Self:

@@ -106,7 +106,7 @@ class FaultTolerant:
 
     def __post_init__(self) -> None:
         not_negative = ("G_assumed",) if self.known is None else ("G_assumed", "known")
-        check_numbers("the controller", self, ("u_max",), not_negative)
+        check_numbers("the controller", self, positive=("u_max",), not_negative=not_negative)
 
     @classmethod
     def from_rig(cls, rig: Rig, inner: Controller | None = None, *, known: float | None = None) -> Self:

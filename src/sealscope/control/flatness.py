@@ -87,7 +87,8 @@ class Flatness:
     v_max: float
 
     def __post_init__(self) -> None:
-        check_numbers("the controller", self, ("v_th", "v_max"), ("M", "F_C", "F_v", "G", "C"))
+        not_negative = ("M", "F_C", "F_v", "G", "C")
+        check_numbers("the controller", self, positive=("v_th", "v_max"), not_negative=not_negative)
 
     @classmethod
     def from_rig(cls, rig: Rig) -> Self:

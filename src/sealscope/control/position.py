@@ -86,7 +86,8 @@ class PositionPI:
 
     def __post_init__(self) -> None:
         not_negative = ("dead_volts", "k_v", "k_i", "dead_band", "delay")
-        check_numbers("the controller", self, ("area_A", "area_B", "u_max", "rate"), not_negative)
+        positive = ("area_A", "area_B", "u_max", "rate")
+        check_numbers("the controller", self, positive=positive, not_negative=not_negative)
 
     @classmethod
     def from_rig(cls, rig: Rig, **gains: float) -> Self:

@@ -94,7 +94,7 @@ def _judge_file(plan: RecordedPlan, recordings: RecordingSet, path: Path, name: 
     try:
         recording = read(path, map=plan.channel_map or None, rate=plan.rate_hz)
         rig, _ = assumed_rig(plan.assumed, recording)
-        scores, statements = judge_record(recording, split_s=None, plan=plan, rig=rig)
+        scores, statements = judge_record(recording, None, plan, rig)  # None: scorers split it in the middle
         levels[STROKE] = _stroke_direction(inspect_recording(recording, INSPECTED).part)
         return make_row(scores=scores, statements=statements)
     except Exception as error:  # one bad recording must not end the campaign; its row carries the error

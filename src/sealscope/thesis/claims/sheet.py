@@ -377,8 +377,8 @@ _CLAIMS: dict[str, SheetClaim] = {
 def claims(evidence: ClaimEvidence) -> Iterator[Claim]:
     """Judge the claims that the data sheet decides: abstract, sections 5.6 and 5.7, Table 5.1, and chapter 6."""
     for number, rule in enumerate(CLAIMED, start=1):
-        where = "section 5.6" if rule is _BOTH_D3D4 else f"Fig. 5.{89 + number}"
-        yield _rate_claim(rule, where).judge(evidence, f"5.4.{number}", "5.4")
+        where = "section 5.6" if rule is _BOTH_D3D4 else f"Fig. 5.{89 + number}"  # Figs. 5.90 to 5.95
+        yield _rate_claim(rule, where).judge(evidence, id=f"5.4.{number}", kind="5.4")
     for id, claim in _CLAIMS.items():
         yield claim.judge(evidence, id)
 
