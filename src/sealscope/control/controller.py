@@ -53,6 +53,7 @@ class Started:
     """A compiled control law that Python can call: it computes the voltage [V] for each `Measured`."""
 
     def __init__(self, law: CompiledLaw) -> None:
+        """Prepare calls of `law` by its address, and a place from which it reads the numbers of a `Measured`."""
         self._law, self._measured = law, np.empty(len(Measured._fields))
         self._call = LAW(law.address)
         self._addresses = law.memory.ctypes.data, self._measured.ctypes.data
@@ -118,7 +119,7 @@ class _PythonLaw:
 def start_law(controller: Controller) -> CompiledLaw:
     """Start a controller for one run and return its control law.
 
-    The law is machine code if the controller has a method `compiled` that provides it. Otherwise it calls the
+    The law is machine code if the controller has a method `compiled` that provides it. Otherwise the law calls the
     Python function that `start` returns.
     """
     law: CompiledLaw | None = controller.compiled() if hasattr(controller, "compiled") else None

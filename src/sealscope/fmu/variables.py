@@ -56,7 +56,7 @@ def input_variables(rows: Mapping[str, tuple[str, str]]) -> Iterator[Variable]:
     `rows`: (unit, description) by name of the variable.
     """
     for k, (name, (unit, description)) in enumerate(rows.items()):
-        yield Variable(REFERENCES["input"] + k, name, "input", "continuous", unit, description, 0.0)
+        yield Variable(REFERENCES["input"] + k, name, "input", "continuous", unit, description, start=0.0)
 
 
 def output_variables(rows: Mapping[str, tuple[str, str]]) -> Iterator[Variable]:
@@ -66,7 +66,7 @@ def output_variables(rows: Mapping[str, tuple[str, str]]) -> Iterator[Variable]:
     """
     for k, (name, (unit, description)) in enumerate(rows.items()):
         if name not in _VALVE_OUTPUTS:
-            yield Variable(REFERENCES["result"] + k, name, "output", "continuous", unit, description, None)
+            yield Variable(REFERENCES["result"] + k, name, "output", "continuous", unit, description, start=None)
 
 
 def rig_variable(rig: Rig, name: str, variability: Literal["tunable", "fixed"]) -> Variable | None:

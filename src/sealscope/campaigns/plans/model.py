@@ -269,7 +269,7 @@ class RecordedPlan(_JudgedPlan):
     @cached_property
     def assumed(self) -> Rig | None:
         """The rig that detectors may assume, or None if the plan states no rig."""
-        return self._load_assumed(None)
+        return self._load_assumed(default=None)
 
 
 AnyPlan: TypeAlias = SimulatedPlan | RecordedPlan
