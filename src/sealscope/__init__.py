@@ -25,7 +25,7 @@ __all__ = list(sorted({*_HOMES, "__version__"} - {"LeakDetector"}))
 
 
 def __getattr__(name: str) -> Any:
-    """Load an exported name of the package when it is first used; a deprecated name warns."""
+    """Load the exported object `name` of the package when it is first used; warn if the name is deprecated."""
     if name == "__version__":
         from importlib.metadata import version
 
@@ -36,7 +36,8 @@ def __getattr__(name: str) -> Any:
         from warnings import warn
 
         replacement, home, attribute = _DEPRECATED[name]
-        warn(f"sealscope.{name} is deprecated and goes with the next release: use {replacement}", DeprecationWarning, 2)
+        message = f"sealscope.{name} is deprecated and goes with the next release: use {replacement}"
+        warn(message, DeprecationWarning, stacklevel=2)  # 2: the line that uses the name
         return getattr(import_module(home), attribute)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 

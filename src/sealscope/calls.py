@@ -49,7 +49,7 @@ def checked_call(function: Callable[P, R]) -> Callable[P, R]:
     signature = inspect.signature(function)
     parameters = signature.parameters.values()
     names = [parameter.name for parameter in parameters if parameter.kind is not parameter.VAR_KEYWORD]
-    takes_any_keyword = len(names) < len(parameters)
+    takes_any_keyword = len(names) < len(parameters)  # it has a parameter `**kwargs`, which is not in `names`
     if names[:1] in (["self"], ["cls"]):
         del names[0]
 
@@ -74,25 +74,24 @@ def checked_call(function: Callable[P, R]) -> Callable[P, R]:
 def argument(default: Any, kind: str, text: str, *, unit: str = "") -> Any:
     """Declare an argument of a function as a dataclass field with a default value and documentation.
 
-    `kind`: type of the argument in words, such as "float"; `text`: its meaning; `unit`: SI unit of a number, empty
-    for other values. The field's metadata contain them under these names, with the unit appended to the text. The
-    decorator `take_fields_of` makes the function's signature and docstring from such fields.
+    `kind`: type of the argument in words, such as "float"; `text`: meaning of the argument; `unit`: SI unit of a
+    number, empty for other values. The field's metadata contain `kind`, `text` and `unit`, with the unit appended to
+    the text. The decorator `take_fields_of` makes the function's signature and docstring from such fields.
     """
-    return field(
-        default=default, metadata={"kind": kind, "text": f"{text} [{unit}]." if unit else f"{text}.", "unit": unit}
-    )
+    full_text = f"{text} [{unit}]." if unit else f"{text}."
+    return field(default=default, metadata={"kind": kind, "text": full_text, "unit": unit})
 
 
 def take_fields_of(declared: Callable[P, V]) -> Callable[[Callable[[V], R]], Callable[P, R]]:
     """Build a decorator that lets callers of a function pass the fields of a dataclass as its arguments.
 
     `declared`: the dataclass, with fields declared by `argument`. The function itself takes an instance of `declared`
-    as its only argument. The decorator puts the fields into the function's signature, and a section "Parameters" on
-    them into its docstring, before the section "Returns". Wrong arguments raise InputError.
+    as its only argument. The decorator puts the fields into the function's signature. It also inserts a section
+    "Parameters" on the fields into the docstring, before the section "Returns". Wrong arguments raise InputError.
     """
     lines: list[str] = []
     for declared_field in fields(declared):  # type: ignore[arg-type]
-        wrapped = fill(declared_field.metadata["text"], 110, break_long_words=False, break_on_hyphens=False)
+        wrapped = fill(declared_field.metadata["text"], width=110, break_long_words=False, break_on_hyphens=False)
         lines += [f"{declared_field.name} : {declared_field.metadata['kind']}, optional", indent(wrapped, "    ")]
     section = "\n".join(["Parameters", "----------", *lines, "", ""])
 

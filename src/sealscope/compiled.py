@@ -66,8 +66,8 @@ def is_known_version(version: str) -> bool:
 def _compiler() -> ModuleType:
     """Import the module that compiles functions with the installed version of numba.
 
-    This is `numba_private` for a version in `KNOWN_VERSIONS`. For other versions it is `numba_pipeline`, which
-    compiles slowly and does not cache; a warning is then logged.
+    The module is `numba_private` for a version in `KNOWN_VERSIONS`. For other versions the module is `numba_pipeline`,
+    which compiles slowly and does not cache; a warning is then logged.
     """
     if is_known_version(numba.__version__):
         return import_module("sealscope.numba_private")
@@ -96,8 +96,8 @@ def source_hash(root: Path) -> str:
 def _user_cache_folder() -> Path | None:
     """Choose the folder in which compiled code of this user is cached.
 
-    It is `SEALSCOPE_CACHE_DIR` if this environment variable is set, else a folder in the user's cache folder. None if
-    the variable is empty, which turns caching off, or if the user has no home folder.
+    The folder is `SEALSCOPE_CACHE_DIR` if this environment variable is set, else a folder in the user's cache folder.
+    None if the variable is empty, which turns caching off, or if the user has no home folder.
     """
     setting = os.environ.get("SEALSCOPE_CACHE_DIR")
     if setting is not None:
@@ -139,10 +139,10 @@ def _make_private(folder: Path) -> None:
     Raises OSError if the folder belongs to another user, or if others could write to it until now.
     """
     folder.mkdir(mode=0o700, exist_ok=True)
-    _check_owner(folder, 0o022)
+    _check_owner(folder, forbidden=0o022)  # others cannot write
     if folder.lstat().st_mode & 0o077:
         folder.chmod(0o700)
-    _check_owner(folder, 0o077)
+    _check_owner(folder, forbidden=0o077)  # others cannot read, either
 
 
 @cache
@@ -167,11 +167,11 @@ def cache_directory() -> Path | None:
                 _make_private(base)
             else:
                 base.mkdir(mode=0o700, parents=True, exist_ok=True)
-                _check_owner(base.resolve(), 0o022)
+                _check_owner(base.resolve(), forbidden=0o022)  # others cannot write
             _make_private(directory.parent)
             _make_private(directory)
-            os.utime(directory)
-            with tempfile.TemporaryFile(dir=directory):
+            os.utime(directory)  # `_prune` keeps the folders that were used last
+            with tempfile.TemporaryFile(dir=directory):  # raises OSError if no file can be written
                 pass
             _prune(directory.parent, key)
         except OSError as error:
@@ -194,8 +194,8 @@ def kernel(function: _F, fastmath: Any = False) -> _F:
 def _compile_law(function: _F, fastmath: Any, inlined: bool = True) -> _F:
     """Compile a law, a function that other compiled functions call.
 
-    `fastmath`: False, or the deviations from IEEE 754 that are allowed, as for `kernel`; `inlined`: insert its code
-    in place of each call. The function is returned unchanged if numba's compilation is disabled.
+    `fastmath`: allowed deviations from IEEE 754 as LLVM's fast-math flags, False for none; `inlined`: True to insert
+    the law's code in place of each call. The law is returned uncompiled if numba's compilation is disabled.
     """
     if numba.config.DISABLE_JIT:
         return function
@@ -207,7 +207,7 @@ def law(function: _F) -> _F:
 
     Its code is inserted in place of each call. A call from Python runs the uncompiled function.
     """
-    return _compile_law(function, False)
+    return _compile_law(function, fastmath=False)
 
 
 def large_law(function: _F) -> _F:
@@ -215,7 +215,7 @@ def large_law(function: _F) -> _F:
 
     A call from Python runs compiled code, too.
     """
-    return _compile_law(function, False, inlined=False)
+    return _compile_law(function, fastmath=False, inlined=False)
 
 
 def contracted(function: _F) -> _F:
@@ -224,7 +224,7 @@ def contracted(function: _F) -> _F:
     A division may also become a product with the reciprocal. The last digits of the results then depend on the
     processor, but not on how the data are split into blocks or lanes (`physics.lanes`).
     """
-    return _compile_law(function, {"contract", "arcp"})
+    return _compile_law(function, fastmath={"contract", "arcp"})  # fused multiply-adds, reciprocals
 
 
 class Entry:
@@ -236,7 +236,7 @@ class Entry:
     _SIGNATURE = numba.float64(types.CPointer(numba.float64), types.CPointer(numba.float64))
 
     def __init__(self, function: Callable[..., Any]) -> None:
-        """Prepare the compilation of a function of two arrays of doubles, which returns a double."""
+        """Prepare the compilation of `function`, which takes two arrays of doubles and returns a double."""
         self._address = _compiler().compile_at_address(function, self._SIGNATURE, cache_directory())
 
     @cached_property
@@ -254,15 +254,15 @@ def entry(function: Callable[..., Any]) -> Entry:
 def call_at(context: Any, address: Any, memory: Any, sample: Any) -> Any:
     """Call the function double f(double *memory, double *sample) at an address, and return its result.
 
-    Compiled code only. The arguments `address`, `memory` and `sample` are addresses as 64-bit integers; numba passes
-    `context`.
+    For use in compiled code only. `address` of the function, `memory` and `sample` are addresses as 64-bit
+    integers; numba passes `context`.
     """
 
     def emit_call(target: Any, builder: Any, signature: Any, values: Any) -> Any:
         """Emit the LLVM instructions that call the function at the address; return its result, a double.
 
-        Numba passes the arguments: `values` are the addresses of the function, of `memory` and of `sample` as 64-bit
-        integers, which are converted to pointers.
+        Numba passes the arguments. `values` are the addresses of the function, of `memory` and of `sample`: 64-bit
+        integers, which are converted to pointers here.
         """
         double = target.get_value_type(numba.float64)
         pointer = double.as_pointer()
@@ -295,8 +295,8 @@ def record_dtype(*numbers: str, **parts: Any) -> np.dtype[Any]:
     `numbers`: names of the fields that are single doubles; they come first. `parts`: further fields by name, each with
     the shape of an array of doubles or with the dtype of a nested record.
     """
-    shaped = [(name, part) if isinstance(part, np.dtype) else (name, "f8", part) for name, part in parts.items()]
-    return np.dtype([*((name, "f8") for name in numbers), *shaped])
+    further = [(name, part) if isinstance(part, np.dtype) else (name, "f8", part) for name, part in parts.items()]
+    return np.dtype([*((name, "f8") for name in numbers), *further])  # f8: NumPy's name of a double
 
 
 def make_record(layout: np.dtype[Any], source: object = None, **values: Any) -> np.recarray[Any, Any]:

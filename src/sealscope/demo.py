@@ -44,13 +44,14 @@ def run_demo(folder: Path, seed: int = 1, progress: Progress | None = None) -> D
     """Simulate recordings, commission a machine on healthy ones, and diagnose a healthy and a leaking one.
 
     All files are written into `folder`, with a page on the leaking recording. `seed`: seed of the simulated noise;
-    `progress`: called with the name of a task and the completed fraction of it.
+    `progress`: called with the name of a task and the task's completed fraction.
     """
     update = progress or (lambda task, share: None)
     names = [*(f"healthy/run{k + 1}.nc" for k in range(N_HEALTHY)), "healthy.nc"]
     recordings = {}  # by file name
     for k, name in enumerate(names):
-        healthy_experiment = Experiment.of(command=COMMAND, duration=SECONDS, seed=len(names) * seed + k)
+        run_seed = len(names) * seed + k  # another one for each recording and each `seed`
+        healthy_experiment = Experiment.of(command=COMMAND, duration=SECONDS, seed=run_seed)
         recordings[name] = simulate_experiment(healthy_experiment).recording
         update("simulating healthy recordings", (k + 1) / len(names))
     experiment = Experiment.of(command=COMMAND, leak=LEAK, duration=60.0, seed=seed)

@@ -89,13 +89,13 @@ def _make_source(name: str, experiment: Experiment, settings: SimulateSettings, 
     """
 
     def play(receiver: BlockReceiver) -> None:
-        """Simulate the actuator, and submit each block to `receiver` when its time has come, until all are submitted.
+        """Simulate the actuator, and submit each block of samples to `receiver` at the time at which it would end.
 
-        Blocks in the receiver's store are skipped; if all are there, nothing is simulated. Returns early if the
-        receiver is stopping.
+        Blocks that the receiver's store already has are skipped; if it has all of them, nothing is simulated. Returns
+        early if the receiver is stopping.
         """
         blocks = range(math.floor(experiment.duration / BLOCK_S))
-        # the store knows all blocks before some block, and none after it
+        # number of the first block to submit: the store has all blocks before it, and none from it on
         first = bisect_left(blocks, True, key=lambda number: not receiver.store.is_known(name, block_identity(number)))
         if first < len(blocks):
             with _simulation_lock:

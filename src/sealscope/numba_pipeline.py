@@ -99,6 +99,7 @@ class ConstantLengths(FunctionPass):  # type: ignore[misc]
                 length = find_length(value)
                 if length is not None:
                     statement.value = ir.Const(length, statement.loc)
+                    # numba also lists the values of each variable, where it looks for definitions
                     definitions = code._definitions[statement.target.name]
                     definitions[definitions.index(value)] = statement.value
                     changed = True
@@ -130,8 +131,8 @@ def compile_kernel(function: Callable[..., Any], fastmath: Any, folder: Path | N
 def compile_law(function: Callable[..., Any], fastmath: Any, inlined: bool, folder: Path | None) -> Any:
     """Compile a function for calls from other compiled functions.
 
-    `fastmath`: as for `numba.njit`; `inlined`: numba may insert its code in place of a call, and Python runs the
-    uncompiled function; `folder` is not used, as nothing is cached here.
+    `fastmath`: as for `numba.njit`; `inlined`: True if numba may insert the function's code in place of a call, and
+    Python is to run the uncompiled function; `folder` is not used, as nothing is cached here.
     """
     if inlined:
         return register_jitable(fastmath=fastmath, **_OPTIONS)(function)

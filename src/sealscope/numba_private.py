@@ -151,9 +151,9 @@ def _dispatcher(function: Callable[..., Any], options: dict[str, Any], folder: P
 
 
 def compile_kernel(function: Callable[..., Any], fastmath: Any, folder: Path | None) -> Any:
-    """Compile a function that Python calls, and cache it in `folder`; None: no cache.
+    """Prepare a function that Python calls for compilation at its first call.
 
-    `fastmath`: as for `numba.njit`.
+    `fastmath`: as for `numba.njit`; `folder`: cache for the compiled code, None without a cache.
     """
     return _dispatcher(function, {"no_cfunc_wrapper": True, "fastmath": fastmath}, folder)
 
@@ -177,9 +177,9 @@ class _LawCompiler(_ShortCompiler):
     """
 
     def define_pipelines(self) -> list[Any]:
-        """Build the list of numba's pipelines, which has one entry: the passes in `_PASSES`.
+        """Build the list of numba's pipelines with one entry, the passes in `_PASSES`, and turn off machine code.
 
-        The generation of machine code is turned off.
+        The compiled function is kept as LLVM code in a `_LawLibrary`.
         """
         self.state.flags.no_compile = True
         self.state.library = _LawLibrary(self.state.targetctx.codegen(), self.state.func_id.func_qualname)
@@ -201,15 +201,16 @@ class _Law(CPUDispatcher):  # type: ignore[misc]
 
         `cres`: numba's result of the compilation.
         """
-        name = object()  # stands for the missing machine code
-        self.targetctx.insert_user_function(name, cres.fndesc, [cres.library])
-        self.overloads[tuple(cres.signature.args)] = cres._replace(entry_point=name)
+        placeholder = object()  # in place of the entry point, under which numba finds the code
+        self.targetctx.insert_user_function(placeholder, cres.fndesc, [cres.library])
+        self.overloads[tuple(cres.signature.args)] = cres._replace(entry_point=placeholder)
 
     @cached_property
     def _for_python(self) -> Any:
         """Function that runs if Python calls the law.
 
-        It is the law's Python source if the law is small (inlined), else a kernel that is compiled from this source.
+        The function is the law's Python source if the law is small (inlined), else a kernel that is compiled from this
+        source.
         """
         inlined = self.targetoptions["forceinline"]
         return self.py_func if inlined else compile_kernel(self.py_func, self.targetoptions["fastmath"], self.folder)
@@ -220,10 +221,10 @@ class _Law(CPUDispatcher):  # type: ignore[misc]
 
 
 def compile_law(function: Callable[..., Any], fastmath: Any, inlined: bool, folder: Path | None) -> Any:
-    """Compile a function for calls from other compiled functions.
+    """Prepare a law, a function for calls from other compiled functions, for compilation when it is first needed.
 
-    `fastmath`: as for `numba.njit`; `inlined`: insert its code in place of each call, as for a small law; `folder`:
-    cache for a large law that Python calls (`_Law`), None without a cache.
+    `fastmath`: as for `numba.njit`; `inlined`: True to insert the law's code in place of each call, as for a small law;
+    `folder`: cache for a large law that Python calls (`_Law`), None without a cache.
     """
     options = {"nopython": True, "nogil": True, "error_model": "numpy", "fastmath": fastmath, "forceinline": inlined}
     options |= {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}

@@ -19,7 +19,7 @@ def paragraph(text: str, head: str = "", indent: int | None = None, width: int =
     """
     indentation = " " * (len(head) if indent is None else indent)
     return fill(
-        printable(text, "\n\t"),
+        printable(text, kept="\n\t"),  # which `fill` turns into blanks
         width,
         initial_indent=head,
         subsequent_indent=indentation,
@@ -33,7 +33,7 @@ def paragraphs(rows: Iterable[tuple[str, str | None]], columns: int, width: int 
 
     Rows without a text are omitted. `width`: longest line in characters. Returns one string for each paragraph.
     """
-    return [paragraph(text, f"  {label}".ljust(columns), columns, width) for label, text in rows if text]
+    return [paragraph(text, f"  {label}".ljust(columns), indent=columns, width=width) for label, text in rows if text]
 
 
 def format_count(count: int, noun: str) -> str:

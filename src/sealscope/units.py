@@ -57,7 +57,7 @@ class Unit(NamedTuple):
         Raises ValueError if the factor exceeds the range of doubles.
         """
         bits = max(other.factor.numerator, other.factor.denominator).bit_length()
-        if abs(power) * bits > _MAX_BITS:
+        if abs(power) * bits > _MAX_BITS:  # checked first, as the power itself could take forever
             raise ValueError
         factor, pi_power = self.factor * Fraction(other.factor**power), self.pi_power + other.pi_power * power
         if max(factor.numerator, factor.denominator).bit_length() > _MAX_BITS or abs(pi_power) > _MAX_PI:
@@ -146,7 +146,7 @@ def _parse_name(name: str) -> Unit:
     result = Unit(Fraction(repr(float(factor))))
     for base_name, power in base._units.items():
         unit = _ATOMS.get(_SPELLINGS.get(base_name, base_name), Unit(powers=((base_name, Fraction(1)),)))
-        result = result.times(unit, Fraction(power).limit_denominator(12))
+        result = result.times(unit, Fraction(power).limit_denominator(12))  # pint's powers are floats, such as 0.5
     return result
 
 
@@ -174,7 +174,7 @@ def _tokenize(text: str) -> list[str]:
 
 
 def _parse_product(tokens: list[str]) -> Unit:
-    """Parse a product with `/`, blanks and brackets, such as ``m^3/(s Pa)``, and remove its tokens from the list.
+    """Parse a product of units, such as ``m^3/(s Pa)``, from its `tokens`, and remove them from the list.
 
     The product ends with the list or before a closing bracket. Raises ValueError if there is no valid product.
     """
@@ -267,7 +267,7 @@ def is_familiar(unit: str) -> bool:
     for part in parts:
         without_power = part.rstrip("23")
         without_mark = part[:-1] if part.endswith(("a", "g")) else part  # of absolute or gauge pressure
-        if not names & {part, without_power, without_mark}:
+        if names.isdisjoint((part, without_power, without_mark)):
             return False
     return True
 
@@ -339,7 +339,7 @@ def to_si(
     if offset_before:
         result += float(offset_before)
     if factor.numerator == 1 and float(factor.denominator) == factor.denominator:
-        result /= float(factor.denominator)
+        result /= float(factor.denominator)  # more exact than a product with the rounded factor
     else:
         result *= float(factor)
     if pi_power:

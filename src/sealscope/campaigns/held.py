@@ -117,23 +117,23 @@ def plan_hold(
 class _HoldDraws:
     """Simulated locked holds of one duration, which show the smallest leak that such holds detect.
 
-    In a locked hold, valves shut the cylinder off from its pump. `load` [N]: load that the cylinder holds; `flow`
-    [m^3/s]: mean flow of the pump under the usual command and load; `duration` [s]: time with shut valves;
-    `false_alarm`: probability of the verdict `leak` without a leak; `detection`: probability of this verdict with the
-    leak.
+    In a locked hold, valves shut the cylinder off from its pump.
     """
 
     def __init__(
         self, rig: Rig, load: float, flow: float, duration: float, false_alarm: float, detection: float
     ) -> None:
-        """Set the pressures of the hold, and the limits on false alarms and missed leaks (arguments: see the class).
+        """Set the pressures of a hold with shut valves, and the limits on false alarms and missed leaks.
 
-        Chamber B is at the charge pressure; the pressure of chamber A is higher by load / A_A.
+        Chamber B is at the charge pressure; the pressure of chamber A is higher by load / A_A. `load` [N]: load that
+        the cylinder holds; `flow` [m^3/s]: mean flow of the pump under the usual command and load; `duration` [s]: time
+        with shut valves; `false_alarm`: probability of the verdict `leak` without a leak; `detection`: probability of
+        this verdict with the leak.
         """
-        pressure_B = rig.fluid.p_charge + P_ATM
         self._rig, self._flow = rig, flow
+        pressure_B = rig.fluid.p_charge + P_ATM  # absolute
         pressure_A = pressure_B + load / rig.cylinder.A_A
-        self._hold = PlannedHold(duration, pressure_A, pressure_B, conductance=np.inf)
+        self._hold = PlannedHold(duration, pressure_A, pressure_B, conductance=np.inf)  # no leak is found so far
         # the fraction `within` of the probability is reserved for the test for a step within a recording
         self._max_false_alarm = false_alarm * (1.0 - DECISION.questions.within)
         self._max_missed = _N_DRAWS - detection * _N_DRAWS
@@ -141,7 +141,7 @@ class _HoldDraws:
     @cached_property
     def _healthy(self) -> list[RecordingSums]:
         """Summaries (`RecordingSums`) of `N_HEALTHY` simulated holds without a leak, to compare leaky holds with."""
-        return [draw_hold(self._rig, self._hold, 0.0, self._flow, seed) for seed in range(N_HEALTHY)]
+        return [draw_hold(self._rig, self._hold, conductance=0.0, flow=self._flow, seed=k) for k in range(N_HEALTHY)]
 
     def detects(self, conductance: float) -> bool:
         """Return True if at least the fraction `detection` of `_N_DRAWS` simulated holds detects a leak.
@@ -150,7 +150,7 @@ class _HoldDraws:
         the probability that a leak-free hold leaks as much is below the allowed false-alarm probability.
         """
         n_missed = 0
-        for seed in range(N_HEALTHY, N_HEALTHY + _N_DRAWS):
+        for seed in range(N_HEALTHY, N_HEALTHY + _N_DRAWS):  # the healthy holds have the seeds before
             rise = held_rise(draw_hold(self._rig, self._hold, conductance, self._flow, seed), self._healthy)
             n_missed += rise is None or not rise.chance < self._max_false_alarm
             if n_missed > self._max_missed:  # further draws cannot change the answer
@@ -175,8 +175,8 @@ class _HoldDraws:
 def _decay_per_conductance(rig: Rig) -> float:
     """Compute the decay rate of p_A - p_B [1/s] per unit of leak conductance, in Pa/m^3, for a piston at mid-stroke.
 
-    It is K (1/V_A + 1/V_B), with the oil's usual bulk modulus K and the chambers' volumes V at mid-stroke, which
-    include an assumed dead volume.
+    The result is K (1/V_A + 1/V_B), with the oil's usual bulk modulus K and the chambers' volumes V at mid-stroke,
+    which include an assumed dead volume.
     """
     oil, cylinder = INFERENCE.held_oil, rig.cylinder
     length = cylinder.L * (0.5 + oil.dead)
@@ -188,11 +188,13 @@ def draw_hold(rig: Rig, hold: PlannedHold, conductance: float, flow: float, seed
 
     `conductance` [m^3/(s Pa)]: conductance of the leak; `flow` [m^3/s]: mean flow of the pump under the usual command
     and load; `seed`: seed of the noise. Returns the summary of a recording with this hold: the leak measured in the
-    hold, the pump's flow and the pressure difference. Its Gram matrix, for data from the motion of the piston, is 0.
+    hold, the pump's flow and the pressure difference. The summary's Gram matrix, which is for data from the motion of
+    the piston, is 0.
     """
     random = np.random.default_rng(seed)
     cylinder, sensors = rig.cylinder, rig.sensors
     t = np.arange(round((BEFORE + hold.duration) * MAX_RATE)) / MAX_RATE
+    # p_A - p_B falls exponentially once the valves are shut, at the time `BEFORE`
     loss = hold.difference * -np.expm1(-conductance * _decay_per_conductance(rig) * np.maximum(t - BEFORE, 0.0))
     fraction_A = cylinder.A_B / (cylinder.A_A + cylinder.A_B)  # of the loss, inverse to the volumes
     p_A, p_B = (
@@ -203,7 +205,8 @@ def draw_hold(rig: Rig, hold: PlannedHold, conductance: float, flow: float, seed
         )
     )
     x = sensors.x.noise * random.standard_normal(t.size)
-    sides = CylinderSides(cylinder.A_A, cylinder.A_B, -0.5 * cylinder.L, 0.5 * cylinder.L)
-    locked_holds = find_locked_holds((t, p_A, p_B, x), t[1:] >= BEFORE, MAX_RATE)
-    chambers = HeldChambers(locked_holds, sides, float(t[0]), float(t[-1]), hold.pressure_B)
-    return RecordingSums(np.zeros((1, 1, 1)), flow, hold.difference, held=np.array(chambers.leaks))
+    sides = CylinderSides(cylinder.A_A, cylinder.A_B, low=-0.5 * cylinder.L, high=0.5 * cylinder.L)
+    locked_holds = find_locked_holds((t, p_A, p_B, x), rests=t[1:] >= BEFORE, rate=MAX_RATE)
+    chambers = HeldChambers(locked_holds, sides, begin=float(t[0]), end=float(t[-1]), charge=hold.pressure_B)
+    held = np.array(chambers.leaks)
+    return RecordingSums(sums=np.zeros((1, 1, 1)), flow=flow, pressure=hold.difference, held=held)

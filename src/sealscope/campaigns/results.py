@@ -37,9 +37,9 @@ class CampaignResult:
 def prior_knowledge(plan: SimulatedPlan | RecordedPlan) -> dict[str, PriorKnowledge]:
     """Collect the information that a plan gives to each of its detectors, by the detector's name.
 
-    A scorer, which only computes a score, may compare two parts of a record. It then knows the true onset of simulated
-    records, because they are split there; recordings are split in the middle. Detectors that are not scorers assume
-    the plan's rig.
+    A scorer, which only computes a score, may compare two parts of a record. Such a scorer knows the true onset of
+    simulated records, because they are split at the onset; recordings are split in the middle. Detectors that are not
+    scorers assume the plan's rig.
     """
     is_simulated = isinstance(plan, SimulatedPlan)
     rig = "" if plan.assumed is None else plan.assumed.name

@@ -166,7 +166,7 @@ class RecordingPlan(NamedTuple):
             for row in comparable
         ]
         notes = [row for row in self.compared if row.note]
-        lines += [paragraph(f"left out: {row.duty}: {row.note}", "  ", 4) for row in notes[:1]]
+        lines += [paragraph(f"left out: {row.duty}: {row.note}", head="  ", indent=4) for row in notes[:1]]
         return "\n".join(lines)
 
     def _format_flow(self, conductance: float) -> str:
@@ -194,8 +194,8 @@ def detectable_leak(
 ) -> DetectableLeak:
     """Compute the smallest leak that is detected in recordings with the command and load `duty`, of `duration` [s].
 
-    The numbers are medians of `N_RECORDS` simulated recordings. `false_alarm`: probability of an alarm without a
-    leak; `detection`: probability of an alarm with it. If a recording cannot be simulated, or its volume balance cannot
+    The numbers are medians of `N_RECORDS` simulated recordings. `false_alarm`: probability of an alarm without a leak;
+    `detection`: probability of an alarm with the leak. If a recording cannot be simulated, or its volume balance cannot
     be computed, the smallest leak is inf, with the reason in `note`.
     """
     steps = []
@@ -226,7 +226,7 @@ def _detectable_steps(recording: Recording, rig: Rig, false_alarm: float, detect
     """Compute from a leak-free recording the smallest sudden increase (step) of the leak that would be detected.
 
     Also computes the smallest step that can be told from a step of the pump's leakage. `false_alarm`: probability of
-    an alarm without a leak; `detection`: probability of an alarm with it. Raises InputError if the volume balance
+    an alarm without a leak; `detection`: probability of an alarm with the leak. Raises InputError if the volume balance
     cannot be computed from the recording.
     """
     detector = VolumeBalance(rig)
@@ -257,7 +257,7 @@ def _separation_ratio(blocks: Blocks, columns: Sequence[ColumnRoles]) -> float:
     if PUMP not in column.names or len(columns) > 1:
         return np.inf
     middle = len(blocks) // 2
-    gram = blocks.gram[:, 0].sum(axis=0)
+    gram = blocks.gram[:, 0].sum(axis=0)  # of the only equation
     gram_after_step = blocks.gram[middle:, 0].sum(axis=0)
     constants = np.array(column.nuisance)
     steps = np.array([column.leak, column.names.index(PUMP)])
@@ -306,7 +306,7 @@ def plan_recording(
         progress("duties compared", (k + 1) / len(compared_duties))
     usual_pressure = compared[0].pressure
     target = None if find is None else find / usual_pressure
-    planned = []
+    planned = []  # for detection, then for separation from a leak of the pump
     for field in ("conductance", "separable"):
         best = min(compared, key=lambda leak: float(getattr(leak, field)))
         if target is not None and np.isfinite(getattr(best, field)):

@@ -53,6 +53,7 @@ class Started:
     """A compiled control law that Python can call: it computes the voltage [V] for each `Measured`."""
 
     def __init__(self, law: CompiledLaw) -> None:
+        """Prepare calls of `law` by its address, and a place from which it reads the numbers of a `Measured`."""
         self._law, self._measured = law, np.empty(len(Measured._fields))
         self._call = LAW(law.address)
         self._addresses = law.memory.ctypes.data, self._measured.ctypes.data
@@ -88,7 +89,7 @@ class _PythonLaw:
     """A controller written in Python that compiled code can call by an address."""
 
     def __init__(self, voltage: Callable[[Measured], float]) -> None:
-        """Wrap the Python function `voltage` as a C function, and make the `CompiledLaw` that holds its address."""
+        """Wrap the controller's Python function `voltage` as a C function, and make the `CompiledLaw` that calls it."""
         self._voltage, self._memory = voltage, np.full(1, math.nan)
         self.raised: BaseException | None = None
         self._function = LAW(self._call_voltage)
@@ -118,7 +119,7 @@ class _PythonLaw:
 def start_law(controller: Controller) -> CompiledLaw:
     """Start a controller for one run and return its control law.
 
-    The law is machine code if the controller has a method `compiled` that provides it. Otherwise it calls the
+    The law is machine code if the controller has a method `compiled` that provides it. Otherwise the law calls the
     Python function that `start` returns.
     """
     law: CompiledLaw | None = controller.compiled() if hasattr(controller, "compiled") else None
@@ -126,9 +127,9 @@ def start_law(controller: Controller) -> CompiledLaw:
 
 
 def reraise_python_error(law: CompiledLaw) -> None:
-    """Raise the exception of a Python controller that failed when compiled code called `law`; else do nothing.
+    """Raise the exception of a controller written in Python that failed while `law` was called; else do nothing.
 
-    A law may call the law of an inner controller, which may be the one written in Python.
+    The Python controller is `law` itself, or the inner controller whose law `law` calls.
     """
     innermost: Any = law
     while isinstance(innermost, CompiledLaw):  # `kept` is the inner law, or the Python controller
@@ -182,6 +183,6 @@ class Controller(Protocol):
         """Start a run of the controller, and return its control law.
 
         The law is a function that computes the voltage [V] of a sample from its `Measured`: time, target and
-        measurements. It is called once a sample.
+        measurements. The law is called once a sample.
         """
         ...

@@ -41,15 +41,16 @@ def drive_voltage(m: Any, flow: float, dp: float) -> float:
     sign(flow) dp is taken as at least 10 % of p_s. To pass the overlap of the edges, 4 u is then added to u, at most
     +-`dead_volts`.
 
-    A pump needs u = (omega + shortfall H(omega + droop dp))/omega_per_volt, with omega = flow/displacement. H is the
-    high-pass filter s/(s + corner), which each call advances by one sample; `m.decay` is exp(-corner/rate).
+    A pump needs u = (omega + shortfall H(omega + droop dp))/omega_per_volt, with omega = flow/displacement and the
+    other parameters of a `Drive`. H is the high-pass filter s/(s + corner), which each call advances by one sample;
+    `m.decay` is exp(-corner/rate) at the sampling rate.
     """
     if m.Q_N > 0.0:  # a servo valve
         valve_drop = max(m.p_s - math.copysign(dp, dp * flow), _MIN_VALVE_FRACTION * m.p_s)  # p_s - sign(flow) dp
         u = m.u_N * flow / (m.Q_N * math.sqrt(0.5 * valve_drop / m.dp_N))
         return u + min(max(_OVERLAP_GAIN * u, -m.dead_volts), m.dead_volts)  # type: ignore[no-any-return]
     omega = flow / m.displacement
-    speed = omega + m.droop * dp
+    speed = omega + m.droop * dp  # input of the high-pass filter
     m.high_passed = m.decay * (m.high_passed + speed - m.previous_speed)
     m.previous_speed = speed
     return (omega + m.shortfall * m.high_passed) / m.omega_per_volt  # type: ignore[no-any-return]
@@ -70,8 +71,8 @@ def filter_lag(values: np.ndarray, decay: float, state: float, out: np.ndarray) 
 def check_numbers(what: str, source: object, positive: Sequence[str], not_negative: Sequence[str] = ()) -> None:
     """Check that attributes of an object are finite numbers in their range; raise InputError otherwise.
 
-    `source`: the object; `positive`: names of the attributes that must be > 0; `not_negative`: names of the attributes
-    that must be >= 0; `what`: name of the object in the error message.
+    `what`: name of the object in the error message; `source`: the object; `positive`: names of its attributes that
+    must be > 0; `not_negative`: names of its attributes that must be >= 0.
     """
     for name in (*positive, *not_negative):
         value = getattr(source, name)
@@ -84,10 +85,10 @@ class _Invertible(ABC):
 
     @abstractmethod
     def coefficients(self, rate: float, dead_volts: float = 0.0) -> Any:
-        """Make the drive's parameters for a controller sampled at `rate` [Hz], as `drive_voltage` takes them.
+        """Make the drive's parameters in the form that `drive_voltage` takes, a record (1,) `DRIVE`.
 
-        Returns a record (1,) `DRIVE`. `dead_volts` [V]: largest voltage that is added to pass the overlap of a
-        servo valve's edges.
+        `rate` [Hz]: sampling rate of the controller; `dead_volts` [V]: largest voltage that is added to pass the
+        overlap of a servo valve's edges.
         """
 
     def inverse(self, rate: float) -> Callable[[float, float], float]:
@@ -119,7 +120,8 @@ class Drive(_Invertible):
     droop: float
 
     def __post_init__(self) -> None:
-        check_numbers("the drive", self, ("displacement", "omega_per_volt"), ("shortfall", "corner", "droop"))
+        not_negative = ("shortfall", "corner", "droop")
+        check_numbers("the drive", self, positive=("displacement", "omega_per_volt"), not_negative=not_negative)
 
     @classmethod
     def from_rig(cls, rig: Rig) -> Self:
@@ -145,11 +147,11 @@ class Drive(_Invertible):
         return rig.fluid.p_charge
 
     def flow(self, u: Array, dp: Array, rate: float) -> Array:
-        """Compute the pump's flow (n,) [m^3/s] for voltages (n,) [V] at `rate` [Hz] against p_A - p_B (n,) [Pa].
+        """Compute the pump's flow (n,) [m^3/s] for voltages `u` (n,) [V] against `dp` = p_A - p_B (n,) [Pa].
 
-        The motor's speed is omega = (omega_d + shortfall (y - droop dp))/(1 + shortfall), with the commanded speed
-        omega_d. The signal y is omega_d + droop dp after a first-order lag with the time constant `lag` (`filter_lag`).
-        The run begins at standstill under the first dp.
+        `rate` [Hz]: sampling rate of voltages and pressures. The motor's speed is omega = (omega_d + shortfall (y -
+        droop dp))/(1 + shortfall), with the commanded speed omega_d. The signal y is omega_d + droop dp after a
+        first-order lag with the time constant `lag` (`filter_lag`). The run begins at standstill under the first dp.
         """
         omega_d, droop_speed = self.omega_per_volt * u, self.droop * dp
         lag_input, y = omega_d + droop_speed, np.empty_like(omega_d)
@@ -158,10 +160,9 @@ class Drive(_Invertible):
         return np.asarray(self.displacement * omega)
 
     def coefficients(self, rate: float, dead_volts: float = 0.0) -> Any:
-        """Make the parameters of the pump's drive for a controller, as `drive_voltage` takes them.
+        """Make the parameters of the pump's drive in the form that `drive_voltage` takes, a record (1,) `DRIVE`.
 
-        Returns a record (1,) `DRIVE`. `rate` [Hz]: sampling rate of the controller. `dead_volts` is ignored: only a
-        servo valve has an overlap.
+        `rate` [Hz]: sampling rate of the controller. `dead_volts` is ignored: only a servo valve has an overlap.
         """
         return make_record(DRIVE, self, decay=math.exp(-self.corner / rate))
 
@@ -193,25 +194,26 @@ class ValveDrive(_Invertible):
     p_s: float
 
     def __post_init__(self) -> None:
-        check_numbers("the valve", self, ("Q_N", "dp_N", "u_N", "p_s"))
+        check_numbers("the valve", self, positive=("Q_N", "dp_N", "u_N", "p_s"))
 
     @classmethod
     def from_rig(cls, rig: Rig) -> Self:
         """Build the model of a rig's servo valve; raise InputError for a pump-controlled rig."""
         valve, supply = rig.valve, rig.supply
         check_circuit_property("a servo valve's drive", rig.name, rig.circuit, "valve_controlled")
-        pump_flow = rig.pump.q_b / (2.0 * math.pi) * supply.omega_P  # all of it through the relief valve
-        return cls(valve.Q_N, valve.dp_N, valve.u_N, supply.p_set + pump_flow / supply.G_set)
+        pump_flow = rig.pump.q_b / (2.0 * math.pi) * supply.omega_P
+        p_s = supply.p_set + pump_flow / supply.G_set  # while the whole pump flow passes the supply's relief valve
+        return cls(valve.Q_N, valve.dp_N, valve.u_N, p_s)
 
     def mean_pressure(self, rig: Rig) -> float:
         """Compute the mean pressure [Pa] of a rig's chambers at standstill: the mean of supply and return."""
-        return 0.5 * (self.p_s + 2.0 * rig.supply.p_return)  # p_s is the supply's pressure above the return's
+        return 0.5 * (self.p_s + 2.0 * rig.supply.p_return)  # the supply is at p_s + p_return
 
     def coefficients(self, rate: float, dead_volts: float = 0.0) -> Any:
-        """Make the parameters of the servo valve, as `drive_voltage` takes them; `rate` is ignored.
+        """Make the parameters of the servo valve in the form that `drive_voltage` takes, a record (1,) `DRIVE`.
 
-        Returns a record (1,) `DRIVE`. `dead_volts` [V]: largest voltage that is added to pass the overlap of the
-        valve's edges.
+        `dead_volts` [V]: largest voltage that is added to pass the overlap of the valve's edges. `rate` is ignored:
+        the model of a valve has no filter.
         """
         return make_record(DRIVE, self, dead_volts=dead_volts)
 

@@ -57,13 +57,14 @@ def _tolerant_law(memory: Any, sample: Any) -> Any:
     m.mean_A += m.pressure_gain * (measured.p_A - m.mean_A)
     m.mean_B += m.pressure_gain * (measured.p_B - m.mean_B)
     mean_dp = m.mean_A - m.mean_B
-    if m.is_known == 0.0:
+    if m.is_known == 0.0:  # the leak's conductance is estimated
         observer = m.observer
         update_observer(observer, measured.theta, measured.x, measured.p_A, measured.p_B)
         G, sd, n_blocks = conductance(observer)
         excess_G = G - m.G_assumed
         target_G = 0.0
         if n_blocks >= _MIN_BLOCKS:
+            # the largest leak whose motion of the piston the encoder does not resolve; 1 Pa: no division by 0
             unresolved_flow = _RESOLVED_COUNTS * observer.x_step * min(observer.area_A, observer.area_B)
             unresolved_G = unresolved_flow / max(abs(mean_dp), 1.0)
             # a leak that is compensated already has half the threshold
@@ -77,7 +78,8 @@ def _tolerant_law(memory: Any, sample: Any) -> Any:
         m.compensated = 0.0
         return u
     m.compensated = m.G * mean_dp
-    return min(max(u + drive_voltage(m.drive, m.compensated, 0.0), -m.u_max), m.u_max)
+    added_u = drive_voltage(m.drive, m.compensated, 0.0)  # for the leak's flow alone, without a load (dp = 0)
+    return min(max(u + added_u, -m.u_max), m.u_max)
 
 
 @dataclass(frozen=True)
@@ -104,7 +106,7 @@ class FaultTolerant:
 
     def __post_init__(self) -> None:
         not_negative = ("G_assumed",) if self.known is None else ("G_assumed", "known")
-        check_numbers("the controller", self, ("u_max",), not_negative)
+        check_numbers("the controller", self, positive=("u_max",), not_negative=not_negative)
 
     @classmethod
     def from_rig(cls, rig: Rig, inner: Controller | None = None, *, known: float | None = None) -> Self:
@@ -131,7 +133,12 @@ class FaultTolerant:
             shut=SHUT * (makeup.p_crack + makeup.p_open) if makeup.check_valves == "pilot-operated" else 0.0,
         )
         return cls(
-            inner or PositionPI.from_rig(rig), Drive.from_rig(rig), balance, rig.daq.u_max, rig.pump.G_pump, known
+            inner or PositionPI.from_rig(rig),
+            Drive.from_rig(rig),
+            balance,
+            u_max=rig.daq.u_max,
+            G_assumed=rig.pump.G_pump,
+            known=known,
         )
 
     @property
@@ -164,4 +171,4 @@ class FaultTolerant:
             drive=self.drive.coefficients(rate),
             observer=make_observer(self.balance, rate),
         )
-        return CompiledLaw(_tolerant_law.address, memory.view(np.float64), inner)
+        return CompiledLaw(_tolerant_law.address, memory.view(np.float64), kept=inner)

@@ -35,14 +35,14 @@ def _flatness_law(memory: Any, sample: Any) -> Any:
     """Compute the voltage [V] of a sample: feedback plus feed-forward by the equations of `Flatness`, within +-u_max.
 
     The feed-forward is the voltage at which the drive delivers the flow G dp + C d(dp)/dt against dp. Here dp is the
-    pressure difference that the load and the target's speed and acceleration require. `memory`, `sample`: addresses of
-    a record `_MEMORY`, which is updated, and of the numbers of a `Measured`.
+    pressure difference that the load and the target's speed v and acceleration a require. `memory`, `sample`: addresses
+    of a record `_MEMORY`, which is updated, and of the numbers of a `Measured`.
     """
     m, measured = _memory_at(memory), measured_at(sample)
     feedback, is_first = m.feedback, m.is_first > 0.0
     v = measured.target_speed if abs(measured.target_speed) <= m.v_max else 0.0  # jumps are not fed forward
     a = 0.0 if is_first else (v - m.v) / m.T
-    a = a if abs(a) * m.T < _MAX_SPEED_CHANGE * m.v_max else 0.0
+    a = a if abs(a) * m.T < _MAX_SPEED_CHANGE * m.v_max else 0.0  # a jump of the speed is no acceleration
     force = m.M * a + m.F_C * math.tanh(v / m.v_th) + m.F_v * v
     pressure_force = feedback.area_A * measured.p_A - feedback.area_B * measured.p_B
     m.load += (1.0 if is_first else m.load_gain) * (pressure_force - force - m.load)
@@ -87,7 +87,8 @@ class Flatness:
     v_max: float
 
     def __post_init__(self) -> None:
-        check_numbers("the controller", self, ("v_th", "v_max"), ("M", "F_C", "F_v", "G", "C"))
+        not_negative = ("M", "F_C", "F_v", "G", "C")
+        check_numbers("the controller", self, positive=("v_th", "v_max"), not_negative=not_negative)
 
     @classmethod
     def from_rig(cls, rig: Rig) -> Self:
@@ -98,7 +99,7 @@ class Flatness:
             feedback=PositionPI.from_rig(rig),
             drive=drive,
             M=cylinder.M_eq,
-            F_C=friction.F_pr + 2.0 * friction.F_cfr * drive.mean_pressure(rig),
+            F_C=friction.F_pr + 2.0 * friction.F_cfr * drive.mean_pressure(rig),  # with p_A = p_B
             F_v=friction.F_v,
             v_th=friction.v_th,
             G=rig.pump.G_pump if rig.circuit.pump_feeds_chambers else 0.0,

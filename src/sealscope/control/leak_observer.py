@@ -55,17 +55,17 @@ def update_observer(m: Any, theta: float, x: float, p_A: float, p_B: float) -> N
     `BLOCK` seconds. The chamber with the higher pressure is balanced, because a check valve may feed the other chamber.
     For chamber A, D dtheta - A dx - (V(x)/K) dp_A - (|p_A - p_B|/K) D dtheta_in = G integral of (p_A - p_B) dt; for B
     the signs are opposite. Here dtheta and dx are the rotation and the travel in the block. dtheta_in is the rotation
-    that pumps oil into the balanced chamber, which compresses this oil from the other chamber's pressure. The filter
+    that pumps oil into the balanced chamber; this oil is compressed from the other chamber's lower pressure. The filter
     also estimates the relative errors of 1/K and of the area. Friction and load do not enter.
     """
-    sample, means = (theta, x, p_A, p_B), m.means
+    sample, means = (theta, x, p_A, p_B), m.means  # `means`: moving averages of the same four signals
     if m.count == 0.0:
         for k in range(4):
             means[k] = m.begin[k] = sample[k]
     previous_angle = means[0]
     for k in range(4):
         means[k] = means[k] + m.lag_gain * (sample[k] - means[k])
-    dp, turned = means[2] - means[3], means[0] - previous_angle
+    dp, turned = means[2] - means[3], means[0] - previous_angle  # p_A - p_B, and rotation since the last sample
     m.min_dp, m.max_dp = min(m.min_dp, dp), max(m.max_dp, dp)
     m.sum_dp += dp
     m.turned_forward += max(turned, 0.0)
@@ -83,8 +83,8 @@ def _update_with_block(m: Any, dp_sum: float) -> None:
     """Update the Kalman filter of a leak observer with the volume balance of the block of samples that ends now.
 
     The filter's state is the leakage conductance and the relative errors of 1/K and of the piston area. `m`: record
-    `OBSERVER`, the memory of the filter; `dp_sum`: sum of p_A - p_B [Pa] over the block's samples, the two at its
-    ends by half.
+    `OBSERVER`, the memory of the filter; `dp_sum`: sum of p_A - p_B [Pa] over the block's samples, of which the first
+    and the last count half.
 
     The block is left out if
 
@@ -99,7 +99,7 @@ def _update_with_block(m: Any, dp_sum: float) -> None:
         return
     if min(abs(m.min_dp), abs(m.max_dp)) < m.shut:
         return
-    begin, end, state, P = m.begin, m.means, m.state, m.P
+    begin, end, state, P = m.begin, m.means, m.state, m.P  # begin, end: averages of angle, position, p_A and p_B
     pumped, travel = m.D * (end[0] - begin[0]), end[1] - begin[1]
     mid_position = 0.5 * (end[1] + begin[1])
     if dp_integral > 0.0:
@@ -109,6 +109,7 @@ def _update_with_block(m: Any, dp_sum: float) -> None:
         side_area, intake_angle = m.area_B, m.turned_back
         V, dp_side = m.V_B - side_area * mid_position, begin[3] - end[3]
     swept = side_area * travel
+    # oil in the chamber is compressed by the pressure change, incoming oil by the mean pressure difference
     compressed = (V * dp_side + m.D * intake_angle * dp_integral * m.rate / m.length) / m.K
     leaked = pumped - swept - compressed
     # uniform error of one encoder count (1/12) at both ends, noise of the averaged pressures, errors of the model

@@ -113,6 +113,7 @@ def _linearise(rig: Rig, rate: float, speed: float, load: float) -> tuple[Array,
     from sealscope.physics.standstill import initial_state
     from sealscope.physics.state import OUTPUTS, POSITION, VELOCITY
 
+    # pushed=(True,): the equations take an additional load
     p = rig_numbers(rig) if load == 0.0 else rig_numbers(rig)._replace(pushed=(True,))
     steps = max(2, math.ceil(1.2 / (rate * min(1e-3, longest_step(p)))))  # per sample; with 20 % in reserve
     h = 1.0 / (rate * steps)
@@ -123,9 +124,10 @@ def _linearise(rig: Rig, rate: float, speed: float, load: float) -> tuple[Array,
     def advance_state(y: Array, u: float, samples: int = 1) -> Array:
         """Integrate the state y (14,) over a number of samples at a constant voltage u [V]; return the new state."""
         n = samples * steps
-        state, rows = np.array(y), np.empty((samples, len(OUTPUTS)))
+        state, outputs = np.array(y), np.empty((samples, len(OUTPUTS)))  # `advance` needs a place for the outputs
         volts, no_leak, force = np.full((n, nodes), u), np.zeros((n, nodes)), np.full((n, nodes), load)
-        advance(implicit, state, h, volts, no_leak, no_leak, force, pack_numbers(p), euler, steps, rows)
+        # both coefficients of a leak, laminar and orifice, are 0
+        advance(implicit, state, h, volts, no_leak, no_leak, force, pack_numbers(p), euler, steps, outputs)
         return state
 
     y, u = initial_state(rig, 0.0, load), 0.0
@@ -145,9 +147,9 @@ def _linearise(rig: Rig, rate: float, speed: float, load: float) -> tuple[Array,
         _, drift_speed = find_moving_state(0.0)  # the load may move the piston at 0 V
         for _ in range(5):  # adjust the voltage to the stated speed: the drive falls short of its command
             state, mean_speed = find_moving_state(min(max(u, -limit), limit))
-            speed_gain = mean_speed - drift_speed
+            speed_gain = mean_speed - drift_speed  # due to the voltage
             if speed_gain * speed > 0.0:
-                u *= min(max((speed - drift_speed) / speed_gain, 0.2), 5.0)
+                u *= min(max((speed - drift_speed) / speed_gain, 0.2), 5.0)  # by at most a factor of 5
             else:  # the piston does not follow
                 u *= 1.5
         if not abs(mean_speed - speed) < 0.2 * abs(speed):
@@ -207,7 +209,7 @@ def _frequency_response(response: Array, z: NDArray[np.complex128]) -> NDArray[n
     transient = response - last_value
     is_relevant = np.abs(transient) > 1e-9 * np.abs(response).max()
     n = int(np.flatnonzero(is_relevant)[-1]) + 1 if np.any(transient) else 0
-    blocks = np.zeros((math.ceil(n / _BLOCK), _BLOCK))
+    blocks = np.zeros((math.ceil(n / _BLOCK), _BLOCK))  # the transient in rows, the last one padded by zeros
     blocks.ravel()[:n] = transient[:n]
     block_sums = z[:, None] ** -np.arange(float(_BLOCK)) @ blocks.T
     total = np.zeros(z.size, dtype=complex)
@@ -219,7 +221,8 @@ def _frequency_response(response: Array, z: NDArray[np.complex128]) -> NDArray[n
 def compute_margins(f: Array, L: NDArray[np.complex128], speed: float = 0.0, damped: bool = True) -> Margins:
     """Compute the stability margins of an open-loop response L (n,) at the frequencies `f` (n,) [Hz].
 
-    Between the frequencies, L is interpolated linearly. `speed`, `damped`: copied to the result.
+    Between the frequencies, L is interpolated linearly. `speed` [m/s] of the piston, and `damped`, True if the rig is
+    stable without the controller, are copied to the result.
     """
     indices = np.arange(f.size)
     unit_gain = _crossings(np.abs(L) - 1.0)  # fractional indices at which |L| = 1

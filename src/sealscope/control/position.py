@@ -41,7 +41,7 @@ def following_voltage(m: Any, measured: Any) -> float:
     u = drive_voltage(m.drive, velocity * area, m.dp)
     # at the limit of the voltage the integral may only decrease
     if abs(error) > m.dead_band and (abs(u) < m.u_max or u * error < 0.0):
-        m.integral += m.k_i_T * error
+        m.integral += m.k_i_T * error  # k_i_T: the gain k_i times the sampling interval
     return min(max(u, -m.u_max), m.u_max)  # type: ignore[no-any-return]
 
 
@@ -86,7 +86,8 @@ class PositionPI:
 
     def __post_init__(self) -> None:
         not_negative = ("dead_volts", "k_v", "k_i", "dead_band", "delay")
-        check_numbers("the controller", self, ("area_A", "area_B", "u_max", "rate"), not_negative)
+        positive = ("area_A", "area_B", "u_max", "rate")
+        check_numbers("the controller", self, positive=positive, not_negative=not_negative)
 
     @classmethod
     def from_rig(cls, rig: Rig, **gains: float) -> Self:
@@ -97,7 +98,7 @@ class PositionPI:
         valve, drive = rig.valve, drive_of(rig)
         gains.setdefault("dead_band", 1.5 * rig.sensors.x.resolution)  # one and a half encoder counts
         if isinstance(drive, Drive):
-            drive = replace(drive, droop=0.0)  # neglects the load
+            drive = replace(drive, droop=0.0)  # a pump's speed is computed as if there were no load
         else:
             # each direction opens two edges; the edge with less overlap opens first
             overlap = max(0.0, 0.5 * (min(valve.o_PA, valve.o_BT) + min(valve.o_PB, valve.o_AT)))
@@ -117,9 +118,9 @@ class PositionPI:
         return CompiledLaw(_position_law.address, self.make_memory().view(np.float64))
 
     def make_memory(self) -> Any:
-        """Make the parameters and the initial state of the control law, as `following_voltage` takes them.
+        """Make the parameters and initial state of the control law, as a record (1,) `FOLLOWING`.
 
-        Returns a record (1,) `FOLLOWING`.
+        This is the form that `following_voltage` takes.
         """
         T = 1.0 / self.rate
         return make_record(

@@ -41,7 +41,7 @@ GROUP = "sealscope.controllers"
 
 @cache
 def _installed() -> Mapping[str, EntryPoint]:
-    """Find the controllers that installed distributions provide, as entry points by the controller's name."""
+    """Find the controllers that installed distributions provide; return their entry points by name of controller."""
     return {point.name: point for point in entry_points(group=GROUP)}
 
 
@@ -53,8 +53,8 @@ def is_installed(name: str) -> bool:
 def check_controller_name(name: str) -> None:
     """Check that `name` is a built-in or installed controller, or has the form of a user's controller.
 
-    A user's controller is written ``MODULE:NAME`` or ``FILE.py:NAME``. It is not imported, so it may not exist.
-    Raises InputError for any other name.
+    A user's controller is written ``MODULE:NAME`` or ``FILE.py:NAME``. Such a controller is not imported, so that it
+    may not exist. Raises InputError for any other name.
     """
     module_or_file, _, attribute = name.rpartition(":")
     if not is_installed(name) and not (module_or_file and attribute):
@@ -69,9 +69,9 @@ def controller_named(name: str, rig: Rig) -> Controller:
     """Make the controller called `name` for a rig.
 
     `name`: the name of a built-in or installed controller, or ``MODULE:NAME`` or ``FILE.py:NAME`` of a class or
-    function. The controller is made by its method `from_rig` from the rig, or without such a method by calling the
-    class or function with the rig. Raises InputError for an unknown name, for code that fails, and for a controller
-    without `rate`, `delay` or `start`.
+    function. A class with a method `from_rig` makes the controller by this method; any other class or function is
+    called with the rig. Raises InputError for an unknown name, for code that fails, and for a controller without
+    `rate`, `delay` or `start`.
 
     Examples
     --------

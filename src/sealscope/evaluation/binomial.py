@@ -85,7 +85,7 @@ def lower_bound(k: int, n: int, confidence: float = 0.95) -> float:
 def upper_tail(k: int, n: int, p: float = 0.5) -> float:
     """Compute the probability of `k` or more successes in `n` trials that each succeed with probability `p`.
 
-    It is the regularised incomplete beta function ``I_p(k, n-k+1)``, and 1 for k = 0. Raises InputError for an
+    The result is the regularised incomplete beta function ``I_p(k, n-k+1)``, and 1 for k = 0. Raises InputError for an
     impossible count or probability. Source: Abramowitz and Stegun, Handbook of Mathematical Functions (1964), eq.
     26.5.24.
     """
@@ -111,8 +111,8 @@ def sign_test(k: int, n: int) -> float:
 def holm(p: Sequence[float]) -> tuple[float, ...]:
     """Correct several p-values for multiple testing by Holm's method; return them in the same order.
 
-    The i-th smallest of m p-values (i from 0) becomes ``max over j <= i of min(1, (m - j) p_(j))``. Raises InputError
-    for a value outside 0 to 1. Source: Holm, Scand. J. Statist. 6 (1979) 65-70.
+    With p_(j) the j-th smallest of m p-values (j from 0), p_(i) becomes ``max over j <= i of min(1, (m - j) p_(j))``.
+    Raises InputError for a value outside 0 to 1. Source: Holm, Scand. J. Statist. 6 (1979) 65-70.
     """
     for value in p:
         if not 0.0 <= value <= 1.0:

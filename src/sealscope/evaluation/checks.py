@@ -31,7 +31,7 @@ def as_numbers(values: npt.ArrayLike, what: str) -> Array:
 
 
 def as_sizes(values: npt.ArrayLike, what: str = "leak sizes") -> Array:
-    """Convert `values` to an array (n,) of leak sizes in any unit; raise InputError for one that is not positive.
+    """Convert `values` to an array (n,) of leak sizes in any unit; raise InputError for a size that is not positive.
 
     Records without a leak have no size; they are counted for false alarms instead. `what` names the values in the
     message.

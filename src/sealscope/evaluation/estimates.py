@@ -57,7 +57,7 @@ def order_ranks(n: int, order: float, confidence: float = 0.95) -> tuple[int, in
     as_probability(order, "the order of a quantile")
     tail = (1.0 - as_probability(confidence, "confidence")) / 2.0
     k = np.arange(1, n + 1)
-    p_at_least_k = betainc(k, n + 1 - k, order)  # P(X >= k), which falls with k, so that counts are ranks
+    p_at_least_k = betainc(k, n + 1 - k, order)  # P(X >= k) falls with k: the largest k above a limit is a count
     r = int(np.count_nonzero(1.0 - p_at_least_k <= tail))
     s = int(np.count_nonzero(p_at_least_k > tail)) + 1
     return r, s
@@ -84,8 +84,8 @@ def estimate_quantile(values: npt.ArrayLike, order: float, confidence: float = 0
 def estimate_mean(values: npt.ArrayLike, confidence: float = 0.95) -> IntervalEstimate:
     """Estimate the mean of the distribution that a sample `values` comes from, with Student's confidence interval.
 
-    The interval is ``mean -+ t s/sqrt(n)``. It is infinite for a single value; without values all results are nan.
-    Raises InputError for a value that is not finite.
+    The interval is ``mean -+ t s/sqrt(n)``, and infinite for a single value; without values all results are nan. Raises
+    InputError for a value that is not finite.
     """
     from scipy.special import stdtrit
 
@@ -107,7 +107,7 @@ def _interval_coverage(
     """Compute the proportion of stated intervals, from `low` to `high`, that contain the true value.
 
     All arrays are (n,), one value per record. A record whose `low` or `high` is nan has no interval and is not
-    counted; None stands for no intervals at all. `confidence`: confidence of the proportion's own interval.
+    counted; None stands for no intervals at all. `confidence`: confidence level of the proportion's interval.
     """
     low = _as_matching(low, truth.size, "lower limits")
     high = _as_matching(high, truth.size, "upper limits")
@@ -117,7 +117,10 @@ def _interval_coverage(
 
 
 def _as_matching(values: npt.ArrayLike | None, n: int, what: str) -> Array:
-    """Convert `values` to an array (n,), all nan for None; raise InputError, which names `what`, for another shape."""
+    """Convert `values` to an array (n,), all nan for None; raise InputError for values of another shape.
+
+    `n`: number of true values; `what`: name of the values in the message.
+    """
     array = np.full(n, math.nan) if values is None else np.asarray(values, dtype=np.float64)
     if array.shape != (n,):
         raise InputError(f"{what} must be as many as the true values, got {array.shape} for {n}")
@@ -135,7 +138,7 @@ def estimate_errors(
 
     `estimates` and `truth` (n,) have the same unit, and so have `low` and `high` (n,), the ends of the stated
     intervals. A missing estimate or interval is nan. The confidence interval of the rmse is the square root of
-    Student's interval of the mean square error, cut off at 0; those of the quantiles are valid for any distribution.
+    Student's interval of the mean square error, cut off at 0. The intervals of quantiles hold for any distribution.
     Raises InputError if no record has an estimate.
     """
     true_values = as_numbers(truth, "true values")

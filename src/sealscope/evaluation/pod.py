@@ -85,8 +85,8 @@ def _information(design: Array, n: Array, eta: Array) -> Array:
 def _log_likelihood(design: Array, n: Array, k: Array, eta: Array, *, firth: bool) -> float:
     """Compute the log-likelihood of `k` hits in `n` trials at m sizes with the log odds `eta` of a hit, all (m,).
 
-    It is ``sum of k eta - n ln(1 + exp eta)``. With `firth`, half the log determinant of the Fisher information is
-    added as a penalty, for which `design` (m, 2) has the columns 1 and logarithm of size.
+    The result is ``sum of k eta - n ln(1 + exp eta)``. With `firth`, half the log determinant of the Fisher information
+    is added as a penalty, for which `design` (m, 2) has the columns 1 and logarithm of size.
     """
     value = float(np.sum(k * eta - n * np.logaddexp(0.0, eta)))
     if not firth:
@@ -111,7 +111,7 @@ def _fit_coefficients(design: Array, n: Array, k: Array, *, firth: bool) -> Arra
         eta = design @ beta
         p = expit(eta)
         residual = k - n * p
-        if firth:  # leverage of each size times (1/2 - p): Firth (1993), Heinze and Schemper (2002)
+        if firth:  # adds leverage of each size times (1/2 - p): Firth (1993), Heinze and Schemper (2002)
             inverse = np.linalg.pinv(_information(design, n, eta))
             residual += n * p * (1.0 - p) * np.einsum("ij,jk,ik->i", design, inverse, design) * (0.5 - p)
         return -_log_likelihood(design, n, k, eta, firth=firth), -design.T @ residual
@@ -173,7 +173,7 @@ class HitMiss:
     def detection_band(self, size: npt.ArrayLike, confidence: float = 0.95) -> tuple[Array, Array]:
         """Compute a two-sided confidence interval (low, high) of the probability of detection at each size.
 
-        `size` (k,): positive sizes; low and high are (k,). The interval is Wald's for the log odds. Its confidence
+        `size` (k,): positive sizes; low and high are (k,). The interval is Wald's for the log odds. The confidence
         applies to each size separately.
         """
         from scipy.special import expit, ndtri
@@ -188,8 +188,8 @@ class HitMiss:
     def size_at(self, detection: float) -> float:
         """Compute the size that is detected with the probability `detection`, such as a90 for 0.9.
 
-        It follows from ``ln(size) = (ln(p/(1-p)) - intercept)/slope`` with p the probability, and is infinite if the
-        detection does not rise with the size.
+        The result follows from ``ln(size) = (ln(p/(1-p)) - intercept)/slope`` with p the probability, and is infinite
+        if the detection does not rise with the size.
         """
         as_probability(detection, "the probability of detection")
         return _exp_size((_log_odds(detection) - self.intercept) / self.slope) if self.slope > 0.0 else math.inf
@@ -211,7 +211,7 @@ class HitMiss:
             raise InputError(f"confidence must be from 0.5 to 1, got {confidence}")
         log_odds = _log_odds(detection)
         allowed_drop = 0.5 * float(ndtri(confidence)) ** 2  # of the log-likelihood
-        if not self.slope > 0.0 or self.log_likelihood - self.null <= allowed_drop:
+        if not self.slope > 0.0 or self.log_likelihood - self.null <= allowed_drop:  # a curve of slope 0 is allowed
             return math.inf
 
         def excess_drop(log_size: float) -> float:
@@ -261,7 +261,7 @@ class HitMiss:
         def loss(slope: float) -> float:
             """Compute the negative log-likelihood of the curve with this slope through the given point.
 
-            It is 1e300 instead of infinity, which the search for the minimum cannot use.
+            The result is 1e300 instead of infinity, which the search for the minimum cannot use.
             """
             eta = log_odds + slope * (x - log_size)
             value = _log_likelihood(design, self.tested, self.hits, eta, firth=self.estimator == "firth")

@@ -107,10 +107,10 @@ def placements(leak_free: Array, leaky: Array) -> tuple[Array, Array]:
 def _newcombe_interval(value: float, n: int, m: int, z: float) -> tuple[float, float]:
     """Compute Newcombe's confidence interval (low, high) of an area A = `value` under the ROC curve.
 
-    Its ends are the solutions t of ``|t - A| = z SE(t)``, with Hanley and McNeil's standard error ``SE(t)^2 = t (1 - t)
-    (1 + (N - 1) q)/(n m)``, where ``q = (1 - t)/(2 - t) + t/(1 + t)`` and N is the mean of n and m. `n`, `m`: numbers
-    of leak-free and of leaky scores; `z`: normal quantile. The interval has a width even if A is 0 or 1. Source:
-    Newcombe, Stat. Med. 25 (2006) 559-573, doi 10.1002/sim.2324, method 5.
+    The ends of the interval are the solutions t of ``|t - A| = z SE(t)``, with Hanley and McNeil's standard error
+    ``SE(t)^2 = t (1 - t) (1 + (N - 1) q)/(n m)``, where ``q = (1 - t)/(2 - t) + t/(1 + t)`` and N is the mean of n and
+    m. `n`, `m`: numbers of leak-free and of leaky scores; `z`: normal quantile. The interval has a width even if A is 0
+    or 1. Source: Newcombe, Stat. Med. 25 (2006) 559-573, doi 10.1002/sim.2324, method 5.
     """
     from scipy.optimize import brentq
 
@@ -121,6 +121,7 @@ def _newcombe_interval(value: float, n: int, m: int, z: float) -> tuple[float, f
         q = (1.0 - t) / (2.0 - t) + t / (1.0 + t)
         return (t - value) ** 2 - z * z * t * (1.0 - t) * (1.0 + (mean_number - 1.0) * q) / (n * m)
 
+    # at A itself the excess is negative; 1e-9: the search ends just beside A
     low = brentq(excess, 0.0, value * (1.0 - 1e-9)) if value > 0.0 else 0.0
     high = brentq(excess, value + (1.0 - value) * 1e-9, 1.0) if value < 1.0 else 1.0
     return float(low), float(high)

@@ -74,9 +74,9 @@ def confusion_matrix(
     """Count the verdicts for each true fault, with Clopper-Pearson intervals of their fractions.
 
     `truth` and `verdicts` are the true fault and the verdict of each record. `faults` are the names of all faults,
-    including the name for no fault, in the order of rows and columns; `confidence` is that of the intervals. Raises
-    InputError for a name that is not in `faults`, if "cannot tell" is among the faults, if there are no records, or if
-    `truth` and `verdicts` differ in length.
+    including the name for no fault, in the order of rows and columns; `confidence`: confidence level of the intervals.
+    Raises InputError for a name that is not in `faults`, if "cannot tell" is among the faults, if there are no records,
+    or if `truth` and `verdicts` differ in length.
     """
     if len(truth) != len(verdicts) or not truth:
         raise InputError(f"verdicts must be as many as the true faults, got {len(verdicts)} for {len(truth)}")

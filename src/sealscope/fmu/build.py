@@ -49,8 +49,8 @@ system, with clang or `zig cc`: clang -O2 -fPIC -shared -I. -Iheaders -o NAME.so
 class Platform(NamedTuple):
     """An operating system and processor on which an FMU can run.
 
-    `triple`: its name for LLVM; `target`: its name for the C compiler; `folders`: by FMI version, its folder in the
-    archive; `suffix`: file suffix of a shared library.
+    `triple`: name of the platform for LLVM; `target`: its name for the C compiler; `folders`: its folder in the archive
+    by FMI version; `suffix`: file suffix of a shared library.
     """
 
     triple: str
@@ -111,8 +111,8 @@ def fmi_headers() -> Path:
 def choose_step(rig: Rig, error: float) -> tuple[float, float]:
     """Choose the solver's step with which the rms error of the pressures is at most `error` [Pa].
 
-    A run of 4 s from mid-stroke is simulated under each of `STEP_COMMANDS`, and chooses its own step to keep this
-    limit. Returns the shortest of these steps [s], and the largest of the errors [Pa] that the runs estimate.
+    A run of 4 s from mid-stroke is simulated under each of `STEP_COMMANDS`, with a step that is chosen to keep this
+    limit. Returns the shortest of these steps [s], and the largest of the errors [Pa] that are estimated for the runs.
     """
     from sealscope.simulation.experiment import Experiment
     from sealscope.simulation.integrate import integrate_run
@@ -369,9 +369,10 @@ def _load_pump_controlled_rig(rig: Rig | str | os.PathLike[str]) -> Rig:
 
 
 def _choose_platforms(path: str | os.PathLike[str], fmi: int, platforms: Sequence[str] | None) -> tuple[str, ...]:
-    """Check the file name, FMI version and platforms of an FMU, and return the platforms, by default the present one.
+    """Choose the platforms of an FMU, `platforms` or else the present one, and check that the FMU can be built.
 
-    Raises InputError if one of these is invalid, or the compiler cannot build for a platform.
+    Raises InputError if `path` does not end in .fmu, if the FMI version `fmi` is not 2 or 3, if a platform is unknown
+    or this version lacks it, or if the compiler cannot build for the platform.
     """
     if Path(path).suffix != ".fmu":
         raise InputError(f"a unit's file must end in .fmu, got {path}")

@@ -74,7 +74,7 @@ def _at_rk4_nodes(a: float, b: float, t: float, h: float) -> tuple[float, float,
 
     The step begins at t [s] and lasts h [s]. At the time s [s] the input is a + b s.
     """
-    n = RK4_NODES
+    n = RK4_NODES  # as fractions of the step
     return a + b * (t + n[0] * h), a + b * (t + n[1] * h), a + b * (t + n[2] * h)
 
 
@@ -84,7 +84,7 @@ def _at_imex_nodes(a: float, b: float, t: float, h: float) -> tuple[float, float
 
     The step begins at t [s] and lasts h [s]. At the time s [s] the input is a + b s.
     """
-    n = IMEX_NODES
+    n = IMEX_NODES  # as fractions of the step
     first = a + b * (t + n[0] * h), a + b * (t + n[1] * h), a + b * (t + n[2] * h)
     return first[0], first[1], first[2], a + b * (t + n[3] * h), a + b * (t + n[4] * h), a + b * (t + n[5] * h)
 
@@ -124,7 +124,7 @@ def _build_parameters_law(
 ) -> Callable[..., Any]:
     """Build the compiled function that computes the model's parameters `RigNumbers` from the FMU's parameter values.
 
-    Its arguments are the values (n,), in the order of `variables.VALUES`, and two conductances [m^3/(s Pa)] of
+    That function takes the values (n,), in the order of `variables.VALUES`, and two conductances [m^3/(s Pa)] of
     external leakage out of the chambers A and B, which are added to those of the rig. `laws`: the equations that the
     rig has (`RigChoice`); `exponent`: 1 if the closed fraction of a throttle is a fraction of its area, 2 if of
     its diameter; `literal_metering`: True if eqs. (4.9)-(4.12) of the thesis are taken as printed.
@@ -192,6 +192,7 @@ def build_functions(choice: RigChoice) -> dict[str, Callable[..., Any]]:
         p, z = model_parameters(v, input_values), state_of(state)
         observe(z, input_values[_U], input_values[_G], input_values[_C], p, out)
         out[_N_OUTPUTS] = _electric(out[_VOLTAGE], z[CURRENT])
+        # without throttles the ports of the pump have the chambers' pressures
         out[_N_OUTPUTS + 1] = _hydraulic(out[_Q_1], (out[P_1] - out[P_2]) if throttled else (out[P_A] - out[P_B]))
         out[_N_OUTPUTS + 2] = _mechanical(out[P_A], out[P_B], z[VELOCITY], p.A_A, p.A_B)
         return 0
@@ -229,7 +230,7 @@ def build_functions(choice: RigChoice) -> dict[str, Callable[..., Any]]:
         has a pressure below vacuum.
         """
         v, state = carray(values, _N_VALUES), carray(y, _N_STATES)
-        a, b = carray(inputs, _N_INPUTS), carray(slopes, _N_INPUTS)
+        a, b = carray(inputs, _N_INPUTS), carray(slopes, _N_INPUTS)  # the inputs at the time t are a + b t
         p, z, h = model_parameters(v, a), state_of(state), span / steps
         for k in range(steps):
             z = step(z, h, k * h, a, b, p)

@@ -94,7 +94,7 @@ def record_fmu(
             "with --map p_A=NAME"
         )
     rate = experiment.rate
-    factor = oversampling_of(rate, MAX_COMMUNICATION_STEP)
+    factor = oversampling_of(rate, MAX_COMMUNICATION_STEP)  # communication steps per sample
     n = round(experiment.duration * rate)  # samples of the recording
     # communication points, with those that the anti-alias filter needs after the last sample
     t = np.arange((n + FILTER_REACH) * factor + 1) / (rate * factor)
@@ -153,11 +153,11 @@ def _read_description(path: Path) -> Any:
 
 
 def _map_variables(path: Path, variables: Mapping[str, Any], names: Mapping[str, str]) -> dict[str, str]:
-    """Find the FMU's variable for each channel and input, and return its name by channel or input.
+    """Find the FMU's variable for each channel and input; return the variables' names by channel or input.
 
-    `names`: variable by channel or input, for variables with another name than the channel; `variables`: all variables
-    of the FMU by name. Channels and inputs without a variable are left out of the result. Raises InputError if `names`
-    has an unknown channel or variable.
+    `path`: the FMU, for messages; `variables`: all variables of the FMU by name; `names`: by channel or input, the name
+    of its variable if the names differ. Channels and inputs without a variable are left out of the result. Raises
+    InputError if `names` has an unknown channel or variable.
     """
     valid_names = {*_INPUT_NAMES, *_MEASURED_NAMES}
     for channel, variable in names.items():
@@ -176,9 +176,9 @@ def _build_input_table(
     """Build the table of inputs that FMPy takes, with a row for each communication point `t` [s].
 
     FMPy keeps an input constant during a step, so each row has the value in the middle of the step, for second-order
-    accuracy. `names`: variable of the FMU by channel or input; `variables`: description of each variable. Raises
-    InputError if the FMU lacks the command or another input that the experiment needs, or if the experiment has a load
-    over position or velocity.
+    accuracy. `path`: the FMU, for messages; `names`: its variable by channel or input; `variables`: description of each
+    variable. Raises InputError if the FMU lacks the command or another input that the experiment needs, or if the
+    experiment has a load over position or velocity.
     """
     half_step = 0.5 * (t[1] - t[0])
     # in each step, the inputs are needed at one time only, its middle
@@ -214,7 +214,10 @@ def _run_unit(
     import fmpy
 
     def report_step(time: float, _recorder: Any) -> bool:
-        """Report the progress at `time` [s] after a step; return True, which tells FMPy to continue."""
+        """Report the progress at `time` [s] after a step; return True, which tells FMPy to continue.
+
+        FMPy also passes its `_recorder` of outputs, which is not used.
+        """
         if progress is not None:
             progress("running the unit", min(1.0, time / duration))
         return True

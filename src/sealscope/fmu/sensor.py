@@ -145,7 +145,8 @@ class SensorChoice(NamedTuple):
         if columns.names != COLUMNS[:-1]:
             raise InputError(f"a soft sensor's terms must be {', '.join(COLUMNS[:-1])}, got {', '.join(columns.names)}")
         fast = columns.fast
-        return cls(rate, size_error(rig), (*fast, *columns.slow, columns.left), len(fast))
+        column_order = (*fast, *columns.slow, columns.left)  # left: the response, the balance's left side
+        return cls(rate, size_error(rig), column_order, n_fast=len(fast))
 
 
 class _Lengths(NamedTuple):
@@ -162,7 +163,7 @@ class _Lengths(NamedTuple):
 
     @classmethod
     def from_rate(cls, rate: float) -> _Lengths:
-        """Convert the times of a stride, a block and half a difference to these numbers, at a sampling rate [Hz]."""
+        """Compute the lengths of a stride, a block and half a difference from their times, at a sampling rate [Hz]."""
         return cls(
             stride_samples=stride_samples(rate),
             block_strides=round(BLOCK_SECONDS / STRIDE),
@@ -214,7 +215,7 @@ def build_functions(choice: SensorChoice) -> dict[str, Callable[..., Any]]:
     """Build the functions ``start``, ``advance`` and ``report`` of a soft sensor's FMU; return them by name.
 
     ``start`` clears the sensor's memory `y` (`memory_layout`), ``advance`` adds the samples of a communication step to
-    it, and ``report`` writes the outputs to `results`. They have the arguments of the functions of a rig's FMU
+    it, and ``report`` writes the outputs to `results`. The three functions have the arguments of those of a rig's FMU
     (`fmu.machine.build_functions`), pointers to arrays of doubles.
     """
     from scipy.special import stdtrit
@@ -261,7 +262,7 @@ def build_functions(choice: SensorChoice) -> dict[str, Callable[..., Any]]:
         return _SUCCESS
 
     def report(values: Any, inputs: Any, y: Any, results: Any) -> int:
-        """Write the sensor's outputs from its memory `y` to `results`; return 0."""
+        """Write the sensor's outputs from its memory `y` to `results`; return 0. `values`, `inputs`: ignored."""
         _write_results(memory(y), size_error, quantiles, carray(results, n_results))
         return _SUCCESS
 
@@ -339,8 +340,8 @@ def _compute_increments(ring: Any, k: int, half: int, rate: float, displacement:
 
     The increments are written to `out` (n,) in the order of `COLUMNS`. For example, the increment of the response is
     the volume that the pump displaces [m^3], and the increment of the leak the time integral of p_A - p_B [Pa s].
-    `ring`: the last samples, where sample k has the column k modulo its width; `half`: samples on either side of a
-    central difference, by which the direction of motion is found; `rate` [Hz]: sampling rate; `displacement` [m^3/rad]:
+    `ring`: the last samples, where sample k has the column k modulo the width of `ring`; `half`: samples on either side
+    of the central difference that shows the direction of motion; `rate` [Hz]: sampling rate; `displacement` [m^3/rad]:
     displacement of the pump.
     """
     width = ring.shape[1]
@@ -362,7 +363,8 @@ def _compute_increments(ring: Any, k: int, half: int, rate: float, displacement:
     earlier, later = max(k - 1, 0), k + 1
     velocity_change = ring[_X, (later + 1) % width] - ring[_X, later % width]
     velocity_change -= ring[_X, (earlier + 1) % width] - ring[_X, earlier % width]
-    out[_LAG] = rate * velocity_change / (later - earlier)  # the position may lag the angle, or lead it
+    # change of velocity, for a position that lags the angle or leads it
+    out[_LAG] = rate * velocity_change / (later - earlier)
     out[_BIAS] = 1.0 / rate
     out[_LEAK] = 0.5 * (ring[_P_A, slot] + ring[_P_A, next_slot] - ring[_P_B, slot] - ring[_P_B, next_slot]) / rate
     out[_RESPONSE] = displacement * (ring[_THETA, next_slot] - ring[_THETA, slot])
@@ -400,7 +402,7 @@ def _append_conductance(m: Any, size_error: float, n_rows: float, pressure: floa
     if not precision > (MIN_REST_PRECISION * m.usual_precision if motion < STANDSTILL else 0.0):
         return
     G, history, k = weighted_G / precision, m.history, int(m.n_estimated) % WINDOW
-    comparable_G = G - weighted_shift / precision
+    comparable_G = G - weighted_shift / precision  # without jumps where the other coefficients improve
     history[k, _G], history[k, _COMPARABLE_G], history[k, _VARIANCE] = G, comparable_G, 1.0 / precision
     history[k, _SYSTEMATIC_VARIANCE] = weighted_systematic / precision**2 + (size_error * G) ** 2
     history[k, _PRESSURE] = pressure
@@ -426,7 +428,7 @@ def _fit_to_waiting(m: Any, size_error: float) -> None:
     fit_coefficients(model)
     for k in range(LEARNED):
         load_block(model, m.waiting_grams[k], _ALL_COLUMNS)
-        m.precisions[k] = estimate_leak(model, m.waiting_sizes[k, _BLOCK_ROWS], is_learned=False)[0]
+        m.precisions[k], _, _, _ = estimate_leak(model, m.waiting_sizes[k, _BLOCK_ROWS], is_learned=False)
     m.usual_precision = median(m.precisions, LEARNED)
     for k in range(LEARNED):
         load_block(model, m.waiting_grams[k], _ALL_COLUMNS)
@@ -545,8 +547,9 @@ def _mean(history: Any, newest: int, n: int, column: int) -> float:
 def _variance_of_mean(history: Any, newest: int, n: int) -> float:
     """Compute the variance of the mean conductance of n blocks, the last of which is block `newest`.
 
-    It is the larger of two variances, divided by n: the sample variance of the blocks' estimates, and the mean of the
-    variances that the fit gives these estimates. `history` (WINDOW, 5): results of the last blocks, as in `_mean`.
+    The result is the larger of two variances, divided by n: the sample variance of the blocks' estimates, and the mean
+    of the variances that the fit gives these estimates. `history` (WINDOW, 5): results of the last blocks, as in
+    `_mean`.
     """
     mean, sample_variance = _mean(history, newest, n, _COMPARABLE_G), 0.0
     for k in range(n):

@@ -37,8 +37,8 @@ _VALVE_OUTPUTS = ("x_s", "v_s")
 class Variable(NamedTuple):
     """A variable of a functional mock-up unit (FMU), described in the terms of the FMI standard.
 
-    `reference`: the number by which a program addresses it; `unit`: its SI unit; `start`: its initial value, None for
-    an output.
+    `reference`: number by which a program addresses the variable; `unit`: SI unit; `start`: initial value, None for an
+    output.
     """
 
     reference: int
@@ -56,7 +56,7 @@ def input_variables(rows: Mapping[str, tuple[str, str]]) -> Iterator[Variable]:
     `rows`: (unit, description) by name of the variable.
     """
     for k, (name, (unit, description)) in enumerate(rows.items()):
-        yield Variable(REFERENCES["input"] + k, name, "input", "continuous", unit, description, 0.0)
+        yield Variable(REFERENCES["input"] + k, name, "input", "continuous", unit, description, start=0.0)
 
 
 def output_variables(rows: Mapping[str, tuple[str, str]]) -> Iterator[Variable]:
@@ -66,7 +66,7 @@ def output_variables(rows: Mapping[str, tuple[str, str]]) -> Iterator[Variable]:
     """
     for k, (name, (unit, description)) in enumerate(rows.items()):
         if name not in _VALVE_OUTPUTS:
-            yield Variable(REFERENCES["result"] + k, name, "output", "continuous", unit, description, None)
+            yield Variable(REFERENCES["result"] + k, name, "output", "continuous", unit, description, start=None)
 
 
 def rig_variable(rig: Rig, name: str, variability: Literal["tunable", "fixed"]) -> Variable | None:
@@ -77,7 +77,7 @@ def rig_variable(rig: Rig, name: str, variability: Literal["tunable", "fixed"]) 
     """
     value = float(attrgetter(name)(rig))
     field = dict(iter_fields(Rig))[name]
-    if value == absent_of(field):
+    if value == absent_of(field):  # the value that stands for an absent part
         return None
     reference, description = REFERENCES["value"] + VALUES.index(name), str(field.title or name)
     return Variable(reference, name, "parameter", variability, unit_of(field), description, value)

@@ -47,9 +47,9 @@ def noise_free_mean_squares(
     """Simulate a test of Appendix C without noise, and compute the mean squares of its wavelet details.
 
     Returns the mean squares of d1..d4 [psi^2] and of the product d3d4 [psi^4] as (chambers, 5). The pressures are
-    sampled at the rig's rate behind its anti-alias filter, from 7.2 s on (`SETTLING`) for 4 pi s (`ANALYSED`). `leak`:
-    text of the leak, None for no leak; `x_0` [m]: start of the piston; `values`: parameters that override the test's.
-    Raises the errors of the simulation.
+    sampled at the rig's rate behind its anti-alias filter, from 7.2 s on (`SETTLING`) for 4 pi s (`ANALYSED`).
+    `condition`: inputs of the test; `leak`: text of the leak, None for no leak; `x_0` [m]: position of the piston at
+    the start; `values`: parameters that override the test's. Raises the errors of the simulation.
     """
     duration = ANALYSED + SETTLING + 128.0 / rig.daq.sample_rate  # d4 depends on 120 later samples
     values = {**experiment_values(condition), **(values or {})}
@@ -79,8 +79,8 @@ def log_rms(squares: Array, sigma: float) -> Array:
 def pressure_noise(rig: Rig, chamber: str) -> float:
     """Compute the standard deviation [psi] of the noise in one sample of a chamber's pressure.
 
-    It is ``sqrt(sensor^2 + common^2 + step^2/12)``, from the noise of the sensor, the noise common to all sensors, and
-    the step of the quantisation.
+    The result is ``sqrt(sensor^2 + common^2 + step^2/12)``, from the noise of the sensor, the noise common to all
+    sensors, and the step of the quantisation.
     """
     sensor, daq = getattr(rig.sensors, chamber), rig.daq
     step = daq.step * (sensor.range_hi - sensor.range_lo) / (daq.sensor_volts_hi - daq.sensor_volts_lo)
@@ -162,18 +162,20 @@ def predicted_sheet(
                 if chamber == "p_B":  # d1..d4 squared scale with the gain squared, d3d4 squared with its fourth power
                     scaled = squares[k] * np.array([h.gain_B**2] * 4 + [h.gain_B**4])
                 rms[row, half, k] = np.exp(log_rms(scaled, pressure_noise(rig, chamber)))
+    # by chamber and detail, the RMS (tests, 2) without and with the leak
     return DataSheet({c: {q: rms[:, :, k, j] for j, q in enumerate(QUANTITIES)} for k, c in enumerate(CHAMBERS)})
 
 
 def _scale_parameters(rig: Rig, factors: Mapping[str, float]) -> Rig:
-    """Multiply parameters of a rig by `factors`, by name of the parameter; return the new rig."""
+    """Multiply parameters of a rig by the `factors` on them, by name of the parameter; return the new rig."""
     return rig.with_overrides({name: float(rig[name]) * factor for name, factor in factors.items()}) if factors else rig
 
 
 def parameters_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Tabulate the parameters in which the rig fitted to Appendix C differs from the thesis's rig, with their sources.
 
-    The columns are name, meaning, value in the thesis's rig, value in the fitted rig, and source.
+    The columns are name, meaning, value in the thesis's rig, value in the fitted rig, and source. `item`: entry of
+    `items.toml` for which the table is made; `context` is not used.
     """
     fitted = load_rig(BENCH_RIG)
     thesis_rows = {row.name: row for row in load_rig("thesis").table()}
@@ -193,7 +195,7 @@ def fit_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     1, and the geometric standard deviation. The second has the geometric means over the tests of each operating
     condition (command and closing of the throttles).
     """
-    assert context.sheet is not None
+    assert context.sheet is not None  # the item needs the measured data sheet
     residuals = log_residuals(load_rig(BENCH_RIG), context.sheet)
     columns = [(c, q, residuals[:, k, j]) for k, c in enumerate(CHAMBERS) for j, q in enumerate(QUANTITIES)]
     rows: list[tuple[Cell, ...]] = []
@@ -221,7 +223,7 @@ def hypotheses_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
 
     The first row is the measured sheet itself. A quick reproduction simulates only the first two hypotheses.
     """
-    assert context.sheet is not None
+    assert context.sheet is not None  # the item needs it
     sheet = context.sheet
     change_columns = [(c, q) for c in CHAMBERS for q in ("d2", "d3", "d4")]  # chamber and quantity
     level_columns = [(c, q) for c, q in change_columns if q != "d2"]
@@ -230,7 +232,7 @@ def hypotheses_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     heads += [f"{c} {q} sign right [of 41]" for c, q in level_columns]
 
     def signs(sheet: DataSheet, c: str, q: str) -> Array:
-        """Return the sign of the change with the leak in each test of a data sheet, (tests,)."""
+        """Return the sign of the change with the leak of detail `q` of chamber `c` in each test, (tests,)."""
         return np.asarray(np.sign(sheet.rms[c][q][:, 1] - sheet.rms[c][q][:, 0]))
 
     measured = [float(100 * np.expm1(np.mean(sheet.log_change(c, q)))) for c, q in change_columns]

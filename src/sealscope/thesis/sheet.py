@@ -55,15 +55,16 @@ class Condition:
 
     @property
     def group(self) -> tuple[str, float]:
-        """Command and closing of the throttles [%]; tests of one group have both in common and differ in the leak."""
+        """Command and closing of both throttles [%], equal for all tests of a group, which differ in the leak."""
         return self.command, self.closed_pct
 
 
 def experiment_values(condition: Condition) -> dict[str, str | float]:
-    """Return the rig parameters of a test `condition` by name, for `Rig.with_overrides` or `Experiment.of(set=...)`.
+    """Return the rig's parameters in a test of Appendix C by name, as `Experiment.of` takes them in `set`.
 
-    Both throttles are closed equally. If they are fully open, `line.orifices` is not set, so that the rig's own value
-    holds: absent in the thesis's model (section 4.2.1), present in a rig that includes the open valves.
+    `condition`: inputs of the test. Both throttles are closed equally. If they are fully open, `line.orifices` is not
+    set, so that the rig's value holds: absent in the thesis's model (section 4.2.1), present in a rig that includes the
+    open valves.
     """
     closed = condition.closed_pct / 100.0
     values: dict[str, str | float] = {"line.closed_A": closed, "line.closed_B": closed}
@@ -122,8 +123,8 @@ class DataSheet:
 def find_sheet(folder: str | os.PathLike[str] | None = None) -> Path | None:
     """Find the folder of the measured data sheet.
 
-    It is `folder`, else the folder that the environment variable SEALSCOPE_SHEET names, else `./data`. Returns None
-    if no folder is named and `./data` has no sheet. Raises InputError if a named folder lacks a file.
+    The result is `folder`, else the folder that the environment variable SEALSCOPE_SHEET names, else `./data`. Returns
+    None if no folder is named and `./data` has no sheet. Raises InputError if a named folder lacks a file.
     """
     named_folder = folder if folder is not None else os.environ.get(VARIABLE) or None
     candidate = Path(named_folder if named_folder is not None else "data")
@@ -171,10 +172,11 @@ def read_sheet(folder: Path) -> tuple[DataSheet, str]:
 def _parse_number(row: dict[str, str], column: str, number: int, path: Path, *, allow_zero: bool = False) -> float:
     """Parse the number in a column of a row of the data sheet.
 
-    `number`: the row's number, for messages. Raises InputError unless the value is > 0, or >= 0 if `allow_zero`.
+    `number`, `path`: number of the row and file, for messages. Raises InputError unless the value is > 0, or >= 0 if
+    `allow_zero`.
     """
     try:
-        value = float(row[column] or "nan")
+        value = float(row[column] or "nan")  # an empty cell is no number > 0
     except ValueError:
         value = math.nan
     if not (0.0 < value < math.inf or (allow_zero and value == 0.0)):

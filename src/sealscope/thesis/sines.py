@@ -32,4 +32,5 @@ def sine_fit(t: Array, values: Array, *omegas: float) -> SineFit:
     basis = np.column_stack([np.ones(t.size), t - t.mean(), np.cos(phases), np.sin(phases)])
     fitted = np.linalg.lstsq(basis, values, rcond=None)[0]
     cosines, sines = np.split(fitted[2:], 2)
-    return SineFit(cosines - 1j * sines, float(fitted[1]), values - basis @ fitted)
+    # Re((c - i s) exp(i omega t)) = c cos(omega t) + s sin(omega t)
+    return SineFit(cosines - 1j * sines, slope=float(fitted[1]), residual=values - basis @ fitted)

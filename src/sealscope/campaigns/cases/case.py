@@ -70,7 +70,7 @@ class CampaignCase(CaseInputs):
 
 
 def digest(value: Any) -> str:
-    """Compute the SHA-256 hash (hex) of a value's JSON text; objects without a JSON form are written by `repr`."""
+    """Compute the SHA-256 hash (hex) of a value's JSON text, in which objects without a JSON form are their `repr`."""
     text = json.dumps(value, sort_keys=True, ensure_ascii=True, allow_nan=False, default=repr)
     return hashlib.sha256(text.encode()).hexdigest()
 
@@ -78,7 +78,7 @@ def digest(value: Any) -> str:
 def profile_key(name: str) -> str:
     """Compute a hash (hex) of the content of a profile, the distribution from which machines are drawn.
 
-    It does not depend on the path of the profile's file.
+    The hash does not depend on the path of the profile's file.
     """
     profile = load_profile(name)
     # the name seeds the draws of machines; a profile with `seeds` shares the draws of that profile
@@ -99,8 +99,8 @@ def shared_inputs(plan: SimulatedPlan) -> dict[str, Any]:
 def _level_digests(plan: SimulatedPlan) -> dict[str, dict[str, str]]:
     """Compute hashes of the machine families and controller files of a plan's factors, by factor and level (value).
 
-    The id of a case depends on the hashes of its own levels only. Its stored row thus stays valid when another family
-    or file is edited.
+    The id of a case depends on the hashes of its own levels only. The stored row of a case thus stays valid when
+    another family or file is edited.
     """
     digests: dict[str, dict[str, str]] = {FAMILY: {}, CONTROLLER: {}}
     for level in plan.factors.get(FAMILY, ()):
@@ -138,7 +138,7 @@ def list_cases(plan: SimulatedPlan) -> list[CampaignCase]:
                 key: digests[levels[key]] for key, digests in digests_by_factor.items() if levels.get(key) in digests
             }
             case_digest = digest({"world": shared, **content, **level_digests})
-            machine, noise = np.random.SeedSequence(int(case_digest, 16)).generate_state(2, np.uint64)
+            machine, noise = np.random.SeedSequence(int(case_digest, 16)).generate_state(2, np.uint64)  # two seeds
             # 63 bits: the seeds are stored as signed 64-bit integers
             machine_seed, noise_seed = int(machine >> np.uint64(1)), int(noise >> np.uint64(1))
             cases.append(CampaignCase(id=case_digest[:16], machine_seed=machine_seed, noise_seed=noise_seed, **content))
@@ -148,8 +148,8 @@ def list_cases(plan: SimulatedPlan) -> list[CampaignCase]:
 def interleave_cases(cases: Sequence[CampaignCase]) -> list[CampaignCase]:
     """Reorder the cases of a campaign, with each group of the plan spread evenly over the list.
 
-    A group has the same use, leak, law of the leak, and fault. If a campaign is ended early, the completed cases are
-    from all groups, in nearly the planned proportions.
+    The cases of a group have the same use, leak, law of the leak, and fault. If a campaign is ended early, the
+    completed cases are from all groups, in nearly the planned proportions.
     """
     groups = [(case.use, case.leak_lpm, case.law, case.fault) for case in cases]
     n_total, n_listed = Counter(groups), Counter[Any]()

@@ -40,7 +40,7 @@ def case_leaks(plan: SimulatedPlan, case: CampaignCase) -> tuple[Leak, ...]:
 
 
 def experiment_with_flow_leak(plan: SimulatedPlan, case: CampaignCase, profile: Profile | None = None) -> Experiment:
-    """Build the experiment of a case, whose leak states its mean flow but not yet its coefficient (`case_leaks`).
+    """Build the experiment of a case, with a leak that states its mean flow but not yet its coefficient (`case_leaks`).
 
     The machine is drawn from the plan's profile with the seed of the case, or is the plan's rig if there is no
     profile. The levels (values) of the plan's factors in this case replace the machine's parameters, command,
@@ -100,7 +100,7 @@ def size_leaks_on_short_run(experiment: Experiment) -> tuple[Leak, ...]:
     """Find the coefficients of an experiment's leaks that give their planned mean flows; return the completed leaks.
 
     The search simulates two or three times, so it uses a short run (`sizing_experiment`) and not the whole record. The
-    true mean flow of the record may therefore differ a little; the record's row states it.
+    true mean flow of the record, which the record's row states, may therefore differ a little from the planned one.
     """
     if not experiment.leaks:
         return ()

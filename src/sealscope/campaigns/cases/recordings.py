@@ -67,8 +67,8 @@ def judge_recordings(plan: RecordedPlan, folder: Path, progress: ProgressCallbac
 def _stroke_direction(recording: Recording) -> str:
     """Classify a recording as a stroke "out" or "in" by the mean of p_A - p_B, or else as "both".
 
-    It is a stroke of one direction if |mean| exceeds the fraction `_MIN_ONE_SIDEDNESS` of the RMS of p_A - p_B; "out"
-    means that p_A is higher on average. Without both pressures the result is "both".
+    The recording is a stroke of one direction if |mean| exceeds the fraction `_MIN_ONE_SIDEDNESS` of the RMS of p_A -
+    p_B; "out" means that p_A is higher on average. Without both pressures the result is "both".
     """
     if not all(name in recording for name in CHAMBERS):
         return "both"
@@ -93,7 +93,8 @@ def _judge_file(plan: RecordedPlan, recordings: RecordingSet, path: Path, name: 
     )
     try:
         recording = read(path, map=plan.channel_map or None, rate=plan.rate_hz)
-        scores, statements = judge_record(recording, None, plan, assumed_rig(plan.assumed, recording)[0])
+        rig, _ = assumed_rig(plan.assumed, recording)
+        scores, statements = judge_record(recording, None, plan, rig)  # None: scorers split it in the middle
         levels[STROKE] = _stroke_direction(inspect_recording(recording, INSPECTED).part)
         return make_row(scores=scores, statements=statements)
     except Exception as error:  # one bad recording must not end the campaign; its row carries the error

@@ -72,9 +72,10 @@ def expected_cause(fault: str) -> str:
 
 
 def duty_label(levels: Mapping[str, str | float]) -> str:
-    """Format the duty of a record, i.e. its command and its direction of stroke, if `levels` has them.
+    """Format the duty of a record, i.e. its command and its direction of stroke; "" if `levels` has neither.
 
-    A score is compared only with a threshold from records of the same duty.
+    `levels`: values of the plan's factors for the record. A score is compared only with a threshold from records of the
+    same duty.
     """
     return ", ".join(str(levels[name]) for name in (COMMAND, STROKE) if name in levels)
 
@@ -112,8 +113,8 @@ def named_cause(evidence: Evidence | Statement) -> str:
 def ranking_score(evidence: Evidence | Statement) -> float | None:
     """Return a detector's score of a record if a higher score means more evidence of a leak, else None.
 
-    It is None if the verdict is `cannot tell`, or if the detector names a cause that is not in `LEAKS`, such as a
-    sensor fault or an external leak.
+    The result is None if the verdict is `cannot tell`, or if the detector names a cause that is not in `LEAKS`, such as
+    a sensor fault or an external leak.
     """
     return evidence.score if named_cause(evidence) in (*LEAKS, NO_CAUSE) else None
 

@@ -31,7 +31,7 @@ def judge_record(
     split the recording into two parts, None for its middle; `rig`: the rig that detectors may assume. Raises InputError
     if the recording has a defect that rules out any verdict.
     """
-    record = inspect_recording(recording, INSPECTED)
+    record = inspect_recording(recording, INSPECTED)  # `part`: usable samples; `share`: their fraction
     if record.defect is not None:
         raise InputError(f"the record cannot be judged: {record.defect}" + (f" ({record.file})" if record.file else ""))
     examination = Examination(record.part, false_alarm_probability=plan.false_alarm, rig=rig, share=record.share)

@@ -117,7 +117,7 @@ def iter_batch_rows(plan: SimulatedPlan, cases: Sequence[CampaignCase], threads:
             try:
                 experiment = experiment_with_flow_leak(plan, case, profile)
                 pairs.append((case, replace(experiment, step=choose_step(case, experiment))))
-            except Exception as error:
+            except Exception as error:  # a defect of one case must not end the campaign
                 rows.append(CaseRow.from_case(case, error=error_text(error)))
         rows += _run_batch(plan, pairs, threads)
         seconds = round((time.process_time() - start_time) / len(batch), 4)
@@ -138,7 +138,8 @@ def _run_batch(plan: SimulatedPlan, pairs: Sequence[tuple[CampaignCase, Experime
         batch = simulate_batch(experiments, bounds=bounds.ravel() / plan.rig.daq.sample_rate, threads=threads)
         for (case, _), rms, flow in zip(pairs, batch.rms, batch.mean_leak_lpm, strict=True):
             # of the three intervals between bounds, 0 and 2 are the two parts, and 1 is the gap between them
-            split_rms = SplitRms.from_squares(dict(zip(CHAMBERS, rms[:, [0, 2]] ** 2, strict=True)), bounds)
+            squares = dict(zip(CHAMBERS, rms[:, [0, 2]] ** 2, strict=True))  # mean squares by chamber
+            split_rms = SplitRms.from_squares(squares, bounds)
             scores = score_details(split_rms, plan.detectors, plan.views)
             rows.append(CaseRow.from_case(case, flow_lpm=float(flow) if case.leak_lpm else 0.0, scores=scores))
         return rows
@@ -186,8 +187,8 @@ def make_step_chooser(
     the result. `N_SCOUT_MACHINES` scout machines are drawn for the cell. On a short run of each, `integrate_run`
     chooses the longest step that passes its check of the error. A case gets the shortest of the steps chosen with the
     case's solver, limited to the longest stable step of the case's machine, but not refined further than by
-    `MAX_STEP_REFINEMENT`. It does not depend on the other cases. `profile`: distribution from which machines are drawn,
-    by default the plan's.
+    `MAX_STEP_REFINEMENT`. The step of a case does not depend on other cases. `profile`: distribution from which
+    machines are drawn, by default the plan's.
     """
     shared = digest(shared_inputs(plan))
 
@@ -201,7 +202,7 @@ def make_step_chooser(
         steps: dict[str, float] = {}
         for number in range(N_SCOUT_MACHINES):
             content: dict[str, Any] = {"use": "calibrate", "leak_lpm": 0.0, "levels": dict(levels), "replicate": number}
-            seed = int(digest([shared, dict(levels), f"scout {number}"])[:15], 16)  # 60 bits
+            seed = int(digest([shared, dict(levels), f"scout {number}"])[:15], 16)  # 15 hex digits: 60 bits
             try:
                 scout = CampaignCase(id="", machine_seed=seed, noise_seed=0, **content)
                 method, step = _choose_method_and_step(experiment_with_flow_leak(plan, scout, profile))

@@ -84,7 +84,7 @@ def run(
 
 
 def _iter_rows(results: Generator[tuple[CampaignCase, CaseRow | None], None, None]) -> Generator[CaseRow, None, None]:
-    """Yield the row of each pair of case and row; in place of None, a row with the error that its process died."""
+    """Yield the row of each pair (case, row), or a row with an error if the row is None because the process died."""
     with closing(results):
         for case, row in results:
             yield row or CaseRow.from_case(case, error="the process that carried it out died")

@@ -118,15 +118,16 @@ def _local_processes(task: Callable[[Any], Any], max_items: int) -> Iterator[_Po
     processes run on items; `max_items`: largest number of processes, each of which has one item at a time.
     """
     context = get_context("spawn")
-    lifeline, parent_end = context.Pipe(duplex=False)
+    lifeline, parent_end = context.Pipe(duplex=False)  # a worker ends when `parent_end` is closed
     pools: list[Executor] = []
 
     def start_process() -> Executor:
         """Start one worker process, as a pool of its own."""
         with _worker_environment():
-            pools.append(ProcessPoolExecutor(1, context, _initialise_worker, (task, lifeline)))
-            pools[-1].submit(os.getpid)  # the first item starts the process, within the environment
-        return pools[-1]
+            pool = ProcessPoolExecutor(1, context, initializer=_initialise_worker, initargs=(task, lifeline))
+            pools.append(pool)
+            pool.submit(os.getpid)  # the first item starts the process, within the environment
+        return pool
 
     try:
         yield _Pools(start_process, max_items, lambda pool, item: pool.submit(_run_task, item), BrokenProcessPool)

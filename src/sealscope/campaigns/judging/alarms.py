@@ -59,7 +59,7 @@ class AlarmFractions:
     def informedness(self) -> float:
         """Youden's J of a group with a leak: fraction of alarms minus `false_alarm`, 1 if perfect, 0 for mere guesses.
 
-        It is nan if `false_alarm` is None.
+        The result is nan if `false_alarm` is None.
         """
         return self.alarms.value - self.false_alarm.value if self.false_alarm else math.nan
 
@@ -86,9 +86,9 @@ class Alarms:
         """Yield the fractions of alarms of each detector for each size of leak; if `pooled`, for all sizes together.
 
         The size is the planned mean flow, in the unit of the plan. Records with other faults are left out. Two
-        reference detectors, which always or never raise an alarm, come last. `hours`: operating time of one record [h],
-        None to omit false alarms per hour. If all records are leak-free, each detector has one result, with alarms in 0
-        of 0 records.
+        reference detectors, which always or never raise an alarm, come last. If all records are leak-free, each
+        detector has one result, with alarms in 0 of 0 records. `hours`: operating time of one record [h], None to omit
+        the rate of false alarms.
         """
         for name, records in drop_other_faults(self._with_references()).items():
             leak_free = [record for record in records if not record.size]
@@ -100,7 +100,7 @@ class Alarms:
             groups = group_by(leaky or leak_free, lambda record: math.nan if pooled else record.size)
             for size, group in groups.items():
                 fractions = self._summarise(name, group, leak_lpm=size)
-                detected = fractions.alarms if leaky else self._proportion(())
+                detected = fractions.alarms if leaky else self._proportion(())  # 0 of 0
                 yield replace(fractions, alarms=detected, false_alarm=false_alarm, per_hour=per_hour)
 
     def by_cell(self) -> Iterator[AlarmFractions]:
@@ -109,9 +109,13 @@ class Alarms:
         The size of a leak is its planned mean flow. A factor is a condition that a plan varies, such as the load; the
         values that occur are called its levels. Records with faults other than a leak are left out.
         """
+
+        def cell_key(record: JudgedRow) -> tuple[float, str]:
+            """Return the size of a record's leak and its levels as text, since texts and numbers have no order."""
+            return record.size, repr(tuple(record.row.levels.items()))
+
         for name, records in drop_other_faults(self.verdicts).items():
-            cells = group_by(records, lambda record: (record.size, repr(tuple(record.row.levels.items()))))
-            for (size, _), group in cells.items():
+            for (size, _), group in group_by(records, cell_key).items():
                 yield self._summarise(name, group, leak_lpm=size, levels=dict(group[0].row.levels))
 
     def by_fault(self) -> Iterator[AlarmFractions]:

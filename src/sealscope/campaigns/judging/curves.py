@@ -50,8 +50,8 @@ class SizeRoc:
 def iter_pods(verdicts: Verdicts, confidence: float) -> Iterator[DetectorPod]:
     """Yield each detector's probability of detection over the size of the leak.
 
-    The size is the planned mean flow, in the unit of the plan. A detector without a record that has a leak is left out.
-    `verdicts`: by detector, its verdict on each record; `confidence`: of the intervals.
+    The size is the planned mean flow, in the unit of the plan. `verdicts`: by detector, its verdict on each record;
+    `confidence`: confidence level of the intervals. If no record has a leak, nothing is yielded.
     """
     for name, records in verdicts.items():
         leaky = [record for record in records if record.size > 0]
@@ -73,8 +73,8 @@ def iter_rocs(verdicts: Verdicts, confidence: float) -> Iterator[SizeRoc]:
     """Yield ROC curves of each detector that has scores: for all leaks together, and for each planned mean flow.
 
     `verdicts`: by detector, its verdict on each record; `confidence`: confidence level of the curves' intervals. A
-    record without a score counts as if its score were the lowest. A curve needs two records with a leak and two
-    without; if there are fewer, it is left out.
+    record without a score counts as if its score were the lowest. A curve is left out unless there are at least two
+    records with a leak and two without.
     """
     for name, records in verdicts.items():
         scores = [record.row.score(name) if record.row.error is None else None for record in records]

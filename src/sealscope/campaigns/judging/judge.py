@@ -82,9 +82,10 @@ def judge(
     threshold, one is set from the leak-free rows with the same command and stroke direction (`compute_thresholds`).
     Raises InputError if there is no row to judge, or too few leak-free rows to set a threshold.
 
+    - `detectors`: names of the detectors
     - `false_alarm`: wanted false-alarm probability
-    - `promise`: "average" if the thresholds keep it on average over sets of leak-free records, "bound" if they keep it
-      with the probability `confidence` (`quantile_threshold`)
+    - `promise`: "average" if the thresholds keep this probability on average over sets of leak-free records, "bound" if
+      they keep it with the probability `confidence` (`quantile_threshold`)
     - `confidence`: also the confidence level of all intervals
     - `limits`: thresholds by detector, in place of all fixed and computed ones
     - `onset_s` [s]: true onset of the leaks, None to compute no errors of onsets

@@ -108,6 +108,7 @@ def iter_cause_confusions(verdicts: Verdicts, confidence: float) -> Iterator[Nam
         if not other_causes or not any(name in record.row.statements for record in single_cause_records):
             continue
         truth = [_true_cause(record) for record in single_cause_records]
+        # rows of the matrix: the true causes, then causes that are only named
         causes = [cause for cause in (NO_CAUSE, PISTON_LEAK) if cause in truth] + other_causes
         named_causes = [
             CANNOT_TELL if record.statement is None else named_cause(record.statement)

@@ -125,9 +125,8 @@ def build_tables(
         cells: TableRow = {}
         for column, content in columns.items():
             if content.startswith("known ") and knowledge:
-                cells[column] = resolve_attribute(
-                    knowledge.get(resolve_attribute(row, "detector")), content.removeprefix("known ")
-                )
+                row_knowledge = knowledge.get(resolve_attribute(row, "detector"))
+                cells[column] = resolve_attribute(row_knowledge, content.removeprefix("known "))
             elif not content.startswith("known "):
                 name = column.format(unit=unit)
                 cells |= _build_cells(name, content, row, factors)

@@ -57,7 +57,7 @@ def parse_detector_name(name: str) -> PlanDetector:
     Names of detectors or views that do not exist are accepted; `check_detector` refuses them.
     """
     base, _, view = name.partition(_VIEW)
-    return PlanDetector(name, base, view, SCORERS.get(base))
+    return PlanDetector(name, base, view, scorer=SCORERS.get(base))
 
 
 def check_detector(name: str, views: Views) -> None:

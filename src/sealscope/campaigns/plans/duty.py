@@ -27,9 +27,9 @@ _TARGET_CHECK_RATE = 50.0
 def check_duty(name: str, level: str | float, rig: Rig, duration: float) -> None:
     """Check a level (value) of a plan's factor `command`, `controller` or `load`; raise InputError if it is invalid.
 
-    `name`: the factor; `duration` [s]: length of a record, during which a command that is a target of the piston's
-    position must stay within the rig's stroke. A built-in controller must fit the rig. Of any other controller, only
-    the form of its name is checked.
+    `name`: the factor; `rig`: rig of the plan; `duration` [s]: length of a record. A command that is a target of the
+    piston's position must stay within the rig's stroke for this time. A built-in controller must fit the rig. Of any
+    other controller, only the form of its name is checked.
     """
     examples = {COMMAND: "'3 sin(4t)' or 'position 50 mm sin(2t)'", CONTROLLER: "'pi'", LOAD: "'2 kN'"}
     if not isinstance(level, str):
@@ -49,7 +49,8 @@ def check_controllers(plan: SimulatedPlan, trust: bool) -> None:
     """Check that every controller of a plan is trusted, and build those that are not built in.
 
     A plan may be hostile, so code that it names (`FILE.py:NAME`, `MODULE:NAME`) is run only if `trust` is True.
-    Built-in and installed controllers are always trusted. Raises InputError if one is untrusted or cannot be built.
+    Built-in and installed controllers are always trusted. Raises InputError if a controller is untrusted or cannot be
+    built.
     """
     names = [str(level) for level in plan.factors.get(CONTROLLER, ())]
     if plan.profile:
@@ -88,8 +89,8 @@ def throttle_values(level: str | float) -> dict[str, str | float]:
 def parse_plan_fault(text: str, onset_s: float) -> Fault:
     """Parse the text of a fault other than a piston leak, such as "pump leak x3".
 
-    The fault starts at `onset_s` [s] unless the text states a time itself, as in "pump leak x3 from 20 s". Raises
-    InputError if the text names no fault.
+    The fault starts at `onset_s` [s] unless the text states a time, as in "pump leak x3 from 20 s". Raises InputError
+    if the text names no fault.
     """
     has_time = any(f" {word} " in f" {text} " for word in ("from", "growing"))
     fault = parse_fault(text if has_time else f"{text} from {onset_s:g} s")

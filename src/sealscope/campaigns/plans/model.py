@@ -32,16 +32,19 @@ def _quantity_validator(unit: str) -> BeforeValidator:
 
 
 def _validate_file_name(name: str) -> str:
-    """Check that `name` has only letters, digits, '-', '_' and '.', and return it; raise ValueError otherwise."""
+    """Return `name` if it is a valid file name of at most 80 letters, digits, '-', '_' and '.'; else raise ValueError.
+
+    A name that begins with '.' is invalid, too.
+    """
     if not all(c.isalnum() or c in "-_." for c in name) or name.startswith(".") or len(name) > _MAX_NAME_LENGTH:
         raise ValueError(f"must be of at most {_MAX_NAME_LENGTH} letters, digits, '-', '_' and '.'")
     return name
 
 
 def _validate_pattern(pattern: str) -> str:
-    """Check a pattern of file names, and return it; raise ValueError if it is invalid.
+    """Return a pattern of file names, such as "day*/*.csv", if it is valid; else raise ValueError.
 
-    The pattern must be a relative path without "..". One component of the path may be `**`, for any subfolders.
+    A pattern must be a relative path without "..". One component of the path may be `**`, for any subfolders.
     """
     parts = Path(pattern).parts
     if not parts or Path(pattern).is_absolute() or ".." in parts:
@@ -60,7 +63,7 @@ def _validate_level(value: Any) -> Any:
 
 
 def _validate_channels(names: tuple[str, ...]) -> tuple[str, ...]:
-    """Check the names of channels, and return them; raise ValueError for an unknown or repeated channel.
+    """Return the names of channels if they are valid; raise ValueError for an unknown or repeated channel.
 
     The channel `q_leak` is refused, too: it measures the leak that detectors are to find.
     """
@@ -72,7 +75,10 @@ def _validate_channels(names: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def _validate_view_name(name: str) -> str:
-    """Check the name of a view, a set of channels, and return it; raise ValueError if it is empty or contains "@"."""
+    """Return the name of a view (a set of channels) if it is not empty and has no "@" and no outer blanks.
+
+    Otherwise raises ValueError.
+    """
     if not name.strip() or name != name.strip() or "@" in name:
         raise ValueError("must be a plain name without '@'")
     return name
@@ -162,10 +168,10 @@ class _JudgedPlan(_Plan):
     assume_set: Values = field(default_factory=dict)
 
     def _load_assumed(self, default: Rig | None) -> Rig | None:
-        """Load the rig `assume` of the plan, or else take `default`, and replace parameters by the plan's `assume_set`.
+        """Load the rig that detectors may assume, and replace its parameters by the values in the plan's `assume_set`.
 
-        If there is neither rig, the packaged rig `thesis` is used for the values in `assume_set`; without such values,
-        the result is None.
+        The rig is `assume` of the plan, else `default`, else the packaged rig `thesis`. Returns None if there is
+        neither a plan's nor a default rig, and no value in `assume_set`.
         """
         rig = default if self.assume is None else load_rig(self.assume)
         if not self.assume_set:
@@ -216,7 +222,7 @@ class SimulatedPlan(_JudgedPlan):
     @cached_property
     def assumed(self) -> Rig:
         """The rig that detectors may assume, by default the simulated one."""
-        return self._load_assumed(self.rig) or self.rig  # with a default never None; `or` satisfies type checkers
+        return self._load_assumed(self.rig) or self.rig  # never None with a default; `or` is for type checkers
 
     @property
     def size(self) -> int:
@@ -263,7 +269,7 @@ class RecordedPlan(_JudgedPlan):
     @cached_property
     def assumed(self) -> Rig | None:
         """The rig that detectors may assume, or None if the plan states no rig."""
-        return self._load_assumed(None)
+        return self._load_assumed(default=None)
 
 
 AnyPlan: TypeAlias = SimulatedPlan | RecordedPlan

@@ -101,12 +101,13 @@ def _parse_tables(tree: Mapping[str, Any], place: str) -> AnyPlan:
             raise InputError(f"[{key}] is not known; a plan with [{source}] has {table_names} ({place})")
     entries = {**tree, "place": place}
     full_names = {name: name for name in tables}  # by entry, its name in messages
-    for table in ("campaign", source) if source_entries else ("campaign",):
+    for table in ("campaign", source) if source_entries else ("campaign",):  # [[records]] stays as it is
         values = entries.pop(table, {})
         if not isinstance(values, Mapping):
             raise InputError(f"{table} must be a table, got {values!r} ({place})")
         for entry in values:
-            if (entry in source_entries) != (table == source) or entry in ("place", *tables):
+            is_misplaced = (entry in source_entries) != (table == source)  # it is an entry of the other table
+            if is_misplaced or entry in ("place", *tables):  # or it would replace the file's path or a table
                 raise InputError(f"{table}.{entry} is not known ({place})")
             full_names[entry] = f"{table}.{entry}"
         entries |= values
@@ -114,7 +115,10 @@ def _parse_tables(tree: Mapping[str, Any], place: str) -> AnyPlan:
 
 
 def _call_for_entry(entry: str, place: str, function: Callable[[], _T]) -> _T:
-    """Call `function` and return its result; if it raises InputError, add `entry` and `place` to the message."""
+    """Call `function` for an entry of a plan, and return the result; add `entry` and `place` to an InputError.
+
+    `entry`: full name of the entry, such as "campaign.rig"; `place`: path of the plan's file.
+    """
     try:
         return function()
     except InputError as error:
@@ -154,7 +158,7 @@ def _complete_simulated_plan(plan: SimulatedPlan) -> SimulatedPlan:
 
 
 def _check_factors(plan: SimulatedPlan) -> None:
-    """Check the factors of a plan and their levels (values); raise InputError if one is invalid.
+    """Check the factors of a plan and their levels (values); raise InputError if one of them is invalid.
 
     Each level must be valid and occur once in its factor. There may be at most `MAX_CELLS` combinations of levels. If
     the plan varies the controller, all its commands must be targets of the piston's position, not voltages.
@@ -175,8 +179,9 @@ def _check_factors(plan: SimulatedPlan) -> None:
 def _commands(plan: SimulatedPlan) -> tuple[str | float, ...]:
     """List the commands of a plan's records.
 
-    These are the levels of the factor `command`. Without this factor, they are the commands of the families of machines
-    in the factor `family` or, if there are no families, of the whole profile. Without a profile it is '3 sin(4t)'.
+    These are the levels of the factor `command`. Without this factor, they are the commands in the plan's profile of
+    machines, but only of the families that the factor `family` lists, if there is one. Without factor and profile the
+    only command is '3 sin(4t)'.
     """
     if COMMAND in plan.factors or not plan.profile:
         return plan.factors.get(COMMAND, ("3 sin(4t)",))
@@ -198,7 +203,7 @@ def _check_level(plan: SimulatedPlan, name: str, level: str | float) -> None:
 
 
 def _check_records(plan: SimulatedPlan) -> None:
-    """Check the groups of records of a plan; raise InputError if one is invalid.
+    """Check the groups of records of a plan; raise InputError if a group is invalid.
 
     No two groups may agree in use, leak, law and fault; each fault must be known; and at least one group must be
     judged. If a detector needs a threshold, there must be enough leak-free records for the plan's false-alarm

@@ -40,7 +40,8 @@ def split_bounds(n: int, rate: float, split: int) -> IntArray:
     the other part or on padding. At the start of the record, `START_SECONDS` at the sampling rate `rate` [Hz] are
     left out, too, but at most `START_FRACTION` of the first part. A part without usable samples has end <= begin.
     """
-    before, after = (int(samples) for samples in edge_samples()[-1])  # of the last level, whose filter is longest
+    # numbers of earlier and of later samples on which a detail of the last level depends, whose filter is longest
+    before, after = (int(samples) for samples in edge_samples()[-1])
     begin = max(before, int(min(START_SECONDS * rate, START_FRACTION * split)))
     return np.array([[begin, split - after], [split + before, n - after]])
 
@@ -64,9 +65,10 @@ class SplitRms:
         """
         rate = recording.rate
         bounds = split_bounds(len(recording), rate, round((split_s - float(recording.t[0])) * rate))
+        has_samples = np.diff(bounds).min() > 0  # in both parts
         squares = {}
-        for chamber in CHAMBERS if np.diff(bounds).min() > 0 else ():
-            if chamber in recording:
+        for chamber in CHAMBERS:
+            if has_samples and chamber in recording:
                 before, _gap, after = mean_squares(details(recording[chamber]), bounds.ravel())
                 squares[chamber] = np.array([before, after])
         return cls.from_squares(squares, bounds)
@@ -75,13 +77,15 @@ class SplitRms:
     def from_squares(cls, squares: Mapping[str, Array], bounds: IntArray) -> SplitRms:
         """Compute the log RMS of the pressures' wavelet details from their mean squares in both parts of a record.
 
-        `squares`: by chamber, mean squares (2, 5) before and after the split; `bounds` (2, 2): first sample and end
-        of each part (`split_bounds`). The mean over both parts is weighted by their numbers of samples.
+        `squares`: by chamber, mean squares (2, 5) of d1 to d4 and d3d4, before and after the split; `bounds` (2, 2):
+        first sample and end of each part (`split_bounds`). The mean over both parts is weighted by their numbers of
+        samples.
         """
         log_rms = {}
-        with np.errstate(divide="ignore"):
+        n_samples = np.diff(bounds)[:, 0]
+        with np.errstate(divide="ignore"):  # the details of a constant pressure are 0
             for chamber, (before, after) in squares.items():
-                overall = np.average((before, after), axis=0, weights=np.diff(bounds)[:, 0])
+                overall = np.average((before, after), axis=0, weights=n_samples)
                 log_rms[chamber] = (0.5 * np.log(before), 0.5 * np.log(after), 0.5 * np.log(overall))
         return cls(log_rms)
 
@@ -161,8 +165,8 @@ class Scorer:
 def _iter_scorers() -> Iterator[Scorer]:
     """Yield all scorers: rules on one wavelet detail of one chamber, and the thesis's rule on both chambers.
 
-    Each rule on a fall or a rise, and the thesis's rule, also occurs as a sign rule, whose threshold is 0. It raises an
-    alarm at any change in the tested direction.
+    Each rule on a fall or a rise, and the thesis's rule, also occurs as a sign rule, whose threshold is 0. A sign rule
+    raises an alarm at any change in the tested direction.
     """
     for chamber, quantity, direction in product(CHAMBERS, QUANTITIES, _DIRECTIONS):
         rule = Scorer(f"{quantity} of {chamber} {direction}", ((quantity, chamber, direction),))

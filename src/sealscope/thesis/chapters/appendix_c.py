@@ -24,8 +24,8 @@ def _chamber_table(sheet: DataSheet, measured: DataSheet | None, chamber: str, i
     """Tabulate the RMS of one chamber's wavelet details in all tests of Appendix C, in the form of the thesis.
 
     A detail has six columns: RMS without the leak, RMS with the leak, and the change [%], simulated and then measured.
-    `sheet`: the simulated data sheet; `measured`: the measured one, None if not given, for which the cells are empty;
-    `chamber`: "p_A" or "p_B"; `item`: entry of `items.toml` for which the table is made.
+    `sheet`: the simulated data sheet; `measured`: the measured one, None if not given, in which case its cells are
+    empty; `chamber`: "p_A" or "p_B"; `item`: entry of `items.toml` for which the table is made.
     """
     heads = ["test", "mean leak [L/min]", "input", "closed [%]", "level"]
     columns: list[list[float] | list[None]] = []
@@ -62,7 +62,7 @@ def compare_sheets(sheet: DataSheet, measured: DataSheet | None) -> list[tuple[C
     rows: list[tuple[Cell, ...]] = []
     for chamber, name in COLUMNS:
         simulated_change = sheet.log_change(chamber, name)
-        comparison: tuple[Cell, ...] = (None,) * 5
+        comparison: tuple[Cell, ...] = (None,) * 5  # without a measured sheet
         if measured is not None:
             measured_change = measured.log_change(chamber, name)
             log_ratio = np.log(sheet.rms[chamber][name][:, 0] / measured.rms[chamber][name][:, 0])
@@ -93,7 +93,7 @@ def difference_figure(context: Context, item: Item) -> tuple[Figure, ...]:
     """Draw the change of a wavelet detail's RMS with the leak, over the mean leak of each test.
 
     The points are the measured change, the change simulated with the leak, and the change between the two halves of a
-    test that is simulated without any leak. One panel shows the changes in the unit of the RMS, the other in %.
+    test that is simulated without any leak. The two panels show the changes in the unit of the RMS and in %.
     `item.inputs` has the chamber, the detail, and the direction in which a leak should change the RMS ("down" or "up").
     """
     chamber, name, direction = (item.inputs[key] for key in ("chamber", "detail", "way"))

@@ -40,10 +40,10 @@ RmsPairs = Mapping[str, Mapping[str, tuple[float, ...]]]
 def draw_drifts(number: int, half: float, draw: int = 0) -> tuple[ParameterDrift, ...]:
     """Draw random steps of the rig's parameters in the middle of a test, which simulate drift.
 
-    Each entry under `drifts` in `cases.toml` lists parameters and a range of relative sizes. One size is drawn
-    uniformly from this range, with a random sign, and all parameters of the entry step by it. `number`: number of the
-    test; `half`: time of the step, half the duration [s]; `draw`: 0, 1, .. for different draws of one test. The random
-    numbers depend on `number` and `draw` only.
+    Each entry under `drifts` in `cases.toml` lists parameters and a range of relative sizes. For each entry, one size
+    is drawn uniformly from this range and given a random sign; all parameters of the entry step by this size. `number`:
+    number of the test; `half`: time of the step, half the duration [s]; `draw`: 0, 1, .. for different draws of one
+    test. The random numbers depend on `number` and `draw` only.
     """
     rng = np.random.default_rng([_SEEDS["drift"], draw, number])
     drifts = load_texts("cases.toml")["drifts"].values()
@@ -109,7 +109,7 @@ def part_detail_rms(recording: Recording, parts: Sequence[tuple[float, float]]) 
     [psi^2]. Each part is shortened at both ends by the reach of the wavelet's filters, so that no detail depends on
     samples outside of it.
     """
-    before, after = reach("db8", 4)[-1]
+    before, after = reach("db8", 4)[-1]  # numbers of earlier and later samples on which d4 depends
     bounds = np.round(np.array(parts) * recording.rate).astype(int) + np.array([before, -after])
     result = {}
     for chamber in CHAMBERS:
@@ -120,7 +120,7 @@ def part_detail_rms(recording: Recording, parts: Sequence[tuple[float, float]]) 
 
 
 def pressure_range(values: Array) -> float:
-    """Compute the range of a pressure as the difference between its 95 % and 5 % quantiles, in its unit."""
+    """Compute the range of a pressure as the difference between its 95 % and 5 % quantiles."""
     return float(np.ptp(np.percentile(values, [5.0, 95.0])))
 
 
@@ -151,7 +151,7 @@ def make_row(
 
 
 def column(table: ThesisTable, head: str) -> Array:
-    """Return the numbers in one column of a table, given by its head; NaN for empty cells."""
+    """Return the numbers in the column of a table with the head `head`; NaN for empty cells."""
     k = table.columns.index(head)
     return np.array([np.nan if row[k] is None else float(row[k]) for row in table.rows])  # type: ignore[arg-type]
 
@@ -161,6 +161,7 @@ def parse_sheet(table: ThesisTable) -> DataSheet:
 
     The table has one row for each test, and both halves of a test in separate columns.
     """
+    # (chambers, details, halves, tests)
     values = np.array([column(table, head) for *_, head in _RMS_COLUMNS]).reshape(len(CHAMBERS), len(QUANTITIES), 2, -1)
     return DataSheet({c: {q: values[k, j].T for j, q in enumerate(QUANTITIES)} for k, c in enumerate(CHAMBERS)})
 

@@ -83,7 +83,7 @@ def wavelet_spectrum(omega: Array) -> np.ndarray:
     """
 
     def response(taps: list[float], omega: Array) -> np.ndarray:
-        """Compute the frequency response of a filter at `omega` [rad per sample] from its coefficients."""
+        """Compute the frequency response of a filter with the coefficients `taps` at `omega` [rad per sample]."""
         return np.asarray(np.polynomial.polynomial.polyval(np.exp(-1j * omega), np.array(taps, dtype=np.float64)))
 
     filters = discrete_wavelet(WAVELET)
@@ -99,7 +99,7 @@ def wavelet_centre() -> WaveletCentre:
     The centre in time is weighted by |psi|^2; the centre in frequency is the peak of |Psi|.
     """
     _, psi, t = mother_wavelet()
-    omega = np.linspace(0.1, 12.0, 12000)
+    omega = np.linspace(0.1, 12.0, 12000)  # [rad per sample], around the peak
     peak = omega[np.abs(wavelet_spectrum(omega)).argmax()]
     return WaveletCentre(float(np.sum(t * psi**2) / np.sum(psi**2)), float(peak / (2.0 * np.pi)))
 
@@ -129,6 +129,7 @@ def continuous_transform(x: Array, rate: float, scales: Array) -> Array:
     centre = wavelet_centre().time
     rows = np.empty((len(scales), x.size))
     for k, a in enumerate(scales):
+        # spectrum of the wavelet at scale a, moved so that its middle is at the time 0
         atom = np.sqrt(a) * wavelet_spectrum(a * omega) * np.exp(1j * a * omega * centre)
         rows[k] = np.fft.irfft(spectrum * np.conj(atom), padded.size)[pad : pad + x.size]  # a correlation
     return rows
@@ -162,10 +163,11 @@ def two_tone_signal(t: Array) -> Array:
 def amplitude_spectrum(x: Array, rate: float) -> AmplitudeSpectrum:
     """Compute the amplitudes and phases of the cosines whose sum is the signal `x` (n,), sampled at `rate` [Hz].
 
-    They follow from the discrete Fourier transform of eq. (3.2).
+    Amplitudes and phases follow from the discrete Fourier transform of eq. (3.2).
     """
     spectrum = np.asarray(np.fft.rfft(x), dtype=np.complex128) * (2.0 / x.size)
-    spectrum[0] /= 2.0  # the mean and the Nyquist frequency have no negative counterpart
+    # a cosine has half of its amplitude at the negative frequency; mean and Nyquist frequency have no such half
+    spectrum[0] /= 2.0
     if x.size % 2 == 0:
         spectrum[-1] /= 2.0
     frequency = np.asarray(np.fft.rfftfreq(x.size, 1.0 / rate), dtype=np.float64)
@@ -192,7 +194,7 @@ def nearest_index(values: Array, target: float) -> int:
 
 
 def two_tone_figure(context: Context, item: Item) -> tuple[Figure, ...]:
-    """Draw Fig. 3.2: the signal of eq. (3.3) and its amplitude spectrum."""
+    """Draw Fig. 3.2: the signal of eq. (3.3) and its amplitude spectrum; `context` is not used."""
     t = np.arange(round(RATE)) / RATE
     x = two_tone_signal(t)
     frequency, amplitude, phase = amplitude_spectrum(x, RATE)
@@ -216,7 +218,7 @@ def two_tone_figure(context: Context, item: Item) -> tuple[Figure, ...]:
 
 
 def wavelet_figure(context: Context, item: Item) -> tuple[Figure, ...]:
-    """Draw Fig. 3.3: mother wavelet and scaling function of db8."""
+    """Draw Fig. 3.3: mother wavelet and scaling function of db8; `context` is not used."""
     phi, psi, t = mother_wavelet()
     step = float(t[1] - t[0])
     panels = (
@@ -237,8 +239,8 @@ def wavelet_figure(context: Context, item: Item) -> tuple[Figure, ...]:
 def vanishing_moments(psi: Array, t: Array) -> int:
     """Count the vanishing moments of a wavelet `psi` (n,) over the time `t` (n,).
 
-    The moments are the integrals of t^k psi(t), k = 0, 1, ... Those before the first moment that differs from 0, to
-    within rounding, are counted, at most 20.
+    The moments are the integrals of t^k psi(t), k = 0, 1, ... They are counted up to the first moment that differs from
+    0 by more than rounding, at most 20.
     """
     k = 0
     centred = t - t.mean()  # smaller powers, the same number of vanishing moments
@@ -251,14 +253,14 @@ def transform_figure(context: Context, item: Item) -> tuple[Figure, ...]:
     """Draw Fig. 3.4: a signal in time, its spectrum, its short-time Fourier transform and its wavelet transform.
 
     The signal is the tone of 100 Hz of eq. (3.3) before 0.5 s, its tone of 30 Hz after, and a pulse of one sample and
-    height 8 at 0.75 s.
+    height 8 at 0.75 s. `context` is not used.
     """
     t = np.arange(round(RATE)) / RATE
     x = np.where(t < 0.5, np.cos(2.0 * np.pi * 100.0 * t), 0.5 * np.sin(2.0 * np.pi * 30.0 * t))
     x[nearest_index(t, 0.75)] += 8.0
     frequency, amplitude, _ = amplitude_spectrum(x, RATE)
     window = 128
-    times, bins, short_time = short_time_spectrum(x, RATE, window, 4)
+    times, bins, short_time = short_time_spectrum(x, RATE, window, step=4)
     frequencies = np.geomspace(10.0, 450.0, 64)
     wavelet = np.abs(continuous_transform(x, RATE, scales_for(frequencies)))
     signal = FigureCurve(t, x, "x(t)", "reference")
@@ -272,8 +274,8 @@ def transform_figure(context: Context, item: Item) -> tuple[Figure, ...]:
         Panel(*axes, title=short_time_title, image=Image(times, bins, short_time, "amplitude [1]")),
         Panel(*axes, title="(d) Wavelet transform, db8", image=wavelet_image, log_y=True),
     )
-    pulse = (t > 0.6) & (t < 0.9)
-    high = nearest_index(frequencies, 300.0)
+    pulse = (t > 0.6) & (t < 0.9)  # [s]
+    high = nearest_index(frequencies, 300.0)  # [Hz], where the tones do not hide the pulse
     numbers = (
         Number("resolution in frequency of (b)", RATE / x.size, "Hz"),
         Number("resolution in frequency of (c)", RATE / window, "Hz"),
@@ -302,7 +304,7 @@ def scalogram_figure(context: Context, item: Item) -> tuple[Figure, ...]:
     run = context.run(Experiment.of(command=_COMMAND, duration=20.0, leak=f"{_LEAK} from {_ONSET:g} s"))
     t = run.recorded.t
     rate = 1.0 / float(t[1] - t[0])
-    frequencies = np.geomspace(12.0, 0.45 * rate, 64)
+    frequencies = np.geomspace(12.0, 0.45 * rate, 64)  # [Hz], to below the Nyquist frequency
     recorded, noise_free = run.recorded["p_A"] * 1e-6, run.outputs["p_A"] * 1e-6
     leak = ((_ONSET, "leak"),)
     panels = [Panel("t [s]", "p_A [MPa]", (FigureCurve(t, recorded, "p_A, recorded", "A"),), "(a) Record", leak)]
@@ -340,7 +342,10 @@ def _running_rms(t: Array, rows: Array, size: int) -> tuple[Array, Array]:
 
 
 def judge_claims(context: Context, item: Item) -> tuple[Claim, ...]:
-    """Judge claims 3.1 to 3.6 on transforms, on the wavelet db8, and on the effect of a leak on the pressures."""
+    """Judge claims 3.1 to 3.6 on transforms, on the wavelet db8, and on the effect of a leak on the pressures.
+
+    `item` is not used.
+    """
     return (*_fourier_claims(), *_wavelet_claims(), _leak_claim(context))
 
 

@@ -63,7 +63,7 @@ class PrintedTest:
     def condition(self) -> Condition:
         """The test of Appendix C for which this test of chapter 5 is taken; the thesis does not name it.
 
-        It is the candidate whose mean leak is nearest to the level's nominal leak (section 5.1).
+        The candidate is taken whose mean leak is nearest to the nominal leak of the test's level (section 5.1).
         """
         return min(self.candidates, key=lambda row: abs(row.mean_leak_lpm - NOMINAL_LPM[self.level]))
 
@@ -82,7 +82,7 @@ def make_test_experiment(test: PrintedTest) -> Experiment:
 
     The rig is the one that was fitted to Appendix C.
     """
-    return leak_test(test.condition, test.half, test.condition.number)
+    return leak_test(test.condition, test.half, seed=test.condition.number)
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,8 +145,8 @@ class FigureView:
     def draw_inputs(self) -> PanelsAndNumbers:
         """Draw command, motor speed and displacement of the test as three panels.
 
-        Also returns the RMS of the speed [rpm] and the drift (linear trend) [mm/s] of the displacement, each without
-        and with the leak.
+        Returns the panels and the numbers: the RMS of the speed [rpm] and the drift (linear trend) [mm/s] of the
+        displacement, each without and with the leak.
         """
         recording = self.recording
         rpm, x = recording["omega"] / _RPM, recording["x"] * 1e3
@@ -165,7 +165,8 @@ class FigureView:
     def draw_leak(self) -> PanelsAndNumbers:
         """Draw the leak flow and both chamber pressures of the test as three panels.
 
-        Also returns the mean leak, and the 5 to 95 % range of each pressure without and with the leak.
+        Returns the panels and the numbers: the mean leak, simulated and measured by the thesis, and the 5 to 95 % range
+        of each pressure without and with the leak.
         """
         recording = self.recording
         flow = self._curve(recording["q_leak"] / LITRE_PER_MINUTE, "flow meter, A to B positive", "leak")
@@ -185,7 +186,7 @@ class FigureView:
     def draw_details(self) -> PanelsAndNumbers:
         """Draw the wavelet details d1 to d4 and d3d4 of one chamber's pressure as five panels.
 
-        Also returns the RMS of each detail without and with the leak, and its change.
+        Returns the panels and the numbers: the RMS of each detail without and with the leak, and the change of the RMS.
         """
         series = zip(QUANTITIES, details(self.recording[self.chamber] / PSI).quantities(), strict=True)
         panels = [self._panel(f"{name} [{UNITS[name]}]", *self._curve_pair(values)) for name, values in series]
@@ -194,8 +195,8 @@ class FigureView:
     def draw_windowed_rms(self) -> PanelsAndNumbers:
         """Draw the windowed RMS of the wavelet details d3, d4 and d3d4 of one chamber's pressure as three panels.
 
-        Horizontal lines mark the RMS over the part of the test without the leak, after the start-up, and over the
-        part with it. Also returns these RMS and their changes.
+        Horizontal lines mark the RMS over the part of the test without the leak, after the start-up, and over the part
+        with the leak. Returns the panels and the numbers: these two RMS of each detail, and the change of the RMS.
         """
         t, curves = windowed_detail_rms(self.recording, self.chamber)
         rms = part_detail_rms(self.recording, self.test.parts)[self.chamber]
@@ -231,7 +232,8 @@ _VIEWS: dict[str, tuple[str, Callable[[FigureView], PanelsAndNumbers]]] = {
 def iter_views() -> Iterator[tuple[str, str, dict[str, object]]]:
     """Yield (id, title, inputs) of Figs. 5.1 to 5.89, which show each test in several views.
 
-    The views (`_VIEWS`) are drawn over the whole test or as a close-up of 20 s around the opening of the leak.
+    The views (`_VIEWS`) are drawn over the whole test or as a close-up of 20 s around the opening of the leak. `inputs`
+    are those of `leak_test_figure`.
     """
     for test in TESTS.values():
         input_views = [("input", "", False), ("input", "", True)]  # (view, chamber, is_closeup)
@@ -310,9 +312,9 @@ def fit_step_time(t: Array, y: Array, min_points: int = 5) -> float:
 
 
 def measure_test(context: Context, test: PrintedTest, *, leak: bool = True) -> LeakTestMeasures:
-    """Simulate one of the ten tests of chapter 5 and compute its measures.
+    """Simulate one of the ten tests of chapter 5, and compute measures of its parts without and with the leak.
 
-    `leak`: False for the same test without its leak.
+    `leak`: False to simulate the same test without its leak.
     """
     experiment = make_test_experiment(test)
     run = context.run(experiment) if leak else context.run(replace(experiment, leaks=()), prove=False)
@@ -323,7 +325,7 @@ def measure_test(context: Context, test: PrintedTest, *, leak: bool = True) -> L
     masks = [(t >= start) & (t < stop) for start, (_, stop) in zip(starts, test.parts, strict=True)]
 
     def compute_pair(values: Array, statistic: Callable[[Array], float] = rms) -> tuple[float, float]:
-        """Compute a statistic of `values` over whole periods of the command, without and with the leak."""
+        """Compute a statistic of `values` (n,) over whole periods of the command, without and with the leak."""
         return statistic(values[masks[0]]), statistic(values[masks[1]])
 
     steps = {}

@@ -87,7 +87,7 @@ def _rig(name: str = RIG) -> Rig:
 
 
 def _amplitude_at(run: Trajectory, mask: NDArray[np.bool_], f: float) -> float:
-    """Compute the amplitude [m] of the piston's motion at the frequency `f` [Hz], over the samples of a mask."""
+    """Compute the amplitude [m] of the piston's motion at the frequency `f` [Hz], from the samples of a mask."""
     return float(np.abs(sine_fit(run.t[mask], run["x"][mask], 2 * math.pi * f).amplitudes[0]))
 
 
@@ -128,7 +128,7 @@ class ControlledRig:
             controller = controller_named(self.controller, rig) if self.controller else None
         experiment = Experiment.of(
             rig=rig,
-            set={**PLANT_MISMATCH, "F_l": LOAD, **dict(self.values)},
+            set={**PLANT_MISMATCH, "F_l": LOAD, **dict(self.values)},  # the controller assumes the rig without these
             command=command,
             duration=duration,
             controller=controller,
@@ -152,16 +152,16 @@ class ControlledRig:
         this amplitude over that of the piston's motion at the same frequency.
         """
         force = f"{STIFFNESS_FORCE} N sin({2 * math.pi * STIFFNESS_FREQUENCY!r}t)"
-        run = self.run("position 0 mm sin(t)", 16.0, force)
-        is_settled = run.t >= 8.0
+        run = self.run("position 0 mm sin(t)", duration=16.0, load=force)  # amplitude 0: a constant target
+        is_settled = run.t >= 8.0  # [s]
         return STIFFNESS_FORCE / (1e3 * _amplitude_at(run, is_settled, STIFFNESS_FREQUENCY))
 
     def bandwidth(self) -> float:
         """Compute the frequency [Hz] at which the tracking error of small sines first exceeds -3 dB of the target.
 
         The error is |x/target - 1| of complex amplitudes, and its limit 0.71. The target is a sum of sines of the
-        frequencies `BANDWIDTH_FREQUENCIES`, between which the result is interpolated. Returns the lowest of them if the
-        error exceeds the limit there already, and inf if the error is below the limit at all of them.
+        frequencies `BANDWIDTH_FREQUENCIES`, between which the result is interpolated. Returns the lowest frequency if
+        the error exceeds the limit there already, and inf if the error exceeds the limit at none of them.
         """
         frequencies = BANDWIDTH_FREQUENCIES
         terms = [f"{1e3 * BANDWIDTH_SPEED / (2 * math.pi * f):.6f} mm sin({2 * math.pi * f!r}t)" for f in frequencies]
@@ -184,9 +184,9 @@ class ControlledRig:
     def efficiencies(self) -> tuple[float, float]:
         """Compute the electrical and the hydraulic efficiency of a sine motion against a damper as the only load.
 
-        They are the work in the damper over the electrical energy of the motor, and over the hydraulic energy. The pump
-        delivers the hydraulic energy at its ports or, in a valve-controlled rig, a lossless supply at the supply's
-        pressure.
+        The efficiencies are the work in the damper over the electrical energy of the motor, and over the hydraulic
+        energy. The hydraulic energy is delivered by the pump at its ports or, in a valve-controlled rig, by a lossless
+        supply at the supply's pressure.
         """
         run, mask = replace(self, values=(("F_l", 0.0), ("d_load", DAMPER))).run_duty()
         flow = supply_flow(run) if _rig(self.rig).circuit.valve_controlled else run["Q_1"]
@@ -276,16 +276,18 @@ def open_loop_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     def drift(run: Trajectory, first: int) -> float:
         """Compute the drift of the piston's mean position [mm/min] from cycle `first` of a run to the next cycle."""
         means = [float(np.mean(run["x"][_cycle_mask(run.t, k)])) for k in (first, first + 1)]
-        return 60e3 * (means[1] - means[0]) / CYCLE
+        return 60e3 * (means[1] - means[0]) / CYCLE  # 60e3 mm/min are 1 m/s
 
     for lpm in _leak_flows(context):
+        # a cosine of the speed makes the position swing about its start
         open_loop = ControlledRig("", lpm).run(f"{OPEN_LOOP_U} sin({OMEGA!r}t + {0.5 * math.pi!r})", 3.0 * CYCLE)
+        open_drift = drift(open_loop, first=1)
         if lpm == 0.0:  # the first of the leaks
-            healthy_drift = drift(open_loop, 1)
+            healthy_drift = open_drift
         is_settled = open_loop.t >= CYCLE
         amplitude_mm = 1e3 * _amplitude_at(open_loop, is_settled, 1 / CYCLE)
-        closed = [drift(ControlledRig(name, lpm).run(DUTY, 4.0 * CYCLE), 2) for name in ("pi", "fault-tolerant")]
-        rows.append((lpm, amplitude_mm, drift(open_loop, 1), drift(open_loop, 1) - healthy_drift, *closed))
+        closed = [drift(ControlledRig(name, lpm).run(DUTY, 4.0 * CYCLE), first=2) for name in ("pi", "fault-tolerant")]
+        rows.append((lpm, amplitude_mm, open_drift, open_drift - healthy_drift, *closed))
     return (item.table(rows, format_note("open-loop", rig=RIG, load=LOAD, u=OPEN_LOOP_U)),)
 
 
@@ -320,7 +322,8 @@ def external_leak_table(context: Context, item: Item) -> tuple[ThesisTable, ...]
     """Tabulate tracking and stiffness of each controller with a leak past the rod seal of either side.
 
     The last column shows the loss of oil from the circuit: the change [kPa] of the mean of min(p_A, p_B) over a cycle,
-    from the third to the fifth cycle. The leak's stated flow is that at the mean pressure of its side without the leak.
+    from the third to the fifth cycle. The flow of a leak is stated for the mean pressure of the leaking side in a run
+    without leaks.
     """
     healthy, mask = ControlledRig("pi", 0.0).run_duty()
     pressure = {side: float(np.mean(healthy[f"p_{side}"][mask])) for side in ("A", "B")}
@@ -371,7 +374,7 @@ def _column_by_leak(table: ThesisTable, names: tuple[str, ...], head: str) -> di
 
 
 def judge_claims(context: Context, item: Item) -> tuple[Claim, ...]:
-    """Judge claims 6.2.1 to 6.2.4 on position control."""
+    """Judge claims 6.2.1 to 6.2.4 on position control; `item` is not used."""
     return _disturbance_claim(context), _tolerance_claim(context), _load_claim(context), _valve_claim(context)
 
 
@@ -382,7 +385,7 @@ def _disturbance_claim(context: Context) -> Claim:
     """
     table = first_table(context, "sec-6.2-open-loop")
     heads = "leak [L/min]", "open: drift by the leak [mm/min]", "pi: drift [mm/min]"
-    rows = [row for row in zip(*(column(table, head) for head in heads), strict=True) if row[0] > 0]
+    rows = [row for row in zip(*(column(table, head) for head in heads), strict=True) if row[0] > 0]  # with a leak
     texts = [f"{lpm:g} L/min: {opened:.1f} open, {closed:.2f} closed" for lpm, opened, closed in rows]
     tests = [abs(closed) < NEGLIGIBLE_DRIFT for *_, closed in rows]
     return judge_claim("6.2.1", tests, drifts="; ".join(texts))
@@ -418,13 +421,13 @@ def _load_claim(context: Context) -> Claim:
     table = first_table(context, "sec-6.2-load")
     error_ranges = {}
     for name in LOAD_CONTROLLERS:
-        errors = column(table, load_head(name, 0.0, _ERROR))
+        errors = column(table, load_head(name, lpm=0.0, quantity=_ERROR))
         error_ranges[name] = float(errors.min()), float(errors.max())
     max_low = max(low for low, _ in error_ranges.values())
     highs = [high for _, high in error_ranges.values()]
     text = "; ".join(f"{name} {low:.3f} to {high:.3f} mm" for name, (low, high) in error_ranges.items())
     tests = [max(highs) > DISTINCT_RATIO * min(highs)]
-    all_below_one_percent = max(highs) < 0.01 * 1e3 * AMPLITUDE
+    all_below_one_percent = max(highs) < 0.01 * 1e3 * AMPLITUDE  # 1 % of the amplitude [mm]
     return judge_claim("6.2.3", tests, spread=text, all_below=all_below_one_percent, largest_low=max_low)
 
 

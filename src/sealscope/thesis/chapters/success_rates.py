@@ -135,10 +135,10 @@ def column_tests(sheet: DataSheet) -> list[_Row]:
 def d1_threshold(sheet: DataSheet, chamber: str, either_side: bool = False) -> float:
     """Compute the change of log RMS that noise alone exceeds in 5 % of the tests (`FALSE_ALARMS`).
 
-    It is ``1.645 rms(log change of d1)`` over the tests of the sheet if changes of one sign count, and 1.960 times this
-    rms if changes of either sign count (`either_side`). d1 is the finest wavelet detail of the pressure `chamber`,
-    "p_A" or "p_B". d1 is noise and does not depend on the leak, so that its changes between the halves of a test are as
-    in a rig without a leak. The other details scatter at least as much.
+    The result is ``1.645 rms(log change of d1)`` over the tests of the sheet if changes of one sign count, and 1.960
+    times this rms if changes of either sign count (`either_side`). d1 is the finest wavelet detail of the pressure
+    `chamber`, "p_A" or "p_B". d1 is noise and does not depend on the leak, so d1 changes between the halves of a test
+    as in a rig without a leak. The other details scatter at least as much.
     """
     change = sheet.log_change(chamber, "d1")
     return float((WITHIN_95 if either_side else UPPER_95) * np.sqrt(np.mean(change**2)))
@@ -147,8 +147,9 @@ def d1_threshold(sheet: DataSheet, chamber: str, either_side: bool = False) -> f
 def drift_threshold(drift: DataSheet, chamber: str, detail: str) -> float:
     """Compute the change of log RMS that drifting parameters alone exceed in 5 % of the tests (`FALSE_ALARMS`).
 
-    It is the 95 % quantile over the tests of `drift`, the sheet simulated with drifting parameters and no leak. Changes
-    count as positive in the direction in which a leak should move the RMS: down for p_A, up for p_B (`DIRECTION`).
+    The result is the 95 % quantile over the tests of `drift`, the sheet simulated with drifting parameters and no leak.
+    Changes count as positive in the direction in which a leak should move the RMS: down for p_A, up for p_B
+    (`DIRECTION`). `detail`: the wavelet detail of the pressure `chamber`, such as "d3".
     """
     return float(np.quantile(drift.log_change(chamber, detail) * DIRECTION[chamber], 1.0 - FALSE_ALARMS))
 

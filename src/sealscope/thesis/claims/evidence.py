@@ -141,13 +141,14 @@ def holm_p_values(sheet: DataSheet) -> dict[tuple[str, str], float]:
     A column has the RMS of one wavelet detail of one chamber pressure. Hypothesis: the RMS rises or falls with the leak
     with probability 1/2 in each test. The correction is for all ten columns. Returns the p-values by (chamber, detail).
     """
+    # a row begins with chamber and detail, and ends with the corrected p-value and whether it is below 5 %
     return {(str(chamber), str(name)): float(p) for chamber, name, *_, p, _ in column_tests(sheet)}  # type: ignore[arg-type]
 
 
 def moves_beyond_chance(sheet: DataSheet, chamber: str, name: str) -> bool:
     """Return True if the RMS of a wavelet detail changes with the leak significantly and as the thesis states.
 
-    It must fall in more tests of the sheet than it rises for p_A, and rise in more tests than it falls for p_B
+    The RMS must fall in more tests of the sheet than it rises for p_A, and rise in more tests than it falls for p_B
     (`DIRECTION`). The p-value of the two-sided sign test, corrected by Holm for all columns of the sheet, must be below
     5 % (`holm_p_values`). `chamber`: "p_A" or "p_B"; `name`: the detail, such as "d3".
     """
@@ -168,7 +169,7 @@ def is_correlated(r: float, n: int, controls: int = 0) -> bool:
 def condition_design() -> Array:
     """Build the design matrix (tests, commands + 1) of the operating conditions of Appendix C for a regression.
 
-    Its columns are an indicator of each command (1 in tests with this command, else 0), and the closed fraction of the
+    The columns are an indicator of each command (1 in tests with this command, else 0), and the closed fraction of the
     throttles.
     """
     commands = sorted({row.command for row in APPENDIX_C})
@@ -179,7 +180,7 @@ def condition_design() -> Array:
 def partial_correlation(x: Array, y: Array, controls: Array) -> float:
     """Compute the partial correlation of `x` and `y` (n,), given the k variables `controls` (n, k).
 
-    It is the correlation of the residuals of `x` and of `y` after least squares on `controls`.
+    The result is the correlation of the residuals of `x` and of `y` after least squares on `controls`.
     """
     residuals = [v - controls @ np.linalg.lstsq(controls, v, rcond=None)[0] for v in (x, y)]
     return float(np.corrcoef(residuals[0], residuals[1])[0, 1])
@@ -191,7 +192,7 @@ def leave_one_out_r2(columns: Array, y: Array) -> float:
     With residuals r and leverages h it is ``1 - sum (r_i/(1 - h_i))^2 / sum (y_i - mean y)^2``. Source: Allen,
     Technometrics 16 (1974) 125-127, doi 10.1080/00401706.1974.10489157.
     """
-    hat = columns @ np.linalg.pinv(columns)
+    hat = columns @ np.linalg.pinv(columns)  # with the leverages on the diagonal
     residuals = (y - hat @ y) / (1.0 - np.diag(hat))
     return float(1.0 - np.sum(residuals**2) / np.sum((y - y.mean()) ** 2))
 
@@ -199,7 +200,7 @@ def leave_one_out_r2(columns: Array, y: Array) -> float:
 def change_design(sheet: DataSheet) -> Array:
     """Build the design matrix (tests, 7) for a regression on the changes of the RMS with the leak.
 
-    Its columns are a constant, and log(RMS with leak / RMS without) of d3, d4 and d3d4 of p_A and of p_B, the wavelet
+    The columns are a constant, and log(RMS with leak / RMS without) of d3, d4 and d3d4 of p_A and of p_B, the wavelet
     details of Table 5.1.
     """
     changes = [sheet.log_change(chamber, name) for chamber in CHAMBERS for name in SENSITIVE]
@@ -225,7 +226,8 @@ def classify_without_baseline(sheet: DataSheet, leave_out: Literal["test", "cond
         raise MissingExtra("a regression on levels needs scikit-learn: pip install 'sealscope[learn]'") from None
 
     detail_rms = [sheet.rms[chamber][f"d{level}"] for chamber in CHAMBERS for level in range(1, 5)]
-    columns = np.column_stack([np.log(rms).T.ravel() for rms in detail_rms])  # all tests without, then with their leaks
+    # rows: the leak-free halves of all tests, then the leaking halves
+    columns = np.column_stack([np.log(rms).T.ravel() for rms in detail_rms])
     is_leaking = np.repeat([False, True], len(APPENDIX_C))
     if leave_out == "test":
         groups: list[object] = [row.number for row in APPENDIX_C]

@@ -79,7 +79,7 @@ def _wavelet_claims() -> Iterator[Claim]:
 
 
 def _percent_change(pair: tuple[float, float]) -> float:
-    """Compute the relative change [%] from the first value of a pair, without a leak, to the second, with it."""
+    """Compute the relative change [%] of a quantity from the first value of `pair`, without a leak, to the second."""
     before, after = pair
     return 100.0 * (after / before - 1.0)
 
@@ -132,7 +132,7 @@ def _d3_sign_claim(evidence: ClaimEvidence) -> Claim:
     In simulations without a leak the RMS must fall in fewer than 5 % of the tests, both with constant and with drifting
     parameters.
     """
-    d3_rule = CLAIMED[0]
+    d3_rule = CLAIMED[0]  # d3 of p_A falls
     sheets = {"leak": evidence.leak_sheet, "no_leak": evidence.no_leak_sheet, "drift": evidence.drift_sheet}
     is_rare = [float(d3_rule.fires(sheets[name]).mean()) < FALSE_ALARMS for name in ("no_leak", "drift")]
     counts = {name: format_rule_rate(sheet, d3_rule) for name, sheet in sheets.items()}

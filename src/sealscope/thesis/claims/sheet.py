@@ -65,8 +65,9 @@ _A_D3, _, _A_D3D4, _, _, _B_D3D4, _BOTH_D3D4 = CLAIMED
 def _exceeds_noise(sheet: DataSheet, chamber: str, name: str) -> np.ndarray:
     """Find the tests in which the RMS of a wavelet detail changes with the leak by more than noise would change it.
 
-    Only falls count for p_A, only rises for p_B. The limit is the change of log RMS that noise alone exceeds in 5 % of
-    the tests (`d1_threshold`). `name`: the detail, such as "d3". Returns a mask (tests,).
+    `chamber`: "p_A", for which only falls count, or "p_B", for which only rises count; `name`: the detail, such as
+    "d3". The limit is the change of log RMS that noise alone exceeds in 5 % of the tests (`d1_threshold`). Returns a
+    mask (tests,).
     """
     return np.asarray(sheet.log_change(chamber, name) * DIRECTION[chamber] > d1_threshold(sheet, chamber))
 
@@ -182,7 +183,7 @@ def _smallest_leak_test(rules: tuple[Rule, ...]) -> SheetTest:
 def _test_abstract_rate(sheet: DataSheet) -> Iterator[Finding]:
     """Test claim a.2: even small leaks lower the RMS of the product d3d4 of p_A.
 
-    It must fall at the smallest leak, and in at least 85 % of the tests with leaks up to 0.0050 L/min.
+    The RMS must fall at the smallest leak, and in at least 85 % of the tests with leaks up to 0.0050 L/min.
     """
     yield from _smallest_leak_test((_A_D3D4,))(sheet)
     fires = _A_D3D4.fires(sheet)
@@ -246,7 +247,7 @@ def _noise_limit_texts(evidence: ClaimEvidence, sheet: DataSheet) -> dict[str, A
 def _trend_test(chamber: str) -> SheetTest:
     """Build the function that tests whether the changes of a chamber's wavelet details grow with the mean leak.
 
-    It tests claim 5.5.3 for p_A or 5.5.4 for p_B on a data sheet. `chamber`: "p_A" or "p_B".
+    The function tests claim 5.5.3 for p_A or 5.5.4 for p_B on a data sheet. `chamber`: "p_A" or "p_B".
     """
     leak, conditions, direction = mean_leaks(), condition_design(), DIRECTION[chamber]
 
@@ -287,9 +288,9 @@ def _prediction_values(evidence: ClaimEvidence, sheet: DataSheet) -> dict[str, A
 def _test_sensitive_details(sheet: DataSheet) -> Iterator[Finding]:
     """Test claim 5.5.1: the wavelet details in Table 5.1 change significantly, and the details left out do not.
 
-    The table has d3, d4 and d3d4 of both chambers, which must move as the thesis states (`moves_beyond_chance`). It
-    leaves out d1 and d2, for which the sign test, corrected by Holm for ten columns, must give a p-value of at least
-    0.05.
+    The table has d3, d4 and d3d4 of both chambers, which must move as the thesis states (`moves_beyond_chance`). The
+    table leaves out d1 and d2, for which the sign test, corrected by Holm for ten columns, must give a p-value of at
+    least 0.05.
     """
     p = holm_p_values(sheet)
     for rule in (*CLAIMED_CELLS, *UNCLAIMED):
@@ -376,8 +377,8 @@ _CLAIMS: dict[str, SheetClaim] = {
 def claims(evidence: ClaimEvidence) -> Iterator[Claim]:
     """Judge the claims that the data sheet decides: abstract, sections 5.6 and 5.7, Table 5.1, and chapter 6."""
     for number, rule in enumerate(CLAIMED, start=1):
-        where = "section 5.6" if rule is _BOTH_D3D4 else f"Fig. 5.{89 + number}"
-        yield _rate_claim(rule, where).judge(evidence, f"5.4.{number}", "5.4")
+        where = "section 5.6" if rule is _BOTH_D3D4 else f"Fig. 5.{89 + number}"  # Figs. 5.90 to 5.95
+        yield _rate_claim(rule, where).judge(evidence, id=f"5.4.{number}", kind="5.4")
     for id, claim in _CLAIMS.items():
         yield claim.judge(evidence, id)
 
@@ -396,7 +397,7 @@ def leak_level_claims() -> Iterator[Claim]:
     leaks = {level: [row.mean_leak_lpm for row in APPENDIX_C if row.level == level] for level in NOMINAL_LPM}
     texts = [f"{level} {min(lpm):.4f} to {max(lpm):.4f}, mean {np.mean(lpm):.4f}" for level, lpm in leaks.items()]
     contains_nominal = [min(values) <= NOMINAL_LPM[level] <= max(values) for level, values in leaks.items()]
-    is_separate = [min(upper) > max(lower) for upper, lower in itertools.pairwise(leaks.values())]
+    is_separate = [min(upper) > max(lower) for upper, lower in itertools.pairwise(leaks.values())]  # largest first
     yield judge_claim("5.1.1", [*contains_nominal, *is_separate], levels="; ".join(texts))
     real_lpm = {level: float(np.mean(values)) for level, values in leaks.items()}
     nominal, real = (
@@ -450,7 +451,8 @@ def curve_claims(evidence: ClaimEvidence) -> Iterator[Claim]:
     comparison, the texts state the simulated changes, and the changes that drifting parameters alone exceed in 5 % of
     the simulated tests.
     """
-    for number, (section, chamber, names, statement) in enumerate(load_texts("cases.toml")["curves"], start=1):
+    curves = load_texts("cases.toml")["curves"]
+    for number, (section, chamber, names, statement) in enumerate(curves, start=1):
         test = TESTS[section]
         rms_pairs = ((name, evidence.test_measures[section].rms[chamber][name]) for name in names)
         simulated_changes = {name: 100 * (after / before - 1) for name, (before, after) in rms_pairs}
@@ -459,6 +461,7 @@ def curve_claims(evidence: ClaimEvidence) -> Iterator[Claim]:
         sheet_text = NO_SHEET
         if evidence.measured_sheet is not None:
             sheet_text, is_beyond = _test_rows(evidence.measured_sheet, test, chamber, names, statement)
+        # `is_beyond` is empty without the measured sheet
         exceeding = [name for name, exceeds_noise in zip(names, is_beyond, strict=False) if exceeds_noise]
         by_relation = {"beyond": exceeding, "within": [name for name in names if name not in exceeding]}
         relations = [f"{_join_words(details)} {relation}" for relation, details in by_relation.items() if details]

@@ -107,7 +107,7 @@ def reproduce(
     root = Path(folder)
     sheet_folder = find_sheet(sheet)
     data, sheet_key = (None, "") if sheet_folder is None else read_sheet(sheet_folder)
-    keys = _item_keys(all_items, sheet_key, quick, publish is not None)
+    keys = _item_keys(all_items, sheet_key, quick, is_published=publish is not None)
     store = make_inner_folder(root, "kept")
     with lock_rows(store, _WHAT):
         stored_rows = read_rows(store, partial(_parse_row, keys), _WHAT, loads)
@@ -164,8 +164,8 @@ def _empty_runs_folder(store: Path) -> Path:
 def _item_keys(items: Sequence[Item], sheet_key: str, quick: bool, is_published: bool) -> dict[str, str]:
     """Compute for each item a digest of all inputs of its products and files, by id.
 
-    `sheet_key`: digest of the data sheet; `is_published`: True if files are written. The digest of an item includes the
-    digests of the items it needs.
+    `sheet_key`: digest of the data sheet, "" if not given; `quick`: True if less is simulated; `is_published`: True if
+    files are written. The digest of an item includes the digests of the items it needs.
     """
     by_id = {item.id: item for item in items}
     sources = sources_key()
@@ -195,8 +195,9 @@ def _parse_row(keys: Mapping[str, str], tree: Any) -> ItemRow | None:
 def _item_status(item: Item, sheet: DataSheet | None, row: ItemRow | None, folder: Path) -> ItemStatus:
     """Determine the status of an item before anything is made: "kept", "left out" or "not made".
 
-    An item is left out if it needs the data sheet and `sheet` is None. It is kept if its stored result `row` is not an
-    error and all its files still exist in `folder`; `row` is None if no result from the present inputs is stored.
+    An item is left out if it needs the data sheet and `sheet` is None. An item is kept if its stored result `row` is
+    not an error and all its files still exist in `folder`; `row` is None if no result from the present inputs is
+    stored.
     """
     if item.needs_sheet and sheet is None:
         return ItemStatus(item, "left out", MISSING)

@@ -56,7 +56,8 @@ def simulate_run(experiment: Experiment, prove: bool) -> SimulatedRun:
     try:
         simulated = simulate_experiment(replace(experiment, allow_unresolved=True), prove=prove)
     except SimulationFailed as error:
-        return SimulatedRun(None, np.empty(0), {}, 0.0, False if prove else None, diverged=str(error))
+        resolved = False if prove else None
+        return SimulatedRun(None, np.empty(0), {}, mean_leak_lpm=0.0, resolved=resolved, diverged=str(error))
     truth, proof = simulated.truth, simulated.proof
     differences = {} if proof is None else {change.name: change.difference for change in proof.differences}
     resolved = None if proof is None else proof.resolved
@@ -86,7 +87,7 @@ class Context:
         same run wait for it.
         """
         path = self.runs / f"{experiment.key()}{'-proved' if prove else ''}.run"
-        with lock_file(path.with_suffix(".lock"), None):
+        with lock_file(path.with_suffix(".lock"), busy=None):  # None: waits without a limit
             if not path.exists():
                 with atomic_write(path) as temporary:
                     temporary.write_bytes(pickle.dumps(simulate_run(experiment, prove)))
@@ -106,7 +107,7 @@ class Context:
 
 
 def first_table(context: Context, item: str) -> ThesisTable:
-    """Return the first table among the products of a needed item with the id `item`.
+    """Return the first table among the products of the item `item`, which the item to be made needs.
 
     Raises InputError if the needed item failed or made no table.
     """

@@ -49,8 +49,8 @@ class Item:
     ) -> Figure:
         """Build the figure of this item, with its id, title and claims.
 
-        `numbers`: numbers reported with the figure; `notes`: text below it; `resolved`: True if all its runs passed the
-        test with half the solver's step, False if one did not, None if nothing was tested.
+        `numbers`: numbers reported with the figure; `resolved`: True if all simulated runs passed the test with half
+        the solver's step, False if one did not, None if nothing was tested; `notes`: text below the figure.
         """
         return Figure(self.id, self.title, tuple(panels), tuple(numbers), self.claims, resolved, notes)
 
@@ -66,13 +66,13 @@ class Item:
     ) -> ThesisTable:
         """Build a table of this item, with its claims.
 
-        `tail` is appended to the item's id, for a second table of one item; `title` and `columns` (heads) replace the
-        item's if stated; `resolved`: True if all its runs passed the test with half the solver's step, False if one did
-        not, None if nothing was tested.
+        `rows`: cells of the table; `notes`: text below the table; `columns` (heads) and `title` replace those of the
+        item if stated; `tail` is appended to the item's id, for a second table of one item; `resolved`: True if all
+        simulated runs passed the test with half the solver's step, False if one did not, None if nothing was tested.
         """
         heads = tuple(columns) or self.columns
         id, title = self.id + tail, title or self.title
-        return ThesisTable(id, title, heads, tuple(rows), self.claims, resolved=resolved, notes=notes)
+        return ThesisTable(id, title, heads, tuple(rows), claims=self.claims, resolved=resolved, notes=notes)
 
 
 _FIELDS = {declared.name for declared in fields(Item)}
@@ -131,7 +131,7 @@ def select_items(items: Sequence[Item], patterns: Sequence[str]) -> tuple[Item, 
         else:
             matches = [name for name in ids if fnmatchcase(name, folded)]
         if not matches:
-            near = nearest(folded, [*ids, "all"], 3)
+            near = nearest(folded, [*ids, "all"], count=3)
             hint = f"; closest: {', '.join(near)}" if near else ""
             raise InputError(
                 "an item must be an id of the list (sealscope reproduce --list), all, chapter-N or a wildcard such as "

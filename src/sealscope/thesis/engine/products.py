@@ -148,8 +148,8 @@ def claim_verdict(tests: Iterable[bool | None]) -> Verdict:
 def thin_curve(x: Array, y: Array, max_points: int = 4000) -> tuple[Array, Array]:
     """Thin a curve (x, y) to about `max_points` points that preserve its peaks.
 
-    They are the minimum and the maximum of each block of successive points; points after the last whole block are left
-    out. A curve with at most `max_points` points is returned unchanged.
+    The points kept are the minimum and the maximum of each block of successive points; points after the last whole
+    block are left out. A curve with at most `max_points` points is returned unchanged.
     """
     if x.size <= max_points:
         return x, y

@@ -29,8 +29,9 @@ def judge_claim(id: str, tests: Iterable[bool | None], kind: str = "", /, **valu
     """Judge the claim `id` by the tests of its parts (`claim_verdict`), and fill `values` into its texts.
 
     `tests`: results, None for a test that cannot be made. The texts are in `claims.toml` under `id`, or under `kind`
-    for claims that share texts. `values` replace their placeholders, except three that replace a whole text: `sheet`
-    (finding on the thesis's data sheet), `simulation` (finding by simulation) and `why` (reason for the verdict).
+    for claims that share texts. Three of the `values`, if given, replace a whole text: `sheet` (finding on the thesis's
+    data sheet), `simulation` (finding by simulation) and `why` (reason for the verdict). The others fill the
+    placeholders of the same name.
     """
     claims = load_texts("claims.toml")
     templates = dict(claims[kind or id])

@@ -110,6 +110,7 @@ def _page_product(
     """
     picture = _encode_picture(folder, product.id) if isinstance(product, Figure) else ""
     product_claims = [claims[name] for name in product.claims if name in claims]
+    # (format, path) of the product's files, which are named by its id
     links = [(Path(name).suffix[1:].upper(), name) for name in status.files if f"/{product.id}." in f"/{name}"]
     heading = caption(product.id, product.title)
     numbers = [number.name for number in product.numbers] if isinstance(product, Figure) else list(product.columns)

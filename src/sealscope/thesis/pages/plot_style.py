@@ -35,7 +35,8 @@ SETTINGS = Path(__file__).with_name("thesis.mplstyle")
 def caption(figure_id: str, title: str) -> str:
     """Format a caption from the id and the title of a product, such as "Fig. 4.22. Pressures in the chambers".
 
-    An id without the number of a figure, table or equation of the thesis gives the title alone.
+    A letter or word after the number in the id, as in "fig-4.2-a", follows the number as "a)" or in brackets. An id
+    without the number of a figure, table or equation of the thesis gives the title alone.
     """
     kind, _, number_and_part = figure_id.partition("-")
     prefix = {"fig": "Fig.", "table": "Table", "eq": "Eq."}.get(kind)

@@ -66,7 +66,7 @@ def draw(figure: Figure) -> tuple[bytes, bytes]:
     with matplotlib.rc_context():
         matplotlib.rcdefaults()  # ignore settings in the working folder, which may be hostile and run TeX
         matplotlib.rcParams.update(matplotlib.rc_params_from_file(SETTINGS, use_default_template=False))
-        matplotlib.rcParams["svg.hashsalt"] = figure.id
+        matplotlib.rcParams["svg.hashsalt"] = figure.id  # equal figures give equal files
         mpl_figure = _draw_figure(figure)
         long_lines = [line for ax in mpl_figure.axes for line in ax.lines if np.size(line.get_xdata()) > _RASTER_POINTS]
         is_large = sum(np.size(line.get_xdata()) for line in long_lines) * _POINT_BYTES > MAX_SVG_BYTES
@@ -112,7 +112,7 @@ def _render_png(mpl_figure: MplFigure, *, has_image: bool) -> bytes:
 def choose_grid(n_panels: int) -> tuple[int, int]:
     """Choose the numbers of rows and columns in which a figure's panels are arranged.
 
-    One column for up to five panels, two for up to twelve, else three.
+    There is one column for up to five panels, there are two columns for up to twelve panels, and else three.
     """
     columns = 1 if n_panels <= 5 else 2 if n_panels <= 12 else 3
     return -(-n_panels // columns), columns  # rows rounded up
@@ -121,14 +121,14 @@ def choose_grid(n_panels: int) -> tuple[int, int]:
 def _draw_figure(figure: Figure) -> MplFigure:
     """Lay out and draw a figure with matplotlib.
 
-    From top to bottom it has: a warning if a run is not resolved by the solver's step, the legend if all panels share
-    it, the panels, and the caption.
+    From top to bottom the figure has: a warning if a run is not resolved by the solver's step, the legend if all panels
+    share it, the panels, and the caption.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure as MplFigure
 
     rows, columns = choose_grid(max(1, len(figure.panels)))
-    row_height = _ROW_HEIGHTS.get(rows, 1.35 if columns == 1 else 1.7)
+    row_height = _ROW_HEIGHTS.get(rows, 1.35 if columns == 1 else 1.7)  # [inch] with five rows or more
     has_shared_legend = _has_shared_legend(figure.panels)
     lines = textwrap.wrap(caption(figure.id, figure.title), _CAPTION_CHARACTERS)
     warning = _WARNING_HEIGHT if figure.resolved is False else 0.0
@@ -154,6 +154,7 @@ def _draw_figure(figure: Figure) -> MplFigure:
         handles, labels = axes.flat[0].get_legend_handles_labels()
         anchor = (0.5, 1 - (_TOP_MARGIN + warning) / height)
         _thicken_lines(mpl_figure.legend(handles, labels, loc="upper center", bbox_to_anchor=anchor, ncols=len(labels)))
+    # positions of texts are fractions of the figure's width and height
     style: dict[str, Any] = {"va": "bottom", "ha": "left", "fontsize": 8.2, "linespacing": 1.25}
     mpl_figure.text(0.012, 0.06 / height, "\n".join(map(typeset, lines)), **style)
     if figure.resolved is False:
@@ -235,8 +236,9 @@ def drawn_points(curve: FigureCurve, x_range: _Range | None) -> tuple[np.ndarray
 def _draw_curve(ax: Axes, curve: FigureCurve, n_before: int, x_range: _Range | None, *, is_only: bool) -> None:
     """Draw a curve into `ax` in the line style of its role.
 
-    `n_before`: number of earlier curves with this role in the panel, by which other dashes are chosen; `is_only`: True
-    for the only curve of a panel, which is drawn in the style "other" if its role is "reference".
+    `n_before`: number of earlier curves with this role in the panel, by which other dashes are chosen; `x_range`:
+    limits of the x axis, None for those of the curves; `is_only`: True for the only curve of a panel, which is drawn in
+    the style "other" if its role is "reference".
     """
     style = STYLES["other" if is_only and curve.role == "reference" else curve.role]
     x, y = drawn_points(curve, x_range)
@@ -271,7 +273,7 @@ def _has_shared_legend(panels: Sequence[Panel]) -> bool:
 
 
 def _add_legend(ax: Axes, panel: Panel) -> None:
-    """Add the legend of a panel, above the axes if it fits on one line, else on their right.
+    """Add the legend of a panel, above the axes if it fits on one line, else on the right of the axes.
 
     A panel with a single curve gets no legend if it has no title or if its y axis names the curve.
     """

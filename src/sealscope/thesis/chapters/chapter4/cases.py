@@ -139,7 +139,7 @@ def make_drift_experiment(
     for a step chosen by its error; `overrides`: parameters that replace those of the interpretation.
     """
     overrides = {"daq.sample_rate": _DRIFT_RATE, **overrides}
-    return make_experiment(COMMAND, closed_pct, reading, solver, _DRIFT_DURATION, overrides)
+    return make_experiment(COMMAND, closed_pct, reading, solver, duration=_DRIFT_DURATION, overrides=overrides)
 
 
 def run_both_solvers(
@@ -177,14 +177,14 @@ def steady_output(run: SimulatedRun, name: str) -> Array:
 
 
 def steady_range(run: SimulatedRun, name: str) -> float:
-    """Compute the maximum minus the minimum of an output from pi to 2 pi seconds of a run; nan if it diverged."""
+    """Compute the maximum minus the minimum of an output from pi to 2 pi seconds; nan if the run diverged."""
     return float(np.ptp(steady_output(run, name)))
 
 
 def mean_difference(run: SimulatedRun, first: str, second: str) -> float:
     """Compute the mean of the output `first` minus the output `second` from pi to 2 pi seconds of a run.
 
-    It is nan if the run diverged.
+    The result is nan if the run diverged.
     """
     return float(np.mean(steady_output(run, first) - steady_output(run, second)))
 
@@ -222,9 +222,6 @@ def piston_drift(run: SimulatedRun) -> float:
 
 
 def visible_pressure() -> float:
-    """Compute the smallest pressure difference [Pa] that counts as visible.
-
-    It is the standard deviation of a pressure transducer's noise.
-    """
+    """Compute the standard deviation [Pa] of a transducer's noise, above which a pressure change counts as visible."""
     sensors = load_rig("thesis").sensors
     return math.hypot(sensors.p_A.noise, sensors.common_noise)

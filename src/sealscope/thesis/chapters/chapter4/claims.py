@@ -53,8 +53,8 @@ Rows = list[dict[str, float]]
 def ringing(run: SimulatedRun, window: float = 0.05, after: float = 0.3) -> float:
     """Compute the median peak-to-peak ringing [Pa] of the noise-free p_A after the pump's reversals.
 
-    The ringing is p_A minus its moving mean over `window` [s]. It is measured from `window` to `after` [s] after each
-    reversal of the pump's direction, without those in the first second.
+    The ringing is p_A minus the moving mean of p_A over `window` [s]. The peak-to-peak value is taken from `window` to
+    `after` [s] after each reversal of the pump's direction. Reversals in the first second are left out.
     """
     rate = 1.0 / float(run.t[1] - run.t[0])
     p_A, omega = run.outputs["p_A"], run.outputs["omega"]
@@ -102,7 +102,8 @@ def _judge_cases_without_orifices(context: Context) -> Iterator[Claim]:
 
         The drift is the mean position in the last whole period of the command minus the mean in the first period.
         """
-        run = context.run(cases.make_drift_experiment(DEFAULT_READING, None, "converged", **overrides))
+        experiment = cases.make_drift_experiment(DEFAULT_READING, closed_pct=None, solver="converged", **overrides)
+        run = context.run(experiment)
         return 1e3 * cases.piston_drift(run)
 
     # F_pr and F_cfr: Coulomb force without pressure, and its increase with pressure; breakaway is a multiple of both
@@ -123,6 +124,7 @@ def _judge_step_and_gains(context: Context) -> Iterator[Claim]:
 
     def largest_change(*, with_throttles: bool) -> str:
         """Format the largest rms change of a pressure by halving the step, in the cases with or without throttles."""
+        # `closed` is None in a case without throttles
         matching_runs = [run for (_, closed), run in runs.items() if (closed is not None) == with_throttles]
         changes = [run.step_changes[name] for run in matching_runs for name in PRESSURES if name in run.step_changes]
         return f"{max(changes):.3g} Pa rms" if changes else "diverged"
@@ -155,7 +157,7 @@ def _judge_equations_and_tables(context: Context) -> Iterator[Claim]:
     """
     rig = thesis_rig()
     charge = rig.fluid.p_charge * 1e-6  # [MPa]
-    run = context.run(make_experiment(COMMANDS[0], 25.0))
+    run = context.run(make_experiment(COMMANDS[0], closed_pct=25.0))
     peaks = [float(steady_output(run, name).max()) * 1e-6 for name in PRESSURES]
     low, high = min(peaks), max(peaks)
     needed = charge + _PRINTED_PEAK_MPA - high  # charge pressure with which the peaks are as printed
@@ -226,7 +228,7 @@ def _range_text(head: str, values: Callable[[Rows], Iterable[float]]) -> Callabl
     """Build a function that formats the smallest and the largest of some numbers [kPa] over several runs.
 
     The function's argument has, for each interpretation of the throttles' equations, the list of its runs' summaries
-    (`summarise_run`). `values`: computes the numbers [Pa] from one such list; `head`: text before the numbers.
+    (`summarise_run`). `head`: text before the numbers; `values`: computes the numbers [Pa] from one of these lists.
     """
     return lambda rows_of_readings: f"{head} {_format_range(v for rows in rows_of_readings for v in values(rows))}"
 
@@ -269,7 +271,7 @@ def _judge_opening(context: Context) -> Iterator[Claim]:
     """
     min_visible = cases.visible_pressure()
     opening = _run_cases(context, (COMMANDS[0], 0.0), (COMMANDS[0], 25.0))
-    p_1, p_2, flows = "mean of p_1 - p_A", "mean of p_2 - p_B", "flows differ"
+    p_1, p_2, flows = "mean of p_1 - p_A", "mean of p_2 - p_B", "flows differ"  # keys of a run's summary
 
     def peak_and_range_changes(rows: Rows) -> list[float]:
         """Compute the changes of all pressures' peaks and ranges [Pa] from open orifices to 25 % closed."""
@@ -319,8 +321,9 @@ def _judge_larger_closings(context: Context) -> Iterator[Claim]:
     def ranges_grow(rows: Rows) -> Iterator[bool]:
         """Yield for each pressure True if its range grows with the closing of the orifices.
 
-        The range is the pressure's maximum minus minimum. It must grow from 25 to 50 and to 75 % closed orifices, and
-        from 25 to 75 % by more than a transducer's noise. `rows`: summaries of these three runs, in this order.
+        The range is the pressure's maximum minus minimum. The range must grow from 25 to 50 and to 75 % closed
+        orifices, and from 25 to 75 % by more than a transducer's noise. `rows`: summaries of these three runs, in this
+        order.
         """
         for name in PRESSURES:
             at_25, at_50, at_75 = (row[f"range of {name}"] for row in rows)
@@ -367,8 +370,8 @@ def _judge_drift(context: Context) -> Iterator[Claim]:
     def drift_formatter(head: str) -> Callable[[list[list[float]]], str]:
         """Build a function that formats the piston's drift with orifices minus that without them, at each closing.
 
-        It states the smallest and the largest value over the interpretations of the throttles' equations; `head`: text
-        before them.
+        The text states the smallest and the largest value over the interpretations of the throttles' equations; `head`:
+        text before them.
         """
 
         def format_drift(rows: list[list[float]]) -> str:

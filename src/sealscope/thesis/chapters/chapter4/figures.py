@@ -129,8 +129,8 @@ def _solver_curves(runs: Runs, name: str) -> tuple[FigureCurve, ...]:
 def _rms_difference(runs: Runs, name: str) -> float:
     """Compute the rms difference of an output between the runs with the thesis's solver and with a converged one.
 
-    The difference is in the figures' unit (`FIGURE_UNITS`), and taken from pi to 2 pi seconds of the runs. It is nan if
-    a run diverged.
+    The difference is in the figures' unit (`FIGURE_UNITS`), and taken from pi to 2 pi seconds of the runs. The result
+    is nan if a run diverged.
     """
     difference = steady_output(runs["as_published"], name) - steady_output(runs["converged"], name)
     return float(np.sqrt(np.mean(difference**2)) * FIGURE_UNITS[name].scale)
@@ -187,6 +187,7 @@ def orifice_figure(context: Context, item: Item) -> tuple[Figure, ...]:
     runs, notes = _run_case(context, item)
     pump, chamber = item.inputs["quantities"]
     panels, differences, numbers = [], [], []
+    # the converged run first; a run that diverged has no panel
     for letter, (role, label, run) in zip("ab", reversed(completed_runs(runs)), strict=False):
         panels.append(Panel("t [s]", "pressure [MPa]", _orifice_curves(run, pump, chamber), f"({letter}) {label}"))
         differences.append(FigureCurve(run.t, (run.outputs[pump] - run.outputs[chamber]) * 1e-6, label, role))
@@ -277,7 +278,7 @@ def volume_figure(context: Context, item: Item) -> tuple[Figure, ...]:
 def measured_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Tabulate the figures of chapter 4 that show only measured curves.
 
-    Each row names such a figure, its content, and the simulated figure that replaces it.
+    Each row names such a figure, its content, and the simulated figure that replaces it. `context` is not used.
     """
     rows = ((*row, "cannot be reproduced: no numbers are given") for row in load_texts("cases.toml")["measured"])
     return (item.table(rows, format_note("measured-only")),)

@@ -65,7 +65,10 @@ def falling_friction_limit(F_C: float) -> float:
 
 
 def friction_models_figure(context: Context, item: Item) -> tuple[Figure, ...]:
-    """Draw Fig. 4.2: Coulomb, static and stick-slip friction and the Stribeck curve, with numbers of Table 4.1."""
+    """Draw Fig. 4.2: Coulomb, static and stick-slip friction and the Stribeck curve, with numbers of Table 4.1.
+
+    `context` is not used.
+    """
     f = thesis_rig().friction
     F, F_brk, v_th = f.F_pr, f.F_pr * f.K_brk, f.v_th
     v = np.linspace(-0.1, 0.1, 801)
@@ -90,11 +93,13 @@ def friction_models_figure(context: Context, item: Item) -> tuple[Figure, ...]:
 def stribeck_figure(context: Context, item: Item) -> tuple[Figure, ...]:
     """Draw Fig. 4.3: friction over velocity, its slope, and both interpretations of eq. (4.22) near standstill.
 
-    The interpretations close the unbalanced bracket of the equation in different places (`stribeck_force`).
+    The interpretations close the unbalanced bracket of the equation in different places (`stribeck_force`). `context`
+    is not used.
     """
     rig = thesis_rig()
     f = rig.friction
-    charged = f.F_pr + f.F_cfr * 2.0 * rig.fluid.p_charge  # Coulomb force with both chambers at charge pressure
+    # Coulomb force with both chambers at charge pressure; F_cfr multiplies the sum of the pressures, eq. (4.20)
+    charged = f.F_pr + f.F_cfr * 2.0 * rig.fluid.p_charge
     v = np.linspace(-0.2, 0.2, 1601)
     v_slow = np.linspace(-2.0 * f.v_th, 2.0 * f.v_th, 1601)
     v_above = np.linspace(f.v_th, 0.2, 800)
