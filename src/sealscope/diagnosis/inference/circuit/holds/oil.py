@@ -63,7 +63,7 @@ class OilRegression(NamedTuple):
     misfit_variance: float
 
     def leaked(self, changes: Array) -> Array:
-        """Compute the volume [m^3] that left each chamber by each reading (r,): the displaced minus the compressed one.
+        """Compute the volume that left a chamber by each reading (r,) [m^3]: the displaced minus the compressed volume.
 
         `changes` (4,): changes of the oil's properties (`_oil_factors`).
         """
@@ -78,7 +78,7 @@ class OilRegression(NamedTuple):
         """
         oil, air, volumes = _oil_factors(changes)
         strained, aired = oil * self.strained, air * self.aired
-        dead = strained[:, 1:] + aired[:, 1:]
+        dead = strained[:, 1:] + aired[:, 1:]  # by the dead volumes of A and B
         return np.column_stack([strained @ volumes, dead, aired @ volumes])
 
 
@@ -97,7 +97,7 @@ def _oil_factors(changes: Array) -> tuple[float, float, Array]:
 
 
 def _oil_deviations() -> Array:
-    """Return prior standard deviations (4,) of the changes of compressibility, dead volumes of A, of B, and air."""
+    """Return prior standard deviations (4,) of the changes of the oil's properties, in the order of `_oil_factors`."""
     prior = INFERENCE.held_oil
     return np.array([prior.deviation, prior.dead_deviation, prior.dead_deviation, prior.air_deviation])
 
@@ -121,13 +121,14 @@ def build_regression(
     """Build the regression of displaced volumes on the oil's properties from all holds (`OilRegression`).
 
     The rows are the readings (sample means) of each hold, side A before side B, relative to their mean over the
-    hold. `flags`: for each hold of n samples, flags (2, n) of the samples in which the displacement of A, and of B,
-    counts, since no check valve refills that chamber; `sides`: areas and stroke of the cylinder; `n_readings`:
-    effective number of independent readings.
+    hold. `flags`: for each hold of n samples, flags (2, n) of the samples in which no check valve refills A, and B, so
+    that the displacement of this side counts; `sides`: areas and stroke of the cylinder; `n_readings`: effective number
+    of independent readings.
     """
     prior, stroke = INFERENCE.held_oil, sides.high - sides.low
     displaced, strained, aired = list[Array](), list[Array](), list[Array]()
     for hold, is_closed in zip(holds, flags, strict=True):
+        # A grows with the position, and B shrinks
         for index, area, p in ((0, sides.area_A, hold.p_A), (1, -sides.area_B, hold.p_B)):
             stroke_end = sides.low if area > 0.0 else sides.high  # where the chamber is smallest
             volumes = np.zeros(3)  # in the stroke, and the dead volumes of A and B
@@ -137,7 +138,7 @@ def build_regression(
             for columns, values in (
                 (displaced, hold.mean(np.cumsum(increments * is_closed[index]))),
                 (strained, np.outer(hold.mean(p), prior.compressibility * volumes)),
-                (aired, np.outer(hold.mean(1.0 / p), -prior.air * P_ATM * volumes)),
+                (aired, np.outer(hold.mean(1.0 / p), -prior.air * P_ATM * volumes)),  # law of Boyle
             ):
                 columns.append(hold.centre(values, is_A=index == 0))
     strained_volumes, aired_volumes = np.vstack(strained), np.vstack(aired)
@@ -155,15 +156,17 @@ def build_regression(
 def fit_leaks(regression: OilRegression, columns: Array, n_readings: float) -> LeakRegression:
     """Fit the coefficients of c leaks together with the properties of the oil.
 
-    `columns` (r, c): volumes leaked with coefficients of 1, at each reading (mean of samples); `n_readings`: effective
-    number of independent readings. The properties, and the variance of a reading, which weights the priors of the
-    properties against the readings, are found by iteration. A dead volume that reaches its lower limit stays there.
+    `regression`: volumes displaced and compressed in the holds; `columns` (r, c): volumes leaked with coefficients of 1
+    by each reading (mean of samples); `n_readings`: effective number of independent readings. The properties are found
+    by iteration, and so is the variance of a reading, which weights their priors against the readings. A dead volume
+    that reaches its lower limit stays there.
     """
     n_leaks = columns.shape[1]
     changes = np.zeros(4)  # of the oil's properties
     left, misfit_variance = regression.leaked(changes), regression.misfit_variance
     degrees_of_freedom = max(n_readings - n_leaks, 1.0)
     variance = max(float(left @ left) / len(left), misfit_variance)
+    # precisions of the priors (0 for leaks, which have none), and lower limits of the properties
     precisions = np.append(np.zeros(n_leaks), regression.inflation / _oil_deviations() ** 2)
     lowest = np.array([-np.inf, *[INFERENCE.held_oil.least_dead / INFERENCE.held_oil.dead - 1.0] * 2, -np.inf])
     is_lowest = np.zeros(4, dtype=bool)  # properties that stay at their lower limit
@@ -174,7 +177,7 @@ def fit_leaks(regression: OilRegression, columns: Array, n_readings: float) -> L
         scale[~(scale > 0.0)] = 1.0
         scales = np.outer(scale, scale)
         prior = variance * precisions
-        means = np.append(np.zeros(n_leaks), np.where(is_lowest, 0.0, -changes))
+        means = np.append(np.zeros(n_leaks), np.where(is_lowest, 0.0, -changes))  # of the corrections' priors
         matrix = (design.T @ design + np.diag(prior)) / scales
         matrix.flat[:: len(scale) + 1] += RIDGE
         inverse = np.linalg.inv(matrix) / scales
@@ -200,11 +203,11 @@ def fit_leaks(regression: OilRegression, columns: Array, n_readings: float) -> L
 
 
 def residual_squares(regression: OilRegression, columns: Array, variance: float) -> Array:
-    """Compute the residual sum of squares (o,) of a fit of a leak for each of o onsets, with a coefficient >= 0.
+    """Compute the residual sum of squares of the fit of a leak with a coefficient >= 0, for each of o onsets, (o,).
 
-    `regression`: regression on the properties of the oil, linearised at their usual values; `columns` (r, o): volume
-    leaked with a coefficient of 1 since each onset, at each reading; `variance`: variance of a reading, by which the
-    priors of the properties count.
+    `regression`: regression on the properties of the oil, here linearised at their usual values; `columns` (r, o):
+    volume leaked with a coefficient of 1 from each onset to each reading; `variance`: variance of a reading, which
+    weights the priors of the properties.
     """
     usual = np.zeros(4)
     left, oil = regression.leaked(usual), regression.slopes(usual)
@@ -214,7 +217,8 @@ def residual_squares(regression: OilRegression, columns: Array, variance: float)
     coupling = (oil / scale).T @ design
     # products of the left side (first) and of the leak for each onset, without the oil (Schur complement)
     gram = design.T @ design - coupling.T @ np.linalg.solve(precision / np.outer(scale, scale), coupling)
-    total, energies, moments = gram[0, 0], np.diag(gram)[1:], np.maximum(gram[0, 1:], 0.0)
+    squares_without_leak, energies = gram[0, 0], np.diag(gram)[1:]
+    moments = np.maximum(gram[0, 1:], 0.0)  # coefficients < 0 become 0
     is_informative = energies > RIDGE * max(float(energies.max()), np.finfo(float).tiny)
     gain = np.where(is_informative, moments**2 / np.where(is_informative, energies, 1.0), 0.0)
-    return np.asarray(np.maximum(total - gain, 0.0))
+    return np.asarray(np.maximum(squares_without_leak - gain, 0.0))
