@@ -318,6 +318,7 @@ def _evaluate_grid(levels: Levels, profiles: Array, *, may_grow: bool = False) -
             log_null = log_prior - np.cumsum(np.log(L.diagonal())) - 0.5 * square
             # a change of size delta has the likelihood ratio exp(b delta - a delta^2/2)
             a, b = np.cumsum(G**2, axis=0), np.cumsum(G * z, axis=0) - G * (z - z_as_last)
+            # mean level of the last group, given all levels without a change, and its variance
             level = float(levels.value[0] + u[:-1, 0] @ z[:-1, 0] + u[-1, 0] * z_as_last[-1, 0])
             variance = wide_variance - float(u[:, 0] @ u[:, 0])
             nodes.append(_Node(float(tau), log_null, a, b, level, variance, G.T @ u[:, 0]))

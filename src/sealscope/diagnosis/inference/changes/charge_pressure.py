@@ -81,8 +81,9 @@ def estimate_low_drifts(recording: Recording) -> LowDrifts | None:
     """Estimate the drifts [Pa/s] of the lowest pressures of both chambers.
 
     In a closed circuit a chamber that carries no load is at the charge pressure. The drift of a chamber is unknown if
-    its lowest pressure is far above the other chamber's, or if too few samples are near the lowest pressure. Return
-    None if neither drift is known, without both pressures, or without the pump's angle or speed.
+    its lowest pressure is by `charge.near` (`priors.toml`) or more above the other chamber's, or if at most the
+    fraction `charge.share` of its samples lies within `charge.near` of the lowest pressure. Return None if neither
+    drift is known, without both pressures, or without the pump's angle or speed.
     """
     flow_channel = flow_source(recording.channels)
     if len(recording) < MIN_SAMPLES or flow_channel not in PUMP or not {"p_A", "p_B"} <= set(recording.channels):
@@ -129,7 +130,7 @@ class ChargeTrend(NamedTuple):
         f = float(np.clip((onset - self.begin) / max(self.end - self.begin, TINY), 0.0, 1.0))
         expected = self.pressure * abs(flow) / volumes * (1.0 - f) ** 2 * (1.0 + 2.0 * f)
         deviation = float(np.hypot(self.error, CHANGES.charge.scatter))
-        # a fall by another cause has a wide, even density; like the normal ones it is multiplied by the deviation
+        # a fall by another cause has a wide, even density, here multiplied by the deviation as the normal densities are
         other_cause = CHANGES.charge.unlike * deviation / CHANGES.zero_drift.size
         with_loss = float(weights @ np.exp(-0.5 * ((self.fall - expected) / deviation) ** 2)) + other_cause
         without_loss = float(np.exp(-0.5 * (self.fall / deviation) ** 2)) + other_cause
@@ -232,7 +233,7 @@ def compare_low_drifts(judged: LowDrifts, healthy: Sequence[LowDrifts]) -> Itera
     prior = CHANGES.charge
     scatter = PriorScatter(deviation=prior.scatter, recordings=prior.recordings)
     drifts = {side: drift for side in "AB" if (drift := judged.estimate(side)) is not None}
-    known = {side: [drift for low in healthy if (drift := low.estimate(side)) is not None] for side in drifts}
+    known = {side: [drift for other in healthy if (drift := other.estimate(side)) is not None] for side in drifts}
     for side, drift in drifts.items():
         change = compare_estimates(LOW.format(side), DRIFT, drift, known[side], scatter)
         if change is not None:
@@ -240,14 +241,14 @@ def compare_low_drifts(judged: LowDrifts, healthy: Sequence[LowDrifts]) -> Itera
     # variance of each side's drift, including the variance between the healthy recordings
     healthy_var = {side: float(np.var([drift.value for drift in known[side]] or [0.0])) for side in drifts}
     variances = {side: prior.scatter**2 + drift.deviation**2 + healthy_var[side] for side, drift in drifts.items()}
-    falls = [mean for low in healthy if (mean := _mean_fall(low, variances)) is not None]
+    falls = [mean for other in healthy if (mean := _mean_fall(other, variances)) is not None]
     judged_fall = _mean_fall(judged, variances)
     assert judged_fall is not None  # at least one drift of the judged recording is known
     fall = compare_estimates(FALL, DRIFT, judged_fall, falls, scatter, above=True)  # a fall is positive
     if fall is None:
         return
     if len(drifts) > 1:
-        differences = [_difference(low) for low in healthy if np.isfinite(low).all()]
+        differences = [_difference(other) for other in healthy if np.isfinite(other).all()]
         difference = compare_estimates(FALL, DRIFT, _difference(judged), differences, scatter)
         chance = 1.0 if difference is None else min(1.0, fall.chance / max(difference.chance, TINY))
         fall = replace(fall, chance=chance)

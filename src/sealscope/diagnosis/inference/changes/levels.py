@@ -239,7 +239,7 @@ def pattern_tests(time: Array, values: Array) -> tuple[LevelChange, ...]:
 
 
 def _whitening_matrix(values: Array) -> Array:
-    """Compute the matrix (c, 4) that transforms pressure levels to c numbers with independent errors of unit variance.
+    """Compute the matrix (c, 4) that transforms pressure levels to c numbers with independent errors of equal variance.
 
     The matrix is S^(-1/2), with the covariance S of the differences between neighbouring blocks. `values` (K, 4): the
     four levels in each of K blocks (`PressureLevels`), of which c vary at all.
@@ -258,8 +258,8 @@ def _test_pattern(name: str, rows: Array, whitened: Array, time: Array) -> Level
     """Test the pressure levels for a step in one pattern, i.e. within a subspace of their possible changes.
 
     `name`: name of the pattern; `rows` (m, c): vectors that span the subspace; `whitened` (K, c): levels in K blocks;
-    `time` (K,): times of the blocks [s]. Vectors and levels are multiplied by the `_whitening_matrix`, so that the
-    errors of the c numbers of a block are independent and have unit variance. Return None if no direction of the
+    `time` (K,): times of the blocks [s]. Vectors and levels must be multiplied by the `_whitening_matrix`, so that the
+    errors of the c numbers of a block are independent and have equal variances. Return None if no direction of the
     subspace can be tested.
     """
     basis, triangle = np.linalg.qr(rows.T)

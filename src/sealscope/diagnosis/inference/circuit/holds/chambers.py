@@ -170,7 +170,8 @@ class HeldChambers:
         chamber is refilled, its readings (sample means) fit any leak. They lower the variance of all readings by this
         fraction.
         """
-        return max(float(np.concatenate(self._closed_flags(refilled), axis=1).mean()), 1.0 / self.n_readings)
+        share = float(np.concatenate(self._closed_flags(refilled), axis=1).mean())
+        return max(share, 1.0 / self.n_readings)  # above 0, since its logarithm is used
 
     def _unit_piston_leak(
         self, offset: float, refilled: tuple[bool, bool] = NEITHER, law: LeakLaw = LAMINAR
@@ -484,8 +485,8 @@ class HeldChambers:
         """Estimate the mean conductance [m^3/(s Pa)] of all leaks in the holds, even if the valves are open.
 
         The leak is past the piston, to the outside, or through open valves and the pump (`_unit_pump_leak`); the
-        estimates are weighted by the probabilities of these hypotheses. Check valves that refill a chamber would hide
-        the oil that leaves it, so no refilling is assumed.
+        estimates are weighted by the probabilities of these hypotheses. A check valve that refills a chamber would hide
+        the oil that leaves the chamber, so no refilling is assumed.
         """
         chambers = replace(self, charge=0.0)  # without a charge pressure check valves stay closed
         sides = (True, False)
@@ -495,6 +496,7 @@ class HeldChambers:
         means = [h.probability * h.fraction_after * h.fit.value for h in hypotheses]
         deviations = [h.fraction_after * h.fit.deviation for h in hypotheses]
         variance = sum(deviation**2 for mean, deviation in zip(means, deviations, strict=True) if mean > 0.0)
+        # without any leak, the deviation is that of a leak past the piston
         return Flow(sum(means), variance**0.5 if any(means) else deviations[0])
 
     @cached_property
