@@ -245,7 +245,7 @@ class TrendPoint(LeakReading):
     low: float | None = None
     high: float | None = None
 
-    def time_of_day(self, day: float) -> float:
+    def seconds_since_1970(self, day: float) -> float:
         """Convert a time of the trend, in days since its first recording, to seconds since 1970."""
         return self.start + (day - self.day) * DAY
 

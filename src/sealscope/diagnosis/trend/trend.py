@@ -254,7 +254,7 @@ class Trend:
         """
         if not math.isfinite(day) or not self.dated:
             return day
-        time_ms = np.datetime64(round(self.points[0].time_of_day(day) * 1e3), "ms")
+        time_ms = np.datetime64(round(self.points[0].seconds_since_1970(day) * 1e3), "ms")
         return str(time_ms)[:19]  # without the fraction of a second
 
     def _format_days(self, days: Interval | None) -> dict[str, str | float | None] | None:

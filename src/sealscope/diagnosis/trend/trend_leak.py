@@ -154,7 +154,7 @@ def _measure_leak(
         cause="internal or external leak" if points[0].basis == "pressure response" else "piston or pump leak",
         rise=_normal_rise(wear, chance),
         rise_flow=mixture_flow(law_priors(), wear.leak.value * flow_factors, leak_sd * flow_factors),
-        rise_onset=wear.onset and Interval(*(points[0].time_of_day(day) for day in wear.onset)),
+        rise_onset=wear.onset and Interval(*(points[0].seconds_since_1970(day) for day in wear.onset)),
         bound_flow=wear.bound,
         pump_flow=(pump_flow, pump_flow),
         lpm_per_flow=None if pressure is None else 1.0,

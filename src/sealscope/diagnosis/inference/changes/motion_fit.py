@@ -110,7 +110,7 @@ def select_motion(recording: Recording) -> Motion | None:
 
 
 def _hat_functions(position: Array, n_knots: int) -> Array:
-    """Evaluate hat functions at positions (n,); return those that are not zero at all positions, (n, k).
+    """Evaluate hat functions at positions (n,), without those that are 0 at every position; shape (n, k).
 
     A hat function is 1 at its knot and falls linearly to 0 at the neighbouring knots. The `n_knots` knots are equally
     spaced from the least to the largest position.
@@ -133,7 +133,7 @@ def solve_weighted(equations: Array, weight: Array) -> Array:
     design and values (`stack_equations`), with n > m; `weight` (n,): factors of the rows.
     """
     _, triangle = qr((equations * weight).T, mode="raw", overwrite_a=True, check_finite=False)
-    # the last column of the triangle R is Q' values
+    # R of the design and, in the last column, the values multiplied by Q^T
     solution = np.linalg.lstsq(triangle[:-1, :-1], triangle[:-1, -1], rcond=ROUNDING * len(weight))
     return np.asarray(solution[0])
 
@@ -219,7 +219,7 @@ def jackknife_errors(design: Array, values: Array, columns: Sequence[int], group
 def remove_slow_changes(motion: Motion, design: Array, values: Array, t: Array) -> tuple[Array, Array]:
     """Remove changes slower than a time tau from the columns of a design matrix and from the values.
 
-    With the times t_k of the samples in `motion`, each column y, and the values likewise, become
+    With the times t_k of the samples in `motion`, each column y of `design`, and likewise `values`, becomes
 
         (y_k - r_k y_(k-1)) / sqrt(1 - r_k^2),    r_k = exp(-(t_k - t_(k-1)) / tau),
 
@@ -254,7 +254,7 @@ def fit_difference(recording: Recording, *, without_slow_changes: bool = False) 
     viscous drop of a steady motion. The result is None without enough motion. It is computed only once for a recording.
     """
     key = ("motion fit of p_A - p_B", without_slow_changes)
-    return compute_once(recording, key, lambda moved: _fit_difference(moved, without_slow_changes))
+    return compute_once(recording, key, lambda recording: _fit_difference(recording, without_slow_changes))
 
 
 @np.errstate(all="ignore")
