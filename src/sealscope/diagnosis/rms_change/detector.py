@@ -109,7 +109,7 @@ def observe_within(blocks: RmsBlocks, rate: float, unused: tuple[str, ...] = ())
     """
     changes = dict[str, tuple[StepTest, float]]()  # by detail: the more significant test, and the size of its step
     judged_steps, bounds = list[StepTest](), list[float]()
-    likelihoods, weights = change_information(blocks)  # of the ringing's changes; parts of the RMS that are not noise
+    likelihoods, weights = change_information(blocks)  # of the ringing's changes; fractions of energy without noise
     for name, likelihood, weight in zip(blocks.names, likelihoods, weights, strict=True):
         steps = step_tests(likelihood, signs=(1.0, -1.0))
         if not steps:
@@ -179,7 +179,7 @@ def compare_summaries(
     levels = np.array([_summary_levels(summary, chambers) for summary in summaries])
     judged_levels, judged_duty = _summary_levels(judged, chambers), np.asarray(judged["duty"], dtype=float)
     observables, bounds = list[Observable](), list[float]()
-    # changes of the ringing, and the part of each RMS that is not noise
+    # changes of the ringing, and the fractions of energy without noise
     rises, weights = estimate_rises(judged_levels, judged_duty, levels, duties, times)
     for name, rise, weight in zip(column_names(chambers), rises, weights, strict=True):
         change = rise._replace(value=abs(rise.value))

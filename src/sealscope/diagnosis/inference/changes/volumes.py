@@ -78,7 +78,7 @@ def volume_observables(
     - `flow_scale`: true flow over the flow of the balance.
     """
     centred, recorded = (series.merge(max_blocks=INFERENCE.blocks.coarse) for series in (blocks, plain))
-    # a laminar leak is tested without the sensor offset, so the offset must be probable, too
+    # a laminar leak is tested without the sensor offset, so an improbable offset counts against the leak
     leak_disadvantage = offset_cost(estimate_offset(blocks, columns))
     observables = []
     for hypothesis in _step_hypotheses(centred, recorded, balances[0].terms, columns, has_accumulator=bool(oil_loss)):
