@@ -126,7 +126,7 @@ def estimate_reading(
     """
     used_rig, machine = assumed_rig(rig, recording)
     inspection = inspect_recording(recording)
-    part = inspection.part  # of the recording, without defects
+    part = inspection.part  # corrected samples that can be used
     has_difference = len(chambers_of(part)) == len(CHAMBERS) and len(part) > 0
     reading = LeakReading(
         file=file or str(recording.provenance.get("file", "recording")),

@@ -292,7 +292,8 @@ def _evaluate_grid(levels: Levels, profiles: Array, *, may_grow: bool = False) -
     # outlying part of each level: while its recording is the last one, and in the whole series
     outlying_as_last, outlying = outlier_excess(levels)
     values = levels.value - levels.value[0] - outlying
-    max_scatter = max(prior.scale, 0.3 * float(np.ptp(levels.value)))  # of few values: about a third of their range
+    # 0.3 of the range is about the standard deviation of ten normal values
+    max_scatter = max(prior.scale, 0.3 * float(np.ptp(levels.value)))
     wide_variance = (_WIDE * max_scatter) ** 2
     mean_covariance = wide_variance * (levels.group == levels.group[-1])  # with the mean level of the last group
     shared = wide_variance * (levels.group[:, None] == levels.group)
@@ -580,8 +581,8 @@ def find_episodes(
 
     `years` is the smallest mean time between false alarms. The first `n_healthy` recordings are known to be healthy.
     `allowed_rise` is the rise of the level at which a repair is due, None if there is no limit. A repair is a fall of
-    the level that the test for a leak detects, applied to falls. After a repair the level is estimated anew, with the
-    scatter before the repair as prior.
+    the level, which the test for a rise detects with the sign reversed. After a repair the level is estimated anew,
+    with the scatter before the repair as prior.
     """
     days = years * DAYS_PER_YEAR
     begin, episodes = 0, list[Episode]()
