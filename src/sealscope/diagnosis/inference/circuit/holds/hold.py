@@ -112,7 +112,7 @@ def find_locked_holds(channels: Sequence[Array], rests: NDArray[np.bool_], rate:
     The time in which the valves shut is the first interval of a hold; the time in which they open is left out. Holds
     that are too short, or have missing samples, are omitted. `channels`: time [s], absolute pressures of A and B [Pa],
     and position [m], (n,) each; `rests` (n - 1,): flags of the sampling intervals in which the pump rests; `rate`:
-    sampling rate [Hz]. The samples of a hold are averages at a rate of about `MAX_RATE` or less.
+    sampling rate [Hz]. The samples of a hold are averages at less than twice `MAX_RATE`.
     """
     prior, holds = INFERENCE.held_oil, list[LockedHold]()
     decimation = max(1, int(rate / MAX_RATE))  # number of samples that are averaged to one
