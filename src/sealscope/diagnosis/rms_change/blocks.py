@@ -86,7 +86,7 @@ class RmsBlocks:
     def without_start(self) -> RmsBlocks:
         """Return the blocks after the machine's start, in which pressures and speed settle.
 
-        The start is taken to last 10 s or three cycles, whichever is longer, but at most an eighth of the blocks.
+        The start is assumed to last 10 s or three cycles, whichever is longer, but at most an eighth of the blocks.
         """
         n_blocks, prior = len(self.log_rms), RMS_PRIORS.blocks
         start_s = max(prior.settling, prior.settling_cycles * (self.cycle or 0.0))
@@ -113,7 +113,8 @@ def measure_levels(recording: Recording) -> tuple[Array, Array]:
     """
     transformed = [details(recording[chamber]) for chamber in judged_chambers(recording)]
     inside = transformed[0].inside()
-    log_rms, duty = _measure_blocks(recording, transformed, np.array([inside.start, inside.stop]))
+    # the recording is a single block
+    log_rms, duty = _measure_blocks(recording, transformed, bounds=np.array([inside.start, inside.stop]))
     return log_rms[0], duty[0]
 
 
@@ -142,11 +143,12 @@ def _measure_blocks(recording: Recording, transformed: list[Details], bounds: In
 
 
 def cut_blocks(recording: Recording) -> RmsBlocks:
-    """Cut a recording into blocks and compute the log RMS of wavelet details and features of the duty of each.
+    """Cut a recording into blocks, and compute for each the log RMS of wavelet details and features of the duty.
 
     The duty is how the machine is moved and loaded. The recording must be uniformly sampled and its gaps filled in.
-    Blocks in which too many samples were missing are left out. So are samples at the ends, where the wavelet transform
-    depends on padding. The mean differences between the phases of a duty cycle are removed, unless a reading is stuck.
+    Blocks in which too many samples were missing are left out, and so are samples at the ends, where the wavelet
+    transform depends on padding. If the duty repeats, its cycle has several blocks, the phases; the mean differences
+    between the phases are removed, unless a reading is stuck.
     """
     chambers = judged_chambers(recording)
     transformed = [details(recording[chamber]) for chamber in chambers]
@@ -175,11 +177,11 @@ def cut_blocks(recording: Recording) -> RmsBlocks:
 def _block_bounds(inside: slice, rate: float, cycle: float | None) -> tuple[IntArray, int]:
     """Choose the sample indices at which blocks begin and end (n + 1,), and the number of blocks per duty cycle.
 
-    `inside` are the samples that do not depend on padding, `rate` is the sampling rate [Hz], and `cycle` the period
-    of the command [s], or None. The length of a block is
+    `inside` are the samples at which the wavelet details do not depend on padding, `rate` is the sampling rate [Hz],
+    and `cycle` the period of the command [s], or None. The length of a block is
 
-    - a fraction 1, 1/2, 1/3, ... of the cycle that is closest to the shortest allowed length,
-    - several cycles if a cycle is shorter than that,
+    - the fraction 1, 1/2, 1/3, ... of the cycle that is closest to the shortest allowed length,
+    - several cycles if a cycle is shorter than the shortest allowed length,
     - the shortest allowed length if there is no cycle.
 
     If there would be too many blocks, they become longer and span whole cycles.
@@ -203,9 +205,9 @@ def _find_frozen(
 ) -> str | None:
     """Describe the first block in which a pressure reading is stuck; None if no reading is stuck.
 
-    A reading is stuck if one of its wavelet details d1 to d4 is only rounding error or not finite. `log_rms`: log RMS
-    of the details in n blocks; `is_complete` (n,): flags of the blocks without missing samples; `times` (n + 1,):
-    bounds of the blocks [s].
+    A reading is stuck if one of its wavelet details d1 to d4 is only rounding error or not finite. `chambers`: names of
+    the pressures; `log_rms` (n, 5 per chamber): log RMS of their details in n blocks; `is_complete` (n,): flags of the
+    blocks without missing samples; `times` (n + 1,): bounds of the blocks [s].
     """
     floor = np.log([ROUNDING * np.abs(recording[name]).max() for name in chambers])[:, None]
     levels = log_rms.reshape(len(log_rms), len(chambers), -1)[:, :, :-1]  # without d3d4

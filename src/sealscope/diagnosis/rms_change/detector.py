@@ -109,8 +109,9 @@ def observe_within(blocks: RmsBlocks, rate: float, unused: tuple[str, ...] = ())
     """
     changes = dict[str, tuple[StepTest, float]]()  # by detail: the more significant test, and the size of its step
     judged_steps, bounds = list[StepTest](), list[float]()
-    for name, quantity, weight in zip(blocks.names, *change_information(blocks), strict=True):
-        steps = step_tests(quantity, (1.0, -1.0))
+    likelihoods, weights = change_information(blocks)  # of the ringing's changes; fractions of energy without noise
+    for name, likelihood, weight in zip(blocks.names, likelihoods, weights, strict=True):
+        steps = step_tests(likelihood, signs=(1.0, -1.0))
         if not steps:
             return Observed(RmsChange.name, lack=f"{name} says nothing in most blocks")
         up, down = steps
@@ -120,9 +121,9 @@ def observe_within(blocks: RmsBlocks, rate: float, unused: tuple[str, ...] = ())
             judged_steps.append(step)
             bounds.append(max(up.bound(), down.bound()))
     rarest = min(judged_steps, key=lambda step: step.chance)
-    # a step of a size that half of all healthy recordings show says nothing of the onset
-    likelihood = np.sum([step.likelihood for step in judged_steps if step is rarest or step.chance < 0.5], axis=0)
-    onset = replace(rarest, likelihood=likelihood, best=int(likelihood.argmax())).onset()
+    # a step that half of all healthy recordings show says nothing of the onset
+    onset_likelihood = np.sum([step.likelihood for step in judged_steps if step is rarest or step.chance < 0.5], axis=0)
+    onset = replace(rarest, likelihood=onset_likelihood, best=int(onset_likelihood.argmax())).onset()
     observables = [
         _make_observable(name, size, step.score, step.chance, blocks.chambers, onset)
         for name, (step, size) in changes.items()
@@ -140,8 +141,8 @@ def observe_within(blocks: RmsBlocks, rate: float, unused: tuple[str, ...] = ())
 def observe_against(recording: Recording, baseline: Sequence[Healthy]) -> Observed:
     """Test the RMS of a recording's wavelet details for changes against leak-free recordings.
 
-    Only leak-free recordings with the same chamber pressures and sampling rate are used. If there are none, the report
-    is empty and states the reason.
+    `baseline` are the leak-free recordings, of which only those with the same chamber pressures and sampling rate are
+    used. If there are none, the report is empty and states the reason.
     """
     chambers, recorded = judged_chambers(recording), list(chambers_of(recording))
     # the duty is computed from all recorded chambers, which must therefore be the same
@@ -178,8 +179,9 @@ def compare_summaries(
     levels = np.array([_summary_levels(summary, chambers) for summary in summaries])
     judged_levels, judged_duty = _summary_levels(judged, chambers), np.asarray(judged["duty"], dtype=float)
     observables, bounds = list[Observable](), list[float]()
-    changes = estimate_rises(judged_levels, judged_duty, levels, duties, times)
-    for name, rise, weight in zip(column_names(chambers), *changes, strict=True):
+    # changes of the ringing, and the fractions of energy without noise
+    rises, weights = estimate_rises(judged_levels, judged_duty, levels, duties, times)
+    for name, rise, weight in zip(column_names(chambers), rises, weights, strict=True):
         change = rise._replace(value=abs(rise.value))
         score = 2.0 * change.log_ratio(change.value)
         observables.append(_make_observable(name, weight * rise.value, score, change.chance, chambers))
@@ -198,9 +200,9 @@ def _make_observable(
 ) -> Observable:
     """Make the observable for the change of one wavelet detail, named by its `column`, such as "d3 of p_A".
 
-    `size` is the change of the log RMS, `score` twice its log likelihood ratio, and `chance` the p-value of a single
-    test. The p-value is multiplied by the number of tests: a rise and a fall of each judged quantity in each of the
-    `chambers`. `onset`: time of the change [s], None for a comparison with healthy recordings.
+    `size` is the change of the log RMS, `score` twice the log likelihood ratio of the change, and `chance` the p-value
+    of a single test. The p-value is multiplied by the number of tests: a rise and a fall of each judged detail in each
+    of the `chambers`. `onset`: time of the change [s], None for a comparison with healthy recordings.
     """
     return Observable(
         name=f"{'rise' if size > 0.0 else 'fall'} of {column}",

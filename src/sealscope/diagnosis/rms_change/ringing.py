@@ -25,7 +25,7 @@ from sealscope.signals.details import QUANTITIES
 
 
 def subtract_noise(log_rms: Array, healthy: Array) -> tuple[Array, Array]:
-    """Compute the change of the log RMS of wavelet details without noise, and the noise-free fraction of energy.
+    """Compute the change of the log RMS of wavelet details without noise, and the fraction of energy without noise.
 
     `log_rms` (n, 5 per chamber): values of n blocks or recordings; `healthy` (k, 5 per chamber): values from which the
     machine's mean energy S_j in each detail d_j is estimated, as the energy of d_j minus the energy of d1. The noise
@@ -38,7 +38,7 @@ def subtract_noise(log_rms: Array, healthy: Array) -> tuple[Array, Array]:
     Both results have the shape of `log_rms`.
     """
     y, weight = np.array(log_rms), np.ones_like(log_rms)
-    min_signal_fraction = RMS_PRIORS.walk.least
+    min_signal_fraction = RMS_PRIORS.walk.least  # S_j is the difference of two estimates, which may be negative
     for d1 in range(0, log_rms.shape[1], len(QUANTITIES)):  # column of each chamber's d1
         noise = np.exp(2.0 * log_rms[:, d1])
         d3, d4, product = (d1 + QUANTITIES.index(name) for name in ("d3", "d4", "d3d4"))
@@ -67,6 +67,7 @@ def change_information(blocks: RmsBlocks) -> tuple[list[Information], Array]:
     exponent_sd = np.array([getattr(RMS_PRIORS.duty, name) for name in features])
     time = blocks.edges[:-1] + 0.5 * blocks.seconds
     walks = RMS_PRIORS.walk
+    # scales are stated for the time `walk.time`; the deviation of a random walk grows with the root of the time
     walk_scale = float(np.sqrt(len(time) * blocks.seconds / walks.time))
     machine_walk = walks.duty if blocks.cycle is None else walks.machine
     results = list[Information]()
@@ -98,11 +99,11 @@ def estimate_rises(
     prior, walk, n = RMS_PRIORS.recordings, RMS_PRIORS.walk, len(healthy)
     exponents = np.array([getattr(RMS_PRIORS.duty, name) for name in DUTY])
     effects = (np.vstack([healthy_duty, duty]) - duty) * exponents
-    # the standard deviation that the process gains in `walk.time` has a half-Cauchy prior, here some quantiles of it
-    quantiles = (np.arange(walk.tried) + 0.5) / walk.tried
-    walk_sd = walk.machine * np.tan(0.5 * np.pi * quantiles)
+    # quantiles of the half-Cauchy prior on the standard deviation that the process gains in `walk.time`
+    probabilities = (np.arange(walk.tried) + 0.5) / walk.tried
+    walk_sd = walk.machine * np.tan(0.5 * np.pi * probabilities)
     rates = (walk_sd / prior.session) ** 2 / (2.0 * walk.time)
-    elapsed, same_session = np.zeros((n + 1, n + 1)), np.ones((n + 1, n + 1))
+    elapsed, same_session = np.zeros((n + 1, n + 1)), np.ones((n + 1, n + 1))  # without dates: one session
     if times is not None:
         sessions = number_sessions(list(times), prior.pause)
         elapsed = np.abs(np.subtract.outer(times, times))

@@ -118,14 +118,15 @@ def estimate_reading(
 ) -> LeakReading:
     """Estimate the leakage of a recording.
 
-    `rig` states the sizes of the machine: a Rig, the name of a packaged rig, or the path of its file. If it is None,
+    `rig` states the sizes of the machine: a Rig, the name of a packaged rig, or the path of its file. If `rig` is None,
     the thesis's rig is assumed. The leakage can then be stated in L/min only if the recording was simulated with a rig
     of the same sizes, or if a flow meter was recorded (`LeakReading.states_flow`). `file` is the name of the recording,
-    by default the name of the file from which it was read. If no estimate is possible, `problem` states the reason.
+    by default the name of the file from which it was read. If no estimate is possible, `problem` of the result states
+    the reason.
     """
     used_rig, machine = assumed_rig(rig, recording)
     inspection = inspect_recording(recording)
-    part = inspection.part
+    part = inspection.part  # corrected samples that can be used
     has_difference = len(chambers_of(part)) == len(CHAMBERS) and len(part) > 0
     reading = LeakReading(
         file=file or str(recording.provenance.get("file", "recording")),
@@ -146,9 +147,9 @@ def estimate_reading(
 def _estimate_level(part: Recording, rig: Rig, machine: AssumedMachine) -> dict[str, Any]:
     """Estimate the leakage by the best method that the channels of a recording allow.
 
-    `rig`, `machine`: assumed sizes. The methods are the volume balance, the pressure response and the damping of the
-    pressures' ringing, in this order. The recording `part` must have no defects. Returns the fields of `LeakReading`
-    that depend on the method, by name; only the field `problem` if no method is possible.
+    The methods are the volume balance, the pressure response and the damping of the pressures' ringing, in this order.
+    `part`: the recording, without defects; `rig`, `machine`: assumed sizes. Returns the fields of `LeakReading` that
+    depend on the method, by name; only the field `problem` if no method is possible.
     """
     balance, response, details = VolumeBalance(rig), PressureResponse(rig), RmsChange()
     balance_lack, response_lack = unusable_reason(balance, part), unusable_reason(response, part)
@@ -174,7 +175,7 @@ def _estimate_level(part: Recording, rig: Rig, machine: AssumedMachine) -> dict[
     damping = float(-np.mean(log_rms_by_chamber[:, judged_columns]))
     if np.isfinite(damping):
         return fields | {"basis": "ringing", "level": damping, "error": TREND.reading.ringing}
-    # different reasons, in this order
+    # without repetitions
     reasons = list(dict.fromkeys(lack for lack in (balance_lack, response_lack) if lack is not None))
     reasons = reasons or ["the pressures do not ring"]
     return {"problem": "no detector states a level: " + "; ".join(reasons)}
@@ -183,15 +184,15 @@ def _estimate_level(part: Recording, rig: Rig, machine: AssumedMachine) -> dict[
 def _balance_fields(solution: RecordedBalance, machine: AssumedMachine) -> dict[str, Any]:
     """Collect the fields of `LeakReading` that follow from a solved volume balance, by name.
 
-    The balance uses assumed sizes; its flows and conductances times `size.scale` (`recorded.Size`) are the true ones.
-    `machine`: assumed machine, of which only the piston area is used.
+    The balance (`solution`) uses assumed sizes; the true flows and conductances are `size.scale` (`recorded.Size`)
+    times those of the balance. `machine`: assumed machine, of which only the piston area is used.
     """
     size = solution.size
     total = solution.conductance  # with its 95 % interval
     return {
         "basis": "volume balance",
         "level": total.value * size.scale,
-        "error": (total.high - total.low) * size.scale / (2.0 * WITHIN_95),
+        "error": (total.high - total.low) * size.scale / (2.0 * WITHIN_95),  # half-width: WITHIN_95 standard errors
         "states_flow": size.stated,
         "area": machine.area if size.stated or ("x", "m") in solution.units else None,
         "scale": None if size.ratio is None else size.ratio.value,
@@ -244,7 +245,7 @@ class TrendPoint(LeakReading):
     low: float | None = None
     high: float | None = None
 
-    def time_of_day(self, day: float) -> float:
+    def seconds_since_1970(self, day: float) -> float:
         """Convert a time of the trend, in days since its first recording, to seconds since 1970."""
         return self.start + (day - self.day) * DAY
 
@@ -255,11 +256,11 @@ def build_timeline(
     """Sort leakage readings by time and group those that can be compared with each other.
 
     Only readings of the most frequent method are used. The readings of a group have nearly the same measured ratio of
-    pump displacement to piston area. This ratio changes if a sensor of position or angle was exchanged and has another
-    scale, or if the recording is of another machine. `every` is the time between readings [s], with which they are
-    dated in the order of their file names; None if their times are known. Returns the readings with their groups, and
-    for each group a text on its difference from the first group, "" for the first. Raises InputError if the time of a
-    reading is unknown.
+    pump displacement to piston area. This ratio changes if a sensor of position or angle was replaced by one of another
+    scale, or if the recording is of another machine. `every` is the time between readings [s], by which the readings
+    are dated in the order of their file names; None if their times are known. Returns the readings with their groups,
+    and for each group a text on its difference from the first group, "" for the first. Raises InputError if the time of
+    a reading is unknown.
     """
     ordered = _sort_by_time(readings, every)
     notes = _note_problems(ordered)
@@ -285,8 +286,8 @@ def build_timeline(
 def _sort_by_time(readings: Sequence[LeakReading], every: float | None) -> list[LeakReading]:
     """Sort estimates of the leakage in single recordings by time.
 
-    If `every` [s] is given, they are dated at equal intervals in the order of their file names. Raises InputError if
-    the time of a recording is unknown.
+    `every`: time between recordings [s], by which they are dated in the order of their file names; None if their times
+    are known. Raises InputError if the time of a recording is unknown.
     """
     ordered = sorted(readings, key=lambda reading: numeric_sort_key(reading.file))
     if every is not None:
@@ -310,7 +311,7 @@ def _note_problems(readings: Sequence[LeakReading]) -> list[str]:
     notes = []
     for reading in readings:
         original = reading.file
-        if reading.basis is not None:
+        if reading.basis is not None:  # the first file with the same samples
             original = file_of_digest.setdefault(reading.digest, reading.file)
         copy_note = "" if original == reading.file else f"the same samples as {original}"
         notes.append(reading.problem or copy_note)
@@ -357,8 +358,9 @@ def _relative_change(scale: float | None, other: float | None) -> float:
 def _find_clock_errors(ordered: Sequence[TrendPoint]) -> list[Finding]:
     """Find signs that a logger's clock was set back; return one finding, or an empty list.
 
-    The signs are recordings that overlap and, if no recordings overlap, times that fall while the numbers in the file
-    names rise. Recordings dated without a time of day have the same start and do not count as overlapping.
+    `ordered`: recordings in the order of time. The signs are recordings that overlap and, if no recordings overlap,
+    times that fall while the numbers in the file names rise. Recordings dated without a time of day have the same start
+    and do not count as overlapping.
     """
     overlaps = [
         f"{early.file} was still recording when {late.file} began: a clock was set back, or they are of two machines"

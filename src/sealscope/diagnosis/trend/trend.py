@@ -254,7 +254,7 @@ class Trend:
         """
         if not math.isfinite(day) or not self.dated:
             return day
-        time_ms = np.datetime64(round(self.points[0].time_of_day(day) * 1e3), "ms")
+        time_ms = np.datetime64(round(self.points[0].seconds_since_1970(day) * 1e3), "ms")
         return str(time_ms)[:19]  # without the fraction of a second
 
     def _format_days(self, days: Interval | None) -> dict[str, str | float | None] | None:
@@ -349,16 +349,16 @@ def trend(
 def _add_episodes(trend: Trend) -> Trend:
     """Complete a trend by the leakage of each recording, the episodes between repairs, and the decision on a leak.
 
-    The trend must have at least one recording that can be compared. Of very many recordings, averages are compared; the
-    trend's `rows` are then the recordings nearest to them.
+    The trend must have at least one recording that can be compared. If there are very many recordings, averages of
+    neighbouring ones are compared; `rows` of the trend are then the recordings nearest in time to the averages.
     """
     levels, trend_units_per_level = _convert_levels(trend)
     points, findings = _add_values(trend, levels)
     averages, rows = levels.average_neighbours(), trend.rows
-    n_healthy = max(1, _count_healthy(trend) * len(averages) // len(levels))
+    n_healthy = max(1, _count_healthy(trend) * len(averages) // len(levels))  # number of healthy averages
     allowed_rise = _allowed_rise(trend, trend_units_per_level)
     episodes = tuple(find_episodes(averages, years=trend.years, n_healthy=n_healthy, allowed_rise=allowed_rise))
-    if averages is not levels:
+    if averages is not levels:  # recordings nearest to the averages
         rows = tuple(rows[int(np.argmin(np.abs(levels.t - t)))] for t in averages.t)
     decision = decide_trend(
         [points[row] for row in rows[episodes[-1].begin :]],
@@ -377,7 +377,7 @@ def _add_values(trend: Trend, levels: Levels) -> tuple[tuple[TrendPoint, ...], t
     `levels` are the converted levels of the compared points. Returns (points, findings).
     """
     points, findings = [*trend.points], [*trend.findings]
-    _, excess = outlier_excess(levels)
+    _, excess = outlier_excess(levels)  # in the whole series
     outliers = np.flatnonzero(excess)
     remark = "apart from the recordings before and after: it counts as if it were near"
     for k, row in enumerate(trend.rows):
@@ -394,9 +394,9 @@ def _add_values(trend: Trend, levels: Levels) -> tuple[tuple[TrendPoint, ...], t
 def _count_healthy(trend: Trend) -> int:
     """Count the compared recordings among the first `trend.healthy` recordings, which are known to be healthy.
 
-    Copies are one recording. The result is at least 1.
+    Copies count as one recording. The result is at least 1.
     """
-    digests = dict.fromkeys(point.digest for point in trend.points)  # copies count once
+    digests = dict.fromkeys(point.digest for point in trend.points)  # equal for copies, in the order of time
     healthy_digests = list(digests)[: trend.healthy]
     return max(1, sum(trend.points[row].digest in healthy_digests for row in trend.rows))
 
@@ -414,23 +414,24 @@ class _ConvertedLevels(NamedTuple):
 def _convert_levels(trend: Trend) -> _ConvertedLevels:
     """Convert the leakage levels of the compared recordings to the trend's unit and to one oil temperature.
 
-    Conductances [m^3/(s Pa)] are converted to L/min at the trend's pressure, or to % of the mean level of the healthy
-    recordings. If the oil temperature of every recording is known, they are also converted to the temperature of the
-    first recording. For the ringing, a level is minus the logarithm of an RMS. It is converted to the difference from
-    the healthy mean, times 100, in %.
+    Levels that are conductances [m^3/(s Pa)] are converted to L/min at the trend's pressure, or to % of the mean level
+    of the healthy recordings. If the oil temperature of every recording is known, conductances are also converted to
+    the temperature of the first recording. A level of the ringing, minus the logarithm of an RMS, is converted to its
+    difference from the healthy mean, times 100, in %.
     """
     compared = [trend.points[k] for k in trend.rows]
     t, group, value, error = (
         np.array([getattr(point, name) for point in compared]) for name in ("day", "group", "level", "error")
     )
-    usual = float(np.mean(value[: _count_healthy(trend)]))
+    usual = float(np.mean(value[: _count_healthy(trend)]))  # of the healthy recordings
     prior = scatter_prior(trend.basis or "ringing", usual)
     warming, slope_sd = np.zeros(t.size), 0.0  # warming of the oil [K], standard deviation of the level's change per K
     temperatures = [point.temperature for point in compared if point.temperature is not None]
     if trend.basis != "ringing" and len(temperatures) == t.size:
         warming = np.array(temperatures) - temperatures[0]
         slope_sd = INFERENCE.oil.per_kelvin_deviation * abs(usual)
-        value, error = (values * np.exp(-INFERENCE.oil.per_kelvin * warming) for values in (value, error))
+        correction = np.exp(-INFERENCE.oil.per_kelvin * warming)
+        value, error = value * correction, error * correction
     if trend.basis == "ringing":
         factor, value = 100.0, value - usual
     elif trend.pressure is not None:
@@ -438,8 +439,10 @@ def _convert_levels(trend: Trend) -> _ConvertedLevels:
     else:
         factor = 100.0 / max(abs(usual), float(np.finfo(float).tiny))
     prior = prior._replace(scale=prior.scale * factor)
-    levels = Levels(t, value * factor, error * factor, group, warming, prior, slope_sd * factor)
-    return _ConvertedLevels(levels, factor)
+    levels = Levels(
+        t, value * factor, error * factor, group, covariate=warming, prior=prior, slope_sd=slope_sd * factor
+    )
+    return _ConvertedLevels(levels, trend_units_per_level=factor)
 
 
 def _allowed_rise(trend: Trend, trend_units_per_level: float) -> float | None:

@@ -68,14 +68,17 @@ class TrendLeak:
         return None if self.rise is None else LeakRise(self.rise)
 
     def relative(self, flow: Flow) -> None:
-        """Return None, as a trend states no leak relative to the pump's flow."""
+        """Return None for any flow of a leak, as a trend states no leak relative to the pump's flow."""
 
     def total(self, detectable_flow: float | None) -> TotalLeakage | None:
-        """Return the present flow past pump and piston [L/min] with its interval; None if no L/min are stated."""
+        """Return the present flow past pump and piston [L/min] with its interval; None if no L/min are stated.
+
+        The detectable flow is not used.
+        """
         return self.present_leakage
 
     def history(self, onset_s: float | None) -> None:
-        """Return None, as the trend itself is the history of the leak."""
+        """Return None whatever the onset [s], as the trend itself is the history of the leak."""
 
 
 def decide_trend(
@@ -131,16 +134,16 @@ def _measure_leak(
     """Describe the increase of the leakage since the last repair as a TrendLeak.
 
     `points` are the recordings since the repair, `wear` is the estimated state of the machine, and `chance` the
-    probability of such an increase in a healthy machine. `trend_units_per_level`: unit of the trend for a level of 1,
-    where a level is a recording's leakage over its pressure; `pressure`: pressure at which flows are stated, None if
-    they are not. The leak may be laminar or an orifice, so its flow is proportional to p^k with one of the exponents k
-    in `EXPONENTS`; the stated flow is the mean over these laws.
+    probability of such an increase in a healthy machine. `trend_units_per_level`: factor from a level (leakage over
+    pressure of a recording) to the unit of the trend; `pressure`: pressure difference at which flows are stated [Pa],
+    None if the unit of the trend is %. The flow of the leak is proportional to p^k, with k from `EXPONENTS` for a
+    laminar leak, an orifice and laws between; the stated flow is the mean over these laws.
     """
     onset_day = -np.inf if wear.onset is None else wear.onset.value
     pressures_since = [point.pressure for point in points if point.day >= onset_day]
     pressure_ratio = float(np.median(pressures_since)) / pressure if pressure and pressures_since else 1.0
-    # A level is the flow over the pressure of the recording. The flow at the stated pressure is the level times this
-    # pressure only for a laminar leak; for the other laws there is a factor.
+    # A level is the flow over the pressure of the recording. The flow at `pressure` is the level times `pressure` only
+    # for a laminar leak, k = 1; for other laws there is a further factor.
     flow_factors = pressure_ratio ** (1.0 - np.array(EXPONENTS))
     leak_sd = (wear.leak.high - wear.leak.low) / (2.0 * WITHIN_95)
     pump_flow = float(np.median([point.pump / point.pressure for point in points])) * trend_units_per_level
@@ -151,7 +154,7 @@ def _measure_leak(
         cause="internal or external leak" if points[0].basis == "pressure response" else "piston or pump leak",
         rise=_normal_rise(wear, chance),
         rise_flow=mixture_flow(law_priors(), wear.leak.value * flow_factors, leak_sd * flow_factors),
-        rise_onset=wear.onset and Interval(*(points[0].time_of_day(day) for day in wear.onset)),
+        rise_onset=wear.onset and Interval(*(points[0].seconds_since_1970(day) for day in wear.onset)),
         bound_flow=wear.bound,
         pump_flow=(pump_flow, pump_flow),
         lpm_per_flow=None if pressure is None else 1.0,
@@ -169,11 +172,11 @@ def _normal_rise(wear: Wear, chance: float) -> Rise | None:
     """
     from scipy.special import ndtri
 
-    score = -float(ndtri(chance))
+    score = -float(ndtri(chance))  # normal quantile of 1 - chance
     if not (score > 0.0 and np.isfinite(score) and wear.bound > 0.0):
         return None
     value = wear.leak.value or wear.bound
-    return Rise(value, value / score, np.inf)
+    return Rise(value, deviation=value / score, degrees_of_freedom=np.inf)
 
 
 def _total_leakage(total: Interval, size_deviation: float, pressure: float) -> TotalLeakage:
@@ -182,8 +185,9 @@ def _total_leakage(total: Interval, size_deviation: float, pressure: float) -> T
     `total`: leakage with the 95 % interval of its estimate [L/min]; `size_deviation`: relative standard error of all
     flows due to area and displacement; `pressure`: pressure difference at which the flow is stated [Pa].
     """
-    below, above = (np.hypot(end - total.value, WITHIN_95 * total.value * size_deviation) for end in total[1:])
-    return TotalLeakage(total.value, (total.value - float(below), total.value + float(above)), pressure)
+    half_width = WITHIN_95 * total.value * size_deviation  # due to the sizes
+    below, above = (float(np.hypot(end - total.value, half_width)) for end in (total.low, total.high))
+    return TotalLeakage(total.value, (total.value - below, total.value + above), pressure)
 
 
 def _report_ringing(points: Sequence[TrendPoint], wear: Wear, chance: float) -> Observed:
@@ -197,15 +201,15 @@ def _report_ringing(points: Sequence[TrendPoint], wear: Wear, chance: float) -> 
     ringing = None
     if wear.onset is not None:
         before, _ = _split_at_onset(points, wear)
-        ringing = Ringing(bound=np.inf, rate=0.0, healthy=len(before), is_dated=True)
+        ringing = Ringing(bound=np.inf, rate=0.0, healthy=len(before), is_dated=True)  # at rate 0 no bound is stated
     return Observed(RMS_CHANGE, (fall,), ringing=ringing)
 
 
 def _split_at_onset(points: Sequence[TrendPoint], wear: Wear) -> tuple[list[TrendPoint], list[TrendPoint]]:
     """Split recordings into those before the onset of the leak and those since; return both lists.
 
-    Only recordings that can be compared with the last recording are included. Without an onset, the second list is the
-    last recording only.
+    `points` are the recordings in the order of time; only those that can be compared with the last one are included.
+    `wear` states the onset. Without an onset, the second list is the last recording only.
     """
     onset = points[-1].day if wear.onset is None else wear.onset.value
     comparable = [point for point in points if point.group == points[-1].group]
@@ -220,7 +224,7 @@ def _rival_changes(points: Sequence[TrendPoint], wear: Wear) -> tuple[Observable
     before. Only recordings whose balance has the same terms as that of the last recording are used. The result is empty
     if there are no such recordings before the onset, or if the last recording has several balances or no balance.
     """
-    names = [roles.names for roles in points[-1].terms]
+    names = [roles.names for roles in points[-1].terms]  # of the terms of each balance
     sums_before, sums_since = (
         [point.sums for point in part if point.sums is not None and [roles.names for roles in point.terms] == names]
         for part in _split_at_onset(points, wear)
@@ -229,8 +233,10 @@ def _rival_changes(points: Sequence[TrendPoint], wear: Wear) -> tuple[Observable
         return ()
     flow = float(np.mean([sums.flow for sums in sums_since]))
     pressure = float(np.mean([sums.pressure for sums in sums_since]))
-    judged = RecordingSums(np.sum([sums.sums for sums in sums_since], axis=0), flow, pressure)
-    return rival_rises(judged, [sums._replace(held=None) for sums in sums_before], points[-1].terms)
+    # all recordings since the onset as one; leaks in holds (`held`) are not compared
+    judged = RecordingSums(np.sum([sums.sums for sums in sums_since], axis=0), flow, pressure, held=None)
+    healthy = [sums._replace(held=None) for sums in sums_before]
+    return rival_rises(judged, healthy, points[-1].terms)
 
 
 def _report_rms_change(points: Sequence[TrendPoint], wear: Wear) -> Observed:

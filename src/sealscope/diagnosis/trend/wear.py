@@ -121,10 +121,10 @@ class Levels:
         For independent normal levels v_changes is the variance of a level, as a change has twice that variance.
         """
         prior = self.prior
-        steps = np.abs(np.diff(self.value))[np.diff(self.group) == 0] / math.sqrt(2.0)
+        changes = np.abs(np.diff(self.value))[np.diff(self.group) == 0] / math.sqrt(2.0)
         prior_variance = prior.scale**2 + (float(np.mean(self.error**2)) if len(self) else 0.0)
-        measured_variance = (_SD_PER_MEDIAN * float(np.median(steps))) ** 2 if steps.size else 0.0
-        weights = prior.freedom, steps.size
+        measured_variance = (_SD_PER_MEDIAN * float(np.median(changes))) ** 2 if changes.size else 0.0
+        weights = prior.freedom, changes.size
         return math.sqrt(float(np.average([prior_variance, measured_variance], weights=weights)))
 
     def average_neighbours(self, max_count: int = 240) -> Levels:
@@ -151,14 +151,14 @@ def outlier_excess(levels: Levels) -> tuple[Array, Array]:
     """Compute the part of each leakage level beyond the limit of outliers, which the fit of the wear subtracts.
 
     The limit L is `outlier` (`priors.toml`) times the scatter of all earlier levels (`Levels.scatter`). With the
-    distance d of a level from the median of up to three levels before it in its group, the result is
+    distance d of a level from the median of up to three levels before it in its group, the excess is
 
         sign(d) max(abs(d) - L, 0).
 
-    The excess is 0 for the first level of a group, and if the level before lies beyond the limit on the same side, as
-    two such levels are a change. Returns two variants, each (n,). The first treats each level as the latest level. The
-    second is for the whole series: the excess is also 0 for the last level of a group, and if the next level lies
-    beyond the limit on the same side.
+    Two successive levels beyond the limit on the same side are a change of the machine. The excess of a level is
+    therefore 0 if the level before it is also beyond, and for the first level of a group. Returns two variants, each
+    (n,). The first treats each level as the latest level. The second is for the whole series: the excess is also 0 if
+    the next level is beyond the limit on the same side, and for the last level of a group.
     """
     excess_as_last, excess = np.zeros((2, len(levels)))
     for group in np.unique(levels.group):
@@ -168,7 +168,7 @@ def outlier_excess(levels: Levels) -> tuple[Array, Array]:
             max_distance = TREND.history.outlier * levels.select(slice(0, row)).scatter
             distances = values - np.median(values[max(position - 3, 0) : position])
             sign = np.sign(distances[position])
-            if sign * distances[position - 1] > max_distance:
+            if sign * distances[position - 1] > max_distance:  # a change
                 continue
             excess_as_last[row] = sign * max(abs(distances[position]) - max_distance, 0.0)
             is_confirmed = position + 1 < rows.size and sign * distances[position + 1] <= max_distance
@@ -207,16 +207,17 @@ class _Changes(NamedTuple):
         """Build the hypotheses of all steps and growths that may begin after the first `n_healthy` recordings.
 
         Each step or growth is combined with several prior scales of its size, each of which is a separate hypothesis.
-        The scales of a step are multiples of the scatter tau (`change.steps` in `priors.toml`). A growth is a rise per
-        month; its scales are tau over several times (`change.intervals`, multiples of the median interval of
-        recordings). With `steps_only` there are no growths.
+        The scales of a step are multiples of the scatter tau (`change.steps` in `priors.toml`). The size of a growth is
+        its rise per month; its scales are tau over several times (`change.intervals`, multiples of the median interval
+        of recordings). With `steps_only` there are no growths.
         """
         scales = TREND.change
-        begin = np.arange(max(n_healthy, 1), len(levels))
+        begin = np.arange(max(n_healthy, 1), len(levels))  # first recording after each change
         step = (np.arange(len(levels))[:, None] >= begin).astype(float)
         growth = np.maximum(levels.t[:, None] - levels.t[begin - 1], 0.0) / DAYS_PER_MONTH
         slopes = [] if steps_only else [DAYS_PER_MONTH / levels.interval / n for n in scales.intervals]
         n_steps = len(scales.steps)
+        # each row of the following arrays belongs to one scale
         scale = np.array([*scales.steps, *slopes], dtype=float)[:, None]
         grows = np.arange(scale.size)[:, None] >= n_steps
         # w_j is shared equally by steps and growths, and by the scales of each
@@ -224,7 +225,7 @@ class _Changes(NamedTuple):
         with np.errstate(divide="ignore"):
             log_weight = np.log(np.clip(levels.t[begin] - levels.t[begin - 1], 0.0, scales.wait) / n_rivals)
         profile_index = np.arange(begin.size) + begin.size * grows  # profiles of growths follow those of steps
-        fields = np.broadcast_arrays(profile_index, scale, begin, grows, log_weight)  # scales by begins
+        fields = np.broadcast_arrays(profile_index, scale, begin, grows, log_weight)  # (scales, begins) each
         return cls(np.hstack([step, growth]), *(values.ravel() for values in fields))  # type: ignore[call-arg]
 
     @classmethod
@@ -272,8 +273,8 @@ def _evaluate_grid(levels: Levels, profiles: Array, *, may_grow: bool = False) -
     """Compute the likelihoods of leakage levels with and without a change, at all points of a grid of tau and r.
 
     tau is the standard deviation between recordings, and r the fraction of its variance that is correlated over time.
-    `profiles` (n, m) are the effects of m changes of unit size on each recording. With `may_grow`, the level may have
-    grown evenly since the first recording even without a change. The covariance of the levels is
+    `profiles` (n, m) are the effects of m changes of unit size on each of n recordings. With `may_grow`, the level may
+    have grown evenly since the first recording even without a change. The covariance of the levels is
 
         shared + tau^2 (r C + (1 - r) I) + diag(error^2) = L L'.
 
@@ -291,13 +292,14 @@ def _evaluate_grid(levels: Levels, profiles: Array, *, may_grow: bool = False) -
     # outlying part of each level: while its recording is the last one, and in the whole series
     outlying_as_last, outlying = outlier_excess(levels)
     values = levels.value - levels.value[0] - outlying
+    # 0.3 of the range is about the standard deviation of ten normal values
     max_scatter = max(prior.scale, 0.3 * float(np.ptp(levels.value)))
     wide_variance = (_WIDE * max_scatter) ** 2
     mean_covariance = wide_variance * (levels.group == levels.group[-1])  # with the mean level of the last group
     shared = wide_variance * (levels.group[:, None] == levels.group)
     shared = shared + levels.slope_sd**2 * np.outer(levels.covariate, levels.covariate)
     if may_grow:
-        growth = 10.0 * levels.scatter / levels.interval * (levels.t - levels.t[0])  # a wide prior
+        growth = 10.0 * levels.scatter / levels.interval * (levels.t - levels.t[0])  # 10: a wide prior
         shared += np.outer(growth, growth)
     elapsed = np.abs(levels.t[:, None] - levels.t)
     correlation = np.mean([np.exp(-elapsed / time) for time in between.times], axis=0)
@@ -317,6 +319,7 @@ def _evaluate_grid(levels: Levels, profiles: Array, *, may_grow: bool = False) -
             log_null = log_prior - np.cumsum(np.log(L.diagonal())) - 0.5 * square
             # a change of size delta has the likelihood ratio exp(b delta - a delta^2/2)
             a, b = np.cumsum(G**2, axis=0), np.cumsum(G * z, axis=0) - G * (z - z_as_last)
+            # mean level of the last group, given all levels without a change, and its variance
             level = float(levels.value[0] + u[:-1, 0] @ z[:-1, 0] + u[-1, 0] * z_as_last[-1, 0])
             variance = wide_variance - float(u[:, 0] @ u[:, 0])
             nodes.append(_Node(float(tau), log_null, a, b, level, variance, G.T @ u[:, 0]))
@@ -356,14 +359,15 @@ class ChangeScores(NamedTuple):
 def score_changes(levels: Levels, n_healthy: int = 1, *, falls: bool = False, may_grow: bool = False) -> ChangeScores:
     """Compute the statistic R of the sequential test for a rise of the leakage level, either a step or a growth.
 
-    R [days] is the sum over all possible changes of the likelihood ratio of the change to no change, times the time
-    between the recordings before and after the beginning of the change [days], at most `wait` (`priors.toml`). The
+    R [days] is a sum over all possible changes. Each term is the likelihood ratio of the change to no change, times the
+    time between the recordings before and after the beginning of the change [days], at most `wait` (`priors.toml`). The
     first `n_healthy` recordings are assumed unchanged. With `falls` the test is for a downward step instead. With
     `may_grow`, an even growth since the first recording does not count as a change.
     """
     if falls:
         levels = replace(levels, value=-levels.value)
     n, changes = len(levels), _Changes.enumerate(levels, n_healthy, steps_only=falls)
+    # sums over the grid of tau and r: prior times likelihood with each change, and without a change
     log_terms, log_null = np.full((n, changes.begin.size), -np.inf), np.full(n, -np.inf)
     if not changes.begin.size:
         return ChangeScores(log_null, np.zeros(n, dtype=np.int64))
@@ -371,17 +375,17 @@ def score_changes(levels: Levels, n_healthy: int = 1, *, falls: bool = False, ma
         log_null = np.logaddexp(log_null, node.log_null)
         a, b = node.a[:, changes.profile_index], node.b[:, changes.profile_index]
         log_terms = np.logaddexp(log_terms, node.log_null[:, None] + _log_mean_ratio(a, b, changes.scale * node.tau))
-    # w_j LR_j(n) of each change, averaged over the grid of tau and r; changes that begin later do not count yet
+    # weighted likelihood ratio w_j LR_j(n) of each change; changes that begin after recording n do not count yet
     log_terms += changes.log_weight - log_null[:, None]
     log_terms[np.arange(n)[:, None] < changes.begin] = -np.inf
     return ChangeScores(np.logaddexp.reduce(log_terms, axis=1), changes.begin[np.argmax(log_terms, axis=1)])
 
 
 def _draw_normal(random: np.random.Generator, mean: Array, sd: Array, *, positive: bool) -> Array:
-    """Draw one number from each of d normal distributions.
+    """Draw one number from each of d normal distributions, shape (d,).
 
-    `mean` (d,) and `sd` (d,) are their means and standard deviations. With `positive` the distributions are truncated
-    to numbers above 0. `random`: source of random numbers.
+    `mean` (d,) and `sd` (d,): means and standard deviations; `positive`: truncate the distributions to numbers above 0;
+    `random`: source of random numbers.
     """
     from scipy.special import ndtr, ndtri
 
@@ -409,21 +413,23 @@ class _Draws(NamedTuple):
         """Draw scatter, change, its size and the mean level before it from their posterior, given the leakage `levels`.
 
         `changes` are the hypotheses, one of which is chosen in each draw. The size of a change has a half-normal prior
-        or, with `signed`, a normal prior, i.e. may be negative. The seed is fixed.
+        or, with `signed`, a normal prior, so that it may be negative. The seed is fixed.
         """
         random = np.random.default_rng(20)  # a fixed seed, so that results repeat
         nodes = _evaluate_grid(levels, changes.profiles)
         a, b = (np.stack([getattr(node, name)[-1][changes.profile_index] for node in nodes]) for name in ("a", "b"))
         scale = changes.scale * np.array([[node.tau] for node in nodes])
-        v = 1.0 / (a + scale**-2)
+        v = 1.0 / (a + scale**-2)  # variance of the size, before any truncation to > 0; its mean is b v
         log_ratio = 0.5 * (np.log(v) + b * b * v) if signed else _log_mean_ratio(a, b, scale)
         log_weight = np.array([[node.log_null[-1]] for node in nodes]) + log_ratio + changes.log_weight
         weight = np.exp(log_weight - log_weight.max())
+        # draw a point of the grid and a change together
         flat_index = random.choice(weight.size, _N_DRAWS, p=weight.ravel() / weight.sum())
         node_number, change = np.unravel_index(flat_index, weight.shape)
         mean, sd = (b * v)[node_number, change], np.sqrt(v)[node_number, change]
         amplitude = _draw_normal(random, mean, sd, positive=not signed)
         tau, level, variance = np.array([(node.tau, node.mean, node.variance) for node in nodes])[node_number].T
+        # a change lowers the mean before it, by `slope` per unit of its size
         slope = np.stack([node.mean_slope[changes.profile_index] for node in nodes])[node_number, change]
         error = np.sqrt(np.maximum(variance, 0.0)) * random.standard_normal(_N_DRAWS)
         return cls(tau, change, amplitude, level - slope * amplitude + error)
@@ -484,12 +490,12 @@ def estimate_wear(levels: Levels, allowed_rise: float | None, change_begin: int 
     """Estimate leakage level, growth and time to the repair limit after the last recording.
 
     `allowed_rise` is the rise above the healthy level at which a repair is due, None if there is no limit.
-    `change_begin` is the index of the first recording after the change that the test has found. If it is None, an
-    even growth or decrease over all recordings is estimated, with a wide prior. Growth and time to the limit are NaN if
-    the recordings span less than a day.
+    `change_begin` is the index of the first recording after the change that the test has found, None if the test has
+    found no change. An even growth or decrease over all recordings is then estimated, with a wide prior. Growth and
+    time to the limit are NaN if the recordings span less than a day.
     """
     is_changed = change_begin is not None
-    is_long = levels.t[-1] - levels.t[0] >= 1.0
+    is_long = levels.t[-1] - levels.t[0] >= 1.0  # [days]
     # without a change the growth may begin with the first recording
     months = (levels.t - levels.t[0]) / DAYS_PER_MONTH if is_long else np.zeros(len(levels))
     even_growth = _Changes.from_profile(months, _WIDE * DAYS_PER_MONTH / levels.interval)
@@ -540,8 +546,8 @@ def _days_to_limit(level: Array, growth: Array, limit: float) -> Array:
 def _estimate_healthy_range(levels: Levels) -> tuple[Interval, float]:
     """Estimate the mean leakage level and the scatter of recordings without a change.
 
-    Returns the mean level, whose interval contains 95 % of the levels of single recordings with their scatter and
-    standard errors, and the standard deviation between recordings.
+    Returns the mean level and the standard deviation between recordings. The interval of the mean level contains 95 %
+    of the levels of single recordings, with their scatter and standard errors.
     """
     no_change = _Changes.from_profile(np.zeros(len(levels)), scale=1.0)
     draws = _Draws.sample(levels, no_change)
@@ -574,8 +580,9 @@ def find_episodes(
     """Divide a series of recordings at repairs, and test and estimate the leakage in each period between them.
 
     `years` is the smallest mean time between false alarms. The first `n_healthy` recordings are known to be healthy.
-    `allowed_rise` is the rise of the level at which a repair is due, or None. A repair is a fall of the level that
-    the same test detects. After a repair the level is estimated anew, with the scatter before the repair as prior.
+    `allowed_rise` is the rise of the level at which a repair is due, None if there is no limit. A repair is a fall of
+    the level, which the test for a rise detects with the sign reversed. After a repair the level is estimated anew,
+    with the scatter before the repair as prior.
     """
     days = years * DAYS_PER_YEAR
     begin, episodes = 0, list[Episode]()
@@ -583,7 +590,7 @@ def find_episodes(
         remaining = levels.select(slice(begin, None))
         rise = score_changes(remaining, n_healthy)
         alarm, end = rise.find_alarm(days), _find_repair(remaining, rise, n_healthy, days)
-        if alarm is not None and alarm >= end:  # the alarm belongs to the next episode
+        if alarm is not None and alarm >= end:  # an alarm after the repair belongs to the next episode
             alarm = None
         change_begin = None if alarm is None else int(rise.begin[end - 1])
         wear = estimate_wear(remaining.select(slice(0, end)), allowed_rise, change_begin)
@@ -600,7 +607,8 @@ def _find_repair(levels: Levels, rise: ChangeScores, n_healthy: int, days: float
 
     A repair is a fall of the leakage level that the sequential test detects. `rise` is the result of the test for a
     rise, and `days` the mean time to a false alarm [days]. The first `n_healthy` recordings are known to be healthy. If
-    the rise is detected first, the worn level since that rise replaces the healthy level: a repair falls below it.
+    a rise is detected before a fall, the level of the worn machine since that rise replaces the healthy level: a repair
+    is then a fall below the worn level.
     """
     first = 0  # index of the first recording that is tested for a fall
     fall = score_changes(levels, n_healthy, falls=True)

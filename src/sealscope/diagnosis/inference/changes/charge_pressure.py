@@ -81,20 +81,21 @@ def estimate_low_drifts(recording: Recording) -> LowDrifts | None:
     """Estimate the drifts [Pa/s] of the lowest pressures of both chambers.
 
     In a closed circuit a chamber that carries no load is at the charge pressure. The drift of a chamber is unknown if
-    its lowest pressure is far above the other chamber's, or if too few samples are near the lowest pressure. Return
-    None if neither drift is known, without both pressures, or without the pump's angle or speed.
+    its lowest pressure is by `charge.near` (`priors.toml`) or more above the other chamber's, or if at most the
+    fraction `charge.share` of its samples lies within `charge.near` of the lowest pressure. Return None if neither
+    drift is known, without both pressures, or without the pump's angle or speed.
     """
-    source = flow_source(recording.channels)
-    if len(recording) < MIN_SAMPLES or source not in PUMP or not {"p_A", "p_B"} <= set(recording.channels):
+    flow_channel = flow_source(recording.channels)
+    if len(recording) < MIN_SAMPLES or flow_channel not in PUMP or not {"p_A", "p_B"} <= set(recording.channels):
         return None
-    prior, regressors = CHANGES.charge, _regressors(recording, source)
+    prior, regressors = CHANGES.charge, _regressors(recording, flow_channel)
     is_known = np.isfinite(regressors).all(axis=1)
     pressures = [average_over(prior.seconds, recording[name], recording.rate) for name in ("p_A", "p_B")]
     lowest = [float(np.nanquantile(p, LOWEST)) for p in pressures]
     drifts = list[float]()
     for p, low in zip(pressures, lowest, strict=True):
         is_low = is_known & np.isfinite(p) & (p < low + prior.near)
-        is_at_charge = low < min(lowest) + prior.near and is_low.mean() > prior.share
+        is_at_charge = low < min(lowest) + prior.near and is_low.mean() > prior.share  # else fit no samples
         drifts += _fit_drift(recording.t, p, regressors, np.flatnonzero(is_low & is_at_charge))
     return LowDrifts(*drifts) if np.isfinite(drifts).any() else None
 
@@ -123,13 +124,14 @@ class ChargeTrend(NamedTuple):
         where f is the fraction of the recording before the onset. V has a log-normal prior, over which the likelihood
         is averaged. A measured fall may also have another cause, with a small probability.
         """
-        prior, z = CHANGES.accumulator, np.linspace(-3.0, 3.0, N_VOLUMES)  # standard normal, of log V
+        prior, z = CHANGES.accumulator, np.linspace(-3.0, 3.0, N_VOLUMES)  # log V in standard deviations
         weights = np.exp(-0.5 * z**2) / np.exp(-0.5 * z**2).sum()
         volumes = prior.size * np.exp(prior.spread * z)
         f = float(np.clip((onset - self.begin) / max(self.end - self.begin, TINY), 0.0, 1.0))
         expected = self.pressure * abs(flow) / volumes * (1.0 - f) ** 2 * (1.0 + 2.0 * f)
         deviation = float(np.hypot(self.error, CHANGES.charge.scatter))
-        other_cause = CHANGES.charge.unlike * deviation / CHANGES.zero_drift.size  # likelihood of any fall by it
+        # a fall by another cause has a wide, even density, here multiplied by the deviation as the normal densities are
+        other_cause = CHANGES.charge.unlike * deviation / CHANGES.zero_drift.size
         with_loss = float(weights @ np.exp(-0.5 * ((self.fall - expected) / deviation) ** 2)) + other_cause
         without_loss = float(np.exp(-0.5 * (self.fall / deviation) ** 2)) + other_cause
         return 2.0 * float(np.log(with_loss / without_loss))
@@ -138,8 +140,9 @@ class ChargeTrend(NamedTuple):
 def estimate_charge_trend(recording: Recording) -> ChargeTrend | None:
     """Estimate how fast the charge pressure of a closed circuit falls [Pa/s], with its standard error [Pa/s].
 
-    The fall is the weighted mean over the chambers whose lowest pressures show it. Return None if there is no such
-    chamber, or if a pressure or the pump's angle or speed is not recorded.
+    The fall is the weighted mean over the chambers that are at times near the charge pressure
+    (`estimate_low_drifts`). Return None if there is no such chamber, or if a pressure or the pump's angle or speed is
+    not recorded.
     """
     drifts = estimate_low_drifts(recording)
     if drifts is None:
@@ -150,18 +153,19 @@ def estimate_charge_trend(recording: Recording) -> ChargeTrend | None:
         return None
     lowest = min(float(np.nanquantile(recording[name], LOWEST)) for name in ("p_A", "p_B"))
     pressure = max(lowest, 0.0) + P_ATM
-    return ChargeTrend(*fall, pressure, begin=float(recording.t[0]), end=float(recording.t[-1]))
+    begin, end = float(recording.t[0]), float(recording.t[-1])
+    return ChargeTrend(fall=fall.value, error=fall.deviation, pressure=pressure, begin=begin, end=end)
 
 
-def _regressors(recording: Recording, source: str) -> Array:
+def _regressors(recording: Recording, flow_channel: str) -> Array:
     """Compute the quantities (n, 2 or 3) that also change the charge pressure: flow of the pump, and position.
 
     The first two columns are the positive and the negative part of the flow, relative to its largest magnitude. The
     third column, if the position is recorded, is the position [m] minus its mean. All are averaged over
-    `charge.seconds` of `priors.toml`. `source`: channel from which the flow is computed, "theta" or "omega".
+    `charge.seconds` of `priors.toml`. `flow_channel`: the pump's angle "theta" or its speed "omega".
     """
-    drive = average_over(CHANGES.charge.seconds, recording[source], recording.rate)
-    flow = np.gradient(drive) if source == "theta" else drive
+    drive = average_over(CHANGES.charge.seconds, recording[flow_channel], recording.rate)
+    flow = np.gradient(drive) if flow_channel == "theta" else drive
     flow = flow / max(float(np.nanmax(np.abs(flow))), TINY)
     columns = [np.maximum(flow, 0.0), np.minimum(flow, 0.0)]
     if "x" in recording:
@@ -173,7 +177,7 @@ def _regressors(recording: Recording, source: str) -> Array:
 def _fit_drift(t: Array, pressure: Array, regressors: Array, rows: NDArray[np.intp]) -> tuple[float, float]:
     """Estimate the drift [Pa/s] of the lower envelope of a pressure, and the standard error of the drift.
 
-    `t` [s] and `pressure` [Pa], (n,): the samples; `regressors` (n, k): position and pump flow, which are fitted
+    `t` [s] and `pressure` [Pa], (n,): the samples; `regressors` (n, k): pump flow and position, which are fitted
     together with the drift; `rows`: indices of the samples to fit, which are thinned out if they are many. Both results
     are NaN for fewer than `MIN_SAMPLES` samples.
     """
@@ -192,11 +196,13 @@ def _fit_drift(t: Array, pressure: Array, regressors: Array, rows: NDArray[np.in
         residual = values - design @ coefficients
         below = np.abs(residual[residual < 0.0])
         scale = WEIGHT_SCALE * float(np.median(below) if below.size else 0.0) + MIN_SCALE
+        # 1/hypot is the root of a Cauchy weight; samples above the envelope count less
         weight = np.where(residual > 0.0, ABOVE, 1.0) / np.hypot(1.0, residual / scale)
     slope = 0  # column of the time
     parts = equal_parts(len(rows))
     (jackknife_error,) = jackknife_errors(design * weight[:, None], values * weight, [slope], parts)
-    return float(coefficients[slope]), float(np.hypot(jackknife_error, _envelope_error(time, residual)))
+    error = np.hypot(jackknife_error, _envelope_error(time, residual))
+    return float(coefficients[slope]), float(error)
 
 
 def _envelope_error(time: Array, residual: Array) -> float:
@@ -216,45 +222,44 @@ def _envelope_error(time: Array, residual: Array) -> float:
 def compare_low_drifts(judged: LowDrifts, healthy: Sequence[LowDrifts]) -> Iterator[Observable]:
     """Compare the drifts of the lowest readings of p_A and p_B with those of healthy recordings.
 
-    Without drifts the lowest readings stay at the charge pressure. Yields a test for each of three explanations, if
-    enough healthy recordings have the drift: the sensor of p_A drifts, the sensor of p_B drifts, or the charge pressure
-    falls, which lowers both pressures alike. A fall does not explain a difference between the two drifts. If both
-    drifts are known, the p-value (`chance`) of a fall is therefore
+    Without drifts the lowest readings stay at the charge pressure. `judged`, `healthy`: drifts in the judged recording,
+    and in each healthy one. Yields a test for each of three explanations, if enough healthy recordings have the drift:
+    the sensor of p_A drifts, the sensor of p_B drifts, or the charge pressure falls, which lowers both pressures alike.
+    A fall does not explain a difference between the two drifts. If both drifts are known, the p-value (`chance`) of a
+    fall is therefore
 
         chance = min(1, chance of the weighted mean of both drifts / chance of their difference).
     """
     prior = CHANGES.charge
-    scatter = PriorScatter(prior.scatter, prior.recordings)
+    scatter = PriorScatter(deviation=prior.scatter, recordings=prior.recordings)
     drifts = {side: drift for side in "AB" if (drift := judged.estimate(side)) is not None}
-    known = {side: [drift for day in healthy if (drift := day.estimate(side)) is not None] for side in drifts}
+    known = {side: [drift for other in healthy if (drift := other.estimate(side)) is not None] for side in drifts}
     for side, drift in drifts.items():
         change = compare_estimates(LOW.format(side), DRIFT, drift, known[side], scatter)
         if change is not None:
-            yield _with_size(change, CHANGES.zero_drift)
-    # variance of each side's drift, including the scatter between the healthy recordings
-    variances = {
-        side: prior.scatter**2 + drift.deviation**2 + float(np.var([day.value for day in known[side]] or [0.0]))
-        for side, drift in drifts.items()
-    }
-    falls = [mean for day in healthy if (mean := _mean_fall(day, variances)) is not None]
+            yield _with_size_prior(change, CHANGES.zero_drift)
+    # variance of each side's drift, including the variance between the healthy recordings
+    healthy_var = {side: float(np.var([drift.value for drift in known[side]] or [0.0])) for side in drifts}
+    variances = {side: prior.scatter**2 + drift.deviation**2 + healthy_var[side] for side, drift in drifts.items()}
+    falls = [mean for other in healthy if (mean := _mean_fall(other, variances)) is not None]
     judged_fall = _mean_fall(judged, variances)
-    assert judged_fall is not None  # at least one of its drifts is known
+    assert judged_fall is not None  # at least one drift of the judged recording is known
     fall = compare_estimates(FALL, DRIFT, judged_fall, falls, scatter, above=True)  # a fall is positive
     if fall is None:
         return
     if len(drifts) > 1:
-        days = [day for day in healthy if np.isfinite(day).all()]
-        difference = compare_estimates(FALL, DRIFT, _difference(judged), [_difference(day) for day in days], scatter)
+        differences = [_difference(other) for other in healthy if np.isfinite(other).all()]
+        difference = compare_estimates(FALL, DRIFT, _difference(judged), differences, scatter)
         chance = 1.0 if difference is None else min(1.0, fall.chance / max(difference.chance, TINY))
         fall = replace(fall, chance=chance)
-    yield _with_size(fall, CHANGES.charge_fall)
+    yield _with_size_prior(fall, CHANGES.charge_fall)
 
 
 def _mean_fall(drifts: LowDrifts, variances: Mapping[str, float]) -> Estimate | None:
     """Compute the rate at which the charge pressure falls [Pa/s], as a mean of both chambers, with its standard error.
 
-    The rate is -sum(drift / variance) / sum(1 / variance) over the chambers with a known drift. `variances`: variance
-    [Pa^2/s^2] of the drift of the sides "A" and "B". Return None if no drift of these sides is known.
+    The rate is -sum(drift / variance) / sum(1 / variance) over the chambers in `variances` whose drift is known.
+    `variances`: variance [Pa^2/s^2] of the drift by chamber, "A" or "B". Return None if none of these drifts is known.
     """
     known = [
         (drift, 1.0 / variance) for side, variance in variances.items() if (drift := drifts.estimate(side)) is not None
@@ -276,9 +281,9 @@ def _difference(drifts: LowDrifts) -> Estimate:
     return Estimate(drifts.low_A - drifts.low_B, error)
 
 
-def _with_size(observable: Observable, size: StepSize) -> Observable:
-    """Return the observable of a drift with the `advantage` that the prior on the size of drifts gives it.
+def _with_size_prior(observable: Observable, prior: StepSize) -> Observable:
+    """Return the observable of a drift with the `advantage` that the `prior` on the size of drifts gives it.
 
     advantage = 2 log(prior density of the drift / largest prior density).
     """
-    return replace(observable, advantage=-size_penalty(size, observable.size))
+    return replace(observable, advantage=-size_penalty(prior, observable.size))

@@ -41,7 +41,7 @@ def duty_tests(recording: Recording) -> list[StepTest]:
     """
     length, cycle = len(recording) // BLOCKS, find_cycle(recording)
     if "x" in recording and cycle is not None:
-        # blocks of whole cycles; not without a position, where a leak also changes the drive's motion within a cycle
+        # whole cycles; without a position the motion is that of the drive, which a leak changes within a cycle
         cycle_samples = cycle * recording.rate
         length = round(max(1, math.ceil(length / cycle_samples)) * cycle_samples)
     time, blocks = _split_blocks(recording, length)
@@ -69,7 +69,7 @@ def is_in_motion(fractions: Array) -> NDArray[np.bool_]:
 
 
 def _find_moving_blocks(recording: Recording, length: int) -> NDArray[np.bool_]:
-    """Flag the blocks of `length` samples in which the piston moves (K,); all of them if no motion is recorded."""
+    """Flag the K blocks of `length` samples in which the piston moves, (K,); all blocks if no motion is recorded."""
     count = len(recording) // length
     motion = motion_columns(recording.channels, recording.rate)
     if motion is None:
@@ -95,10 +95,11 @@ def amplitude_step_tests(time: Array, amplitudes: Mapping[str, Array]) -> list[S
     """Test the log amplitudes of command and motion in K blocks for a step; return one test for each.
 
     `time` (K,): middles of the blocks [s]; `amplitudes`: log amplitudes (K,) by the names "command" and "motion". The
-    list is empty if one amplitude is constant, has missing values or too few blocks.
+    list is empty if one amplitude cannot be tested: if it is constant, has missing values or too few blocks.
     """
     tests = [feature_step_test(time, values) for values in amplitudes.values()]
-    return [test for test in tests if test is not None] if None not in tests else []
+    possible_tests = [test for test in tests if test is not None]
+    return possible_tests if len(possible_tests) == len(tests) else []
 
 
 def sensor_tests(recording: Recording) -> list[tuple[str, StepTest]]:
@@ -124,7 +125,8 @@ def sensor_tests(recording: Recording) -> list[tuple[str, StepTest]]:
 def _split_blocks(recording: Recording, length: int) -> tuple[Array, dict[str, Array]]:
     """Split the channels of a recording into K blocks of `length` samples.
 
-    Returns the middles of the blocks (K,) [s], and the samples (K, length) by channel name, NaN where missing.
+    Returns the middles of the blocks (K,) [s], and the samples (K, length) by channel name, NaN where missing. Samples
+    after the last whole block are left out.
     """
     count = len(recording) // length
     blocks = {name: values[: count * length].reshape(count, length) for name, values in recording.channels.items()}
@@ -157,7 +159,7 @@ def sensor_features(blocks: Mapping[str, Array], rate: float) -> Iterator[tuple[
         flow = blocks[channel] if channel in ("omega", "u") else np.gradient(blocks[channel], axis=1)
         difference = p_A - p_B - np.nanmean(p_A - p_B)
         yield "sense of p_A - p_B", np.sign(_row_statistic(np.mean, np.nanmean, difference * flow))
-    # median instead of mean: pressure jumps at reversals are outliers
+    # high-order differences contain little motion; median instead of mean, as pressure jumps at reversals are outliers
     noise_A, noise_B = (
         np.log(_row_statistic(np.median, np.nanmedian, np.diff(p, ORDER, axis=1) ** 2)) for p in (p_A, p_B)
     )
@@ -165,6 +167,7 @@ def sensor_features(blocks: Mapping[str, Array], rate: float) -> Iterator[tuple[
     yield "noise of p_A beside that of p_B", noise_A - noise_B
     bin_width = rate / (p_A.shape[1] // 2)  # [Hz], of the spectra of half a block
     for hertz in _PRIORS.mains:
+        # the sampling rate must resolve the line and the neighbouring bins
         if hertz + _NEIGHBOURS[-1] * bin_width < _PRIORS.highest * rate:
             yield f"hum of {hertz:g} Hz", _log_hum(p_A + p_B, hertz / rate)
 
@@ -194,7 +197,7 @@ def _row_statistic(statistic: Callable[..., Array], without_missing: Callable[..
     """Compute a statistic of the known values of each row (K, n); NaN for a row without known values.
 
     `statistic`: function for rows without missing values, such as `np.median`; `without_missing`: function that skips
-    missing values, such as `np.nanmedian`. It takes ten times longer and is used only for rows that have some.
+    missing values, such as `np.nanmedian`; ten times slower, it is used only for rows with missing values.
     """
     results = np.full(len(values), np.nan)
     is_known = np.isfinite(values)
@@ -213,6 +216,6 @@ def feature_step_test(time: Array, values: Array) -> StepTest | None:
     """
     if len(values) < MIN_BLOCKS or not np.isfinite(values).all() or not np.ptp(values) > 0.0:
         return None
-    drift = _PRIORS.wander
+    drift = _PRIORS.wander  # prior scale of a healthy machine's slow change, linear or as a random walk
     precision = np.eye(len(values))  # independent errors of equal variance, which the test estimates
-    return two_sided_step_test(Information(time, precision, values, slope=drift, walk=drift))
+    return two_sided_step_test(Information(time, precision, vector=values, slope=drift, walk=drift))

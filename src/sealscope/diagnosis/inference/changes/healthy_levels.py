@@ -78,7 +78,7 @@ class HealthyLevels:
     def compare(self, recording: Recording, baseline: Sequence[Healthy]) -> Iterator[Observable]:
         """Compare friction, drifts and spectra of a recording with those of healthy ones; yield one test for each.
 
-        Quantities that the recording, or too many of the healthy recordings in `baseline`, do not have are left out.
+        Quantities that the recording or too many of the healthy recordings (`baseline`) lack are left out.
         """
         judged = self.learn(recording)
         if judged is None:
@@ -109,8 +109,9 @@ def _low_drifts(summary: Summary) -> LowDrifts | None:
 def _compare_friction(judged: Summary, healthy: Sequence[Summary]) -> Observable | None:
     """Test whether the friction of a recording, as a pressure difference, is higher than in healthy recordings.
 
-    Logarithms are compared, by that of the two estimates (`FRICTION_KEYS`) which scatters less between the healthy
-    recordings. Return None if the recording, or too many of the healthy recordings, have no usable value.
+    `judged`, `healthy`: summaries of the recordings, with up to two estimates of the friction (`FRICTION_KEYS`).
+    The estimate whose logarithm scatters less between the healthy recordings is compared. Return None if the judged
+    recording has no usable value of this estimate, or if fewer than `MIN_HEALTHY` healthy recordings have one.
     """
     prior = CHANGES.healthy
     choices = [
@@ -120,24 +121,24 @@ def _compare_friction(judged: Summary, healthy: Sequence[Summary]) -> Observable
     ]
     if not choices:
         return None
-    _, judged_log, healthy_logs = min(choices, key=lambda choice: choice[0])
+    _, judged_log, healthy_logs = min(choices, key=lambda choice: choice[0])  # with the smallest scatter
     if judged_log is None:
         return None
-    scatter = PriorScatter(prior.friction_scatter, prior.recordings)
+    scatter = PriorScatter(deviation=prior.friction_scatter, recordings=prior.recordings)
     return compare_estimates(FRICTION, FRICTION, judged_log, healthy_logs, scatter, above=True)
 
 
 def _log_frictions(
     judged: Summary, healthy: Sequence[Summary], key: str, error_key: str
 ) -> tuple[Estimate | None, list[Estimate]]:
-    """Return logarithms of the friction of the judged recording and of the healthy ones, with their standard errors.
+    """Compute the logarithm of the friction in the judged recording and in the healthy ones, with standard errors.
 
-    The sign of the friction depends on the sign of the motion's channel, so it is taken from the sum over the healthy
-    recordings of friction / standard error. Since friction resists the motion, healthy frictions of the other sign show
-    that the standard errors are too small: all are multiplied by the upper quartile of abs(friction) / error, which
-    counts as 0 for the right sign, so that a single odd recording changes nothing. A friction that does not exceed its
-    error with the right sign is not usable: the judged one is then None, a healthy one is left out. `key`,
-    `error_key`: keys of friction and standard error [Pa] in the summaries.
+    `key`, `error_key`: keys of friction and standard error [Pa] in the summaries `judged` and `healthy`. The usual sign
+    of the friction depends on the motion's channel; the sum of friction / error over the healthy recordings has this
+    sign. As friction resists the motion, healthy frictions of the other sign show that the errors are too small. All
+    errors are therefore multiplied by the upper quartile of abs(friction) / error, taken as 0 for the usual sign, if
+    the quartile exceeds 1. A friction is usable if it has the usual sign and exceeds its error. The result for the
+    judged recording is None if its friction is not usable; healthy frictions that are not usable are left out.
     """
     known = [summary for summary in healthy if {key, error_key} <= set(summary)]
     if not known or not {key, error_key} <= set(judged):
@@ -157,19 +158,19 @@ def _log_frictions(
 
 
 def _compare_drifts(judged: Summary, healthy: Sequence[Summary]) -> Iterator[Observable]:
-    """Compare the drifts of p_A and p_B in motion with those of healthy recordings, each with its standard error.
+    """Compare the drifts of p_A and p_B during motion with those of healthy recordings.
 
-    Yields a test for each of three explanations, if the recording and enough healthy recordings have both drifts: p_A
-    drifts, p_B drifts, both drift alike (`_describe_drifts`).
+    `judged`, `healthy`: summaries of the recordings. If the judged recording and enough healthy ones have both drifts,
+    yields a test for each of three explanations: p_A drifts, p_B drifts, both drift alike (`_describe_drifts`).
     """
     judged_drifts = _drifts(judged)
     if judged_drifts is None:
         return
-    healthy_days = [drifts for summary in healthy if (drifts := _drifts(summary)) is not None]
+    healthy_drifts = [drifts for summary in healthy if (drifts := _drifts(summary)) is not None]
     prior = CHANGES.healthy
-    scatter = PriorScatter(prior.drift, prior.drift_recordings, prior.drift_inflation)
-    tests = [
-        compare_estimates(name, DRIFT, judged_drifts[k], [day[k] for day in healthy_days], scatter)
+    scatter = PriorScatter(prior.drift, recordings=prior.drift_recordings, inflation=prior.drift_inflation)
+    tests = [  # of the drifts of p_A, p_B and p_A - p_B
+        compare_estimates(name, DRIFT, judged_drifts[k], [drifts[k] for drifts in healthy_drifts], scatter)
         for k, name in enumerate(DRIFTS)
     ]
     if None not in tests:
@@ -191,7 +192,7 @@ def _describe_drifts(drift_A: Observable, drift_B: Observable, difference_AB: Ob
     """Yield three alternative explanations of drifting pressures: p_A drifts, p_B drifts, or both drift alike.
 
     `drift_A`, `drift_B`, `difference_AB`: tests of the drifts of p_A, p_B and p_A - p_B. The `chance` of a test is its
-    p-value. A common drift does not explain a drift of the difference, so the third explanation gets
+    p-value. If both drift alike, p_A - p_B does not drift, so the third explanation gets
 
         chance = min(1, chance_A chance_B / chance_difference),    score = max(0, score_A + score_B - score_difference).
     """
@@ -229,12 +230,13 @@ def _estimate_levels(recording: Recording) -> Summary | None:
 
 
 def _estimate_drift(motion: Motion, pressure: Array) -> Estimate:
-    """Estimate the drift [Pa] of a `pressure` (n,) over the recording, from the samples in motion.
+    """Estimate the drift [Pa] of a `pressure` (n,) over the whole recording, from the samples in `motion`.
 
-    Residuals may be correlated within a stroke. The standard error is infinite if the motion does not determine the
-    drift.
+    The standard error allows for residuals that are correlated within a stroke. It is infinite if the motion does not
+    determine the drift.
     """
     values = pressure[motion.rows]
     coefficients, weight = fit_robustly(motion.design, values)
+    # TIME is the column of the time over the recording's duration
     (error,) = jackknife_errors(motion.design * weight[:, None], values * weight, [TIME], motion.strokes)
     return Estimate(float(coefficients[TIME]), influence_factor(weight) * float(error))

@@ -115,7 +115,7 @@ def top_speed(motion: Array) -> float:
 def _central_difference(values: Array, half_length: int) -> Array:
     """Compute the difference (n,) between the values `half_length` samples after and before each of n samples.
 
-    It is not divided by the distance. Beyond the ends the first and last values are repeated.
+    The difference is not divided by the time. Beyond the ends the first and last values are repeated.
     """
     padded = np.pad(values, half_length, mode="edge")
     return np.asarray(padded[2 * half_length :] - padded[: -2 * half_length])
@@ -127,14 +127,14 @@ def estimate_levels(recording: Recording) -> PressureLevels | None:
     The samples in motion are fitted by least squares with p = level + half sign(v) + b v + c dv/dt + d x. Level and
     half difference are free in each block; the slopes b, c and d on speed v, acceleration and position x are common to
     the recording. Without a recorded motion the levels are means and the half differences zero. Several lengths of
-    blocks are tried. Return None if a pressure is not recorded, or if for each length some block has too few samples of
-    one direction.
+    blocks are tried, whole cycles first; the first length with enough samples of both directions in every block is
+    used. Return None if there is no such length, or if a pressure is not recorded.
     """
     if not {"p_A", "p_B"} <= set(recording.channels):
         return None
     means = np.array([recording["p_A"].mean(), recording["p_B"].mean()])
     rows = pressure_level_rows(recording.channels, recording.rate, means)
-    lengths = [len(recording) // count for count in _PRIORS.blocks]  # [samples], from the shortest on
+    lengths = [len(recording) // count for count in _PRIORS.blocks]  # of a block [samples], from the shortest on
     cycle = find_cycle(recording)
     if cycle is not None:  # try blocks of whole cycles first
         cycle_samples = cycle * recording.rate
@@ -145,7 +145,8 @@ def estimate_levels(recording: Recording) -> PressureLevels | None:
         if length < 2 or count < min_count:
             continue
         blocks = rows[: count * length].reshape(count, length, rows.shape[1])
-        values = fit_pressure_levels(blocks.transpose(0, 2, 1) @ blocks, length, means)
+        gram = blocks.transpose(0, 2, 1) @ blocks
+        values = fit_pressure_levels(gram, length, means)
         if values is not None:
             return PressureLevels(recording.t[0] + (np.arange(count) + 0.5) * length / recording.rate, values)
     return None
@@ -158,8 +159,8 @@ def pressure_level_rows(
 
     The rows of samples at rest or without a known motion are zero. If no motion is recorded, the rows are 1, p_A, p_B.
     `channels`: samples by channel name; `rate`: sampling rate [Hz]; `means` (2,) [Pa]: subtracted from the pressures;
-    `max_speed`: highest speed, of which moving samples exceed a fixed fraction; by default the `top_speed` of
-    `channels`.
+    `max_speed`: highest speed, by default the `top_speed` of `channels`. A sample is at rest below the fraction
+    `levels.slowest` (`priors.toml`) of this speed.
     """
     motion = motion_columns(channels, rate)
     pressures = np.column_stack([channels["p_A"], channels["p_B"]]) - means
@@ -178,13 +179,13 @@ def fit_pressure_levels(gram: Array, length: float, means: Array) -> Array | Non
 
     The result (K, 4) contains level_A, level_B, half_A and half_B [Pa], with half = (p for v > 0 - p for v < 0) / 2
     (`PressureLevels`). It is None if a block has too few samples of one direction. `gram` (K, m, m): Gram matrices of
-    the rows of `pressure_level_rows`; `length`: samples in a block; `means` (2,) [Pa]: means that were subtracted from
-    the pressures.
+    the rows 1, sign(v), motion, p_A, p_B (`pressure_level_rows`); `length`: samples in a block; `means` (2,) [Pa]:
+    means that were subtracted from the pressures.
     """
     # free in each block: the constant and, if a motion is recorded, sign(v); the last two columns are p_A and p_B
     n_free = min(2, gram.shape[1] - 2)
     if n_free == 2:
-        # (number of moving samples +- sum of sign(v)) / 2, with v > 0 and with v < 0
+        # numbers of samples with v > 0 and with v < 0: (number of moving samples +- sum of sign(v)) / 2
         samples_each_way = 0.5 * (gram[:, 0, :1] + np.multiply.outer(gram[:, 0, 1], [1.0, -1.0]))
         if samples_each_way.min() < _PRIORS.least * length:
             return None
@@ -192,19 +193,20 @@ def fit_pressure_levels(gram: Array, length: float, means: Array) -> Array | Non
     # eliminate the free coefficients of each block, then fit the motion's slopes to all blocks together
     reduced = (gram[:, n_free:, n_free:] - gram[:, n_free:, :n_free] @ free).sum(axis=0)
     scale = np.sqrt(np.maximum(np.diag(reduced)[:-2], _TINY))[:, None]
-    slopes = np.linalg.lstsq(reduced[:-2, :-2] / scale / scale.T, reduced[:-2, -2:] / scale, rcond=None)[0] / scale
-    values = np.zeros((len(gram), 4))
+    normalised, right_sides = reduced[:-2, :-2] / scale / scale.T, reduced[:-2, -2:] / scale
+    slopes = np.linalg.lstsq(normalised, right_sides, rcond=None)[0] / scale
+    values = np.zeros((len(gram), 4))  # half differences stay 0 without a recorded motion
     values[:, : 2 * n_free] = (free[:, :, -2:] - free[:, :, :-2] @ slopes).reshape(len(gram), -1)
     values[:, :2] += means
     return values
 
 
 def level_tests(recording: Recording) -> tuple[LevelChange, ...]:
-    """Test the pressure levels of a recording for a step, in one pattern after another; the likeliest pattern is first.
+    """Test the pressure levels of a recording for a step in each of several patterns, the most likely pattern first.
 
-    The levels are the pressures' means and half their changes with the direction of motion (`PressureLevels`). A
-    pattern is the combination of levels that one cause changes, such as friction or a sensor's offset. The result is
-    empty if the levels cannot be estimated.
+    The levels are, of each pressure, the mean over both directions of motion, and half the change with the direction
+    (`PressureLevels`). A pattern is the combination of levels that one cause changes, such as friction or a sensor's
+    offset. The result is empty if the levels cannot be estimated.
     """
     levels = estimate_levels(recording)
     return () if levels is None else pattern_tests(*levels)
@@ -237,12 +239,12 @@ def pattern_tests(time: Array, values: Array) -> tuple[LevelChange, ...]:
 
 
 def _whitening_matrix(values: Array) -> Array:
-    """Compute the matrix (c, 4) that transforms pressure levels to c numbers with independent errors of unit variance.
+    """Compute the matrix (c, 4) that transforms pressure levels to c numbers with independent errors of equal variance.
 
     The matrix is S^(-1/2), with the covariance S of the differences between neighbouring blocks. `values` (K, 4): the
     four levels in each of K blocks (`PressureLevels`), of which c vary at all.
     """
-    varying = np.flatnonzero(np.ptp(values, axis=0) > 0.0)
+    varying = np.flatnonzero(np.ptp(values, axis=0) > 0.0)  # half differences are constant without a motion
     differences = np.diff(values[:, varying], axis=0)
     covariance = differences.T @ differences / len(differences)
     deviations = np.sqrt(np.diag(covariance))
@@ -256,11 +258,12 @@ def _test_pattern(name: str, rows: Array, whitened: Array, time: Array) -> Level
     """Test the pressure levels for a step in one pattern, i.e. within a subspace of their possible changes.
 
     `name`: name of the pattern; `rows` (m, c): vectors that span the subspace; `whitened` (K, c): levels in K blocks;
-    `time` (K,): times of the blocks [s]. Vectors and levels are multiplied by the `_whitening_matrix`, so that the
-    errors of the c numbers of a block are independent and have unit variance. Return None if no direction of the
+    `time` (K,): times of the blocks [s]. Vectors and levels must be multiplied by the `_whitening_matrix`, so that the
+    errors of the c numbers of a block are independent and have equal variances. Return None if no direction of the
     subspace can be tested.
     """
     basis, triangle = np.linalg.qr(rows.T)
+    # orthonormal directions, without those of vectors that depend on earlier ones
     basis = basis[:, np.abs(np.diag(triangle)) > RANK_TOLERANCE * np.abs(triangle).max()]
     components = [Information(time, np.eye(len(time)), whitened @ direction) for direction in basis.T]
     tests = [test for component in components if (test := two_sided_step_test(component)) is not None]

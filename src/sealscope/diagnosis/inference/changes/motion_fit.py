@@ -69,10 +69,10 @@ class Motion(NamedTuple):
 def select_motion(recording: Recording) -> Motion | None:
     """Select the samples in which the piston moves, and build the design matrix of their fit (`Motion`).
 
-    The piston moves if its speed, averaged over `AVERAGING_TIME`, exceeds both its noise and a fraction
-    (`healthy.slowest` in `priors.toml`) of its mean (`max_rest_rate`): the pressures of a piston that a servo holds
-    are any between those of both directions. Samples in motion are thinned out if they are many. Return None if a
-    chamber pressure or a signal of the motion is not recorded, or if the piston moves in fewer than `MIN_ROWS` samples.
+    The piston moves if its speed, averaged over `AVERAGING_TIME`, exceeds both the noise of the speed and the fraction
+    `healthy.slowest` (`priors.toml`) of the mean speed (`max_rest_rate`). At rest, friction may have any value between
+    those of both directions. Samples in motion are thinned out if they are many. Return None if a chamber pressure or
+    a channel of the motion is not recorded, or if the piston moves in fewer than `MIN_ROWS` samples.
     """
     name = next((channel for channel in ("x", "theta", "omega", "u") if channel in recording.channels), None)
     if name is None or len(recording) < MIN_ROWS or not set(CHAMBERS) <= set(recording.channels):
@@ -84,7 +84,8 @@ def select_motion(recording: Recording) -> Motion | None:
     acceleration = average_over(AVERAGING_TIME, rate * np.gradient(speed), rate)
     is_known = np.isfinite(speed) & np.isfinite(acceleration) & np.isfinite(values)
     is_known &= np.isfinite(recording["p_A"]) & np.isfinite(recording["p_B"])
-    slowest = max_rest_rate(np.diff(values) if is_position else values / rate, rate, CHANGES.healthy.slowest)
+    increments = np.diff(values) if is_position else values / rate  # of the position
+    slowest = max_rest_rate(increments, rate, fraction=CHANGES.healthy.slowest)
     rows = np.flatnonzero(is_known & (np.abs(speed) > slowest))
     if len(rows) < MIN_ROWS:
         return None
@@ -103,14 +104,16 @@ def select_motion(recording: Recording) -> Motion | None:
             _hat_functions(position, min(KNOTS, len(rows) // ROWS_PER_KNOT)),
         ]
     )
-    is_new = (np.diff(np.sign(speed[rows])) != 0) | (np.diff(recording.t[rows]) > MIN_REST)
-    return Motion(rows, design, np.concatenate([[0], np.cumsum(is_new)]), top_speed)
+    begins_stroke = (np.diff(np.sign(speed[rows])) != 0) | (np.diff(recording.t[rows]) > MIN_REST)
+    strokes = np.concatenate([[0], np.cumsum(begins_stroke)])
+    return Motion(rows, design, strokes, top_speed)
 
 
 def _hat_functions(position: Array, n_knots: int) -> Array:
-    """Evaluate the hat functions (n, k) of `n_knots` equally spaced knots at positions (n,), those that are not zero.
+    """Evaluate hat functions at positions (n,), without those that are 0 at every position; shape (n, k).
 
-    The first knot is the least position and the last one the largest.
+    A hat function is 1 at its knot and falls linearly to 0 at the neighbouring knots. The `n_knots` knots are equally
+    spaced from the least to the largest position.
     """
     distance = (n_knots - 1) * (position - position.min()) / max(float(np.ptp(position)), TINY)
     hats = np.maximum(1.0 - np.abs(distance[:, None] - np.arange(n_knots)), 0.0)
@@ -130,6 +133,7 @@ def solve_weighted(equations: Array, weight: Array) -> Array:
     design and values (`stack_equations`), with n > m; `weight` (n,): factors of the rows.
     """
     _, triangle = qr((equations * weight).T, mode="raw", overwrite_a=True, check_finite=False)
+    # R of the design and, in the last column, the values multiplied by Q^T
     solution = np.linalg.lstsq(triangle[:-1, :-1], triangle[:-1, -1], rcond=ROUNDING * len(weight))
     return np.asarray(solution[0])
 
@@ -138,9 +142,9 @@ def fit_robustly(design: Array, values: Array) -> tuple[Array, Array]:
     """Fit coefficients c (m,) of `design` (n, m) to `values` (n,), values = design c, by reweighted least squares.
 
     The weights are 1/(1 + (residual/scale)^2), where the scale is `WEIGHT_SCALE` times the median of abs(residual),
-    plus `MIN_RESIDUAL`. The iteration starts with equal weights, and a second time with the residuals from the median
-    of the values, by which the high pressure of a contact counts little; the fit with the smaller scale is taken.
-    Returns the coefficients and the weights (n,).
+    plus `MIN_RESIDUAL`. The iteration is run twice: from equal weights, and from weights by the distance of the values
+    from their median, which are small for the high pressure of contact with a workpiece. The fit with the smaller scale
+    is taken. Returns the coefficients and the weights (n,).
     """
     equations = stack_equations(design, values)
     fits = list[tuple[float, Array, Array]]()
@@ -155,16 +159,17 @@ def fit_robustly(design: Array, values: Array) -> tuple[Array, Array]:
 
 
 def _robust_weight(residual: Array) -> Array:
-    """Compute the weights (n,) of rows with these magnitudes of residuals (n,) [Pa], as in `fit_robustly`."""
+    """Compute the weights (n,) of rows from the magnitudes of their residuals (n,) [Pa], as in `fit_robustly`."""
     scale = WEIGHT_SCALE * float(np.median(residual)) + MIN_RESIDUAL
     return np.asarray(1.0 / (1.0 + (residual / scale) ** 2))
 
 
 def influence_factor(weight: Array) -> float:
-    """Compute by how much errors with fixed weights understate those of a robust fit with the final `weight` (n,).
+    """Compute the factor by which a robust fit has larger standard errors than a fit with fixed weights.
 
-    With u = residual / scale and the weight w = 1/(1 + u^2), the fit solves sum psi(u) row = 0 with psi = u w^2. With
-    fixed weights the slope of psi would be w^2; it is 4 w^3 - 3 w^2. The factor is the ratio of both means, at most 10.
+    `weight` (n,): final weights of the robust fit (`fit_robustly`). With u = residual / scale and w = 1/(1 + u^2), this
+    fit solves sum psi(u) row = 0 with psi = u w^2. The slope of psi is 4 w^3 - 3 w^2; with fixed weights it would be
+    w^2. The factor is the mean of w^2 over the mean of the slope, at most 10.
     """
     squares = float((weight**2).mean())
     slopes = float((4.0 * weight**3 - 3.0 * weight**2).mean())
@@ -172,25 +177,26 @@ def influence_factor(weight: Array) -> float:
 
 
 def equal_parts(n_rows: int) -> NDArray[np.intp]:
-    """Assign rows (n,) to `GROUPS` parts of equal size in the order of time, as groups for `jackknife_errors`."""
+    """Assign `n_rows` rows to `GROUPS` parts of equal size, in the order of time; return the part of each row, (n,)."""
     return np.arange(n_rows) * GROUPS // n_rows
 
 
 def jackknife_errors(design: Array, values: Array, columns: Sequence[int], groups: NDArray[np.intp]) -> Array:
     """Compute standard errors of some coefficients of a weighted least-squares fit by leaving out groups of rows.
 
-    With the coefficient c_k from all rows but those of group k, of at most `GROUPS` groups P,
+    With P groups, the coefficient c from all rows, and c_k from all rows but those of group k,
 
-        error^2 = (P - 1) / P sum over groups of (c_k - c)^2,
+        error^2 = (P - 1) / P sum over groups of (c_k - c)^2.
 
-    where c is the coefficient from all rows. Residuals may be correlated within a group. An error is infinite if the
-    rows, or all but those of one group, do not determine the coefficient. `design` (n, m), `values` (n,): the rows in
-    the order of time, multiplied by the weights of the fit; `columns`: indices of the coefficients; `groups` (n,):
-    number of each row's group, in increasing order. Neighbouring groups are merged if there are too many.
+    Residuals may be correlated within a group. An error is infinite if all rows, or all but those of one group, do not
+    determine the coefficient. `design` (n, m), `values` (n,): the rows in the order of time, multiplied by the weights
+    of the fit; `columns`: indices of the coefficients; `groups` (n,): number of each row's group, in increasing order.
+    More than `GROUPS` groups are merged with their neighbours.
     """
     n_groups = min(int(groups[-1]) + 1, GROUPS)
     if n_groups < 2:
         return np.full(len(columns), np.inf)
+    # first row of each of `n_groups` merged groups
     edges = np.searchsorted(groups * n_groups // (groups[-1] + 1), np.arange(n_groups + 1))
     parts = [slice(*ends) for ends in itertools.pairwise(edges)]
     scale = np.maximum(np.sqrt((design**2).sum(axis=0)), TINY)
@@ -201,18 +207,19 @@ def jackknife_errors(design: Array, values: Array, columns: Sequence[int], group
     matrices = np.concatenate([matrices.sum(axis=0) - matrices, matrices.sum(axis=0)[None]])
     moments = np.concatenate([moments.sum(axis=0) - moments, moments.sum(axis=0)[None]])
     eigenvalues, vectors = np.linalg.eigh(matrices)
-    is_free = eigenvalues < FREE * eigenvalues[:, -1:]
+    is_free = eigenvalues < FREE * eigenvalues[:, -1:]  # combinations of coefficients that the rows do not determine
     inverse = np.where(is_free, 0.0, 1.0 / np.where(is_free, 1.0, eigenvalues))
     coefficients = np.einsum("kij,kj,klj,kl->ki", vectors, inverse, vectors, moments, optimize=True) / scale
+    # a coefficient is undetermined if it takes part in a free combination
     is_undetermined = np.einsum("kij,kj->ki", vectors**2, is_free.astype(float)).max(axis=0) > np.sqrt(FREE)
     errors = np.sqrt((n_groups - 1.0) / n_groups * ((coefficients[:-1] - coefficients[-1]) ** 2).sum(axis=0))
     return np.asarray(np.where(is_undetermined, np.inf, errors)[list(columns)])
 
 
 def remove_slow_changes(motion: Motion, design: Array, values: Array, t: Array) -> tuple[Array, Array]:
-    """Remove changes slower than the time tau from the columns of a design matrix and from the values.
+    """Remove changes slower than a time tau from the columns of a design matrix and from the values.
 
-    With the samples k in motion at the times t_k, each column y becomes
+    With the times t_k of the samples in `motion`, each column y of `design`, and likewise `values`, becomes
 
         (y_k - r_k y_(k-1)) / sqrt(1 - r_k^2),    r_k = exp(-(t_k - t_(k-1)) / tau),
 
@@ -243,25 +250,26 @@ class DifferenceFit(NamedTuple):
 def fit_difference(recording: Recording, *, without_slow_changes: bool = False) -> DifferenceFit | None:
     """Fit p_A - p_B of a recording by friction, which reverses with the motion, and a viscous drop.
 
-    `without_slow_changes`: first remove loads that change slowly (`remove_slow_changes`); the drop then contains
-    little of the steady motion. The result is None without enough motion. It is computed only once for a recording.
+    `without_slow_changes`: first remove loads that change slowly (`remove_slow_changes`). This also removes most of the
+    viscous drop of a steady motion. The result is None without enough motion. It is computed only once for a recording.
     """
     key = ("motion fit of p_A - p_B", without_slow_changes)
-    return compute_once(recording, key, lambda moved: _fit_difference(moved, without_slow_changes))
+    return compute_once(recording, key, lambda recording: _fit_difference(recording, without_slow_changes))
 
 
 @np.errstate(all="ignore")
 def _fit_difference(recording: Recording, without_slow_changes: bool) -> DifferenceFit | None:
-    """Fit friction and viscous drop to p_A - p_B in motion, with their standard errors; None without enough motion.
+    """Fit friction and viscous drop to p_A - p_B in motion, with their standard errors.
 
-    The result is None also if the motion does not determine both. The standard errors allow for residuals that are
+    With `without_slow_changes`, loads that change slowly are first removed (`remove_slow_changes`). The result is None
+    without enough motion, or if the motion does not determine both. The standard errors allow for residuals that are
     correlated within parts of the recording (`equal_parts`).
     """
     motion = select_motion(recording)
     if motion is None:
         return None
     difference = recording["p_A"][motion.rows] - recording["p_B"][motion.rows]
-    design = np.delete(motion.design, TIME, axis=1)
+    design = np.delete(motion.design, TIME, axis=1)  # columns: sign of the speed (DIRECTION), SPEED, ...
     if without_slow_changes:
         design, difference = remove_slow_changes(motion, design, difference, recording.t)
     coefficients, weight = fit_robustly(design, difference)
@@ -281,9 +289,9 @@ def _fit_difference(recording: Recording, without_slow_changes: bool) -> Differe
 def estimate_viscous_drop(recording: Recording) -> Array | None:
     """Estimate the logarithm of the viscous pressure drop [Pa] per speed, and its standard error, shape (2,).
 
-    The drop in lines and the friction of seals rise with the speed and with the viscosity of the oil: the drop stands
-    for the temperature of the oil where none is logged. A drop below its standard error is replaced by this error, so
-    that the logarithm exists. Return None without enough motion.
+    The drop in lines and seals rises with the speed and with the viscosity of the oil. It replaces the temperature of
+    the oil if that is not recorded. A drop below its standard error is replaced by this error, so that the logarithm
+    exists. Return None without enough motion.
     """
     fit = fit_difference(recording)
     if fit is None:

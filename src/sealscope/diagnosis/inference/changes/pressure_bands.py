@@ -79,9 +79,9 @@ class Octaves(NamedTuple):
 def compute_octaves(recording: Recording, pair: tuple[str, str] = CHAMBERS) -> Octaves | None:
     """Compute the amplitude of both channels of a `pair` in octaves of frequency, and the phase between the channels.
 
-    The power of an octave is a high quantile (`octaves.busy` of `priors.toml`) over windows, since a machine may often
-    rest. Return None if a channel is not recorded, if the recording is too short or has too few octaves, or if all
-    windows have missing samples.
+    The power in an octave is a high quantile (`octaves.busy` of `priors.toml`) over windows of time, since a machine
+    may often rest. Return None if a channel is not recorded, if the recording is too short or its sampling rate too low
+    for `MIN_OCTAVES` octaves, or if all windows have missing samples.
     """
     priors = CHANGES.octaves
     if not set(pair) <= set(recording.channels):
@@ -101,7 +101,7 @@ def compute_octaves(recording: Recording, pair: tuple[str, str] = CHAMBERS) -> O
     cross_power = cross_powers.sum(axis=0)
     mean_power = np.sqrt((powers_A.sum(axis=0) + min_A) * (powers_B.sum(axis=0) + min_B))  # geometric mean
     coherence_squared = np.clip(np.abs(cross_power) / mean_power, MIN_COHERENCE, 1.0) ** 2
-    # (1 - c^2) / (2 n c^2) for n independent windows; windows overlap by half, so that n is half of their number
+    # (1 - c^2) / (2 n c^2) with the coherence c; n independent windows are half of all windows, which overlap by half
     phase_variance = (1.0 - coherence_squared) / coherence_squared / len(powers_A)
     phase = np.angle(cross_power)
     octaves = Octaves(log_A, log_B, phase, np.minimum(phase_variance, MAX_VARIANCE))
@@ -182,10 +182,11 @@ class _FilterFactor(NamedTuple):
 
 
 def _compare_pair(judged: Octaves, healthy: Sequence[Octaves], pair: tuple[str, str]) -> _FilterFactor | None:
-    """Compute the Bayes factor of a low-pass filter of a pressure to none, by the spectra of a `pair` of channels.
+    """Compute the Bayes factor of a new low-pass filter of one pressure to no filter, from the spectra of two channels.
 
-    The factor is averaged over possible filters of each pressure in the pair; the channel and the cut-off frequency of
-    the most likely one are returned with it. Return None if too few healthy recordings have at least as many octaves
+    `judged`, `healthy`: spectra of these channels (the `pair`) in the judged recording, and in each healthy one. The
+    factor is averaged over possible filters of each pressure in the pair. The result also states the channel and the
+    cut-off frequency of the most likely filter. It is None if too few healthy recordings have at least as many octaves
     as the judged one, or if the factor is not finite.
     """
     from scipy.special import logsumexp
@@ -220,9 +221,9 @@ def _filter_effects(healthy: Sequence[Octaves], sides: Sequence[int]) -> _Filter
     """Compute how a low-pass filter of one channel changes log amplitude ratio and phase of channel A to channel B.
 
     The first entry of the result is without a filter. `sides`: channels that may be filtered, 0 for channel A and 1 for
-    channel B. Each is combined with several cut-off frequencies and levels of noise. The sensor's white noise is not
-    filtered; its power density is a fraction (`filtered.noises` in `priors.toml`) of the lowest power density of any
-    octave in the `healthy` recordings.
+    channel B. Each side is combined with several cut-off frequencies and levels of the sensor's white noise, which is
+    not filtered. The power density of the noise is a fraction (`filtered.noises` in `priors.toml`) of the lowest power
+    density of any octave in the `healthy` recordings.
     """
     from itertools import product
 
@@ -232,10 +233,10 @@ def _filter_effects(healthy: Sequence[Octaves], sides: Sequence[int]) -> _Filter
     log_ratios, phases, filtered_sides, cutoffs = [unchanged], [unchanged], [0], [np.inf]  # no filter
     grid = np.geomspace(priors.lowest, priors.highest, CUTOFFS)
     for side, noise_fraction, cutoff in product(sides, priors.noises, grid):
-        power = np.exp([2.0 * octaves[side] for octaves in healthy]).mean(axis=0)
+        power = np.exp([2.0 * octaves[side] for octaves in healthy]).mean(axis=0)  # from log_A or log_B
         noise = noise_fraction * float(np.min(power / widths)) * widths
         filtered_power = (power - noise) / (1.0 + (frequencies / cutoff) ** 2) + noise
-        sign = 1.0 if side == 0 else -1.0
+        sign = 1.0 if side == 0 else -1.0  # ratio and phase are those of A to B
         log_ratios.append(sign * 0.5 * np.log(filtered_power / power))
         phases.append(-sign * np.arctan(frequencies / cutoff))
         filtered_sides.append(side)
@@ -244,9 +245,10 @@ def _filter_effects(healthy: Sequence[Octaves], sides: Sequence[int]) -> _Filter
 
 
 def _ratio_log_likelihoods(judged: Octaves, healthy: Sequence[Octaves], filters: _Filters) -> Array:
-    """Compute the log likelihood (m,) of the judged log ratios of A to B for each filter, up to a constant.
+    """Compute the log likelihood (m,) of the judged recording's log amplitude ratios for each filter, up to a constant.
 
-    The ratios follow a multivariate t distribution about the mean of the healthy recordings.
+    The ratios of channel A to channel B in the octaves follow a multivariate t distribution about the mean of the
+    healthy recordings.
     """
     prior = CHANGES.octaves
     ratios = np.array([octaves.log_A - octaves.log_B for octaves in healthy])
@@ -254,8 +256,10 @@ def _ratio_log_likelihoods(judged: Octaves, healthy: Sequence[Octaves], filters:
     freedom = prior.recordings + count - 1.0
     mean = ratios.mean(axis=0)
     squares = ((ratios - mean) ** 2).sum(axis=0)
+    # the prior counts as `prior.recordings` further recordings with the variance scatter^2
     deviations = np.sqrt((prior.recordings * prior.scatter**2 + squares) / freedom)
     correlations = np.exp(-np.abs(np.subtract.outer(octave, octave)) / prior.neighbours)
+    # scatter of a new recording about the mean, correlated between octaves, and an independent error of each ratio
     scale = np.outer(deviations, deviations) * correlations * (1.0 + 1.0 / count) + prior.error**2 * np.eye(len(mean))
     residuals = judged.log_A - judged.log_B - mean - filters.log_ratio
     whitened = np.linalg.solve(np.linalg.cholesky(scale), residuals.T)
@@ -264,10 +268,10 @@ def _ratio_log_likelihoods(judged: Octaves, healthy: Sequence[Octaves], filters:
 
 
 def _phase_log_likelihoods(judged: Octaves, healthy: Sequence[Octaves], filters: _Filters) -> Array:
-    """Compute the log likelihood (m,) of the judged phases between A and B for each filter.
+    """Compute the log likelihood (m,) of the judged recording's phases between channels A and B for each filter.
 
-    The phase of each octave follows a von Mises distribution about the mean direction of the healthy recordings, or
-    is uniform with a small probability.
+    The phase in each octave follows a von Mises distribution about the mean direction of the healthy recordings, or
+    is uniform with a small probability. The likelihood is relative to that of uniform phases.
     """
     from scipy.special import i0e
 
@@ -283,7 +287,7 @@ def _phase_log_likelihoods(judged: Octaves, healthy: Sequence[Octaves], filters:
     is_filtered = np.any(filters.phase != 0.0, axis=1)[:, None]
     # the phase that a filter causes in an octave is known only to within `prior.error`
     concentrations = 1.0 / (variances + np.where(is_filtered, prior.error**2, 0.0))
-    # von Mises densities relative to the uniform one
+    # von Mises densities exp(k cos) / I_0(k) relative to the uniform one; i0e(k) is I_0(k) exp(-k)
     densities = np.exp(concentrations * (np.cos(residuals) - 1.0)) / i0e(concentrations)
     log_likelihoods: Array = np.log((1.0 - prior.uniform) * densities + prior.uniform).sum(axis=1)
     return log_likelihoods

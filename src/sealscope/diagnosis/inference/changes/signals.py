@@ -32,9 +32,9 @@ def observe_signals(recording: Recording) -> Observed:
 
 @np.errstate(all="ignore")
 def _test_signals(recording: Recording) -> Observed:
-    """Test duty, sensors and pressure levels for steps; for too short a recording report only that it is too short."""
-    shortest = CHANGES.features.shortest
-    if len(recording) < BLOCKS * max(ORDER + 2, shortest * recording.rate):
+    """Test duty, sensors and pressure levels for steps; if the recording is too short, report only this reason."""
+    shortest = CHANGES.features.shortest  # length of a block [s]
+    if len(recording) < BLOCKS * max(ORDER + 2, shortest * recording.rate):  # differences of `ORDER` need samples
         return Observed(SIGNALS, lack="too short for changes of its signals")
     observables = run_tests(
         lambda: duty_observables(duty_tests(recording)),
@@ -47,7 +47,7 @@ def _test_signals(recording: Recording) -> Observed:
 def run_tests(*tests: Callable[[], Iterator[Observable]]) -> tuple[Observable, ...]:
     """Run all tests and collect the observables that they yield.
 
-    If numbers overflow or a matrix is singular, that test ends early; the observables yielded before are kept.
+    If numbers overflow or a matrix is singular in a test, this test ends early, and its observables so far are kept.
     """
     observables: list[Observable] = []
     for test in tests:
@@ -64,10 +64,10 @@ _MIN_STEP_RATIO = math.tan(math.pi / 8.0)
 def duty_observables(tests: Sequence[StepTest]) -> Iterator[Observable]:
     """Yield an observable of a step of the duty if the amplitudes of command and motion change by similar ratios.
 
-    The smaller step of the two log amplitudes must exceed `_MIN_STEP_RATIO` times the larger one. Otherwise nothing is
-    yielded, since a leak changes only one of the amplitudes. Score, onset and size are those of the test with the lower
-    score; the p-value is twice the higher one, since each test covers a rise and a fall. `tests`: step tests of the log
-    amplitudes of command and motion (`duty_tests`).
+    `tests`: step tests of the log amplitudes of command and motion (`duty_tests`). The smaller step must exceed
+    `_MIN_STEP_RATIO` times the larger one. Otherwise nothing is yielded, since a leak changes only one of the
+    amplitudes. Score, onset and size are those of the test with the lower score. The p-value is twice the higher
+    p-value of the tests, since each test covers a rise and a fall.
     """
     steps = np.abs([test.fitted.size for test in tests])
     if tests and steps.min() > _MIN_STEP_RATIO * steps.max():
@@ -100,10 +100,10 @@ _MAX_EXPONENT = 700.0
 def level_observables(changes: Sequence[LevelChange]) -> Iterator[Observable]:
     """Convert tests for steps of the pressure levels to observables.
 
-    `changes`: one test for each pattern, the highest rank first. The rank (`LevelChange`) becomes the score. The
-    p-value of change k is chance_k = min(1, chance_1 exp(rank_1 - rank_k)). Half of this exponent is the log Bayes
-    factor of change 1 over change k (Schwarz's approximation). The other half is a prior against descriptions that need
-    further coefficients. The interval of an onset is one block to either side.
+    `changes`: one test for each pattern of levels, the highest rank first. The rank (`LevelChange`) becomes the score.
+    The p-value of change k is chance_k = min(1, chance_1 exp(rank_1 - rank_k)). Half of the exponent rank_1 - rank_k is
+    the log Bayes factor of change 1 over change k (Schwarz's approximation), the other half a prior against patterns
+    that need further coefficients. The interval of an onset is one block to either side.
     """
     for change in changes:
         onset = Interval(change.onset, change.onset - change.block, change.onset + change.block)

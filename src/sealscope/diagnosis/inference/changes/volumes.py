@@ -73,11 +73,12 @@ def volume_observables(
       tests of laminar leaks; `plain`: the same with the pressures as recorded, for all other tests.
     - `balances`, `columns`: the equations, and for each the indices of its columns by role (leak, motion, left side).
     - `oil_loss`: tests for an external leak by the oil that the accumulator lost, by the name of the term.
-    - `volume_ratio`: measured over assumed ratio of area to displacement.
+    - `volume_ratio`: measured over assumed ratio of piston area to pump displacement.
     - `charge`: trend of the charge pressure, None if it is unknown.
     - `flow_scale`: true flow over the flow of the balance.
     """
-    centred, recorded = (series.merge(INFERENCE.blocks.coarse) for series in (blocks, plain))
+    centred, recorded = (series.merge(max_blocks=INFERENCE.blocks.coarse) for series in (blocks, plain))
+    # a laminar leak is tested without the sensor offset, so an improbable offset counts against the leak
     leak_disadvantage = offset_cost(estimate_offset(blocks, columns))
     observables = []
     for hypothesis in _step_hypotheses(centred, recorded, balances[0].terms, columns, has_accumulator=bool(oil_loss)):
@@ -94,6 +95,7 @@ def volume_observables(
             advantage += _accumulator_support(step, accumulator_test)
         elif charge is not None and (name == OUTSIDE or name.startswith("external leak")):
             term = name.removesuffix(MADE_UP)
+            # the coefficient of a loss to the outside is a flow, that of another leak a flow over a pressure
             unit_flow = 1.0 if name == OUTSIDE else recorded.driving_pressure(columns[0].names, term)
             flow = step.fitted.size * unit_flow * flow_scale
             advantage += charge.loss_support(flow, float(step.onsets[step.best]))
@@ -168,22 +170,22 @@ def _step_hypotheses(
 def _is_tested(term: Term, roles: ColumnRoles, has_accumulator: bool) -> bool:
     """Return True if the coefficient of a term of the volume balance is tested for a step by itself.
 
-    It is not tested by itself if it changes only together with others, or if another test covers its steps. `roles`:
-    indices of the balance's columns by role (leak, motion, left side); `has_accumulator`: True if the recording shows
-    the volume of an accumulator.
+    A coefficient that changes only together with others is not tested by itself, nor one whose steps another test
+    covers. `roles`: names of the balance's columns, and their indices by role (leak, motion, left side);
+    `has_accumulator`: True if the recording shows the volume of an accumulator.
     """
     if term.name.startswith("motion"):
         # a change of area, displacement or a sensor's scale changes all coefficients of motion: the test of SCALE
         return False
     if term.name == SPEED_LOSS:
-        return False  # a single recording has too little variety of motion to determine it
+        return False  # the motion in a single recording varies too little to determine this coefficient
     if term.name == ORIFICE:
         return False  # a leak through an orifice is tested as another law of the leak
     if term.name == HOLDING:
         return False  # a leaking piston raises this coefficient as well: the test of the leak covers it
     if AIR in roles.names and term.cause == "air in the oil" and term.nuisance:
         return False  # free air changes all these coefficients: the test of AIR (not a nuisance term) covers it
-    # a constant flow stands for an external leak that no pressure drives; with an accumulator, its pressure drives it
+    # BIAS, a constant flow, is an external leak that no pressure drives; with an accumulator a pressure drives the leak
     return not (has_accumulator and term.name == BIAS)
 
 
@@ -201,9 +203,9 @@ def _observable_name(term: Term) -> str:
 def _accumulator_support(balance_test: StepTest, accumulator_test: StepTest) -> float:
     """Compute twice the log likelihood ratio of an external leak to no leak, by the oil that the accumulator lost.
 
-    The leak under test has the size b and the onset that the volume balance finds. With the size a that the accumulator
-    shows for this onset, and its standard error s, the result is (a/s)^2 - ((a - b)/s)^2. `balance_test`,
-    `accumulator_test`: tests for a step of the leak by the volume balance and by the accumulator.
+    `balance_test`, `accumulator_test`: tests for a step of the leak by the volume balance and by the accumulator. With
+    the size b of the leak by the balance, and the size a by the accumulator for the same onset with the standard error
+    s, the result is (a/s)^2 - ((a - b)/s)^2.
     """
     onset = balance_test.onsets[balance_test.best]
     nearest = int(np.abs(accumulator_test.onsets - onset).argmin())
@@ -220,12 +222,12 @@ def _with_fitted_motion(blocks: Blocks, columns: Sequence[ColumnRoles], index: i
     the whole recording. `columns`: for each equation the indices of its columns by role (leak, motion, left side).
     """
     gram = blocks.gram.copy()
-    for e, (roles, total) in enumerate(zip(columns, sum_blocks(blocks, columns), strict=True)):
+    for equation, (roles, total) in enumerate(zip(columns, sum_blocks(blocks, columns), strict=True)):
         nuisance, motion = list(roles.nuisance), list(roles.motion)
         coefficients = np.zeros(len(total))
         coefficients[nuisance] = solve(total[np.ix_(nuisance, nuisance)], total[nuisance, roles.left])
         transform = np.eye(len(total))  # from the old columns to the new ones
         transform[:, index] = 0.0
         transform[motion, index] = coefficients[motion]
-        gram[:, e] = transform.T @ gram[:, e] @ transform
+        gram[:, equation] = transform.T @ gram[:, equation] @ transform
     return replace(blocks, gram=gram)

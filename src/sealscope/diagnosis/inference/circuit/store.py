@@ -32,25 +32,25 @@ if TYPE_CHECKING:
 def cycle_length(speed: Array, rate: float) -> float | None:
     """Estimate the period of a machine's cycle [s], from its strokes or else from the spectrum of a speed.
 
-    Without regular strokes it is the period of the strongest spectral line, or None if the recording contains fewer
-    than `MIN_BLOCKS` of these periods. `speed` (n,): speed or flow at the sampling `rate` [Hz].
+    Without regular strokes the result is the period of the strongest spectral line, or None if the recording contains
+    fewer than `MIN_BLOCKS` of these periods. `speed` (n,): speed or flow at the sampling `rate` [Hz].
     """
     cycle = estimate_period(speed, rate)
     if cycle is None:
         spectrum = np.abs(np.fft.rfft((speed - speed.mean()) * np.hanning(speed.size)))
-        n_periods = int(spectrum.argmax())
+        n_periods = int(spectrum.argmax())  # in the recording
         if n_periods < MIN_BLOCKS:
             return None
         cycle = speed.size / rate / n_periods
-    return 1.0 / fundamental_frequency(speed, np.arange(speed.size) / rate, cycle)
+    return 1.0 / fundamental_frequency(speed, np.arange(speed.size) / rate, cycle)  # refines the period
 
 
 def recorded_oil_loss_tests(recording: Recording, rig: Rig, offset: float) -> dict[str, StepTest]:
     """Test a recording with a position for an external leak of chamber A or B that begins within it.
 
     The tests use the volume of oil in the accumulator, and are returned by the name of the leak (`oil_loss_tests`).
-    `offset`: sensor offset of p_A - p_B [Pa]. The result is empty for a double rod, in whose circuit check valves let
-    either side keep its pressure.
+    `rig`: sizes of the cylinder and the accumulator; `offset`: sensor offset of p_A - p_B [Pa]. The result is empty for
+    a double rod: check valves let either side keep its pressure, which need not be that of the accumulator.
     """
     if not rig.cylinder.single_rod:
         return {}
@@ -63,12 +63,12 @@ def recorded_oil_loss_tests(recording: Recording, rig: Rig, offset: float) -> di
 def oil_loss_tests(signals: Signals, rig: Rig, cycle: float | None, begin: float) -> dict[str, StepTest]:
     """Test for an external leak of chamber A or B that begins within a recording, by the volume of the accumulator.
 
-    The volume of oil that the accumulator has delivered follows from the pressure of the unloaded side, to which it is
-    connected, by the polytropic law of its gas. If the position is recorded, the oil that the rod displaces is
-    subtracted. The volume and the pressure of a side are averaged over blocks, and the leak's conductance is tested for
-    a step between blocks (`step_test`). `signals`: both pressures and, if recorded, the position; `begin`: time of the
-    first sample [s]; `cycle`: duration of the machine's cycle [s], None if there is no cycle. Blocks are whole
-    multiples of the cycle, so that motion within a cycle averages out; without a cycle they have any length.
+    The accumulator is connected to the unloaded side. The volume of oil that the accumulator has delivered follows from
+    the pressure of this side by the polytropic law of the gas; the oil that the rod displaces is subtracted if the
+    position is recorded. Volume and pressure are averaged over blocks, and the leak's conductance is tested for a step
+    between blocks (`step_test`). `signals`: both pressures and, if recorded, the position; `begin`: time of the first
+    sample [s]; `cycle`: duration of the machine's cycle [s], None if there is no cycle. Blocks are whole multiples of
+    the cycle, so that motion within a cycle averages out; without a cycle they have any length.
 
     The result maps "external leak A" and "external leak B" to their tests. A side that cannot be tested is left out.
     The result is empty without an accumulator (`makeup.check_valves` = "absent") or for fewer than `MIN_BLOCKS` blocks.
@@ -124,8 +124,8 @@ def _estimate_conductance(volume: Array, pressure: Array, block_s: float, begin:
     noise = float(np.mean(np.diff(volume, 2) ** 2)) / 6.0  # second differences have 6 times white noise's variance
     temperature = INFERENCE.level.gas * np.column_stack([time, time**2 / time[-1]])
     weight = np.linalg.inv(max(noise, np.finfo(float).tiny) * np.eye(count) + temperature @ temperature.T)
-    weight -= np.outer(weight.sum(axis=0), weight.sum(axis=1)) / weight.sum()  # without the initial volume
+    weight -= np.outer(weight.sum(axis=0), weight.sum(axis=1)) / weight.sum()  # eliminates the initial volume
     precision, vector = losses.T @ weight @ losses, losses.T @ weight @ volume
     healthy_deviation = INFERENCE.healthy.outside  # of the conductance in a healthy machine
-    precision = 0.5 * (precision + precision.T)
+    precision = 0.5 * (precision + precision.T)  # exactly symmetric
     return Information(begin + time, precision, vector, level=healthy_deviation, slope=healthy_deviation)

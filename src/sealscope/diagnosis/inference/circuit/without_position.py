@@ -60,10 +60,11 @@ class CycleBalance(NamedTuple):
 
 
 def circulations(recording: Recording, rig: Rig) -> list[CycleBalance]:
-    """Compute the volume balances that a recording allows without a position, over whole cycles and over holds.
+    """Compute the volume balances of a recording without position or without flow, over whole cycles and over holds.
 
     A hold is a time in which the piston is held at standstill. A recording with a position but without flow gives only
-    a balance over holds behind shut valves. The list is empty if no balance is possible.
+    a balance over the holds in which valves are shut. `rig`: circuit and sizes of the machine. The list is empty if no
+    balance is possible.
     """
     channels, begin = frozenset(recording.channels), float(recording.t[0])
     equation = locked(rig, channels) if "x" in channels else circulation(rig, channels)
@@ -74,7 +75,7 @@ def circulations(recording: Recording, rig: Rig) -> list[CycleBalance]:
     if not is_locked:
         samples = derive_drive_signals(samples, rig, recording.rate, loaded=True)
     signals = Signals(samples, recording.rate)
-    # left side as a flow [m^3/s]: delivered by the pump, or displaced by a piston behind shut valves
+    # left side of the balance as a flow [m^3/s]: delivered by the pump, or displaced by a piston behind shut valves
     flow, dp = equation.left(signals) * recording.rate, signals.pressure_difference
     # friction dissipates power, so a negative power means reversed signs of the flow
     if not is_locked and float(np.nansum((dp - np.nanmean(dp)) * flow)) < 0.0:
@@ -86,11 +87,12 @@ def circulations(recording: Recording, rig: Rig) -> list[CycleBalance]:
     single_rod = rig.cylinder.single_rod
     # a constant command means shut valves; else a control loop may hold the piston at any command
     may_hold = is_known & (signals.step("u") == 0.0) if is_locked and "u" in channels else is_known
+    # flow of a piston that creeps behind shut valves; a flow up to this limit counts as a hold
     max_creep = _PRIORS.creep * max(rig.cylinder.A_A, rig.cylinder.A_B) if is_locked else 0.0
-    is_held = is_known & _find_holds(np.where(may_hold, flow, np.inf), recording.rate, max_creep)
+    is_held = is_known & _find_holds(np.where(may_hold, flow, np.inf), recording.rate, min_limit=max_creep)
     if is_locked and "u" not in channels and not is_held.all():
         first_motion = int(np.argmin(is_held))
-        is_held[:first_motion] = False  # before it the machine may be off
+        is_held[:first_motion] = False  # the machine may be off before the first motion
     cycle = None if is_locked else cycle_length(np.where(is_known, flow, 0.0), recording.rate)
     balances = []
     for half_width, is_used in ((cycle, is_known), (HOLD_HALF_WIDTH, is_held)):
@@ -106,8 +108,9 @@ def circulations(recording: Recording, rig: Rig) -> list[CycleBalance]:
 def _find_holds(flow: Array, rate: float, min_limit: float = 0.0) -> NDArray[np.bool_]:
     """Flag the samples (n,) in which the piston is held, i.e. the flow has been near zero for the settling time.
 
-    The averaged flow is near zero up to a fraction of its largest value, or up to `min_limit` [m^3/s] if that is
-    larger. `flow` (n,): flow [m^3/s] at the sampling `rate` [Hz], infinite where the piston is surely not held.
+    The averaged flow is near zero below a limit: a fraction of its largest value, or `min_limit` [m^3/s] if this is
+    larger. `flow` (n,): flow [m^3/s] at the sampling `rate` [Hz], infinite where the piston is surely not held. The
+    times of averaging and settling and the fraction are those of `held` in `priors.toml`.
     """
     window, settling = max(1, round(_PRIORS.averaged * rate)), max(1, round(_PRIORS.settles * rate))  # [samples]
     mean_flow = np.abs(np.convolve(flow, np.full(window, 1.0 / window), "same"))
@@ -121,18 +124,19 @@ def _find_holds(flow: Array, rate: float, min_limit: float = 0.0) -> NDArray[np.
 def _build_blocks(
     signals: Signals, equation: Equation, half_width: float, is_used: NDArray[np.bool_], begin: float, one_sided: bool
 ) -> Blocks | None:
-    """Compute the blocks of a volume balance whose rows are means over triangular windows of a `half_width` [s].
+    """Compute the blocks of a volume balance from rows, each a mean over a triangular window of a `half_width` [s].
 
-    `is_used` (n,): flags of the sampling intervals that may be part of a row; `begin`: time of the first sample [s];
-    `one_sided`: use only rows in which the same side has the higher pressure throughout. Return None if fewer than
-    `MIN_BLOCKS` blocks have rows.
+    `signals`: samples of the recording; `equation`: the volume balance; `is_used` (n,): flags of the sampling intervals
+    that may be part of a row; `begin`: time of the first sample [s]; `one_sided`: use only rows in which the same side
+    has the higher pressure throughout. Return None if fewer than `MIN_BLOCKS` blocks have rows.
     """
     left, dp, rate = equation.left(signals), signals.pressure_difference, signals.rate
     rows = _integrate_rows([*(term.increments(signals) for term in equation.terms), left], is_used, half_width, rate)
     _shrink_offset(rows.values, [term.name for term in equation.terms])
     if one_sided:
-        by_A = _integrate_rows([signals.carried_by_A[1:] / rate], is_used, half_width, rate).values[:, 0]
-        rows = rows._replace(whole=rows.whole & (np.minimum(by_A, 1.0 - by_A) < _PRIORS.elsewhere))
+        # weighted fraction of each row's window in which A has the higher pressure
+        share_A = _integrate_rows([signals.carried_by_A[1:] / rate], is_used, half_width, rate).values[:, 0]
+        rows = rows._replace(whole=rows.whole & (np.minimum(share_A, 1.0 - share_A) < _PRIORS.elsewhere))
     # rows are half of `half_width` apart; a block has the rows of one cycle (`half_width`), or of `MAX_BLOCK_TIME`
     rows_per_block = 2 if half_width > HOLD_HALF_WIDTH else round(2.0 * MAX_BLOCK_TIME / half_width)
     n_blocks = len(rows.time) // rows_per_block
@@ -150,15 +154,17 @@ def _build_blocks(
     flow = np.array([_mean_flow(left[block], rate) for block in samples])
     pressures = np.array([sorted_part_means(dp[block], rate) for block in samples])
     start, end = begin + ends.T
-    return Blocks(start, end, gram, n_rows.astype(float), flow, pressures, np.zeros(n_blocks)).merge()
+    no_offset = np.zeros(n_blocks)
+    return Blocks(start, end, gram, n_rows.astype(float), flow, pressures, zero=no_offset).merge()
 
 
 def _integrate_rows(increments: list[Array], is_used: NDArray[np.bool_], half_width: float, rate: float) -> Rows:
     """Compute rows of a regression: mean rates of c columns over overlapping triangular windows.
 
-    `increments`: arrays (n,) of each column; `is_used` (n,): flags of the intervals that may be part of a row; a row
-    with other intervals is flagged as not whole. The windows have a `half_width` [s], and their middles are half of it
-    apart. The integral over a triangle is computed as the second difference of the twice integrated increments.
+    `increments`: an array (n,) for each column, its increments in n sampling intervals; `is_used` (n,): flags of the
+    intervals that may be part of a row; a row with other intervals is flagged as not whole; `half_width`: of a window
+    [s]; `rate`: sampling rate [Hz]. The middles of the windows are half of `half_width` apart. The integral over a
+    triangle is computed as the second difference of the twice integrated increments.
     """
     half_length, n_samples = half_width * rate, len(is_used)
     centres = np.arange(half_length, n_samples - half_length, 0.5 * half_length)
@@ -180,11 +186,12 @@ def _integrate_rows(increments: list[Array], is_used: NDArray[np.bool_], half_wi
 
 
 def _shrink_offset(values: Array, names: list[str]) -> None:
-    """Reduce, in place, the columns of the leak in rows (r, c) by the part that sensor offsets may cause.
+    """Reduce, in place, the columns of the leak by the part that sensor offsets may cause.
 
-    A row is the volume balance integrated with one test function; `names`: names of the columns. The mean pressure
-    difference d of a row becomes d - z^2/d, or 0 if |d| is smaller than the largest usual offset z (Breiman's garrote).
-    The column of an orifice is scaled by the same factor.
+    `values` (r, c): rows of the volume balance, each a mean over one window of time; `names`: names of the columns. The
+    mean pressure difference d of a row, in the column of a laminar leak, becomes d - z^2/d, or 0 if |d| is smaller than
+    the largest usual offset z (Breiman's garrote). The column of a leak through an orifice is scaled by the same
+    factor.
     """
     max_offset = WITHIN_95 * INFERENCE.zero.pressure
     mean_pressure = values[:, names.index(LEAK)]

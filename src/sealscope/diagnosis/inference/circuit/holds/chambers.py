@@ -95,9 +95,10 @@ class HeldChambers:
     def area_variants(self) -> list[tuple[float, HeldChambers]]:
         """Return variants of this estimator with other areas of the less certain side, each with its probability.
 
-        The logarithm of the area takes the three values of the Gauss-Hermite quadrature of its normal distribution. The
-        holds do not choose between them, since what the balances leave, by delays of the sensors, repeats from hold to
-        hold. The only variant is this estimator itself if both areas are known to within `size.area` (`priors.toml`).
+        The logarithm of the area takes the three values of the Gauss-Hermite quadrature of its normal distribution. How
+        well a variant fits the holds does not change its probability: errors by delays of the sensors repeat from hold
+        to hold, so that a good fit proves nothing. If both areas are known to within `size.area` (`priors.toml`), the
+        only variant is this estimator itself.
         """
         sides = self.sides
         if max(sides.deviation_A, sides.deviation_B) <= INFERENCE.size.area:
@@ -125,25 +126,26 @@ class HeldChambers:
         """Regressions that estimate the oil's properties, one for each choice of the sides that check valves refill."""
         return {
             refilled: build_regression(self.holds, self._closed_flags(refilled), self.sides, self.n_readings)
-            for refilled in (NEITHER, self._larger_side, BOTH)
+            for refilled in (NEITHER, self._refillable_sides, BOTH)
         }
 
     @property
-    def _larger_side(self) -> tuple[bool, bool]:
-        """Flags of A and B: true for the side of the larger area, if the areas differ.
+    def _refillable_sides(self) -> tuple[bool, bool]:
+        """Flags of A and B: true for the side that a check valve may refill while the piston leaks.
 
-        A check valve may refill this side while the piston leaks. The leak moves equal volumes from one side to the
-        other, and the piston follows the side that loses oil. If the other side has the larger area, its volume grows
-        by more than the leak supplies.
+        It is the side of the larger area, neither if the areas are equal. The leak moves equal volumes from one side to
+        the other, and the piston follows the side that loses oil. If the side that gains oil has the larger area, its
+        volume grows by more than the leak supplies.
         """
         area_A, area_B = abs(self.sides.area_A), abs(self.sides.area_B)
         return area_A > area_B, area_B > area_A
 
     def _is_closed(self, hold: LockedHold, p: Array) -> NDArray[np.bool_]:
-        """Flag the samples (n,) of a hold in which the check valve of a chamber is closed and does not refill it.
+        """Flag the samples (n,) of a hold in which no check valve refills a chamber.
 
-        It is closed while the chamber's pressure exceeds the charge pressure by a margin. `p` (n,): absolute pressure
-        of the chamber in the `hold` [Pa], which is averaged over `held_oil.steady` (`priors.toml`) to remove noise.
+        The valve is closed while the chamber's pressure exceeds the charge pressure by a margin. `p` (n,): absolute
+        pressure of the chamber in the `hold` [Pa], here averaged over `held_oil.steady` (`priors.toml`) to remove
+        noise.
         """
         prior = INFERENCE.held_oil
         steady_pressure = average_over(prior.steady, p, 1.0 / float(np.diff(hold.t).mean()))
@@ -164,10 +166,12 @@ class HeldChambers:
     def _closed_share(self, refilled: tuple[bool, bool]) -> float:
         """Compute the fraction of the samples of both sides in all holds in which no check valve refills the chamber.
 
-        The others follow from any leak if check valves replace displaced oil, and say nothing of it. The variance of
-        all readings is then smaller by this fraction than that of the readings that do.
+        `refilled`: true for A, and for B, if a check valve refills that side once it is at the charge pressure. While a
+        chamber is refilled, its readings (sample means) fit any leak. They lower the variance of all readings by this
+        fraction.
         """
-        return max(float(np.concatenate(self._closed_flags(refilled), axis=1).mean()), 1.0 / self.n_readings)
+        share = float(np.concatenate(self._closed_flags(refilled), axis=1).mean())
+        return max(share, 1.0 / self.n_readings)  # above 0, since its logarithm is used
 
     def _unit_piston_leak(
         self, offset: float, refilled: tuple[bool, bool] = NEITHER, law: LeakLaw = LAMINAR
@@ -190,11 +194,12 @@ class HeldChambers:
     def pressure_difference(self, t: Array, difference: Array, offset: float) -> Array:
         """Subtract the sensor offset from p_A - p_B = `difference` (n,) [Pa] at times `t` (n,) [s] of the recording.
 
-        In a hold its own offset is subtracted (`LockedHold.offset_in_hold`), so that pressures which a leak has
-        equalised differ by 0; otherwise the `offset` [Pa] of the recording.
+        Outside of holds this is the `offset` [Pa] of the recording. In a hold it is the offset of the hold
+        (`LockedHold.offset_in_hold`), so that pressures which a leak has equalised differ by 0.
         """
         prior, offsets = INFERENCE.held_oil, np.full(len(t), offset)
         for hold in self.holds:
+            # including the end of the rest, in which the valves open
             begin, end = hold.t[0], hold.t[-1] + prior.settles + INFERENCE.rest.averaged
             offsets[(t >= begin) & (t <= end)] = hold.offset_in_hold(offset)[0]
         return np.asarray(difference - offsets)
@@ -207,7 +212,7 @@ class HeldChambers:
         """
         pressures = [(hold, hold.p_A if is_A else hold.p_B) for hold in self.holds]
         flows = [np.maximum(p - P_ATM, 0.0) * self._is_closed(hold, p) for hold, p in pressures]
-        return UnitLeak([flow_of_side(flow, is_A) for flow in flows], BOTH)
+        return UnitLeak([flow_of_side(flow, is_A) for flow in flows], refilled=BOTH)
 
     def _unit_pump_leak(self, is_A: bool) -> UnitLeak:
         """Compute the flow with a conductance of 1 out of one chamber through open valves and the pump into the other.
@@ -216,31 +221,36 @@ class HeldChambers:
         or a shuttle valve connect it to the charge pressure.
         """
         sign = 1.0 if is_A else -1.0
-        differences = [sign * (hold.p_A - hold.p_B - hold.offset_in_hold(0.0)[0]) for hold in self.holds]
-        return UnitLeak([flow_of_side(np.maximum(difference, 0.0), is_A) for difference in differences])
+        flows = []
+        for hold in self.holds:
+            hold_offset, _ = hold.offset_in_hold(0.0)
+            flow = np.maximum(sign * (hold.p_A - hold.p_B - hold_offset), 0.0)
+            flows.append(flow_of_side(flow, is_A))
+        return UnitLeak(flows)
 
     @cached_property
     def _fits_without_leak(self) -> dict[tuple[bool, bool], LeakRegression]:
         """Fits of the oil's properties without any leak, by the sides that check valves refill."""
-        n_rows = len(self._regressions[NEITHER].displaced)  # as many with check valves as without
+        n_rows = len(self._regressions[NEITHER].displaced)  # the same in all regressions
         no_columns = np.empty((n_rows, 0))
         return {
             refilled: fit_leaks(regression, no_columns, self.n_readings)
             for refilled, regression in self._regressions.items()
         }
 
-    def fit_piston_leak(self, fit: PistonFit, law: LeakLaw = LAMINAR) -> LeakFit:
-        """Fit a leak past the piston to the times in which shut valves hold the load.
+    def fit_piston_leak(self, conditions: PistonFit, law: LeakLaw = LAMINAR) -> LeakFit:
+        """Fit the coefficient of a leak past the piston to the times in which shut valves hold the load.
 
-        `fit`: onset of the leak, sensor offset of p_A - p_B, and whether check valves replace displaced oil; `law`: law
-        of the leak (`_unit_piston_leak`). The likelihood includes the prior on the offset.
+        `conditions`: onset of the leak, sensor offset of p_A - p_B, and whether check valves replace displaced oil;
+        `law`: exponent of the leak over the pressure difference, and its growth. The likelihood includes the prior on
+        the offset.
         """
-        unit_leak = self._unit_piston_leak(fit.offset, fit.refilled, law)
-        result = self._fit_leak(unit_leak, fit.onset)
-        return result._replace(likelihood=result.likelihood - 0.5 * self._offset_cost(fit.offset))
+        unit_leak = self._unit_piston_leak(conditions.offset, conditions.refilled, law)
+        fit = self._fit_leak(unit_leak, conditions.onset)
+        return fit._replace(likelihood=fit.likelihood - 0.5 * self._offset_cost(conditions.offset))
 
     def _offset_cost(self, offset: float) -> float:
-        """Compute -2 log of the prior density of a sensor offset [Pa] and of the deviations of all holds from it."""
+        """Compute -2 log of the prior density of a sensor offset [Pa] and of the holds' deviations from this offset."""
         return offset_cost(offset) + sum(hold.offset_in_hold(offset)[1] for hold in self.holds)
 
     def leaks_since(self, onset: float) -> Array | None:
@@ -248,8 +258,8 @@ class HeldChambers:
 
         The leaks are past the piston, to the outside from A, and to the outside from B, as in `HeldLeaks`. The
         conductance past the piston is that of a leak since `onset` [s], times the probability of this leak
-        (`piston_leak`), by which its standard deviation is not multiplied. The leaks to the outside are means over the
-        recording. Return None if no hold shows a flow past the piston after the onset.
+        (`piston_leak`); the standard deviation is not multiplied by the probability. The leaks to the outside are means
+        over the recording. Return None if no hold shows a flow past the piston after the onset.
         """
         fits = self._fits_over_offsets(onset)
         if not fits:
@@ -280,6 +290,7 @@ class HeldChambers:
         value, deviation, by_oil, variance = 0.0, UNKNOWN, 0.0, fit_without_leak.variance
         if column.any():
             fit = fit_leaks(self._regressions[leak.refilled], column, self.n_readings)
+            # the leak is the only coefficient
             deviation, by_oil = float(fit.by_noise[0, 0]) ** 0.5, float(max(fit.by_oil[0, 0], 0.0)) ** 0.5
             if not fit.coefficients[0] < 0.0:  # a leak flows from the higher to the lower pressure only
                 value, variance = float(fit.coefficients[0]), fit.variance
@@ -294,7 +305,8 @@ class HeldChambers:
         """
         onsets = [self.begin]
         for k, hold in enumerate(self.holds):
-            onsets += [0.5 * (self.holds[k - 1].t[-1] + hold.t[0])] if k else []
+            if k > 0:
+                onsets.append(0.5 * (self.holds[k - 1].t[-1] + hold.t[0]))
             evenly_spaced = np.linspace(hold.t[0], hold.t[-1], N_ONSETS + 2)[1:-1]
             onsets += [*np.sort(np.append(evenly_spaced, hold.steepest_time()))]
         return np.array(onsets)
@@ -303,16 +315,17 @@ class HeldChambers:
     def _onset_log_priors(self) -> Array:
         """Log prior probability of each possible onset of a leak in `onsets`, shape (o,).
 
-        The fraction `held_oil.from_start` of `priors.toml` exists from the start; later onsets are equally probable.
+        With the probability `held_oil.from_start` (`priors.toml`) a leak exists from the start. The later onsets are
+        equally probable.
         """
         from_start, n_later = INFERENCE.held_oil.from_start, len(self.onsets) - 1
         return np.asarray(np.log(np.append(from_start, np.full(n_later, (1.0 - from_start) / max(n_later, 1)))))
 
     def _leak_columns(self, leak: UnitLeak, onsets: Array) -> Array:
-        """Compute the volume that a leak with a coefficient of 1 loses since each of o onsets, at r readings, (r, o).
+        """Compute the volume that a leak with a coefficient of 1 loses from each of o `onsets` to r readings, (r, o).
 
-        A reading is a mean of samples. The volumes have the sign of the flow in the volume balance of each side, and
-        are relative to their mean over the hold.
+        A reading is a mean of samples. The volumes are those that leave each side, relative to their mean over the
+        hold. `leak`: flow of the leak out of both sides in each hold.
         """
         columns = []
         for hold, sides in zip(self.holds, leak.flows, strict=True):
@@ -333,8 +346,8 @@ class HeldChambers:
 
         The result is log prior - N/2 log(residual sum of squares), up to a constant, for N independent readings and a
         coefficient >= 0, with the properties of the oil eliminated. `leak`: flow of the leak with a coefficient of 1.
-        The priors of the properties count by the variance of the readings without a leak at first, then by that with
-        the most probable onset.
+        The variance of the readings weights the priors of the properties: at first the variance without a leak, then
+        the variance with the most probable onset.
         """
         regression = self._regressions[leak.refilled]
         variance, n_rows = self._fits_without_leak[leak.refilled].variance, len(regression.displaced)
@@ -375,9 +388,9 @@ class HeldChambers:
         leak's law (`LeakLaw`).
         """
         grid, fits = self._offset_grid, list[tuple[float, PistonFit]]()
-        is_never_open = self._closed_share(self._larger_side) == 1.0
-        for refilled in (NEITHER,) if is_never_open else (NEITHER, self._larger_side):
-            posteriors = [self._find_onset(float(offset), refilled, exponent)[0] for offset in grid]
+        is_never_refilled = self._closed_share(self._refillable_sides) == 1.0
+        for refilled in (NEITHER,) if is_never_refilled else (NEITHER, self._refillable_sides):
+            posteriors = [self._find_onset(float(offset), refilled, exponent)[0] for offset in grid]  # without the fits
             best = int(np.argmax(posteriors))
             refined = np.linspace(grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)], N_REFINED)
             fits += [self._find_onset(float(offset), refilled, exponent) for offset in (*refined, grid[best])]
@@ -402,19 +415,25 @@ class HeldChambers:
         """
         fits, log_weights = list[LeakFit](), list[float]()
         for growth, probability in growth_priors():
-            law = LeakLaw(1.0, growth, onset)
+            law = LeakLaw(exponent=1.0, growth=growth, onset=onset)
             flows = [
                 flow * law.growth_factor(hold.t, self.end) for flow, hold in zip(leak.flows, self.holds, strict=True)
             ]
             fit = self._fit_leak(leak._replace(flows=flows), onset)
-            fits.append(fit.scale(1.0 + 0.5 * growth, fit.likelihood))
+            mean_growth = 1.0 + 0.5 * growth  # of a coefficient that grows linearly
+            fits.append(fit.scale(mean_growth, fit.likelihood))
             log_weights.append(fit.likelihood + float(np.log(probability)))
         return fits[int(np.argmax(log_weights))]._replace(likelihood=float(np.logaddexp.reduce(log_weights)))
 
     def _mean_unit_flow(self, conditions: PistonFit, law: LeakLaw) -> float:
-        """Compute the mean magnitude of the flow of a leak with a coefficient of 1 in the holds, after its onset."""
+        """Compute the mean magnitude of the flow past the piston in the holds, for a leak with a coefficient of 1.
+
+        The mean is over the time after the onset. `conditions`: onset and sensor offset; `law`: law of the leak.
+        """
         leak = self._unit_piston_leak(conditions.offset, law=law)
-        flows = [np.abs(flow[0])[hold.t >= conditions.onset] for hold, flow in zip(self.holds, leak.flows, strict=True)]
+        flows = [  # out of A, which is the first row
+            np.abs(sides[0])[hold.t >= conditions.onset] for hold, sides in zip(self.holds, leak.flows, strict=True)
+        ]
         after_onset = np.concatenate(flows)
         return max(float(after_onset.mean()) if after_onset.size else 0.0, float(np.finfo(float).tiny))
 
@@ -427,6 +446,7 @@ class HeldChambers:
         posteriors = self._onset_posteriors(self._unit_piston_leak(offset, refilled, LeakLaw(exponent)))
         onset = int(posteriors.argmax())
         log_posterior = float(posteriors[onset]) - 0.5 * self._offset_cost(offset)
+        # readings during a refill lower the variance without any information
         log_posterior += 0.5 * self.n_readings * float(np.log(self._closed_share(refilled)))
         return log_posterior, PistonFit(float(self.onsets[onset]), offset, refilled)
 
@@ -438,10 +458,10 @@ class HeldChambers:
     def _weigh_hypotheses(self, leaks: Sequence[UnitLeak]) -> list[LeakHypothesis]:
         """Fit a leak past the piston and each of the other `leaks`, and compute their probabilities, in this order.
 
-        Each may grow from its onset on. The coefficient of the leak past the piston is that of its most probable law,
-        converted to the conductance of a laminar leak with the same mean flow in the holds; those of the others are
-        means from the onset to the end. The likelihood of a leak is a mean over its laws and growths, weighted by their
-        prior probabilities.
+        Each leak may grow from its onset on. The coefficient of the leak past the piston is that of its most probable
+        law, converted to the conductance of a laminar leak with the same mean flow in the holds. The coefficients of
+        the other leaks are means from the onset to the end. The likelihood of a leak is a mean over its laws and
+        growths, weighted by their prior probabilities.
         """
         best = max(self.law_fits, key=lambda fit: fit.log_weight)
         unit_ratio = self._mean_unit_flow(best.conditions, best.law) / self._mean_unit_flow(best.conditions, LAMINAR)
@@ -465,8 +485,8 @@ class HeldChambers:
         """Estimate the mean conductance [m^3/(s Pa)] of all leaks in the holds, even if the valves are open.
 
         The leak is past the piston, to the outside, or through open valves and the pump (`_unit_pump_leak`); the
-        estimates are weighted by the probabilities of these hypotheses. Check valves that refill a chamber would hide
-        the oil that leaves it, so no refilling is assumed.
+        estimates are weighted by the probabilities of these hypotheses. A check valve that refills a chamber would hide
+        the oil that leaves the chamber, so no refilling is assumed.
         """
         chambers = replace(self, charge=0.0)  # without a charge pressure check valves stay closed
         sides = (True, False)
@@ -476,6 +496,7 @@ class HeldChambers:
         means = [h.probability * h.fraction_after * h.fit.value for h in hypotheses]
         deviations = [h.fraction_after * h.fit.deviation for h in hypotheses]
         variance = sum(deviation**2 for mean, deviation in zip(means, deviations, strict=True) if mean > 0.0)
+        # without any leak, the deviation is that of a leak past the piston
         return Flow(sum(means), variance**0.5 if any(means) else deviations[0])
 
     @cached_property
@@ -501,10 +522,10 @@ class HeldChambers:
 
     @property
     def probability_after_holds(self) -> float:
-        """Prior probability that a leak begins after the last time that shut valves hold the load, and does not show.
+        """Prior probability that a leak begins after the last time that shut valves hold the load (the last hold).
 
-        The probability is (1 - `held_oil.from_start`), the probability of a leak that begins within the recording,
-        times the fraction of the recording's time after that hold.
+        No hold shows such a leak. Its probability is (1 - `held_oil.from_start`), the probability of a leak that begins
+        within the recording, times the fraction of the recording's time after the last hold.
         """
         time_after, begins_within = self.end - float(self.holds[-1].t[-1]), 1.0 - INFERENCE.held_oil.from_start
         return begins_within * time_after / max(self.end - self.begin, np.finfo(float).tiny)
@@ -519,7 +540,7 @@ class HeldChambers:
         posteriors = self._onset_posteriors(self._unit_piston_leak(fit.offset, fit.refilled))
         weights = np.exp(posteriors - posteriors.max())
         first, best, last = np.searchsorted(np.cumsum(weights) / weights.sum(), [0.5 * TAIL, 0.5, 1.0 - 0.5 * TAIL])
-        if first < 2:  # it may be the beginning of the recording or the first onset within a hold
+        if first < 2:  # the onset may be the beginning of the recording or the first one within a hold
             return None
         ends = np.append(self.onsets, self.end)
         return Interval(float(self.onsets[best]), float(ends[first - 1]), float(ends[last + 1]))

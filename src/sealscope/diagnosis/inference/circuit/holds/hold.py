@@ -41,15 +41,16 @@ class LockedHold(NamedTuple):
         return np.asarray(sums / np.diff(self.edges))
 
     def carries(self, is_A: bool) -> bool:
-        """Return True if A has the higher pressure when the hold begins, or, for `is_A` False, if B has it."""
+        """Return True if the side A (or B, if `is_A` is False) has the higher pressure when the hold begins."""
         settling = slice(self.edges[0], self.edges[1])
         is_A_higher = float(self.p_A[settling].mean()) > float(self.p_B[settling].mean())
         return is_A_higher == is_A
 
     def centre(self, readings: Array, is_A: bool) -> Array:
-        """Subtract the mean over the hold from `readings` (k, ...) of side A, or of B; return an array of this shape.
+        """Subtract the mean over the hold from `readings` (k, ...) of side A, or of side B if `is_A` is False.
 
-        The first reading of the side of the higher pressure does not count, and becomes 0.
+        The first reading of the side with the higher pressure becomes 0 and does not count towards the mean, since the
+        valves may still be shutting.
         """
         first = int(self.carries(is_A))
         centred = np.asarray(readings - readings[first:].mean(axis=0))
@@ -60,8 +61,8 @@ class LockedHold(NamedTuple):
         """Estimate the sensor offset of p_A - p_B [Pa] in this hold, given the recording's `offset` [Pa].
 
         The offset varies with the pressure if the two sensors differ in gain. The offset of a hold is therefore normal
-        about `offset`; its standard deviation s is `held_oil.gain` (`priors.toml`) times the higher pressure at the end
-        of the hold. The more probable of two cases is assumed:
+        about `offset`; its standard deviation s is `held_oil.gain` (`priors.toml`) times the higher of both pressures
+        at the end of the hold. The more probable of two cases is assumed:
 
         - A leak has equalised the pressures. The recorded p_A - p_B at the end is then the offset of the hold.
         - A load causes p_A - p_B at the end, and all values up to the higher pressure are equally probable. The offset
@@ -93,7 +94,7 @@ class LockedHold(NamedTuple):
     def steepest_time(self) -> float:
         """Find the time [s] at which the largest change of p_A - p_B in the hold begins.
 
-        Changes are taken over `held_oil.equalises` of `priors.toml`, the time in which a large leak equalises the
+        Changes are differences over the time `held_oil.equalises` (`priors.toml`), in which a large leak equalises the
         pressures.
         """
         n_equalising = int(np.searchsorted(self.t, self.t[0] + INFERENCE.held_oil.equalises))  # [samples]
@@ -102,17 +103,19 @@ class LockedHold(NamedTuple):
 
 
 def find_charge_pressure(lower_pressure: Array, rests: NDArray[np.bool_], rate: float) -> float:
-    """Find the pressure [Pa] that check valves maintain in a chamber without load: the lowest while the pump rests.
+    """Find the pressure [Pa] that check valves maintain in a chamber without load.
 
-    It is at most the median while the pump turns, since a leak may equalise the pressures in every rest. If the pump
-    never rests, it is the lowest pressure of the recording. This may be too low, since a moving piston draws oil
-    through lines and check valves, which drop pressure. `lower_pressure` (n,): the lower chamber pressure [Pa]; `rests`
-    (n - 1,): flags of the sampling intervals in which the pump rests; `rate`: sampling rate [Hz].
+    It is the lowest pressure while the pump rests, but at most the median while the pump turns, since a leak may
+    equalise the pressures in every rest. If the pump never rests, it is the lowest pressure of the recording. This may
+    be too low, since a moving piston draws oil through lines and check valves, which drop pressure. `lower_pressure`
+    (n,): the lower of both chamber pressures in each sample [Pa]; `rests` (n - 1,): flags of the sampling intervals in
+    which the pump rests; `rate`: sampling rate [Hz].
     """
     steady_pressure = average_over(INFERENCE.held_oil.steady, lower_pressure, rate)
     if not rests.any():
         return float(np.nanquantile(steady_pressure, LOWEST))
-    lowest, turning = float(np.nanquantile(steady_pressure[:-1][rests], LOWEST)), steady_pressure[:-1][~rests]
+    at_rest, turning = steady_pressure[:-1][rests], steady_pressure[:-1][~rests]
+    lowest = float(np.nanquantile(at_rest, LOWEST))
     return min(lowest, float(np.nanmedian(turning))) if np.isfinite(turning).any() else lowest
 
 
@@ -136,10 +139,10 @@ def extend_rests(rests: NDArray[np.bool_], flow: Array, rate: float) -> NDArray[
 def find_locked_holds(channels: Sequence[Array], rests: NDArray[np.bool_], rate: float) -> list[LockedHold]:
     """Find the holds of a recording, i.e. the rests of the pump during which shut valves hold the load.
 
-    The time in which the valves shut is the first interval of a hold; that in which they open is left out. Holds that
-    are too short, or have missing samples, are omitted. `channels`: time [s], absolute pressures of A and B [Pa], and
-    position [m], (n,) each; `rests` (n - 1,): flags of the sampling intervals in which the pump rests; `rate`: sampling
-    rate [Hz], which is reduced to about `MAX_RATE`.
+    The time in which the valves shut is the first interval of a hold; the time in which they open is left out. Holds
+    that are too short, or have missing samples, are omitted. `channels`: time [s], absolute pressures of A and B [Pa],
+    and position [m], (n,) each; `rests` (n - 1,): flags of the sampling intervals in which the pump rests; `rate`:
+    sampling rate [Hz]. The samples of a hold are averages at less than twice `MAX_RATE`.
     """
     prior, holds = INFERENCE.held_oil, list[LockedHold]()
     decimation = max(1, int(rate / MAX_RATE))  # number of samples that are averaged to one
@@ -157,6 +160,7 @@ def find_locked_holds(channels: Sequence[Array], rests: NDArray[np.bool_], rate:
         )
         n_settling = max(1, settling // decimation)
         edges = np.append(0, n_settling + _reading_edges(n_samples - n_settling, FIRST_READING * rate / decimation))
+        # one interval of settling, and at least `MIN_READINGS` further ones
         if len(edges) > MIN_READINGS + 1 and np.isfinite([p_A, p_B, x]).all():
             holds.append(LockedHold(t, p_A, p_B, x, edges))
     return holds

@@ -27,7 +27,10 @@ class LeakLaw(NamedTuple):
     onset: float = 0.0
 
     def growth_factor(self, t: Array, end: float) -> Array:
-        """Compute the coefficient at times `t` (n,) [s] over that at the onset; `end`: end of the recording [s]."""
+        """Compute the coefficient at times `t` (n,) [s], relative to its value at the onset.
+
+        `end`: end of the recording [s].
+        """
         return 1.0 + self.growth * np.clip((t - self.onset) / max(end - self.onset, np.finfo(float).tiny), 0.0, 1.0)
 
 
@@ -90,7 +93,7 @@ class LeakFit(NamedTuple):
     likelihood: float
 
     def scale(self, factor: float, likelihood: float) -> LeakFit:
-        """Multiply coefficient and standard deviations by a factor, and replace the log likelihood.
+        """Multiply coefficient and standard deviations by a `factor`, and set the log `likelihood`.
 
         The deviation `UNKNOWN` of a leak without information is kept.
         """
@@ -121,8 +124,8 @@ class LeakHypothesis(NamedTuple):
 
 def flow_of_side(flow: Array, is_A: bool) -> Array:
     """Arrange a flow (n,) out of side A, or out of B if `is_A` is False, as the flows out of both sides, (2, n)."""
-    none = np.zeros_like(flow)
-    return np.array([flow, none] if is_A else [none, flow])
+    no_flow = np.zeros_like(flow)
+    return np.array([flow, no_flow] if is_A else [no_flow, flow])
 
 
 def average_fits(fits: Sequence[LeakFit]) -> Flow:

@@ -23,6 +23,8 @@ from sealscope.units import P_ATM
 MAX_ITERATIONS, TOLERANCE = 20, 1e-3
 #: Ridge that is added to the unit diagonal of a scaled matrix.
 RIDGE = 1e-12
+#: Relative rounding error that a property may lie outside of its limits.
+ROUNDING = 1e-9
 #: Largest change of a property of the oil in one iteration.
 MAX_STEP = 0.5
 
@@ -64,7 +66,7 @@ class OilRegression(NamedTuple):
     misfit_variance: float
 
     def leaked(self, changes: Array) -> Array:
-        """Compute the volume [m^3] that left each chamber by each reading (r,): the displaced minus the compressed one.
+        """Compute the volume that left a chamber by each reading (r,) [m^3]: the displaced minus the compressed volume.
 
         `changes` (4,): changes of the oil's properties (`_oil_factors`).
         """
@@ -79,7 +81,7 @@ class OilRegression(NamedTuple):
         """
         oil, air, volumes = _oil_factors(changes)
         strained, aired = oil * self.strained, air * self.aired
-        dead = strained[:, 1:] + aired[:, 1:]
+        dead = strained[:, 1:] + aired[:, 1:]  # by the dead volumes of A and B
         return np.column_stack([strained @ volumes, dead, aired @ volumes])
 
 
@@ -98,7 +100,7 @@ def _oil_factors(changes: Array) -> tuple[float, float, Array]:
 
 
 def _oil_deviations() -> Array:
-    """Return prior standard deviations (4,) of the changes of compressibility, dead volumes of A, of B, and air."""
+    """Return prior standard deviations (4,) of the changes of the oil's properties, in the order of `_oil_factors`."""
     prior = INFERENCE.held_oil
     return np.array([prior.deviation, prior.dead_deviation, prior.dead_deviation, prior.air_deviation])
 
@@ -129,13 +131,14 @@ def build_regression(
     """Build the regression of displaced volumes on the oil's properties from all holds (`OilRegression`).
 
     The rows are the readings (sample means) of each hold, side A before side B, relative to their mean over the
-    hold. `flags`: for each hold of n samples, flags (2, n) of the samples in which the displacement of A, and of B,
-    counts, since no check valve refills that chamber; `sides`: areas and stroke of the cylinder; `n_readings`:
-    effective number of independent readings.
+    hold. `flags`: for each hold of n samples, flags (2, n) of the samples in which no check valve refills A, and B, so
+    that the displacement of this side counts; `sides`: areas and stroke of the cylinder; `n_readings`: effective number
+    of independent readings.
     """
     prior, stroke = INFERENCE.held_oil, sides.high - sides.low
     displaced, strained, aired = list[Array](), list[Array](), list[Array]()
     for hold, is_closed in zip(holds, flags, strict=True):
+        # A grows with the position, and B shrinks
         for index, area, p in ((0, sides.area_A, hold.p_A), (1, -sides.area_B, hold.p_B)):
             stroke_end = sides.low if area > 0.0 else sides.high  # where the chamber is smallest
             volumes = np.zeros(3)  # in the stroke, and the dead volumes of A and B
@@ -145,7 +148,7 @@ def build_regression(
             for columns, values in (
                 (displaced, hold.mean(np.cumsum(increments * is_closed[index]))),
                 (strained, np.outer(hold.mean(p), prior.compressibility * volumes)),
-                (aired, np.outer(hold.mean(1.0 / p), -prior.air * P_ATM * volumes)),
+                (aired, np.outer(hold.mean(1.0 / p), -prior.air * P_ATM * volumes)),  # law of Boyle
             ):
                 columns.append(hold.centre(values, is_A=index == 0))
     strained_volumes, aired_volumes = np.vstack(strained), np.vstack(aired)
@@ -163,15 +166,17 @@ def build_regression(
 def fit_leaks(regression: OilRegression, columns: Array, n_readings: float) -> LeakRegression:
     """Fit the coefficients of c leaks together with the properties of the oil.
 
-    `columns` (r, c): volumes leaked with coefficients of 1, at each reading (mean of samples); `n_readings`: effective
-    number of independent readings. The properties, and the variance of a reading, which weights the priors of the
-    properties against the readings, are found by iteration. A dead volume that reaches its lower limit stays there.
+    `regression`: volumes displaced and compressed in the holds; `columns` (r, c): volumes leaked with coefficients of 1
+    by each reading (mean of samples); `n_readings`: effective number of independent readings. The properties are found
+    by iteration, and so is the variance of a reading, which weights their priors against the readings. A dead volume
+    that reaches its lower limit stays there.
     """
     n_leaks = columns.shape[1]
     changes = np.zeros(4)  # of the oil's properties
     left, misfit_variance = regression.leaked(changes), regression.misfit_variance
     degrees_of_freedom = max(n_readings - n_leaks, 1.0)
     variance = max(float(left @ left) / len(left), misfit_variance)
+    # precisions of the priors (0 for leaks, which have none), and lower limits of the properties
     precisions = np.append(np.zeros(n_leaks), regression.inflation / _oil_deviations() ** 2)
     lowest = _lowest_changes()
     is_lowest = np.zeros(4, dtype=bool)  # properties that stay at their lower limit
@@ -182,7 +187,7 @@ def fit_leaks(regression: OilRegression, columns: Array, n_readings: float) -> L
         scale[~(scale > 0.0)] = 1.0
         scales = np.outer(scale, scale)
         prior = variance * precisions
-        means = np.append(np.zeros(n_leaks), np.where(is_lowest, 0.0, -changes))
+        means = np.append(np.zeros(n_leaks), np.where(is_lowest, 0.0, -changes))  # of the corrections' priors
         matrix = (design.T @ design + np.diag(prior)) / scales
         matrix.flat[:: len(scale) + 1] += RIDGE
         inverse = np.linalg.inv(matrix) / scales
@@ -208,7 +213,7 @@ def fit_leaks(regression: OilRegression, columns: Array, n_readings: float) -> L
 
 
 def residual_squares(regression: OilRegression, columns: Array, variance: float) -> Array:
-    """Compute the residual sum of squares (o,) of a fit of a leak for each of o onsets, with a coefficient >= 0.
+    """Compute the residual sum of squares of the fit of a leak with a coefficient >= 0, for each of o onsets, (o,).
 
     `regression`: regression on the properties of the oil, linearised at their usual values; `columns` (r, o): volume
     leaked with a coefficient of 1 since each onset, at each reading; `variance`: variance of a reading, by which the
@@ -233,6 +238,7 @@ def residual_squares(regression: OilRegression, columns: Array, variance: float)
         [rest[:, :, None], np.broadcast_to(with_columns, (len(rest), *with_columns.shape))], axis=2
     )
     solutions = np.linalg.solve(matrices, np.where(is_free[:, :, None], columns_of_rest, 0.0))
+    # changes of the properties without the leak, and by which they are smaller for a leak with a coefficient of 1
     by_rest, by_leak = solutions[:, :, 0], solutions[:, :, 1:]  # (c, 4), (c, 4, o)
     total = left @ left - (limits * (with_left + rest)).sum(axis=1) - (rest * by_rest).sum(axis=1)
     energy = np.einsum("ro,ro->o", columns, columns) - np.einsum("ko,cko->co", with_columns, by_leak)
@@ -241,6 +247,6 @@ def residual_squares(regression: OilRegression, columns: Array, variance: float)
     is_informative = energy > RIDGE * np.maximum(energy.max(axis=1, keepdims=True), np.finfo(float).tiny)
     leak = np.where(is_informative, moment / np.where(is_informative, energy, 1.0), 0.0)
     changes = by_rest[:, :, None] - leak[:, None] * by_leak
-    is_within = ((changes >= lowest[:, None]) | ~is_free[:, :, None]).all(axis=1)
+    is_within = ((changes >= (1.0 + ROUNDING) * lowest[:, None]) | ~is_free[:, :, None]).all(axis=1)
     squares = np.where(is_within, np.maximum(total[:, None] - leak * moment, 0.0), np.inf)
     return np.asarray(squares.min(axis=0))
