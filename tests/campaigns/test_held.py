@@ -96,6 +96,9 @@ def test_a_plan_names_the_hold_and_what_it_separates() -> None:
     assert "1.2e-05 L/min" in lines[1] and "piston from pump and rod seals" in lines[1]
     assert plan.as_dict()["locked_hold"]["duration_s"] == 10.0
     assert "locked hold" not in plan._replace(hold=None).text()
+    useless = plan._replace(hold=hold._replace(conductance=np.inf))
+    assert "finds no leak" in useless.text()
+    assert useless.as_dict()["locked_hold"]["smallest_leak_lpm"] is None
 
 
 def test_a_rig_without_valves_in_its_lines_has_no_hold() -> None:

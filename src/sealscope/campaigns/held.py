@@ -61,13 +61,22 @@ class PlannedHold(NamedTuple):
         """Pressure difference across the piston at the beginning of the hold [Pa]."""
         return self.pressure_A - self.pressure_B
 
+    @property
+    def finds_a_leak(self) -> bool:
+        """True if some leak is found with the wanted probability, i.e. `conductance` is finite."""
+        return bool(np.isfinite(self.conductance))
+
+    def _lpm(self, difference: float) -> float:
+        """Compute the flow [L/min] of the smallest leak at a pressure difference [Pa] across the piston."""
+        return self.conductance * difference / LITRE_PER_MINUTE
+
     def as_dict(self) -> dict[str, Any]:
-        """Convert the hold to plain JSON values, with the leak as a flow [L/min] at the hold's initial p_A - p_B."""
+        """Convert the hold to plain JSON values, with the leak as a flow [L/min] at its initial p_A - p_B."""
         return {
             "duration_s": self.duration,
             "pressure_A_Pa": self.pressure_A,
             "pressure_B_Pa": self.pressure_B,
-            "smallest_leak_lpm": self.conductance * self.difference / LITRE_PER_MINUTE,
+            "smallest_leak_lpm": self._lpm(self.difference) if self.finds_a_leak else None,
             "separates": "piston from pump and rod seals",
             "healthy_days": N_HEALTHY,
         }
@@ -77,12 +86,12 @@ class PlannedHold(NamedTuple):
 
         A is the loaded side, which is pressed against the stop.
         """
-        flow = self.conductance * stated_pressure / LITRE_PER_MINUTE
+        found = f"{self._lpm(stated_pressure):.2g} L/min" if self.finds_a_leak else "no leak, however large"
         high, low = self.pressure_A / 1e6, self.pressure_B / 1e6
         return (
             "  or a locked hold: press the piston against a stop, shut the valves, stop the motor; "
             f"{self.duration:g} s from {high:.2g} and {low:.2g} MPa\n"
-            f"    finds {flow:.2g} L/min, limited by the sensors' noise, against {N_HEALTHY} healthy days; it "
+            f"    finds {found}, limited by the sensors' noise, against {N_HEALTHY} healthy days; it "
             "separates piston from pump and rod seals"
         )
 

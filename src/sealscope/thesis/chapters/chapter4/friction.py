@@ -61,7 +61,9 @@ def falling_friction_limit(F_C: float) -> float:
     coefficient, K_brk breakaway force over Coulomb force, C_c [s/m] decay of the Stribeck effect.
     """
     f = thesis_rig().friction
-    return max(0.0, math.log(F_C * (f.K_brk - 1.0) * f.C_c / f.F_v) / f.C_c)
+    # slope of the Stribeck friction at standstill over that of the viscous friction
+    steepness = F_C * (f.K_brk - 1.0) * f.C_c / f.F_v
+    return math.log(max(steepness, 1.0)) / f.C_c
 
 
 def friction_models_figure(context: Context, item: Item) -> tuple[Figure, ...]:
