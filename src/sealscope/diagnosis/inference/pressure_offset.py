@@ -78,10 +78,10 @@ def _find_relative_offset(leak_steps: Array, flow_offset_steps: Array, residuals
         residuals = size S[:, k] + noise,    cov noise = kappa (I + q S S'),
 
     where q S S' is the random walk of the leak's coefficient. The likelihood is maximised over size > 0, k, kappa and
-    q, not averaged; `offset_cost` is the prior on the offset. The search is over asinh of the offset, which is linear
+    q; `offset_cost` states the prior on the offset. The search is over asinh of the offset, which is linear
     near zero and logarithmic for large offsets.
     """
-    usual, far = INFERENCE.zero.pressure, INFERENCE.zero.far
+    usual, far = INFERENCE.zero.pressure, INFERENCE.zero.far  # standard deviations of the prior [Pa]
     # only walks up to the best one without an offset: else offset and walk describe changes that no leak explains
     walks = WALKS[: int(_walk_likelihoods(leak_steps, residuals, WALKS).argmax()) + 1]
 
@@ -103,10 +103,10 @@ def _find_relative_offset(leak_steps: Array, flow_offset_steps: Array, residuals
 
     positions = np.arcsinh(3.0 * far / usual) * np.linspace(-1.0, 1.0, N_GRID)
     # search about the maxima of prior and likelihood: a far offset has a high likelihood and a low prior
-    starts = {N_GRID // 2, int(np.argmax([log_likelihood(position) for position in positions]))}
+    starts = {N_GRID // 2, int(np.argmax([log_likelihood(position) for position in positions]))}  # indices of positions
     minima = []
     for start in starts:
-        low, high = positions[max(start - 1, 0)], positions[min(start + 1, N_GRID - 1)]
+        low, high = positions[max(start - 1, 0)], positions[min(start + 1, N_GRID - 1)]  # neighbours on the grid
         minima.append(find_minimum(cost, low, high, tolerance=1e-3))
     position, _ = min(minima, key=lambda minimum: minimum[1])  # by the cost
     return float(np.sinh(position))
