@@ -102,9 +102,9 @@ def shut_odds(blocks: Blocks, roles: ColumnRoles) -> float:
     """Compute the log odds that valves cut the pump off from the cylinder while it rests.
 
     The leakage at rest is compared with zero and with the leakage in motion (`rest_log_odds`). Positive log odds mean
-    that valves cut the pump off. The log odds are limited to +-`rest.most` of `priors.toml`, and 0 if the recording says
-    nothing about the valves. `roles`: indices of the columns of `blocks` by role; they include the leakage of a pump
-    that moves or holds the piston, and the flow offset in motion (`terms.with_rests`).
+    that valves cut the pump off. The log odds are limited to +-`rest.most` of `priors.toml`, and are 0 if the recording
+    says nothing about the valves. `roles`: indices of the columns of `blocks` by role; they include the leakage of a
+    pump that moves or holds the piston, and the flow offset in motion (`terms.with_rests`).
     """
     if not has_rests(blocks, roles) or len(blocks) < 2:
         return 0.0
@@ -117,25 +117,26 @@ def shut_odds(blocks: Blocks, roles: ColumnRoles) -> float:
     rest_variance, difference_variance = float(covariance[rest, rest]), float(covariance[extra, extra])
     if not (rest_variance > 0.0 and difference_variance > 0.0):
         return 0.0
-    odds = rest_log_odds(rest_leak, rest_variance, motion_leak, difference_variance)
+    odds = rest_log_odds(rest_leak, motion_leak, rest_variance=rest_variance, difference_variance=difference_variance)
     max_odds: float = INFERENCE.rest.most
     return float(np.clip(odds, -max_odds, max_odds))
 
 
-def rest_log_odds(value: float, variance: float, motion: float, difference_variance: float) -> float:
+def rest_log_odds(rest: float, motion: float, *, rest_variance: float, difference_variance: float) -> float:
     """Compute the log odds that the leakage at rest is about zero rather than about equal to the leakage in motion.
 
-    With the leakage r = `value` at rest, the leakage g = `motion` in motion, and the normal density N(x; variance),
+    With the leakage r = `rest` at rest, the leakage g = `motion` in motion, and the normal density N(x; variance),
 
-        log odds = log N(r; variance + (s g)^2) - log N(r - g; difference_variance + (w g)^2).
+        log odds = log N(r; rest_variance + (s g)^2) - log N(r - g; difference_variance + (w g)^2).
 
-    `variance` and `difference_variance` are the variances of the errors of r and of r - g. s and w are the prior
+    `rest_variance` and `difference_variance` are the variances of the errors of r and of r - g. s and w are the prior
     scatters of r relative to g (`rest.shut` and `rest.open` of `priors.toml`). All leakages are conductances
     [m^3/(s Pa)], or all are flows [m^3/s].
     """
     prior = INFERENCE.rest
-    shut = _normal_log_density(value, variance + (prior.shut * motion) ** 2)
-    return shut - _normal_log_density(value - motion, difference_variance + (prior.open * motion) ** 2)
+    if_shut = _normal_log_density(rest, rest_variance + (prior.shut * motion) ** 2)
+    if_open = _normal_log_density(rest - motion, difference_variance + (prior.open * motion) ** 2)
+    return if_shut - if_open
 
 
 def fit_with_robust_covariance(gram: Array, columns: list[int], left: int) -> tuple[Array, Array]:

@@ -225,9 +225,11 @@ class RecordedBalance:
         begin, end = np.searchsorted(recording.t, hold.t[[hold.edges[1], -1]])  # with the valves shut
         flow = pumped[begin:end] * recording.rate
         flow = flow[np.isfinite(flow)]
+        mean_flow = abs(float(flow.mean()))
         variance = float(flow.var()) / max(flow.size, 1)  # of the mean
         holding_flow = INFERENCE.rest.holding * self.blocks.moving_flow
-        return rest_log_odds(abs(float(flow.mean())), variance, holding_flow, variance) > 0.0
+        # `holding_flow` is given without an error, so that the difference has the same variance
+        return rest_log_odds(mean_flow, holding_flow, rest_variance=variance, difference_variance=variance) > 0.0
 
     def _is_loaded(self, hold: LockedHold) -> bool:
         """Return True if p_A - p_B in a hold almost certainly is a load, not the sensors' offset at equal pressures.
@@ -267,7 +269,9 @@ class RecordedBalance:
         variance = hold_leak.deviation**2
         total_variance = ((total_leak.high - total_leak.low) / (2.0 * WITHIN_95)) ** 2
         max_odds: float = INFERENCE.rest.most
-        odds = rest_log_odds(hold_leak.value, variance, total_leak.value, variance + total_variance)
+        odds = rest_log_odds(
+            hold_leak.value, total_leak.value, rest_variance=variance, difference_variance=variance + total_variance
+        )
         return float(np.clip(odds, -max_odds, max_odds))
 
     def _cylinder_sides(self) -> CylinderSides | None:
@@ -427,7 +431,8 @@ class RecordedBalance:
         if not variance > 0.0:
             return 0.0
         max_odds: float = INFERENCE.rest.most
-        return float(np.clip(-rest_log_odds(flow, variance, holding_flow, variance), -max_odds, max_odds))
+        loop_odds = rest_log_odds(flow, holding_flow, rest_variance=variance, difference_variance=variance)
+        return float(np.clip(-loop_odds, -max_odds, max_odds))
 
     @cached_property
     def total_history(self) -> History:
