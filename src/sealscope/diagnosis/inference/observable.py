@@ -69,8 +69,8 @@ class Observable:
         """Make the observable of a step, a sudden lasting change, within the recording.
 
         `test`: the best of `n_tests` tests, whose chance is therefore multiplied by their number (Bonferroni);
-        `sign`: -1 for a step down, whose size the test states as positive. `name`, `data` and `advantage` become the
-        fields of the observable.
+        `sign`: 1 for a step up, -1 for a step down, whose size the test states as positive. `name`, `data` and
+        `advantage` become the fields of the observable.
         """
         return cls(
             name=name,
@@ -101,10 +101,11 @@ class Remark(NamedTuple):
 
 
 class LeakRise(NamedTuple):
-    """Rise of the leakage, i.e. the leakage above that of healthy recordings, and its agreement with a step.
+    """Leakage of a recording above that of healthy recordings (`rise`), and its agreement with a step.
 
-    `step_log_ratio`: log likelihood ratio of two explanations of the estimated rise. One is the step found within the
-    recording, and the other that the leakage has not risen. It is positive if the rise agrees with the step.
+    `step_log_ratio`: log likelihood ratio of two explanations of the estimated rise. One is a step of the leakage that
+    was found within the recording, the other is that the leakage has not risen. The log ratio is positive if the rise
+    agrees with the step.
     """
 
     rise: Rise
