@@ -185,7 +185,7 @@ class BlockStream:
     def load_state(self, state: Mapping[str, Any]) -> None:
         """Restore the state of a stream from the plain values that the method `state` returned.
 
-        Raise InputError if they do not fit the balances of this stream.
+        Raise InputError if the values do not fit the balances of this stream.
         """
         samples = require_part(state, "samples", Mapping)
         self.restart(float(require_part(state, "begin", (float, int))))
@@ -220,13 +220,15 @@ class BlockStream:
         for balance, columns, values in zip(self._balances, self.columns, rows, strict=True):
             pressure, left = values[:, columns.leak], balance.flow_sign * values[:, columns.left]
             motion = values[:, [k for k in columns.motion if columns.names[k].startswith("motion")]].sum(axis=1)
-            odds = _sign_log_odds(_leak_z_score(values.T @ values, columns, len(values)), INFERENCE.sense.leak)
+            leak_z = _leak_z_score(values.T @ values, columns, len(values))
+            odds = _sign_log_odds(leak_z, other_cause=INFERENCE.sense.leak)
             if (flow := np.abs(left)).any():
                 constant_load = np.average(pressure, weights=flow)
-                odds += _sign_log_odds(_z_score((pressure - constant_load) * left), INFERENCE.sense.work)
+                work_z = _z_score((pressure - constant_load) * left)
+                odds += _sign_log_odds(work_z, other_cause=INFERENCE.sense.work)
             motion_z = _z_score(motion * left)
             if motion_z > 0.0:  # else either x or the flow may be reversed
-                odds += _sign_log_odds(motion_z, INFERENCE.sense.sides)
+                odds += _sign_log_odds(motion_z, other_cause=INFERENCE.sense.sides)
             signs.append(-1.0 if odds < 0.0 else 1.0)
         return tuple(signs)
 
@@ -297,7 +299,13 @@ class BlockStream:
         piece = {  # with margins
             name: values[begin - self._first : stop + self._margin - self._first] for name, values in samples.items()
         }
-        signals = Signals(piece, self._rate, self._absolute_offsets, self._offset, self._rest_limits)
+        signals = Signals(
+            piece,
+            self._rate,
+            to_absolute=self._absolute_offsets,
+            offset=self._offset,
+            rest_limits=self._rest_limits,
+        )
         without_margins = slice(start - begin, stop - 1 - begin)  # of the increments, one fewer than samples
         is_whole = np.ones((end - first) * self._strides_per_block, dtype=bool)
         lefts = [balance.left(signals) for balance in self._balances]
@@ -366,7 +374,7 @@ def _sign_log_odds(z: float, other_cause: float) -> float:
 def _leak_z_score(gram: Array, roles: ColumnRoles, n_rows: int) -> float:
     """Compute the z score of the leak's coefficient by least squares, under the hypothesis that it is zero.
 
-    A positive score means that oil flows from high to low pressure. It is 0 if the rows do not determine the
+    A positive score means that oil flows from high to low pressure. The score is 0 if the rows do not determine the
     coefficient. `gram` (m, m): Gram matrix of `n_rows` rows of the regression; `roles`: indices of its columns by role
     (leak, motion, left side).
     """
@@ -377,9 +385,10 @@ def _leak_z_score(gram: Array, roles: ColumnRoles, n_rows: int) -> float:
         gram[np.ix_(nuisance, nuisance)], coupling
     )
     energy, moment, left_square = float(reduced[0, 0]), float(reduced[0, 1]), float(reduced[1, 1])
-    if not energy > RIDGE * float(gram[roles.leak, roles.leak]) or n_rows <= len(nuisance) + 1:
+    freedom = n_rows - len(nuisance) - 1  # degrees of freedom of the residual
+    if not energy > RIDGE * float(gram[roles.leak, roles.leak]) or freedom <= 0:
         return 0.0
-    variance = OVERLAP * max(left_square - moment * moment / energy, 0.0) / (n_rows - len(nuisance) - 1)
+    variance = OVERLAP * max(left_square - moment * moment / energy, 0.0) / freedom
     return moment / max(float(np.sqrt(variance * energy)), np.finfo(float).tiny)
 
 
@@ -593,7 +602,8 @@ def _find_rest_limits(samples: Mapping[str, Array], rate: float, balance: Equati
     """
     signals = Signals(samples, rate)
     if flow_source(samples) == "q_pump":
-        return RestLimits(max_rest_rate(balance.left(signals), rate, INFERENCE.rest.moves), piston=-math.inf)
+        max_flow = max_rest_rate(balance.left(signals), rate, fraction=INFERENCE.rest.moves)
+        return RestLimits(pump=max_flow, piston=-math.inf)
     return RestLimits(pump=max_rest_rate(balance.left(signals), rate), piston=max_rest_rate(signals.step("x"), rate))
 
 

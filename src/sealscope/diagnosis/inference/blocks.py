@@ -177,12 +177,12 @@ class Blocks:
     def driving_pressure(self, names: Sequence[str], term: str) -> float:
         """Estimate the root mean square of the pressure that drives a term [Pa], such as p_B for a leak out of side B.
 
-        `names`: names of the columns, in the order of `gram`. With s = sqrt(sum of squares of a column), over the
-        equations that contain the term,
+        `names`: names of the columns, in the order of `gram`. With the sums of squares s^2 of the columns of the term
+        and of the leak, over the equations that contain the term, and the root mean square rms(p_A - p_B),
 
-            pressure = root mean square of p_A - p_B * s of the term / s of the leak.
+            pressure = rms(p_A - p_B) s_term / s_leak.
         """
-        squares = np.einsum("keii->ei", self.gram)
+        squares = np.einsum("keii->ei", self.gram)  # of each column, by equation
         squares = squares[squares[:, names.index(term)] > 0.0].sum(axis=0)
         ratio = squares[names.index(term)] / max(squares[names.index(LEAK)], np.finfo(float).tiny)
         mean_squares = ((self.pressures - self.zero[:, None]) ** 2).mean(axis=1)  # of p_A - p_B, in each block
@@ -286,8 +286,8 @@ class ColumnRoles:
         """Compute the prior standard deviation of a leak's coefficient in a healthy machine, in the coefficient's unit.
 
         `column`: index of the leak's column. For a flow through an orifice, the prior gives the same mean flow over
-        `blocks` as the prior of a laminar leak. The result is infinite for a column that no pressure drives (the left
-        side is one), or without a prior.
+        `blocks` as the prior of a laminar leak. The result is infinite for a column that no pressure drives, such as
+        the left side, or without a prior.
         """
         driver = self.drivers[column] if column < self.left else ""
         pressure, root = float(np.mean(blocks.mean_pressure())), float(np.mean(blocks.mean_root()))
@@ -565,7 +565,7 @@ def _fit_equation(gram: Array, blocks: Blocks, roles: ColumnRoles, test: int, nu
     n_rows, n_polynomials = max(float(blocks.rows.sum()), 1.0), polynomials.shape[1]
     total = gram.sum(axis=0)
     constants = solve(total[np.ix_(nuisance, nuisance)], total[nuisance, roles.left])  # without drifts
-    magnitudes = np.minimum(np.abs(constants), roles.level_deviation[nuisance])
+    magnitudes = np.minimum(np.abs(constants), roles.level_deviation[nuisance])  # at most the prior deviation
     # standard deviations of the drifts over the recording; the offset does not drift
     drift = np.append(magnitudes * roles.drift_rate[nuisance] * minutes, 0.0)
     offset_deviation = roles.offset_deviation(test, blocks)
@@ -686,7 +686,7 @@ def estimate_leak_and_bias(blocks: Blocks, roles: ColumnRoles) -> LeakAndBias:
     assert bias is not None
     gram = blocks.gram[:, 0].copy()
     bias_energy = gram[:, bias, bias]
-    has_bias = bias_energy > RIDGE * bias_energy.max()  # false if the offset's column is zero, as in a block at rest
+    has_bias = bias_energy > RIDGE * bias_energy.max()  # false if the flow offset's column is zero, as at rest
     pressure = np.where(has_bias, gram[:, leak, bias], 0.0) / np.where(has_bias, bias_energy, 1.0)
     fit = _fit_equation(gram, blocks, roles, leak, _nuisance_columns(roles))
     # subtract from the leak's column its mean in the block, so that leak and bias are uncorrelated there
@@ -709,8 +709,9 @@ def estimate_leak_and_bias(blocks: Blocks, roles: ColumnRoles) -> LeakAndBias:
 def estimate_weighted_mean(blocks: Blocks, roles: ColumnRoles, weights: Mapping[int, float]) -> tuple[float, float]:
     """Estimate a weighted mean of several coefficients of the first volume balance, and its standard error.
 
-    `roles`: indices of its columns by role (leak, motion, left side). `weights` maps the index of a nuisance column to
-    its weight; the weights sum to 1. Only the constant part of each coefficient is averaged, not its drift.
+    `roles`: indices of the columns of this balance by role (leak, motion, left side). `weights` maps the index of a
+    nuisance column to the weight of its coefficient; the weights sum to 1. Only the constant part of each coefficient
+    is averaged, not its drift.
     """
     nuisance = _nuisance_columns(roles)
     normal, fit, _ = _fit_equation(blocks.gram[:, 0], blocks, roles, roles.leak, nuisance)
@@ -718,7 +719,8 @@ def estimate_weighted_mean(blocks: Blocks, roles: ColumnRoles, weights: Mapping[
     for column, weight in weights.items():
         constant = nuisance.index(column) * fit.n_polynomials  # index of the first of the column's coefficients
         contrast[constant] = weight
-    precision = normal.eliminate_tested()[0] + np.diag(fit.prior_precision)
+    gram, _, _ = normal.eliminate_tested()
+    precision = gram + np.diag(fit.prior_precision)
     variance = float(contrast @ solve(precision, contrast)) * fit.variance
     return float(contrast @ fit.coefficients), float(np.sqrt(max(variance, 0.0)))
 

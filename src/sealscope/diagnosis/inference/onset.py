@@ -410,9 +410,9 @@ def _fit_steps(z: Array, steps: Array, eigen: Array) -> _StepFits:
 def _residual_squares(total: Array, moments: Array, energies: Array) -> Array:
     """Compute the residual sum of squares after the fit of a step up, shape (w, o).
 
-    It is computed for w assumed variances of the coefficient's random walk and o onsets. A step down does not reduce
-    it. `total` (w,): sum of squares before the fit; `moments` and `energies` (w, o): products of the steps with the
-    whitened values and with themselves.
+    There is one result for each of w assumed variances of the coefficient's random walk and each of o onsets. A step
+    down does not reduce the sum. `total` (w,): sum of squares before the fit; `moments` and `energies` (w, o): products
+    of the steps with the whitened values and with themselves.
     """
     return np.asarray(np.maximum(total[:, None] - np.maximum(moments, 0.0) ** 2 / energies, 1e-12 * total[:, None]))
 
@@ -441,13 +441,14 @@ class _Whitened(NamedTuple):
     def step_shapes(self, positions: Array, shape: Array | None = None, growth: float = 0.0) -> Array:
         """Compute the change of the coefficient in each of K blocks by a unit step at each of o onsets, shape (K, o).
 
-        `positions` (o,): onsets, counted in blocks from the start; `shape` (up to K,): factor on the step in each of
-        the last blocks, by default 1; `growth`: relative growth of the step from its onset to the end.
+        `positions` (o,): onsets, counted in blocks from the start; `shape`: factor on the step in each block of the
+        recording, by default 1; `growth`: relative growth of the step from its onset to the end. A prior on the level,
+        which counts as the first of the K blocks, has no entry in `shape`.
         """
         count = self.transform.shape[1]
         steps = step_shapes(count, positions, growth)
         if shape is not None:
-            steps[count - len(shape) :] *= shape[:, None]  # a prior on the level may precede the blocks
+            steps[count - len(shape) :] *= shape[:, None]
         return steps
 
 
@@ -510,7 +511,7 @@ def _whiten_blocks(information: Information) -> _Whitened | None:
     time, precision, vector = _prepend_level_prior(information)
     if not np.isfinite(precision).all():
         return None
-    if np.array_equal(precision, np.eye(len(time))):
+    if np.array_equal(precision, np.eye(len(time))):  # the matrices of this frequent case are cached
         whitening = _unit_whitening(len(time), information.slope, information.walk)
     else:
         whitening = _build_whitening(precision, information.slope, information.walk)
@@ -627,7 +628,7 @@ def _test_step_up(whitened: _Whitened, steps: Array, fits: _StepFits) -> StepTes
     norm = np.sqrt(energies[allowed])
     cosines = (weight[allowed] @ (steps[:, 1:] * steps[:, :-1])) / (norm[:, 1:] * norm[:, :-1])
     length = np.arccos(np.clip(cosines, -1.0, 1.0)).sum(axis=1).max()
-    law = NullLaw(min(n, 0.5 * n + 2.0), float(length))  # degrees of freedom: see the module
+    law = NullLaw(dimensions=min(n, 0.5 * n + 2.0), length=float(length))  # degrees of freedom: see the module
     noise = float(residual_squares[walk, best]) / n
     size_at_best, error_at_best = moments[walk, best] / energies[walk, best], np.sqrt(noise / energies[walk, best])
     size = moments[walk_without_step] / energies[walk_without_step]

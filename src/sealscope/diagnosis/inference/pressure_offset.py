@@ -57,7 +57,7 @@ def remove_pressure_offset(blocks: Blocks, columns: Sequence[ColumnRoles]) -> Bl
     if not equations:
         return blocks
     leak_steps, flow_offset_steps, residuals = (np.concatenate(parts) for parts in zip(*equations, strict=True))
-    unit = columns[0].offset_deviation(columns[0].leak, blocks)  # [Pa]
+    unit = columns[0].offset_deviation(columns[0].leak, blocks)  # usual standard deviation of the offset [Pa]
     offset = unit * _find_relative_offset(leak_steps, unit * flow_offset_steps, residuals)
     gram = blocks.gram.copy()
     for k, roles in enumerate(columns):
@@ -98,7 +98,7 @@ def _find_relative_offset(leak_steps: Array, flow_offset_steps: Array, residuals
         return independent_fraction * float(_walk_likelihoods(steps, residuals, walks).max())
 
     def cost(position: float) -> float:
-        """Compute minus the log posterior density of a sensor offset, up to a constant, at its asinh `position`."""
+        """Compute minus the log posterior density of a sensor offset, up to a constant; `position`: its asinh."""
         return 0.5 * offset_cost(usual * float(np.sinh(position))) - log_likelihood(position)
 
     positions = np.arcsinh(3.0 * far / usual) * np.linspace(-1.0, 1.0, N_GRID)
@@ -127,8 +127,9 @@ class _WhitenedSteps(NamedTuple):
 def _whiten_steps(blocks: Blocks, roles: ColumnRoles) -> _WhitenedSteps | None:
     """Convert the estimates of leak and constant flow in K blocks to residuals with independent unit noise.
 
-    Also computes how unit steps of leak and constant flow change these residuals. `roles`: indices of the columns of
-    the first equation by role (leak, motion, left side). Return None if the blocks have too little information.
+    The result also contains the changes of these residuals by unit steps of leak and constant flow. `roles`: indices of
+    the columns of the first equation by role (leak, motion, left side). Return None if the blocks have too little
+    information.
 
     The 2 K estimates (K leaks, K constant flows) have the inverse covariance P. With a root R of it, P = R' R, the
     residuals are R times the estimates. Slow changes are then projected out: level and slope of the leak, and a

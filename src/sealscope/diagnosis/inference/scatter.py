@@ -168,9 +168,9 @@ class Rise(NamedTuple):
     def log_ratio(self, rise: float, log_deviation: float = 0.0) -> float:
         """Compute the log likelihood ratio of a true rise of the leak's coefficient by `rise` to no rise.
 
-        Both are compared with the estimate `value`, in whose unit `rise` is. `log_deviation`: standard deviation of
-        the logarithm of the true rise about log(`rise`); 0 if the true rise is known to be `rise`. In the latter case
-        the estimate may contain any fraction of the rise if `may_be_partial`.
+        `rise` is in the unit of the estimate `value`, with which both hypotheses are compared. `log_deviation`:
+        standard deviation of the logarithm of the true rise about log(`rise`); 0 if the true rise is known to be
+        `rise`. If it is known and `may_be_partial`, the estimate may contain any fraction of the rise.
         """
         if log_deviation > 0.0 and rise > 0.0:
             return self._log_ratio_lognormal(rise, log_deviation)
@@ -297,10 +297,10 @@ def _conductance_of_flow(recording: RecordingSums) -> float:
 def rise(judged: RecordingSums, baseline: Sequence[RecordingSums], columns: Sequence[ColumnRoles]) -> Rise:
     """Estimate by how much a recording's leak coefficient exceeds that of healthy recordings of the same machine.
 
-    `judged`: Gram matrices of the recording's volume balance, with its mean flow and pressure; `baseline`: those of the
-    healthy ones; `columns`: for each equation the indices of its columns by role (leak, motion, left side), the same
-    for all recordings. The rise and its standard deviation are in the unit of the leak's coefficient, for the laminar
-    leak m^3/(s Pa).
+    `judged`: summary of the recording, i.e. Gram matrices of its volume balance, mean flow and mean pressure;
+    `baseline`: summaries of the healthy recordings; `columns`: for each equation the indices of its columns by role
+    (leak, motion, left side), the same for all recordings. The rise and its standard deviation are in the unit of the
+    leak's coefficient, for the laminar leak m^3/(s Pa).
     """
     healthy_sums = np.sum([recording.sums for recording in baseline], axis=0)
     count, prior = len(baseline), INFERENCE.scatter

@@ -399,6 +399,7 @@ def _free_air_term(rig: Rig, weight_A: Callable[[Signals], Array | float]) -> Te
 
     cylinder = rig.cylinder
     mid_volumes = dict(zip("AB", mid_stroke_volumes(cylinder), strict=True))
+    # change of each volume with the position
     areas = {"A": cylinder.A_A, "B": -cylinder.A_B} if cylinder.volumes == "position" else {"A": 0.0, "B": 0.0}
 
     def expansion(s: Signals, side: str) -> Array:
@@ -431,7 +432,7 @@ def _external_leak_term(side: str, weight: float = 1.0) -> Term:
         """Compute the increments `weight` max(p, 0) dt of the term [Pa s], shape (n - 1,)."""
         return np.asarray(weight * np.maximum(s.mean(p), 0.0) * s.dt)
 
-    return _conductance_term(f"external leak {side}", lost_volume, "external leak", (p,))
+    return _conductance_term(f"external leak {side}", lost_volume, cause="external leak", needs=(p,))
 
 
 def _compensated_leak_term(side: str) -> Term:
@@ -446,7 +447,7 @@ def _compensated_leak_term(side: str) -> Term:
         weight = _interval_means(s.carried_by_A) - float(side == "B")  # 1 or 0 for side A, 0 or -1 for side B
         return np.asarray(weight * np.maximum(s.mean(f"p_{side}"), 0.0) * s.dt)
 
-    return _conductance_term(f"external leak {side}{MADE_UP}", lost_volume, "external leak")
+    return _conductance_term(f"external leak {side}{MADE_UP}", lost_volume, cause="external leak")
 
 
 _START = _sensor_term("start of the drive", "m^3/s", lambda s: s.mean(START) * s.dt, drift="bias", needs=(START,))
@@ -586,9 +587,9 @@ _STANDSTILL = (*(_chamber_terms(side)[0] for side in "AB"), *_STANDSTILL_LEAKS)
 def circulation(rig: Rig, channels: frozenset[str]) -> Equation | None:
     """Return the volume balance of a pump while the piston displaces no net volume.
 
-    It holds over whole cycles or at standstill, so the position need not be known. An offset of the flow cannot be
-    separated from leakage under a steady load, and is assumed to be zero. Return None if the pump does not feed the
-    chambers, or if its delivery or a chamber's pressure is not recorded.
+    The balance holds over whole cycles or at standstill, so the position need not be known. An offset of the flow
+    cannot be separated from leakage under a steady load, and is assumed to be zero. Return None if the pump does not
+    feed the chambers, or if its delivery or a chamber's pressure is not recorded.
     """
     left = pump_volume(rig, channels)
     if not rig.circuit.pump_feeds_chambers or left is None or not channels.issuperset(_PRESSURES):

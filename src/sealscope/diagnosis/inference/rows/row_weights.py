@@ -114,7 +114,7 @@ def median(values: Any, n: int) -> float:
 def _sum_products(values: Any, begin: int, end: int, weights: Any, gram: Any) -> None:
     """Compute the Gram matrix of the rows `begin` to `end` - 1 of `values` (r, m), with `weights` (r,).
 
-    It is written to `gram` (m, m).
+    The result is written to `gram` (m, m).
     """
     width = values.shape[1]
     for i in range(width):

@@ -426,8 +426,8 @@ class BalanceLeak:
 
         Behind a servo valve, with a balance for each chamber, the flow is not stated, since the valve's edges leak as
         well. `detectable_flow`: flow [m^3/s], by the assumed sizes, of the smallest leak that would be detected if it
-        began within the recording; None if that was not tested. The result repeats it in L/min and as a fraction of the
-        pump's flow (`findable_lpm`, `findable_share`).
+        began within the recording; None if that was not tested. The result repeats this flow in L/min and as a fraction
+        of the pump's flow (`findable_lpm`, `findable_share`).
         """
         balance = self.balance
         size, pressure, pump_flow = balance.size, balance.mean_pressure(), balance.mean_flow

@@ -247,8 +247,8 @@ class VolumeBalance:
         if not balance.is_creep or flow_source(balance.recording.channels) is not None:
             return True
         max_odds: float = INFERENCE.rest.alone
-        healthy = np.clip([summary.get("creep_odds", 0.0) for summary in summaries], -max_odds, max_odds)
-        return float(healthy.sum()) > 0.0
+        creep_odds = np.clip([summary.get("creep_odds", 0.0) for summary in summaries], -max_odds, max_odds)
+        return float(creep_odds.sum()) > 0.0
 
     def _columns(self, channels: frozenset[str], shut: bool) -> list[ColumnRoles]:
         """Return for each volume balance the indices of its columns by role: leak, left side, motion and so on.

@@ -306,14 +306,15 @@ class RecordedBalance:
         nuisance = list(roles.nuisance)
         fitted = solve(total[np.ix_(nuisance, nuisance)], total[nuisance, roles.left])
         coefficients = dict(zip(nuisance, fitted, strict=True))
-        areas, energies = [], []  # an energy is the sum of squares of all columns of motion of a side
+        areas, energies = [], []  # for A and B
         for side in "AB":
             motion = [k for k in roles.motion if roles.names[k].endswith(f"{side} carries")]
             squares = np.diag(total)[motion]
-            energies.append(float(squares.sum()))
-            areas.append(float(squares @ [coefficients[k] for k in motion]) / max(energies[-1], np.finfo(float).tiny))
+            energy = float(squares.sum())
+            areas.append(float(squares @ [coefficients[k] for k in motion]) / max(energy, np.finfo(float).tiny))
+            energies.append(energy)
         shares = self._loaded_shares()
-        main = int(np.argmax(np.array(energies) * shares))  # index 0 (A) or 1 (B)
+        main = int(np.argmax(np.array(energies) * shares))  # index of the main side: 0 for A, 1 for B
         other = 1 - main
         deviation: float = INFERENCE.size.area
         if self.rig.states("cylinder.A_A", "cylinder.A_B") and self.size.stated:
@@ -330,19 +331,19 @@ class RecordedBalance:
         return area_A, area_B, deviation_A, deviation_B
 
     def _loaded_shares(self) -> tuple[float, float]:
-        """Compute for side A and for side B in which fraction of the motion under its load it surely carries the load.
+        """Compute, for A and for B, the fraction of the motion with this side loaded in which it surely carries a load.
 
-        A side carries the load while its pressure is higher. It surely does so if p_A - p_B almost certainly is a load,
-        and not an offset of the sensors (`_load_log_odds`). The motion is measured by the sum of squared speeds over
-        the samples. A side that never carries the load has the fraction 0.
+        A side counts as loaded while its pressure is higher. It surely carries a load if p_A - p_B almost certainly is
+        not an offset of the sensors (`_load_log_odds`). The motion is measured by the sum of squared speeds over the
+        samples. A side that is never loaded has the fraction 0.
         """
         recording = self.recording
         difference = recording["p_A"] - recording["p_B"] - self.pressure_offset
         speed = Signals(dict(recording.channels), recording.rate).speed
         is_load = self._load_log_odds(np.abs(difference)) > INFERENCE.held_oil.loaded
         shares = []
-        for carries in (difference > 0.0, difference <= 0.0):
-            squares = np.where(carries & np.isfinite(speed * difference), speed**2, 0.0)
+        for is_loaded in (difference > 0.0, difference <= 0.0):  # A, B
+            squares = np.where(is_loaded & np.isfinite(speed * difference), speed**2, 0.0)
             shares.append(float(squares[is_load].sum()) / max(float(squares.sum()), np.finfo(float).tiny))
         return shares[0], shares[1]
 
