@@ -130,8 +130,8 @@ class ResponseLeak:
     def bound_flow(self) -> float:
         """95 % upper bound of the mean flow [m^3/s] of a leak; infinite if nothing was tested.
 
-        With healthy recordings it bounds the leakage above theirs, otherwise a leak that begins within the recording.
-        An orifice is assumed, which has the largest flow for a fitted conductance.
+        With healthy recordings the bound is on the leakage above that of these recordings, otherwise on a leak that
+        begins within the recording. An orifice is assumed, which has the largest flow for a fitted conductance.
         """
         test = self.step if self.rise is None else self.rise
         if test is None:
@@ -174,8 +174,8 @@ class ResponseLeak:
         """Return the smallest detectable leak, without the total leakage, which pressures alone do not show.
 
         `detectable_flow`: flow [m^3/s] of the smallest leak that would be detected if it began within the recording,
-        None if that was not tested. It is stated in L/min and as a fraction of the pump's flow (`findable_lpm`,
-        `findable_share`).
+        None if that was not tested. The result states this flow in L/min and as a fraction of the pump's flow
+        (`findable_lpm`, `findable_share`).
         """
         (pump_flow, _), lpm_per_flow = self.pump_flow, self.lpm_per_flow
         return TotalLeakage(

@@ -97,14 +97,16 @@ def _advance_friction(
     Returns the friction force after the step and the friction of steady sliding at the speed v, both [N].
     `friction_0`, `steady_0`: the same two forces before the step.
 
-    Without the damping of the contact, which vanishes when it slides, the law of the friction force F is compliance
-    dF/dt = v - |v| F/magnitude, with the contact's compliance and the magnitude of the steady friction
-    (`_steady_friction`). The step is L-stable and of order 2: with a = h |v|/(compliance magnitude) and the steady
-    friction F_s, or F_s0 before the step, F = (F_0 + (a/2) (F_s0 + (1 + a) F_s)) / (1 + a + a^2/2). Numerator and
-    denominator are both multiplied by (compliance magnitude)^2.
+    The law, without the damping of the contact, is c dF/dt = v - |v| F/F_m for the friction force F, with the contact's
+    compliance c and the magnitude F_m of the steady friction (`_steady_friction`). The step is L-stable and of order 2:
+    with a = h |v|/(c F_m), the steady friction F_s at the speed v, and F_s0 before the step,
+
+        F = (F_0 + (a/2) (F_s0 + (1 + a) F_s)) / (1 + a + a^2/2).
+
+    In the code numerator and denominator are multiplied by (c F_m)^2.
     """
     steady, magnitude, speed = _steady_friction(v, theta, m)
-    slip, stretch = h * speed, theta[COMPLIANCE] * magnitude  # [m]: path in h, deflection at full friction
+    slip, stretch = h * speed, theta[COMPLIANCE] * magnitude  # [m]: h |v|, and c F_m
     numerator = friction_0 * stretch * stretch + 0.5 * slip * (steady_0 * stretch + steady * (stretch + slip))
     return numerator / (stretch * stretch + slip * (stretch + 0.5 * slip)), steady
 

@@ -382,7 +382,15 @@ class Follower:
         # hum has the same sign in both pressures, so that its frequencies show best in their sum
         waves = mains_waves(block["p_A"] + block["p_B"], block.rate) * sample_weights
         dp = self.sense * (block["p_A"] - block["p_B"])
-        return Segment(self.machine, self.priors, np.append(self.last, u), dp, self.states, waves, sample_weights)
+        return Segment(
+            self.machine,
+            self.priors,
+            command=np.append(self.last, u),
+            dp=dp,
+            states=self.states,
+            waves=waves,
+            sample_weights=sample_weights,
+        )
 
     def _prior(self, block_s: float, jumped: int | None = None) -> Normal:
         """Compute the prior on the parameters in the next block, which is `block_s` [s] long.

@@ -97,8 +97,8 @@ class BalanceLeak:
     def step_flow(self) -> Flow:
         """Mean flow [m^3/s] of a leak that begins within the recording, from its onset to the end.
 
-        It is averaged over the laws, growths and onsets of the leak, and mixed with the flow that shows while shut
-        valves hold the load (`_mix_with_holds`). Without a step test it is 0 with an infinite standard error.
+        The flow is averaged over the laws, growths and onsets of the leak, and combined with the flow that shows while
+        shut valves hold the load (`_mix_with_holds`). Without a step test it is 0 with an infinite standard error.
         """
         balance, test = self.balance, self.balance.test
         if test is None:
@@ -279,7 +279,8 @@ class BalanceLeak:
         """
         balance = self.balance
         limit, size = healthy_leakage(balance.rig), balance.size
-        # without a measured flow, the drive's droop under load looks like leakage
+        # behind a servo valve (several balances) its edges leak, too; without a measured flow, the drive's droop under
+        # load looks like leakage
         is_measured = len(balance.columns) == 1 and not balance.equations[0].by_command
         if not (limit > 0.0 and self.rise is None and size.stated and is_measured):
             return None
@@ -291,10 +292,10 @@ class BalanceLeak:
     def bound_flow(self) -> float:
         """95 % upper bound of the leak's mean flow over the recording [m^3/s]; infinite if nothing was tested.
 
-        With healthy recordings it bounds the leakage above theirs; without them, a leak that begins within the
-        recording. If the times in which shut valves hold the load show the rise (`rise`), `_hold_bound` computes the
-        bound. The bound is widened by the uncertainty of the scale of the flows (displacement, area or flow meter) and
-        of the leak's law (laminar or orifice).
+        With healthy recordings the bound is on the leakage above that of these recordings; without them, on a leak that
+        begins within the recording. If the times in which shut valves hold the load show the rise (`rise`),
+        `_hold_bound` computes the bound. The bound is widened by the uncertainty of the scale of the flows
+        (displacement, area or flow meter) and of the leak's law (laminar or orifice).
         """
         test = self.step if self._motion_rise is None else self._motion_rise
         if test is None:

@@ -158,7 +158,7 @@ class VolumeBalance:
 
         `regime`: the blocks for one assumption on the valves while the pump rests, open or shut.
         """
-        offset = float(regime.blocks.zero[0])
+        offset = float(regime.blocks.zero[0])  # sensor offset that was removed from p_A - p_B [Pa]
         oil_loss = compute_once(
             recording, ("lost oil", self.rig), lambda samples: recorded_oil_loss_tests(samples, self.rig, offset), READ
         )
@@ -291,7 +291,7 @@ class VolumeBalance:
         has_position_balance = bool(equations(self.rig, frozenset(recording.channels)))
         recorded = self._compute_blocks(recording) if has_position_balance else None
         if recorded is None:
-            balances = [self.balance(recording)]
+            balances = [self.balance(recording)]  # without a position, or None
         else:
             regimes = [regime for regime in (recorded.open, recorded.shut) if regime is not None]
             balances = [self._build_balance(recording, regime) for regime in regimes]

@@ -280,7 +280,8 @@ class RecordedBalance:
     def _cylinder_sides(self) -> CylinderSides | None:
         """Estimate the piston areas and the ends of the recorded stroke; None if they are not determined.
 
-        They are not determined if nothing moves, or if the ratio of the areas is implausible.
+        They are not determined if nothing moves, or if the ratio of the areas is implausible. The ends are quantiles of
+        the position (`END_QUANTILE`).
         """
         area_A, area_B, deviation_A, deviation_B = self._signed_areas()
         x = self.recording["x"][np.isfinite(self.recording["x"])]
@@ -351,7 +352,7 @@ class RecordedBalance:
     def pressure_offset(self) -> float:
         """Sensor offset of p_A - p_B [Pa], i.e. the recorded difference at equal pressures.
 
-        Only a change of the leak reveals it; without one the estimate stays near 0.
+        Only a change of the leak reveals the offset; without such a change the estimate stays near 0.
         """
         return estimate_offset(self.blocks, self.columns)
 
@@ -375,7 +376,7 @@ class RecordedBalance:
         return self.mean_of_blocks(self.blocks.mean_pressure(self.pressure_offset), since)
 
     def outside_unit_flows(self) -> dict[str, float]:
-        """Compute the mean flow [m^3/s] of each external leak with a conductance of 1 m^3/(s Pa), by its term."""
+        """Compute the mean flow [m^3/s] of each external leak with a conductance of 1 m^3/(s Pa), by name of its term."""
         names, recorded = self.columns[0].names, self.blocks if self.plain is None else self.plain
         return {
             name: recorded.driving_pressure(names, name) * self.size.scale
@@ -387,8 +388,8 @@ class RecordedBalance:
     def mean_flow(self) -> float:
         """Mean magnitude of the pump's flow over the recording [m^3/s].
 
-        If only the creep of a held load is known (`is_creep`), it is the volume that the larger side of the piston
-        displaces per time.
+        If only the creep of a held load is known (`is_creep`), the result is the mean flow that the larger side of the
+        piston displaces.
         """
         if not self.is_creep:
             return self.mean_of_blocks(self.blocks.flow)
