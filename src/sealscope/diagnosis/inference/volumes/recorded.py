@@ -376,7 +376,7 @@ class RecordedBalance:
         return self.mean_of_blocks(self.blocks.mean_pressure(self.pressure_offset), since)
 
     def outside_unit_flows(self) -> dict[str, float]:
-        """Compute the mean flow [m^3/s] of each external leak with a conductance of 1 m^3/(s Pa), by name of its term."""
+        """Compute the mean flow [m^3/s] of an external leak of 1 m^3/(s Pa), for each term of such a leak by name."""
         names, recorded = self.columns[0].names, self.blocks if self.plain is None else self.plain
         return {
             name: recorded.driving_pressure(names, name) * self.size.scale
