@@ -393,13 +393,14 @@ def _compare_levels(judged: RecordingSums, baseline: Sequence[RecordingSums], es
     unexplained = rises - level * (oil_factor - oil_factor.mean())
     scatter = float(np.median(unexplained.std(axis=1)))
     scale = _LevelScale(level, max(level_error, float(np.median(errors)), scatter, 0.1 * level, min_crossover))
-    steepness = scale.slope(level)
-    relative_slope = steepness * level
+    steepness = scale.slope(level)  # dz/da at the healthy mean
+    relative_slope = steepness * level  # change of z for a relative change of a
     log_condition_excess = sum(condition.log_excess for condition in find_unusual_conditions(judged, baseline))
     pause = 3600.0 * INFERENCE.oil.shift  # from hours to seconds
     sessions = number_sessions([recording.start_s for recording in recordings], pause)
-    max_relative = min(steepness * prior.largest * conductance_of_flow, prior.relative)
-    max_sigma = np.maximum(max_relative, 10.0 * steepness * errors)
+    # grid of sigma in z, for each row of the estimates: from the standard error to the largest plausible scatter
+    max_scatter = min(steepness * prior.largest * conductance_of_flow, prior.relative)
+    max_sigma = np.maximum(max_scatter, 10.0 * steepness * errors)
     sigma = np.geomspace(steepness * errors, max_sigma, NODES, axis=1)
     judged_z, healthy_z = scale.transform(values), scale.transform(rises)
     # log Jacobian of z, plus log prior of the width
@@ -678,18 +679,18 @@ class Population:
         weight = 1.0 / (variance[..., None] + self._eigen)  # (s, g, nodes, n)
         weighted_ones, cross = weight * self._ones, self._cross
         precision = (weighted_ones * self._ones).sum(axis=-1)
-        rotated = np.einsum("gij,si->sgj", self._basis, healthy)[:, :, None]
+        rotated = np.einsum("gij,si->sgj", self._basis, healthy)[:, :, None]  # along the eigenvectors
         mean = (weighted_ones * rotated).sum(axis=-1) / precision
         weighted_residual = weight * (rotated - mean[..., None] * self._ones)
         log_likelihood = 0.5 * (
             np.log(weight).sum(axis=-1) - np.log(precision) - (weighted_residual * rotated).sum(axis=-1)
         )
         log_likelihood += self._log_priors + np.reshape(log_priors, (-1, 1, 1))
-        # prior density of log sigma, times the spacing of its grid
+        # add the log of the prior density of log sigma, times the spacing of its grid
         log_spacing = np.log(np.log(sigma[:, 1:2] / sigma[:, :1]))
         log_likelihood += np.broadcast_to(sigma_log_prior, sigma.shape)[:, None] + log_spacing[:, None]
         centres = mean + (weighted_residual * cross).sum(axis=-1) - values[:, None, None]
-        mean_deficit = 1.0 - (weighted_ones * cross).sum(axis=-1)
+        mean_deficit = 1.0 - (weighted_ones * cross).sum(axis=-1)  # weight of the estimated mean in the prediction
         variances = variance + self._judged_variance - (weight * cross**2).sum(axis=-1) + mean_deficit**2 / precision
         return Mixture(log_likelihood, np.sqrt(variances), centres)
 
