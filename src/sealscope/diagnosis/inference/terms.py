@@ -699,6 +699,7 @@ def _pump_leakage_terms(
         """Compute (p_A - p_B) dt [Pa s] in intervals in which the pump holds the load, else 0, shape (n - 1,)."""
         return s.holding(pump_volume) * s.pressure_difference * s.dt
 
+    # no further channels are needed: the balance requires both pressures anyway
     make_term = partial(_conductance_term, cause="pump leak", needs=(), drift=drift)
     return make_term(TURNING, turning), make_term(HOLDING, holding)
 

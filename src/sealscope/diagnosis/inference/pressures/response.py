@@ -103,7 +103,7 @@ class Segment:
         return np.asarray(np.linalg.pinv(self.waves @ self.waves.T, hermitian=True))
 
     def _project_on_waves(self, rows: Array) -> tuple[Array, Array, Array]:
-        """Smooth rows (m, n) of n samples, set samples without a weight to 0, and fit k waves of the mains hum to them.
+        """Smooth rows (m, n) of n samples, set samples without a weight to 0, and fit k waves of mains hum to each row.
 
         Returns the smoothed rows (m, n), their products with the waves (m, k), and the fitted amplitudes of the waves
         (m, k).
@@ -134,7 +134,7 @@ class Segment:
         sets are simulated only for their residual sums of squares, which `squares` of the result contains.
         """
         theta, n_sets = sets[0], len(sets)
-        n_slopes = SPRING + 1  # number of parameters whose derivatives are simulated, the first ones
+        n_slopes = SPRING + 1  # the derivatives by the first parameters, up to SPRING, are simulated
         # simulated together: theta, theta with each parameter up to SPRING increased by a unit, and the other sets
         simulated = np.concatenate([sets[:1], np.tile(theta, (n_slopes, 1)), sets[1:]])
         simulated[range(1, n_slopes + 1), range(n_slopes)] += self.priors.unit[:n_slopes]
@@ -160,7 +160,7 @@ class Segment:
         """
         change = np.asarray(np.gradient(response))
         change[1:-1] -= np.diff(change, 2) / 6.0  # to fourth order, since the ringing is fast
-        by_lead = theta[SCALE] * self.machine.rate * change  # derivative by the time
+        by_lead = theta[SCALE] * self.machine.rate * change  # time derivative of the reading
         decay = math.exp(-1.0 / (self.machine.rate * max(theta[LAG], _MIN)))
         # first-order low pass of -by_lead, as the solution of a bidiagonal system
         by_lag = dtbtrs(np.tile([[1.0], [-decay]], by_lead.size), (decay - 1.0) * by_lead, uplo="L")[0]
@@ -264,7 +264,7 @@ def fit_from_priors(segment: Segment, total: Array, noise: float) -> Linearisati
     gains = priors.centre[GAIN] * _geometric_grid(*PRESSURE.start["gain"], 8)
     springs = priors.centre[SPRING] + priors.width[SPRING] * np.array([0.0, 1.0])
     variants = {GAIN: np.tile(gains, 2), SPRING: np.repeat(springs, 8)}  # all 16 combinations
-    (best_start, *_) = rank_starts(slow_part, priors.centre, n_groups=1, values=variants)  # (1, p)
+    best_start, *_ = rank_starts(slow_part, priors.centre, n_groups=1, values=variants)  # (1, p)
     theta = slow_part.descend(slow_part.linearise(best_start), priors.normal, _N_STEPS // 2).theta
     ringing = segment.machine.ringing_stiffnesses(segment.dp, total, priors)
     stiffnesses = np.append(ringing, priors.centre[K_OIL] * _geometric_grid(*PRESSURE.start["K"], 2))  # (4,)
