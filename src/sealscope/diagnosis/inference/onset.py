@@ -466,7 +466,7 @@ def step_shapes(count: int, positions: Array, growth: float = 0.0) -> Array:
 
 
 class _Whitening(NamedTuple):
-    """Matrices that whiten the estimates of a coefficient in K blocks (`whiten`), whatever the estimates are.
+    """Matrices that whiten the estimates of a coefficient in K blocks (`whiten`), from their precision and priors only.
 
     `root` (r,) and `vectors` (K, r): square roots of the non-zero eigenvalues of the precision, and their eigenvectors;
     `complement` (n, r + s): directions orthogonal to level and slope, where s = 1 if a prior on the slope adds one more

@@ -186,9 +186,9 @@ def _prior_precision(n_blocks: int, priors: Priors, block_s: float) -> Array:
 
 
 def _estimate_noise(blocks: Sequence[Block], deviations: Array, parameter: int) -> tuple[float, float]:
-    """Compute the variance of the residual [Pa^2], and the factor by which correlated noise inflates estimates.
+    """Compute the variance of the residual [Pa^2], and its inflation in estimates by the correlation of the noise.
 
-    The factor is the variance of the scores (`Block`) over their variance under white noise, at least 1.
+    The inflation is the variance of the scores (`Block`) over their variance under white noise, at least 1.
     `deviations` (K p,): deviations of the parameters from `theta` of each block, in multiples of `Priors.unit`;
     `parameter`: index of the tested parameter.
     """
