@@ -174,18 +174,18 @@ class LeakMeasure(Protocol):
 
     @property
     def rise(self) -> RiseTest | None:
-        """Test of the mean leakage against that of healthy recordings; None if there are none."""
+        """Test of the mean leakage against the leakage of healthy recordings; None without these."""
 
     @property
     def rise_flow(self) -> Flow | None:
-        """Mean flow [m^3/s] of the leakage above that of healthy recordings; None if it is unknown.
+        """Mean flow [m^3/s] of the leakage above that of healthy recordings; None if the flow is unknown.
 
         Without healthy recordings it is the flow of the total leakage.
         """
 
     @property
     def rise_onset(self) -> Interval | None:
-        """Onset [s] of the leakage above that of healthy recordings; None if nothing shows when it began."""
+        """Onset [s] of the leakage above that of healthy recordings; None if nothing shows its beginning."""
 
     @property
     def excess(self) -> float | None:

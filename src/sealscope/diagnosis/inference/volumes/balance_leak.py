@@ -149,7 +149,7 @@ class BalanceLeak:
         hold_rise = held_rise(self.balance.recording_sums, self.healthy)
         if hold_rise is None:
             return None
-        # its error is smaller than the error of the rise from the whole recording, or than the latter rise itself
+        # its error is smaller than the error, or than the value, of the rise from the whole recording
         is_precise = hold_rise.deviation < max(motion_rise.deviation, motion_rise.value)
         return hold_rise if is_precise or hold_rise.chance < INFERENCE.held_oil.rare else None
 

@@ -299,9 +299,9 @@ class RecordedBalance:
         Returns both areas, and the standard deviations of the logarithms of their magnitudes. The areas are negative if
         the position x is reversed, and zero if nothing moves. The area of a side is the mean of the coefficients of the
         motion under its load in the volume balance, weighted by the sums of squares of their columns. The main side is
-        the one with more motion in which it surely carries the load. The area of the other side is corrected for motion
-        that may belong to the main side (`log_area_ratio`). If the rig's file states the areas, these are used instead,
-        scaled to the flows of the volume balance.
+        the side with more motion in which it surely carries the load. The area of the other side is corrected for
+        motion that may belong to the main side (`log_area_ratio`). If the rig's file states the areas, these are used
+        instead, scaled to the flows of the volume balance.
         """
         roles, total = self.columns[0], self.blocks.gram[:, 0].sum(axis=0)
         nuisance = list(roles.nuisance)
