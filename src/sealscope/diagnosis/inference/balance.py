@@ -80,7 +80,7 @@ class BlockStream:
     block_s : float
         Length of a block [s], rounded to whole strides of the weak form.
     n_first : int, optional
-        Number of first blocks that are weighted together; None for all blocks of the first `push`.
+        Number of first blocks whose rows are weighted together; None for all blocks of the first `push`.
     start : float
         Time of the first sample [s].
     offset : float
@@ -104,9 +104,9 @@ class BlockStream:
         self._balances, self._rate, self._offset = balances, rate, offset
         self._stride = stride_samples(rate)
         self._strides_per_block = max(SPAN, round(block_s / STRIDE))
-        # number of samples on either side of a block that its speeds and rests depend on
+        # samples on either side of a block that its speeds and rests depend on; 2 for differences of neighbours
         self._margin = max(1, round(HALF_DIFFERENCE * rate)) + 2
-        self._finds_rests = any(MOVING_BIAS in columns.names for columns in self.columns)
+        self._finds_rests = any(MOVING_BIAS in columns.names for columns in self.columns)  # a term that is 0 at rest
         if self._finds_rests:
             self._margin += round(AVERAGING_TIME * rate) + round(MIN_REST * rate)
         self._rest_limits: RestLimits | None = None  # from the first samples on
@@ -141,7 +141,8 @@ class BlockStream:
         # number of samples after a block that its last rows extend over, and that its speeds and rests depend on
         tail = (SPAN - 1) * self._stride + 1 + (0 if last else self._margin)
         n_complete = max(0, (self._end - tail) // length)
-        min_blocks = 1 if last or self._weighting.has_blocks else self._n_first or 1
+        is_waiting = not (last or self._weighting.has_blocks)  # for the first `n_first` blocks
+        min_blocks = (self._n_first or 1) if is_waiting else 1
         if n_complete <= self._n_closed or (self._n_closed == 0 and n_complete < min_blocks):
             return None
         joined = self._join_pieces()
@@ -184,7 +185,7 @@ class BlockStream:
     def load_state(self, state: Mapping[str, Any]) -> None:
         """Restore the state of a stream from the plain values that the method `state` returned.
 
-        Raise InputError if they do not fit the balances of this stream.
+        Raise InputError if the values do not fit the balances of this stream.
         """
         samples = require_part(state, "samples", Mapping)
         self.restart(float(require_part(state, "begin", (float, int))))
@@ -219,13 +220,15 @@ class BlockStream:
         for balance, columns, values in zip(self._balances, self.columns, rows, strict=True):
             pressure, left = values[:, columns.leak], balance.flow_sign * values[:, columns.left]
             motion = values[:, [k for k in columns.motion if columns.names[k].startswith("motion")]].sum(axis=1)
-            odds = _sign_log_odds(_leak_z_score(values.T @ values, columns, len(values)), INFERENCE.sense.leak)
+            leak_z = _leak_z_score(values.T @ values, columns, len(values))
+            odds = _sign_log_odds(leak_z, other_cause=INFERENCE.sense.leak)
             if (flow := np.abs(left)).any():
                 constant_load = np.average(pressure, weights=flow)
-                odds += _sign_log_odds(_z_score((pressure - constant_load) * left), INFERENCE.sense.work)
+                work_z = _z_score((pressure - constant_load) * left)
+                odds += _sign_log_odds(work_z, other_cause=INFERENCE.sense.work)
             motion_z = _z_score(motion * left)
             if motion_z > 0.0:  # else either x or the flow may be reversed
-                odds += _sign_log_odds(motion_z, INFERENCE.sense.sides)
+                odds += _sign_log_odds(motion_z, other_cause=INFERENCE.sense.sides)
             signs.append(-1.0 if odds < 0.0 else 1.0)
         return tuple(signs)
 
@@ -237,7 +240,8 @@ class BlockStream:
         signs of the left sides, for all blocks of the stream. `on_samples` is called with the samples of each block.
         """
         length = self._strides_per_block * self._stride  # of a block [samples]
-        self._estimate_stream_constants(samples, (self._n_first or end) * length)
+        n_first_samples = (self._n_first or end) * length  # of the first blocks; of all without `_n_first`
+        self._estimate_stream_constants(samples, n_first_samples)
         if self._on_samples is not None:
             for k in range(first * length, end * length, length):
                 block = slice(k - self._first, k - self._first + length)
@@ -246,16 +250,16 @@ class BlockStream:
         batches = [self._compute_rows(samples, k, min(k + step, end)) for k in range(first, end, step)]
         weights = np.concatenate([batch.weights for batch in batches])
         is_counted = weights > 0.0  # rows without missing samples
-        roots = np.sqrt(weights[is_counted])[:, None]
-        by_balance = zip(*(batch.rows for batch in batches), strict=True)
-        rows = [np.concatenate(parts)[is_counted] * roots for parts in by_balance]
+        root_weights = np.sqrt(weights[is_counted])[:, None]  # products of two rows then have the weight
+        rows_by_balance = zip(*(batch.rows for batch in batches), strict=True)
+        rows = [np.concatenate(parts)[is_counted] * root_weights for parts in rows_by_balance]
         self._left_signs = self._left_signs or self._flow_signs(rows)
         for equation_rows, columns, sign in zip(rows, self.columns, self._left_signs, strict=True):
             equation_rows[:, columns.left] *= sign
         block_ends = np.cumsum(is_counted.reshape(-1, self._strides_per_block).sum(axis=1))  # [counted rows]
         stride = self._stride / self._rate  # [s]
         first_rows = np.arange(first, end, dtype=float) * self._strides_per_block
-        start = self._begin + (first_rows + 0.5 * SPAN) * stride
+        start = self._begin + (first_rows + 0.5 * SPAN) * stride  # middle of each block's first test function
         return Blocks(
             start=start,
             end=start + (self._strides_per_block - 1) * stride,
@@ -295,7 +299,13 @@ class BlockStream:
         piece = {  # with margins
             name: values[begin - self._first : stop + self._margin - self._first] for name, values in samples.items()
         }
-        signals = Signals(piece, self._rate, self._absolute_offsets, self._offset, self._rest_limits)
+        signals = Signals(
+            piece,
+            self._rate,
+            to_absolute=self._absolute_offsets,
+            offset=self._offset,
+            rest_limits=self._rest_limits,
+        )
         without_margins = slice(start - begin, stop - 1 - begin)  # of the increments, one fewer than samples
         is_whole = np.ones((end - first) * self._strides_per_block, dtype=bool)
         lefts = [balance.left(signals) for balance in self._balances]
@@ -364,7 +374,7 @@ def _sign_log_odds(z: float, other_cause: float) -> float:
 def _leak_z_score(gram: Array, roles: ColumnRoles, n_rows: int) -> float:
     """Compute the z score of the leak's coefficient by least squares, under the hypothesis that it is zero.
 
-    A positive score means that oil flows from high to low pressure. It is 0 if the rows do not determine the
+    A positive score means that oil flows from high to low pressure. The score is 0 if the rows do not determine the
     coefficient. `gram` (m, m): Gram matrix of `n_rows` rows of the regression; `roles`: indices of its columns by role
     (leak, motion, left side).
     """
@@ -375,18 +385,20 @@ def _leak_z_score(gram: Array, roles: ColumnRoles, n_rows: int) -> float:
         gram[np.ix_(nuisance, nuisance)], coupling
     )
     energy, moment, left_square = float(reduced[0, 0]), float(reduced[0, 1]), float(reduced[1, 1])
-    if not energy > RIDGE * float(gram[roles.leak, roles.leak]) or n_rows <= len(nuisance) + 1:
+    freedom = n_rows - len(nuisance) - 1  # degrees of freedom of the residual
+    if not energy > RIDGE * float(gram[roles.leak, roles.leak]) or freedom <= 0:
         return 0.0
-    variance = OVERLAP * max(left_square - moment * moment / energy, 0.0) / (n_rows - len(nuisance) - 1)
+    variance = OVERLAP * max(left_square - moment * moment / energy, 0.0) / freedom
     return moment / max(float(np.sqrt(variance * energy)), np.finfo(float).tiny)
 
 
 def max_rest_rate(increments: Array, rate: float, fraction: float = INFERENCE.rest.share) -> float:
     """Compute the speed [m/s] or flow [m^3/s] below which a piston or a pump counts as resting.
 
-    It is the larger of two: a `fraction` of the mean speed in motion, sum(v^2) / sum(abs(v)), and three standard
-    deviations of the noise of a speed that is averaged over `AVERAGING_TIME`. `increments` (n,): increments of the
-    position [m] or of the pump's volume [m^3] between samples; `rate`: sampling rate [Hz].
+    The limit is the larger of two speeds: a `fraction` of the mean speed in motion, sum(v^2) / sum(abs(v)), and three
+    standard deviations of the noise of a speed that is averaged over `AVERAGING_TIME`. For a pump the "speed" v is its
+    flow. `increments` (n,): increments of the position [m] or of the pump's volume [m^3] between samples; `rate`:
+    sampling rate [Hz].
     """
     velocity = increments[np.isfinite(increments)] * rate
     speed = np.abs(velocity)
@@ -394,9 +406,9 @@ def max_rest_rate(increments: Array, rate: float, fraction: float = INFERENCE.re
     # sixth differences of white noise have 924 times its variance; every second value only, since neighbouring
     # increments share a sample
     differences = np.abs(np.diff(velocity[::2], 6))
-    # 1.4826: standard deviation of normal values over the median of their magnitudes
+    # standard deviation; 1.4826: that of normal values over the median of their magnitudes
     noise = 1.4826 * float(np.median(differences)) / math.sqrt(924.0) if len(differences) else 0.0
-    # 2: variance of a sum of means of neighbouring samples, as of a speed, over that of independent values
+    # 2: increments may be means of neighbouring samples, which share samples; this doubles the variance of their sum
     return max(fraction * mean_speed, 3.0 * noise * math.sqrt(2.0 / max(1.0, AVERAGING_TIME * rate)))
 
 
@@ -474,8 +486,8 @@ def _hold_missing(values: Array) -> Array:
 def min_samples_for_step(rate: float) -> int:
     """Compute the minimum number of samples to test a recording for a leak that begins within it.
 
-    These are the samples of `MIN_BLOCKS` blocks of minimum length, and those beyond the last block over which its last
-    rows extend. `rate`: sampling rate [Hz].
+    These are the samples of `MIN_BLOCKS` blocks of minimum length, and the samples after the last block over which the
+    test functions of its last rows extend. `rate`: sampling rate [Hz].
     """
     stride = stride_samples(rate)
     block = max(SPAN, round(MIN_BLOCK_TIME / STRIDE)) * stride  # [samples]
@@ -529,6 +541,7 @@ def recorded_blocks(recording: Recording, rig: Rig) -> RecordedBlocks | None:
     balances = equations(rig, names)
     if not balances:
         return None
+    # only a recorded flow of a pump shows whether valves cut the pump off
     may_shut = balances[0].name == CYLINDER and not balances[0].by_command
     stream_balances = tuple(with_rests(balance) for balance in balances) if may_shut else balances
     channels = {"x", "p_A", "p_B", str(flow_source(names))}
@@ -537,35 +550,35 @@ def recorded_blocks(recording: Recording, rig: Rig) -> RecordedBlocks | None:
     if balances[0].by_command:
         samples = derive_drive_signals(samples, rig, recording.rate)
     start = float(recording.t[0])
-    block_s = min(MAX_BLOCK_TIME, max(MIN_BLOCK_TIME, recording.duration / _BLOCKS.blocks))
+    block_s = min(MAX_BLOCK_TIME, max(MIN_BLOCK_TIME, recording.duration / _BLOCKS.blocks))  # length of a block
 
     @cache
-    def blocks_about(offset: float) -> Blocks | None:
+    def compute_blocks(offset: float) -> Blocks | None:
         """Compute the blocks after subtracting `offset` [Pa] from p_A - p_B; None if no block is complete."""
         stream = BlockStream(stream_balances, recording.rate, block_s, n_first=None, start=start, offset=offset)
         return stream.push(samples, last=True)
 
-    recorded = blocks_about(0.0)
+    recorded = compute_blocks(0.0)
     if recorded is None:
         return None
     columns = ColumnRoles(stream_balances[0])
 
     has_holds = may_shut and _longest_hold(samples, recording.rate, balances[0]) >= INFERENCE.held_oil.shortest
 
-    def regime_blocks_about(shut: bool, offset: float) -> Blocks:
+    def compute_regime_blocks(offset: float, shut: bool) -> Blocks:
         """Compute the blocks after subtracting `offset` [Pa] from p_A - p_B, for one assumption on the valves.
 
         `shut`: true if valves cut the pump off from the cylinder while it rests, false if they do not.
         """
-        blocks = blocks_about(offset)
+        blocks = compute_blocks(offset)
         assert blocks is not None  # as many samples as for `recorded`
         return apply_regime(blocks, columns, shut, has_holds) if may_shut else blocks
 
-    open_regime = _build_regime(balances, partial(regime_blocks_about, False))
+    open_regime = _build_regime(balances, partial(compute_regime_blocks, shut=False))
     if not may_shut or not has_rests(recorded, columns):
-        return RecordedBlocks(open_regime, None, 0.0)
+        return RecordedBlocks(open_regime, shut=None, odds=0.0)
     shut_balances = tuple(shut_at_rest(balance) for balance in balances)
-    shut_regime = _build_regime(shut_balances, partial(regime_blocks_about, True))._replace(shut=True)
+    shut_regime = _build_regime(shut_balances, partial(compute_regime_blocks, shut=True))._replace(shut=True)
     return RecordedBlocks(open_regime, shut_regime, shut_odds(recorded, columns))
 
 
@@ -589,21 +602,23 @@ def _find_rest_limits(samples: Mapping[str, Array], rate: float, balance: Equati
     """
     signals = Signals(samples, rate)
     if flow_source(samples) == "q_pump":
-        return RestLimits(max_rest_rate(balance.left(signals), rate, INFERENCE.rest.moves), piston=-math.inf)
+        max_flow = max_rest_rate(balance.left(signals), rate, fraction=INFERENCE.rest.moves)
+        return RestLimits(pump=max_flow, piston=-math.inf)
     return RestLimits(pump=max_rest_rate(balance.left(signals), rate), piston=max_rest_rate(signals.step("x"), rate))
 
 
-def _build_regime(balances: tuple[Equation, ...], blocks_about: Callable[[float], Blocks]) -> RegimeBlocks:
+def _build_regime(balances: tuple[Equation, ...], compute_blocks: Callable[[float], Blocks]) -> RegimeBlocks:
     """Compute the blocks of the volume balances, both as recorded and without the sensor offset of p_A - p_B.
 
-    `blocks_about(offset)` computes the blocks after subtracting an offset [Pa] from p_A - p_B. The offset is estimated
-    from the recorded blocks and removed from their Gram matrices. If it exceeds `NEGLIGIBLE_OFFSET` standard deviations
-    of its prior, the blocks are instead computed again after subtracting it, and the remaining offset is removed.
+    `compute_blocks(offset)` computes the blocks after subtracting an offset [Pa] from p_A - p_B. The offset is
+    estimated from the recorded blocks and removed from their Gram matrices. If it exceeds `NEGLIGIBLE_OFFSET` standard
+    deviations of its prior, the blocks are instead computed again after subtracting it, and the remaining offset is
+    removed.
     """
     columns = tuple(ColumnRoles(balance) for balance in balances)
-    plain = blocks_about(0.0)
+    plain = compute_blocks(0.0)  # as recorded
     blocks = remove_pressure_offset(plain, columns)
     offset = float(blocks.zero[0])
     if abs(offset) >= NEGLIGIBLE_OFFSET * INFERENCE.zero.pressure:  # else the terms are linear enough in the offset
-        blocks = remove_pressure_offset(blocks_about(offset), columns)
+        blocks = remove_pressure_offset(compute_blocks(offset), columns)
     return RegimeBlocks(blocks.merge(), plain.merge(), balances, columns)

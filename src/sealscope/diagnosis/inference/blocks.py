@@ -177,12 +177,12 @@ class Blocks:
     def driving_pressure(self, names: Sequence[str], term: str) -> float:
         """Estimate the root mean square of the pressure that drives a term [Pa], such as p_B for a leak out of side B.
 
-        `names`: names of the columns, in the order of `gram`. With s = sqrt(sum of squares of a column), over the
-        equations that contain the term,
+        `names`: names of the columns, in the order of `gram`. With the sums of squares s^2 of the columns of the term
+        and of the leak, over the equations that contain the term, and the root mean square rms(p_A - p_B),
 
-            pressure = root mean square of p_A - p_B * s of the term / s of the leak.
+            pressure = rms(p_A - p_B) s_term / s_leak.
         """
-        squares = np.einsum("keii->ei", self.gram)
+        squares = np.einsum("keii->ei", self.gram)  # of each column, by equation
         squares = squares[squares[:, names.index(term)] > 0.0].sum(axis=0)
         ratio = squares[names.index(term)] / max(squares[names.index(LEAK)], np.finfo(float).tiny)
         mean_squares = ((self.pressures - self.zero[:, None]) ** 2).mean(axis=1)  # of p_A - p_B, in each block
@@ -207,11 +207,15 @@ class ColumnRoles:
       or None;
     - `fast`, `slow`: terms whose coefficients are free in each block, or common to all, while rows are weighted.
 
-    Prior standard deviations of the coefficients (m - 1,): `drift_rate`, drift relative to the coefficient [1/min];
-    `between_deviation`, relative difference between recordings, infinite without a prior, 0 for a zero of the flow that
-    repeats; `level_deviation`, of the
-    constant part of the coefficient, in its unit. `names` and `drivers` (m - 1,): names and drivers of the terms;
-    `healthy_conductance` [m^3/(s Pa)]: standard deviation of a healthy machine's leak.
+    Prior standard deviations of the coefficients (m - 1,):
+
+    - `drift_rate`: drift, relative to the coefficient [1/min];
+    - `between_deviation`: relative difference between recordings, infinite without a prior, 0 for a flow offset that
+      repeats in all recordings;
+    - `level_deviation`: constant part of the coefficient, in the coefficient's unit.
+
+    `names` and `drivers` (m - 1,): names and drivers of the terms (`Term`); `healthy_conductance` [m^3/(s Pa)]:
+    standard deviation of a healthy machine's leak.
     """
 
     def __init__(self, equation: Equation) -> None:
@@ -219,7 +223,7 @@ class ColumnRoles:
         self.left = len(self.names)
         self.nuisance = tuple(k for k, term in enumerate(equation.terms) if term.nuisance)
         self.compared = tuple(k for k, term in enumerate(equation.terms) if term.nuisance or term.compared)
-        is_shut = HOLDING in self.names and MOVING_BIAS not in self.names
+        is_shut = HOLDING in self.names and MOVING_BIAS not in self.names  # made by `terms.shut_at_rest`
         self.hold_leak = self.names.index(HOLDING) if is_shut else None
         self.leak = self.names.index(LEAK)
         drift_priors = vars(INFERENCE.drift)
@@ -236,7 +240,8 @@ class ColumnRoles:
         states = [self.names.index(name) for name in (TURNING, MOVING_BIAS)] if MOVING_BIAS in self.names else []
         self.slow = (*(k for k in self.nuisance if k not in self.fast), *states)
         self.bias = self.names.index(BIAS) if BIAS in self.names else None
-        # where valves shut at rest, it stands for the pump's losses in motion; with an angle, for oil that leaks
+        # a flow offset repeats in all recordings, unless its term stands for an external leak (drift "outside") or,
+        # if valves shut at rest, for losses of the pump in motion
         if self.bias is not None and equation.terms[self.bias].drift == "bias" and not is_shut:
             self.between_deviation[self.bias] = 0.0
         self.drivers = tuple(term.driver for term in equation.terms)
@@ -245,20 +250,21 @@ class ColumnRoles:
     def difference_precisions(self, indices: Sequence[int], coefficients: Array, leak_coefficient: float) -> Array:
         """Compute the precisions of the priors on the differences of c coefficients between recordings.
 
-        `indices` (c,): indices of their columns; `coefficients` (c,): their values in the other recordings;
-        `leak_coefficient`: that of the leak there [m^3/(s Pa)]. The prior deviations are relative to the coefficients.
-        The zero of the flow repeats, but p_A - p_B may be off by `zero.pressure` (`priors.toml`) more or less than in
-        the other recordings, which changes the constant flow by the leak's flow at this pressure.
+        The differences are those of one recording from the other recordings. `indices` (c,): indices of the columns of
+        the coefficients; `coefficients` (c,): coefficients in the other recordings; `leak_coefficient`: the leak's
+        coefficient in the other recordings [m^3/(s Pa)]. The prior deviations are relative to the coefficients. An
+        exception is a flow offset that repeats: it differs only by the leak's flow at the pressure `zero.pressure`
+        (`priors.toml`), the standard deviation of a sensor offset of p_A - p_B.
         """
         is_leak = np.array(indices) == self.names.index(LEAK)
         deviations = np.abs(coefficients) * np.where(is_leak, INFERENCE.between.pump, self.between_deviation[indices])
-        is_zero = (np.array(indices) == self.bias) & (self.between_deviation[indices] == 0.0)
-        deviations[is_zero] = abs(leak_coefficient) * INFERENCE.zero.pressure
+        repeats = (np.array(indices) == self.bias) & (self.between_deviation[indices] == 0.0)  # flow offset
+        deviations[repeats] = abs(leak_coefficient) * INFERENCE.zero.pressure
         with np.errstate(divide="ignore", over="ignore"):
             return np.asarray(1.0 / deviations**2)
 
     def with_free_zero(self) -> ColumnRoles:
-        """Return a copy of these column roles with a zero of the flow that may differ freely between recordings."""
+        """Return a copy of these column roles with a flow offset that may differ freely between recordings."""
         roles = copy(self)
         if self.bias is not None:
             roles.between_deviation = self.between_deviation.copy()
@@ -280,8 +286,8 @@ class ColumnRoles:
         """Compute the prior standard deviation of a leak's coefficient in a healthy machine, in the coefficient's unit.
 
         `column`: index of the leak's column. For a flow through an orifice, the prior gives the same mean flow over
-        `blocks` as the prior of a laminar leak. The result is infinite for a column that no pressure drives (the left
-        side is one), or without a prior.
+        `blocks` as the prior of a laminar leak. The result is infinite for a column that no pressure drives, such as
+        the left side, or without a prior.
         """
         driver = self.drivers[column] if column < self.left else ""
         pressure, root = float(np.mean(blocks.mean_pressure())), float(np.mean(blocks.mean_root()))
@@ -342,8 +348,8 @@ class Weighting:
 
         `values`: for each equation the rows (r, m) of all blocks; `ends` (K,): index past the last row of each block.
         Huber's weights follow from a fit to these and earlier blocks. In this fit the coefficients of fast columns are
-        free in each block, the coefficients of slow columns are common to all blocks (`ColumnRoles`). The number of
-        blocks and the sums over earlier blocks are updated.
+        free in each block, and the coefficients of slow columns are common to all blocks (`ColumnRoles`). The number of
+        blocks and the sums over earlier blocks, which this object stores, are updated.
         """
         self._count += len(ends)
         update_fraction = min(1.0, SUPPORT / self._count)  # a mean at first, then exponential forgetting
@@ -357,13 +363,14 @@ class Weighting:
 def solve(matrix: Array, right: Array) -> Array:
     """Solve matrix x = right for a positive semidefinite `matrix` (n, n) and `right` (n,) or (n, k).
 
-    The matrix is scaled to a unit diagonal, with a small ridge; components of x in its null space are about zero.
+    The matrix is scaled to a unit diagonal, to which a small ridge is added. Components of x in the null space of the
+    matrix are about zero.
     """
     scale = np.sqrt(np.maximum(matrix.diagonal(), 0.0))
     scale[~(scale > 0.0)] = 1.0
     column = scale[:, None]
     scaled = matrix / column / scale
-    scaled.flat[:: len(scale) + 1] += RIDGE  # on the diagonal
+    scaled.flat[:: len(scale) + 1] += RIDGE  # this stride selects the diagonal
     right_scale = scale if right.ndim == 1 else column
     scaled_right = right / right_scale
     if not scaled_right.size:  # nothing to solve
@@ -388,11 +395,12 @@ def _positive_definite_solver() -> Callable[[Array, Array], tuple[Array, Array, 
 def information(blocks: Blocks, columns: Sequence[ColumnRoles], test: int, left_out: int | None = None) -> Information:
     """Compute the joint likelihood of one coefficient's values in all blocks, with the other coefficients eliminated.
 
-    It is normal, and given by its precision matrix and the product of this matrix with the mean, beside the standard
-    deviation by which the coefficient, one of a volume balance, may wander. `columns`: for each equation the indices of
-    its columns by role (leak, motion, left side); the likelihoods of the equations are multiplied. `test`: index of the
-    coefficient's column, or of the left side to test a change of the left side's scale. `left_out`: index of another
-    column to leave out of the regression, or None.
+    The coefficient is that of one term of a volume balance. Its likelihood is normal: the result contains the precision
+    matrix, and the product of this matrix with the mean. For a leak it also contains the prior standard deviation of
+    the coefficient in a healthy machine (`level`). `columns`: for each equation the indices of its columns by role
+    (leak, motion, left side); the likelihoods of the equations are multiplied. `test`: index of the coefficient's
+    column, or of the left side to test a change of the left side's scale. `left_out`: index of another column to leave
+    out of the regression, or None.
     """
     count = len(blocks)
     precision, vector = np.zeros((count, count)), np.zeros(count)
@@ -401,16 +409,16 @@ def information(blocks: Blocks, columns: Sequence[ColumnRoles], test: int, left_
         equation_precision, equation_vector = _eliminate_nuisance(blocks.gram[:, e], blocks, roles, test, nuisance)
         precision += equation_precision
         vector += equation_vector
-    return Information(blocks.time, precision, vector, columns[0].leak_deviation(test, blocks))
+    return Information(blocks.time, precision, vector, level=columns[0].leak_deviation(test, blocks))
 
 
 def _drift_polynomials(blocks: Blocks) -> tuple[Array, float]:
     """Compute Legendre polynomials in time over K blocks, (K, DRIFT_DEGREE + 1), and the recording's length [min].
 
-    Slow drifts of coefficients are sums of these. A single block has only the constant polynomial.
+    Slow drifts of coefficients are weighted sums of these polynomials. A single block has only the constant polynomial.
     """
     minutes = max(float(blocks.end[-1] - blocks.start[0]), 1e-9) / 60.0
-    position = (blocks.time - blocks.start[0]) / (60.0 * minutes) * 2.0 - 1.0
+    position = (blocks.time - blocks.start[0]) / (60.0 * minutes) * 2.0 - 1.0  # -1 to 1, the polynomials' range
     return np.polynomial.legendre.legvander(position, DRIFT_DEGREE if len(blocks) > 1 else 0), minutes
 
 
@@ -461,6 +469,7 @@ def _build_normal_equations(
     products = (polynomials[:, :, None] * polynomials[:, None, :]).reshape(len(gram), n_polynomials**2)
     sums = gram[:, nuisance][:, :, nuisance].reshape(len(gram), n * n).T @ products
     return _NormalEquations(
+        # a column for each pair of a nuisance column (i or j) and a polynomial (p or q): (i, j, p, q) to (i p, j q)
         gram=sums.reshape(n, n, n_polynomials, n_polynomials).transpose(0, 2, 1, 3).reshape(size, size),
         moment=np.einsum("ki,kp->ip", gram[:, nuisance, left], polynomials).ravel(),
         coupling=np.einsum("ki,kp->kip", gram[:, nuisance, test], polynomials).reshape(len(gram), size),
@@ -505,9 +514,9 @@ def _fit_nuisance(normal: _NormalEquations, prior: _Prior, n_polynomials: int, n
 
     `normal`: normal equations of the regression, from which the tested coefficient, free in each block, is eliminated.
     Each other (nuisance) column has `n_polynomials` coefficients, one for each polynomial of its drift, the constant
-    polynomial first. `prior`: prior standard deviations of these; `n_rows`: number of rows in all blocks. The variance
-    determines the weight of the prior, and so the fit; both are found by iteration, until the variance changes by at
-    most the fraction `TOLERANCE`.
+    polynomial first. `prior`: prior standard deviations of the coefficients; `n_rows`: number of rows in all blocks.
+    The residual variance determines the weight of the prior, and so the fit. Both are found by iteration, until the
+    variance changes by at most the fraction `TOLERANCE`.
     """
     gram, moment, left_square = normal.eliminate_tested()
     min_variance = 1e-14 * normal.left_square / n_rows  # rounding errors of the sums
@@ -556,7 +565,7 @@ def _fit_equation(gram: Array, blocks: Blocks, roles: ColumnRoles, test: int, nu
     n_rows, n_polynomials = max(float(blocks.rows.sum()), 1.0), polynomials.shape[1]
     total = gram.sum(axis=0)
     constants = solve(total[np.ix_(nuisance, nuisance)], total[nuisance, roles.left])  # without drifts
-    magnitudes = np.minimum(np.abs(constants), roles.level_deviation[nuisance])
+    magnitudes = np.minimum(np.abs(constants), roles.level_deviation[nuisance])  # at most the prior deviation
     # standard deviations of the drifts over the recording; the offset does not drift
     drift = np.append(magnitudes * roles.drift_rate[nuisance] * minutes, 0.0)
     offset_deviation = roles.offset_deviation(test, blocks)
@@ -590,9 +599,9 @@ def _shift_offset(gram: Array, roles: ColumnRoles, test: int, coefficients: Arra
     size = gram.shape[1]
     transform = np.zeros((len(gram), size, size + 1))
     transform[:, :, :size] = np.eye(size)
-    if roles.bias is not None:  # its column is dt
-        transform[:, roles.bias, test] -= offset
-        transform[:, roles.bias, size] -= coefficients
+    if roles.bias is not None:  # the column of the flow offset is dt
+        transform[:, roles.bias, test] -= offset  # tested column minus offset dt
+        transform[:, roles.bias, size] -= coefficients  # appended column -g dt
     return np.asarray(transform.transpose(0, 2, 1) @ gram @ transform)
 
 
@@ -620,7 +629,7 @@ def _eliminate_nuisance(
 
 
 def _nuisance_columns(roles: ColumnRoles) -> list[int]:
-    """Return the indices of the columns whose coefficients are unknown in any machine, except for the leak's."""
+    """Return the indices of the nuisance columns, whose coefficients are unknown in any machine, without the leak's."""
     return [k for k in roles.nuisance if k != roles.leak]
 
 
@@ -677,7 +686,7 @@ def estimate_leak_and_bias(blocks: Blocks, roles: ColumnRoles) -> LeakAndBias:
     assert bias is not None
     gram = blocks.gram[:, 0].copy()
     bias_energy = gram[:, bias, bias]
-    has_bias = bias_energy > RIDGE * bias_energy.max()  # false if the offset's column is zero, as in a block at rest
+    has_bias = bias_energy > RIDGE * bias_energy.max()  # false if the flow offset's column is zero, as at rest
     pressure = np.where(has_bias, gram[:, leak, bias], 0.0) / np.where(has_bias, bias_energy, 1.0)
     fit = _fit_equation(gram, blocks, roles, leak, _nuisance_columns(roles))
     # subtract from the leak's column its mean in the block, so that leak and bias are uncorrelated there
@@ -700,8 +709,9 @@ def estimate_leak_and_bias(blocks: Blocks, roles: ColumnRoles) -> LeakAndBias:
 def estimate_weighted_mean(blocks: Blocks, roles: ColumnRoles, weights: Mapping[int, float]) -> tuple[float, float]:
     """Estimate a weighted mean of several coefficients of the first volume balance, and its standard error.
 
-    `roles`: indices of its columns by role (leak, motion, left side). `weights` maps the index of a nuisance column to
-    its weight; the weights sum to 1. Only the constant part of each coefficient is averaged, not its drift.
+    `roles`: indices of the columns of this balance by role (leak, motion, left side). `weights` maps the index of a
+    nuisance column to the weight of its coefficient; the weights sum to 1. Only the constant part of each coefficient
+    is averaged, not its drift.
     """
     nuisance = _nuisance_columns(roles)
     normal, fit, _ = _fit_equation(blocks.gram[:, 0], blocks, roles, roles.leak, nuisance)
@@ -709,7 +719,8 @@ def estimate_weighted_mean(blocks: Blocks, roles: ColumnRoles, weights: Mapping[
     for column, weight in weights.items():
         constant = nuisance.index(column) * fit.n_polynomials  # index of the first of the column's coefficients
         contrast[constant] = weight
-    precision = normal.eliminate_tested()[0] + np.diag(fit.prior_precision)
+    gram, _, _ = normal.eliminate_tested()
+    precision = gram + np.diag(fit.prior_precision)
     variance = float(contrast @ solve(precision, contrast)) * fit.variance
     return float(contrast @ fit.coefficients), float(np.sqrt(max(variance, 0.0)))
 

@@ -80,7 +80,7 @@ def compare_with_healthy(
     Parameters
     ----------
     name, data : str
-        Name of the observable, and of the data it is computed from.
+        Name of the observable, and of the kind of data from which it is computed (`Observable`).
     value : float
         Value of the judged recording.
     healthy : sequence of float
@@ -90,8 +90,8 @@ def compare_with_healthy(
     above : bool
         Count only a value above the healthy ones.
     prior_change : float
-        Standard deviation of a true change. The chance is then at least the inverse of the Bayes factor of such a
-        change, and 1 if a true change explains the value no better than scatter does.
+        Standard deviation of a true change, infinite if unknown. If it is known, the chance is at least the inverse of
+        the Bayes factor of such a change, and 1 if a true change explains the value no better than scatter does.
 
     Returns
     -------
@@ -115,7 +115,7 @@ def compare_with_healthy(
     if not np.isfinite(score):
         return None
     if np.isfinite(prior_change):
-        # Bayes factor: density of Student's law, its variance larger by that of a true change, over the null's density
+        # Bayes factor of a true change: density of Student's t with the variance of such a change added, over without
         variance_ratio = 1.0 + prior_change**2 / max(variance, TINY)
         log_factor = 0.5 * (freedom + 1.0) * np.log1p(t * t / freedom)
         log_factor -= 0.5 * (freedom + 1.0) * np.log1p(t * t / variance_ratio / freedom) + 0.5 * np.log(variance_ratio)
@@ -138,7 +138,7 @@ def compare_estimates(
     Parameters
     ----------
     name, data : str
-        Name of the observable, and of the data it is computed from.
+        Name of the observable, and of the kind of data from which it is computed (`Observable`).
     judged : Estimate
         Estimate from the judged recording.
     healthy : sequence of Estimate
@@ -163,15 +163,16 @@ def compare_estimates(
         return None
     values, errors = np.array(healthy, dtype=float).T
     max_ratio = max(MAX_RATIO, MAX_RATIO_TO_VALUES * float(values.std()) / prior.deviation)
+    # grids of the scatter over its prior deviation, and of the factor by which the errors are too small
     ratios = np.exp(np.linspace(-np.log(MAX_RATIO), np.log(max_ratio), NODES))
     inflations = np.geomspace(1.0, prior.inflation, INFLATIONS) if prior.inflation > 1.0 else np.ones(1)
     ratios, inflations = (grid.ravel() for grid in np.meshgrid(ratios, inflations))
-    scatter = prior.deviation * ratios  # at each point of the grid of scatter and inflation
+    scatter = prior.deviation * ratios  # at each point of the joint grid
     weights = 1.0 / (scatter[:, None] ** 2 + (inflations[:, None] * errors) ** 2)
     precision = weights.sum(axis=1)
     means = weights @ values / precision
     squares = (weights * (values - means[:, None]) ** 2).sum(axis=1)
-    # density of log s: the prior's is s^-m exp(-m s_0^2 / (2 s^2))
+    # the prior density of log s is s^-m exp(-m s_0^2 / (2 s^2)); for the other factors see the module
     log_posterior = -prior.recordings * (np.log(ratios) + 0.5 / ratios**2)
     log_posterior += 0.5 * (np.log(weights).sum(axis=1) - np.log(precision) - squares)
     posterior = np.exp(log_posterior - log_posterior.max())
@@ -185,11 +186,11 @@ def compare_estimates(
 
 
 def excess_error(error: float, healthy_errors: Sequence[float]) -> float:
-    """Compute the part of a value's standard error that must be added to the scatter of healthy values.
+    """Compute the part of a value's standard error `error` that must be added to the scatter of healthy values.
 
     The scatter already contains an error as large as the median of `healthy_errors`, the standard errors of the
-    healthy values. The result is sqrt(`error`^2 - median^2), or 0 for a smaller error. It is `error` if there are no
-    healthy values.
+    healthy values. The result is sqrt(`error`^2 - median^2), or 0 if `error` is below the median. Without healthy
+    values the result is `error`.
     """
     if not healthy_errors:
         return error

@@ -43,16 +43,16 @@ def apparent_conductances(blocks: Blocks, columns: Sequence[ColumnRoles]) -> dic
     """Compute the conductance that a leak with the flow |p_A - p_B|^e appears to have in each of K blocks.
 
     It is the regression coefficient of this flow on p_A - p_B within the block. For an orifice, e = 1/2, the Gram
-    matrices give this coefficient r. For the other exponents r^(2 (1 - e)) approximates it; that is 1 for laminar flow,
-    e = 1. The result maps each exponent e of `EXPONENTS` to an array (K,) [Pa^(e - 1)]. `blocks`: the K blocks, with
-    the Gram matrices of the volume balance; `columns`: for each equation the indices of the columns of these matrices
-    by role (leak, motion, left side).
+    matrices give this coefficient r. For the other exponents it is approximated by r^(2 (1 - e)), which is 1 for
+    laminar flow, e = 1. The result maps each exponent e of `EXPONENTS` to an array (K,) [Pa^(e - 1)]. `blocks`: the K
+    blocks, with the Gram matrices of the volume balance; `columns`: for each equation the indices of the columns of
+    these matrices by role (leak, motion, left side).
     """
     leak, orifice = columns[0].leak, columns[0].names.index(ORIFICE)
     gram = blocks.gram.sum(axis=1)
     energy = np.maximum(gram[:, leak, leak], _TINY)
-    by_orifice = np.maximum(gram[:, orifice, leak] / energy, _TINY)
-    return {exponent: by_orifice ** (2.0 * (1.0 - exponent)) for exponent in EXPONENTS}
+    orifice_slope = np.maximum(gram[:, orifice, leak] / energy, _TINY)  # r
+    return {exponent: orifice_slope ** (2.0 * (1.0 - exponent)) for exponent in EXPONENTS}
 
 
 def law_flows(blocks: Blocks) -> dict[float, Array]:
@@ -97,7 +97,10 @@ def find_leak_step(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Informa
 
 
 def growth_priors() -> list[tuple[float, float]]:
-    """List possible relative growths of a leak, from its onset to the recording's end, each with its probability."""
+    """List possible relative growths of a leak from its onset to the recording's end, as pairs (growth, probability).
+
+    The growth 0 (a constant leak) has the probability `growth.steady` (`priors.toml`), the others are equally probable.
+    """
     prior = INFERENCE.growth
     growths = prior.most * (np.arange(N_GROWTHS) + 1.0) / N_GROWTHS  # evenly spaced up to the largest
     probability = (1.0 - prior.steady) / N_GROWTHS
@@ -105,10 +108,10 @@ def growth_priors() -> list[tuple[float, float]]:
 
 
 def _onset_positions(leak: Information, test: StepTest) -> Array:
-    """Return the onsets (o,) of a step test, counted in blocks from the start of the first block.
+    """Return the onsets (o,) that a step test has tried, counted in blocks from the start of the first block.
 
-    `leak`: likelihood on which the test was made. If it has a prior on the level, the test counts that prior as one
-    block before the first.
+    `leak`: likelihood of the tested coefficient. If it has a prior on the coefficient's level, `test` counts this prior
+    as one block before the first, which is subtracted here.
     """
     return test.positions - float(np.isfinite(leak.level))
 
@@ -129,9 +132,9 @@ def estimate_step_flow(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Inf
     rows = np.maximum(blocks.rows, 1e-9)
     n_rows_after = np.maximum(rows @ step_shapes(len(blocks), positions), _TINY)
     shapes, unit_flows = apparent_conductances(blocks, columns), law_flows(blocks)
-    log_weights, flows, standard_errors = [], [], []
+    log_weights, flows, standard_errors = [], [], []  # lists of arrays (o,), for each growth and exponent
     for growth, probability in growth_priors():
-        steps = step_shapes(len(blocks), positions, growth)
+        steps = step_shapes(len(blocks), positions, growth)  # (K, o)
         for exponent in EXPONENTS:
             sizes = step_sizes(leak, onsets, shapes[exponent], growth)
             unit = (rows * unit_flows[exponent]) @ steps / n_rows_after  # mean flow of a step of 1 after its onset
@@ -177,16 +180,17 @@ def estimate_rise_flow(
     Returns
     -------
     Flow
-        If every leak is excluded as too large, that of the first law from the start of the recording.
+        The mean flow and its standard error. If all combinations of onset and law are excluded, the flow is that of
+        the first law for a leak from the start of the recording.
     """
     log_weights, fractions = _weigh_rise_onsets(leak, test, value)
     unit_flows, law_log_weights = np.array(laws).T
-    flows = value * unit_flows / fractions[:, None]  # for each onset and law
+    flows = value * unit_flows / fractions[:, None]  # (onset, law)
     log_weights = np.where(np.abs(flows) > max_flow, -np.inf, log_weights[:, None] + law_log_weights)
     if not np.isfinite(log_weights).any():
         return Flow(value * float(unit_flows[0]), deviation * float(unit_flows[0]))
     weights = np.exp(log_weights - log_weights.max())
-    law = int(weights.sum(axis=0).argmax())
+    law = int(weights.sum(axis=0).argmax())  # the most probable
     flow = float(weights[:, law] @ flows[:, law] / weights[:, law].sum())
     variances = (deviation * unit_flows / fractions[:, None]) ** 2 + (flows - flow) ** 2
     return Flow(flow, float(np.sqrt((weights * variances).sum() / weights.sum())))
@@ -195,11 +199,11 @@ def estimate_rise_flow(
 def _weigh_rise_onsets(leak: Information, test: StepTest | None, value: float) -> tuple[Array, Array]:
     """Weigh the possible onsets of a leak whose coefficient has risen by `value` on average over the recording.
 
-    Returns the log weight of each onset, and the fraction of the recording's information after it, (o,) each. The first
-    onset is the recording's start, with log weight 0 and fraction 1. The others are the onsets of `test` with a
-    fraction above `MIN_FRACTION`. A leak that begins later must cause a larger step, `value` / fraction. The weight is
-    the likelihood of such a step relative to no step, divided by the number of onsets. Without a `test`, or if `value`
-    is not positive, only the first onset remains. `leak`: likelihood of the coefficient in the blocks.
+    Returns the log weight of each onset, and the fraction of the recording's information after the onset, (o,) each.
+    The first onset is the recording's start, with log weight 0 and fraction 1. The others are the onsets of `test` with
+    a fraction above `MIN_FRACTION`. A leak that begins later must cause a larger step, `value` / fraction. The weight
+    of an onset is the likelihood of this step relative to no step, divided by the number of onsets. Without a `test`,
+    or if `value` is not positive, only the first onset remains. `leak`: likelihood of the coefficient in the blocks.
     """
     if test is None or not value > 0.0:
         return np.zeros(1), np.ones(1)
@@ -208,9 +212,10 @@ def _weigh_rise_onsets(leak: Information, test: StepTest | None, value: float) -
     fraction_after = information @ step_shapes(len(information), positions) / max(float(information.sum()), _TINY)
     step = value / np.maximum(fraction_after, MIN_FRACTION)
     precision = 1.0 / np.maximum(test.deviation, _TINY) ** 2
-    log_likelihood = precision * step * (test.size - 0.5 * step) - np.log(len(positions))
+    log_likelihood = precision * step * (test.size - 0.5 * step)  # normal, relative to no step
+    log_weights = log_likelihood - np.log(len(positions))
     is_used = fraction_after > MIN_FRACTION
-    return np.append(0.0, log_likelihood[is_used]), np.append(1.0, fraction_after[is_used])
+    return np.append(0.0, log_weights[is_used]), np.append(1.0, fraction_after[is_used])
 
 
 def mixture_flow(weights: Array, flows: Array, deviations: Array) -> Flow:

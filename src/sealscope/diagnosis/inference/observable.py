@@ -69,8 +69,8 @@ class Observable:
         """Make the observable of a step, a sudden lasting change, within the recording.
 
         `test`: the best of `n_tests` tests, whose chance is therefore multiplied by their number (Bonferroni);
-        `sign`: -1 for a step down, whose size the test states as positive. `name`, `data` and `advantage` become the
-        fields of the observable.
+        `sign`: 1 for a step up, -1 for a step down, whose size the test states as positive. `name`, `data` and
+        `advantage` become the fields of the observable.
         """
         return cls(
             name=name,
@@ -101,10 +101,11 @@ class Remark(NamedTuple):
 
 
 class LeakRise(NamedTuple):
-    """Rise of the leakage, i.e. the leakage above that of healthy recordings, and its agreement with a step.
+    """Leakage of a recording above that of healthy recordings (`rise`), and its agreement with a step.
 
-    `step_log_ratio`: log likelihood ratio of two explanations of the estimated rise. One is the step found within the
-    recording, and the other that the leakage has not risen. It is positive if the rise agrees with the step.
+    `step_log_ratio`: log likelihood ratio of two explanations of the estimated rise. One is a step of the leakage that
+    was found within the recording, the other is that the leakage has not risen. The log ratio is positive if the rise
+    agrees with the step.
     """
 
     rise: Rise
@@ -173,18 +174,18 @@ class LeakMeasure(Protocol):
 
     @property
     def rise(self) -> RiseTest | None:
-        """Test of the mean leakage against that of healthy recordings; None if there are none."""
+        """Test of the mean leakage against the leakage of healthy recordings; None without these."""
 
     @property
     def rise_flow(self) -> Flow | None:
-        """Mean flow [m^3/s] of the leakage above that of healthy recordings; None if it is unknown.
+        """Mean flow [m^3/s] of the leakage above that of healthy recordings; None if the flow is unknown.
 
         Without healthy recordings it is the flow of the total leakage.
         """
 
     @property
     def rise_onset(self) -> Interval | None:
-        """Onset [s] of the leakage above that of healthy recordings; None if nothing shows when it began."""
+        """Onset [s] of the leakage above that of healthy recordings; None if nothing shows its beginning."""
 
     @property
     def excess(self) -> float | None:

@@ -162,7 +162,7 @@ class StepTest:
         The interval is widened by half a block at both ends, since the rows within the block of the onset are
         weighted as if the whole block leaked or none of it. A block has `PARTS` evenly spaced onsets.
         """
-        tail = 0.5 - 0.5 * probability
+        tail = 0.5 - 0.5 * probability  # on either side of the interval
         low, high = np.interp([tail, 1.0 - tail], np.cumsum(self.weights), self.onsets)
         best = float(self.onsets[self.best])
         spacing = float(self.onsets[1] - self.onsets[0]) if len(self.onsets) > 1 else 0.0
@@ -170,9 +170,9 @@ class StepTest:
         return Interval(best, min(float(low), best) - half_block, max(float(high), best) + half_block)
 
     def bound(self, probability: float = BOUND_PROBABILITY) -> float:
-        """Compute the upper bound of the step: the quantile of its size at `probability`, given that the size is > 0.
+        """Compute the upper bound of the step, in the unit of the coefficient.
 
-        The size is in the unit of the coefficient.
+        It is the quantile of the step's size at `probability`, given that the size is > 0, over all tried onsets.
         """
         return bound_steps(self.weights, self.size, self.deviation, probability)
 
@@ -254,9 +254,10 @@ class History(NamedTuple):
 def fit_history(information: Information, test: StepTest | None, *, with_step: bool) -> History:
     """Estimate a coefficient in each block of a recording, as the sum of a level, a slope and a random walk.
 
-    `information`: likelihood of the coefficient; `test`: source of the variances of walk and noise. Without a test
-    there is no walk and the noise has the variance 1. With fewer than `MIN_BLOCKS` blocks there is no slope.
-    `with_step`: use the variances that were fitted with a step, and add a step at the best onset of `test`.
+    `information`: likelihood of the coefficient; `test`: step test of the coefficient, whose fitted variances of walk
+    and noise are used. Without a test there is no walk, and the noise has the variance 1. With fewer than `MIN_BLOCKS`
+    blocks there is no slope. `with_step`: add a step at the best onset of `test`, and use the variances that were
+    fitted together with a step.
     """
     time = information.time
     count = len(time)
@@ -266,7 +267,7 @@ def fit_history(information: Information, test: StepTest | None, *, with_step: b
     columns = [np.ones(count)]  # level
     if count >= MIN_BLOCKS:  # slope
         columns.append((np.arange(count) - 0.5 * (count - 1)) / max(count, 1))
-    if with_step and test is not None:
+    if with_step and test is not None:  # step: fraction of each block after the onset
         block_s = float(time[1] - time[0]) if count > 1 else 1.0
         columns.append(np.clip((time - test.onsets[test.best]) / block_s + 0.5, 0.0, 1.0))
     n_fixed = len(columns)
@@ -409,9 +410,9 @@ def _fit_steps(z: Array, steps: Array, eigen: Array) -> _StepFits:
 def _residual_squares(total: Array, moments: Array, energies: Array) -> Array:
     """Compute the residual sum of squares after the fit of a step up, shape (w, o).
 
-    It is computed for w assumed variances of the coefficient's random walk and o onsets. A step down does not reduce
-    it. `total` (w,): sum of squares before the fit; `moments` and `energies` (w, o): products of the steps with the
-    whitened values and with themselves.
+    There is one result for each of w assumed variances of the coefficient's random walk and each of o onsets. A step
+    down does not reduce the sum. `total` (w,): sum of squares before the fit; `moments` and `energies` (w, o): products
+    of the steps with the whitened values and with themselves.
     """
     return np.asarray(np.maximum(total[:, None] - np.maximum(moments, 0.0) ** 2 / energies, 1e-12 * total[:, None]))
 
@@ -440,13 +441,14 @@ class _Whitened(NamedTuple):
     def step_shapes(self, positions: Array, shape: Array | None = None, growth: float = 0.0) -> Array:
         """Compute the change of the coefficient in each of K blocks by a unit step at each of o onsets, shape (K, o).
 
-        `positions` (o,): onsets, counted in blocks from the start; `shape` (up to K,): factor on the step in each of
-        the last blocks, by default 1; `growth`: relative growth of the step from its onset to the end.
+        `positions` (o,): onsets, counted in blocks from the start; `shape`: factor on the step in each block of the
+        recording, by default 1; `growth`: relative growth of the step from its onset to the end. A prior on the level,
+        which counts as the first of the K blocks, has no entry in `shape`.
         """
         count = self.transform.shape[1]
         steps = step_shapes(count, positions, growth)
         if shape is not None:
-            steps[count - len(shape) :] *= shape[:, None]  # a prior on the level may precede the blocks
+            steps[count - len(shape) :] *= shape[:, None]
         return steps
 
 
@@ -464,7 +466,7 @@ def step_shapes(count: int, positions: Array, growth: float = 0.0) -> Array:
 
 
 class _Whitening(NamedTuple):
-    """Matrices that whiten the estimates of a coefficient in K blocks (`whiten`); they depend on the precision only.
+    """Matrices that whiten the estimates of a coefficient in K blocks (`whiten`), from their precision and priors only.
 
     `root` (r,) and `vectors` (K, r): square roots of the non-zero eigenvalues of the precision, and their eigenvectors;
     `complement` (n, r + s): directions orthogonal to level and slope, where s = 1 if a prior on the slope adds one more
@@ -488,7 +490,7 @@ class _Whitening(NamedTuple):
         precision matrix times the estimates, as in `Information`.
         """
         z = (self.vectors.T @ vector) / self.root
-        z = np.append(z, np.zeros(self.complement.shape[1] - len(z)))  # a prior on the slope is one more reading of 0
+        z = np.append(z, np.zeros(self.complement.shape[1] - len(z)))  # a prior on the slope is one more estimate, 0
         return _Whitened(
             z=self.basis.T @ (self.complement @ z),
             transform=self.transform,
@@ -509,7 +511,7 @@ def _whiten_blocks(information: Information) -> _Whitened | None:
     time, precision, vector = _prepend_level_prior(information)
     if not np.isfinite(precision).all():
         return None
-    if np.array_equal(precision, np.eye(len(time))):
+    if np.array_equal(precision, np.eye(len(time))):  # the matrices of this frequent case are cached
         whitening = _unit_whitening(len(time), information.slope, information.walk)
     else:
         whitening = _build_whitening(precision, information.slope, information.walk)
@@ -539,20 +541,21 @@ def _build_whitening(precision: Array, slope: float, walk: float) -> _Whitening 
     if count < MIN_BLOCKS or np.count_nonzero(is_informative) < MIN_BLOCKS:
         return None
     root = np.sqrt(values[is_informative])
-    design = (vectors[:, is_informative] * root).T
+    design = (vectors[:, is_informative] * root).T  # from the coefficient in all blocks to z
     index = np.arange(count)
     fixed = design @ np.column_stack([np.ones(count), (index - index.mean()) / count])  # level and slope
-    if np.isfinite(slope):  # the prior on the slope is one more reading
+    if np.isfinite(slope):  # the prior on the slope is one more estimate
         fixed = np.vstack([fixed, [0.0, 1.0 / slope]])
         design = np.vstack([design, np.zeros(count)])
-    complement = np.linalg.qr(fixed, mode="complete")[0][:, 2:].T  # orthogonal to level and slope
+    # the columns of the orthogonal matrix after the first two are orthogonal to level and slope
+    complement = np.linalg.qr(fixed, mode="complete")[0][:, 2:].T
     transform = complement @ design
     covariance = transform @ (np.minimum.outer(index, index) + 1.0) @ transform.T  # of the walk: min(k, l)
     # scale of the walk's variance at which walk and noise change z equally on average
     unit = len(complement) / max(float(np.trace(covariance)), np.finfo(float).tiny)
     eigen, basis = np.linalg.eigh(unit * covariance)
     transform = basis.T @ transform
-    positions = np.arange(EDGE, count - EDGE + 1e-9, 1.0 / PARTS)
+    positions = np.arange(EDGE, count - EDGE + 1e-9, 1.0 / PARTS)  # 1e-9 includes the upper end
     # a step before or after all blocks with information changes nothing that is not level or slope
     energies = ((transform @ step_shapes(count, positions)) ** 2).sum(axis=0)
     return _Whitening(
@@ -564,6 +567,7 @@ def _build_whitening(precision: Array, slope: float, walk: float) -> _Whitening 
         eigen=np.maximum(eigen, 0.0),
         unit=unit,
         positions=positions[energies > RANK_TOLERANCE * energies.max()],
+        # half-Cauchy prior on the standard deviation of the walk over all blocks, whose scale is `walk`
         walk_log_priors=-np.log1p(WALKS * unit * count / walk**2),
     )
 
@@ -580,7 +584,7 @@ def _prepend_level_prior(information: Information) -> tuple[Array, Array, Array]
     """Add the prior on a coefficient's level to its likelihood, as one more block before the first.
 
     Returns time (K,) [s], precision (K, K) and vector (K,) as in `Information`, where K includes the added block. No
-    block is added without such a prior, or if there are fewer than `MIN_BLOCKS` blocks.
+    block is added if the likelihood has no prior on the level, or fewer than `MIN_BLOCKS` blocks.
     """
     time, precision, vector, level, _, _ = information
     if not np.isfinite(level) or len(time) < MIN_BLOCKS:
@@ -588,7 +592,8 @@ def _prepend_level_prior(information: Information) -> tuple[Array, Array, Array]
     with_prior = np.zeros((len(time) + 1, len(time) + 1))
     with_prior[0, 0] = 1.0 / level**2
     with_prior[1:, 1:] = precision
-    return np.concatenate([[2.0 * time[0] - time[1]], time]), with_prior, np.concatenate([[0.0], vector])
+    time_before = 2.0 * time[0] - time[1]  # one block before the first
+    return np.concatenate([[time_before], time]), with_prior, np.concatenate([[0.0], vector])
 
 
 def _onset_times(time: Array, positions: Array) -> Array:
@@ -609,7 +614,7 @@ def _test_step_up(whitened: _Whitened, steps: Array, fits: _StepFits) -> StepTes
     """
     n, walk_log_priors, unit = len(whitened.z), whitened.walk_log_priors, whitened.unit
     weight, total, moments, energies, residual_squares = fits
-    # of each walk, twice the log of: square root of the determinant of the weights, times the prior
+    # for each walk, twice the log of (square root of the determinant of the weights, times the prior)
     twice_log_factor = np.log(weight).sum(axis=1) + 2.0 * walk_log_priors
     log_likelihood = 0.5 * twice_log_factor - 0.5 * n * np.log(total / n)
     log_likelihood_with_step = 0.5 * twice_log_factor[:, None] - 0.5 * n * np.log(residual_squares / n)
@@ -623,7 +628,7 @@ def _test_step_up(whitened: _Whitened, steps: Array, fits: _StepFits) -> StepTes
     norm = np.sqrt(energies[allowed])
     cosines = (weight[allowed] @ (steps[:, 1:] * steps[:, :-1])) / (norm[:, 1:] * norm[:, :-1])
     length = np.arccos(np.clip(cosines, -1.0, 1.0)).sum(axis=1).max()
-    law = NullLaw(min(n, 0.5 * n + 2.0), float(length))  # degrees of freedom: see the module
+    law = NullLaw(dimensions=min(n, 0.5 * n + 2.0), length=float(length))  # degrees of freedom: see the module
     noise = float(residual_squares[walk, best]) / n
     size_at_best, error_at_best = moments[walk, best] / energies[walk, best], np.sqrt(noise / energies[walk, best])
     size = moments[walk_without_step] / energies[walk_without_step]

@@ -57,7 +57,7 @@ def remove_pressure_offset(blocks: Blocks, columns: Sequence[ColumnRoles]) -> Bl
     if not equations:
         return blocks
     leak_steps, flow_offset_steps, residuals = (np.concatenate(parts) for parts in zip(*equations, strict=True))
-    unit = columns[0].offset_deviation(columns[0].leak, blocks)  # [Pa]
+    unit = columns[0].offset_deviation(columns[0].leak, blocks)  # usual standard deviation of the offset [Pa]
     offset = unit * _find_relative_offset(leak_steps, unit * flow_offset_steps, residuals)
     gram = blocks.gram.copy()
     for k, roles in enumerate(columns):
@@ -78,10 +78,10 @@ def _find_relative_offset(leak_steps: Array, flow_offset_steps: Array, residuals
         residuals = size S[:, k] + noise,    cov noise = kappa (I + q S S'),
 
     where q S S' is the random walk of the leak's coefficient. The likelihood is maximised over size > 0, k, kappa and
-    q, not averaged; `offset_cost` is the prior on the offset. The search is over asinh of the offset, which is linear
+    q; `offset_cost` states the prior on the offset. The search is over asinh of the offset, which is linear
     near zero and logarithmic for large offsets.
     """
-    usual, far = INFERENCE.zero.pressure, INFERENCE.zero.far
+    usual, far = INFERENCE.zero.pressure, INFERENCE.zero.far  # standard deviations of the prior [Pa]
     # only walks up to the best one without an offset: else offset and walk describe changes that no leak explains
     walks = WALKS[: int(_walk_likelihoods(leak_steps, residuals, WALKS).argmax()) + 1]
 
@@ -98,15 +98,15 @@ def _find_relative_offset(leak_steps: Array, flow_offset_steps: Array, residuals
         return independent_fraction * float(_walk_likelihoods(steps, residuals, walks).max())
 
     def cost(position: float) -> float:
-        """Compute minus the log posterior density of a sensor offset, up to a constant, at its asinh `position`."""
+        """Compute minus the log posterior density of a sensor offset, up to a constant; `position`: its asinh."""
         return 0.5 * offset_cost(usual * float(np.sinh(position))) - log_likelihood(position)
 
     positions = np.arcsinh(3.0 * far / usual) * np.linspace(-1.0, 1.0, N_GRID)
     # search about the maxima of prior and likelihood: a far offset has a high likelihood and a low prior
-    starts = {N_GRID // 2, int(np.argmax([log_likelihood(position) for position in positions]))}
+    starts = {N_GRID // 2, int(np.argmax([log_likelihood(position) for position in positions]))}  # indices of positions
     minima = []
     for start in starts:
-        low, high = positions[max(start - 1, 0)], positions[min(start + 1, N_GRID - 1)]
+        low, high = positions[max(start - 1, 0)], positions[min(start + 1, N_GRID - 1)]  # neighbours on the grid
         minima.append(find_minimum(cost, low, high, tolerance=1e-3))
     position, _ = min(minima, key=lambda minimum: minimum[1])  # by the cost
     return float(np.sinh(position))
@@ -127,8 +127,9 @@ class _WhitenedSteps(NamedTuple):
 def _whiten_steps(blocks: Blocks, roles: ColumnRoles) -> _WhitenedSteps | None:
     """Convert the estimates of leak and constant flow in K blocks to residuals with independent unit noise.
 
-    Also computes how unit steps of leak and constant flow change these residuals. `roles`: indices of the columns of
-    the first equation by role (leak, motion, left side). Return None if the blocks have too little information.
+    The result also contains the changes of these residuals by unit steps of leak and constant flow. `roles`: indices of
+    the columns of the first equation by role (leak, motion, left side). Return None if the blocks have too little
+    information.
 
     The 2 K estimates (K leaks, K constant flows) have the inverse covariance P. With a root R of it, P = R' R, the
     residuals are R times the estimates. Slow changes are then projected out: level and slope of the leak, and a

@@ -55,7 +55,8 @@ def apply_regime(blocks: Blocks, roles: ColumnRoles, shut: bool, has_holds: bool
     moving_bias, holding = names.index(MOVING_BIAS), names.index(HOLDING)
     columns = [moving_bias if name == BIAS else k for k, name in enumerate(names) if name != MOVING_BIAS]
     gram = blocks.gram.copy()
-    if not has_holds or _rest_share(blocks, roles, TURNING, HOLDING) < NEGLIGIBLE:
+    is_always_on = _rest_share(blocks, roles, TURNING, HOLDING) < NEGLIGIBLE  # the pump moves the piston or holds it
+    if not has_holds or is_always_on:
         gram[..., holding, :] = gram[..., holding] = 0.0
     return replace(blocks, gram=np.asarray(gram[..., columns, :][..., columns]))
 
@@ -100,41 +101,42 @@ def _rest_share(blocks: Blocks, roles: ColumnRoles, *states: str) -> float:
 def shut_odds(blocks: Blocks, roles: ColumnRoles) -> float:
     """Compute the log odds that valves cut the pump off from the cylinder while it rests.
 
-    They compare the leakage at rest with zero and with the leakage in motion (`rest_log_odds`). Positive log odds mean
-    that valves cut the pump off. They are limited to +-`rest.most` of `priors.toml`, and 0 if the recording says
-    nothing about the valves. `roles`: indices of the columns of `blocks` by role; they include the leakage of a pump
-    that moves or holds the piston, and the flow offset in motion (`terms.with_rests`).
+    The leakage at rest is compared with zero and with the leakage in motion (`rest_log_odds`). Positive log odds mean
+    that valves cut the pump off. The log odds are limited to +-`rest.most` of `priors.toml`, and are 0 if the recording
+    says nothing about the valves. `roles`: indices of the columns of `blocks` by role; they include the leakage of a
+    pump that moves or holds the piston, and the flow offset in motion (`terms.with_rests`).
     """
     if not has_rests(blocks, roles) or len(blocks) < 2:
         return 0.0
     turning, moving_bias = roles.names.index(TURNING), roles.names.index(MOVING_BIAS)
     columns = [*roles.nuisance, turning, moving_bias]
     coefficients, covariance = fit_with_robust_covariance(blocks.gram[:, 0], columns, roles.left)
-    # the leak's coefficient holds at rest; in motion the coefficient of the turning pump is added
+    # at rest the leakage is the leak's coefficient; in motion the coefficient of the turning pump is added
     rest, extra = columns.index(roles.leak), columns.index(turning)
     rest_leak, motion_leak = coefficients[rest], coefficients[rest] + coefficients[extra]
-    rest_variance, extra_variance = float(covariance[rest, rest]), float(covariance[extra, extra])
-    if not (rest_variance > 0.0 and extra_variance > 0.0):
+    rest_variance, difference_variance = float(covariance[rest, rest]), float(covariance[extra, extra])
+    if not (rest_variance > 0.0 and difference_variance > 0.0):
         return 0.0
-    odds = rest_log_odds(rest_leak, rest_variance, motion_leak, extra_variance)
+    odds = rest_log_odds(rest_leak, motion_leak, rest_variance=rest_variance, difference_variance=difference_variance)
     max_odds: float = INFERENCE.rest.most
     return float(np.clip(odds, -max_odds, max_odds))
 
 
-def rest_log_odds(value: float, variance: float, motion: float, difference_variance: float) -> float:
+def rest_log_odds(rest: float, motion: float, *, rest_variance: float, difference_variance: float) -> float:
     """Compute the log odds that the leakage at rest is about zero rather than about equal to the leakage in motion.
 
-    With the leakage r = `value` at rest, the leakage g = `motion` in motion, and the normal density N(x; variance),
+    With the leakage r = `rest` at rest, the leakage g = `motion` in motion, and the normal density N(x; variance),
 
-        log odds = log N(r; variance + (s g)^2) - log N(r - g; difference_variance + (w g)^2).
+        log odds = log N(r; rest_variance + (s g)^2) - log N(r - g; difference_variance + (w g)^2).
 
-    `variance` and `difference_variance` are the variances of the errors of r and of r - g. s and w are the prior
+    `rest_variance` and `difference_variance` are the variances of the errors of r and of r - g. s and w are the prior
     scatters of r relative to g (`rest.shut` and `rest.open` of `priors.toml`). All leakages are conductances
     [m^3/(s Pa)], or all are flows [m^3/s].
     """
     prior = INFERENCE.rest
-    shut = _normal_log_density(value, variance + (prior.shut * motion) ** 2)
-    return shut - _normal_log_density(value - motion, difference_variance + (prior.open * motion) ** 2)
+    if_shut = _normal_log_density(rest, rest_variance + (prior.shut * motion) ** 2)
+    if_open = _normal_log_density(rest - motion, difference_variance + (prior.open * motion) ** 2)
+    return if_shut - if_open
 
 
 def fit_with_robust_covariance(gram: Array, columns: list[int], left: int) -> tuple[Array, Array]:
@@ -146,9 +148,9 @@ def fit_with_robust_covariance(gram: Array, columns: list[int], left: int) -> tu
     grams, moments = gram[:, columns][:, :, columns], gram[:, columns, left]
     total = grams.sum(axis=0)
     coefficients = solve(total, moments.sum(axis=0))
-    scores = moments - grams @ coefficients
+    scores = moments - grams @ coefficients  # (K, c), products of the residual with the columns
     inverse = solve(total, np.eye(len(total)))
-    small_sample_factor = len(grams) / (len(grams) - 1.0)
+    small_sample_factor = len(grams) / (len(grams) - 1.0)  # K / (K - 1)
     return coefficients, inverse @ (scores.T @ scores) @ inverse * small_sample_factor
 
 

@@ -86,7 +86,7 @@ class Mixture(NamedTuple):
         """Compute the quantile of the mixture: the value below which it lies with the given probability."""
         from scipy.special import ndtr, ndtri
 
-        # a typical deviation, in units of which the quantile is of the order of one
+        # scale all values by a typical deviation, so that the quantile is of the order of one
         scale = max(float(self.weights @ np.minimum(self.deviations, 1e3 * self.deviations.min())), TINY)
         scaled = self._replace(centres=self.centres / scale, deviations=self.deviations / scale)
 
@@ -168,9 +168,9 @@ class Rise(NamedTuple):
     def log_ratio(self, rise: float, log_deviation: float = 0.0) -> float:
         """Compute the log likelihood ratio of a true rise of the leak's coefficient by `rise` to no rise.
 
-        Both are compared with the estimate `value`, in whose unit `rise` is. `log_deviation`: standard deviation of
-        the logarithm of the true rise about log(`rise`); 0 if the true rise is known to be `rise`. In the latter case
-        the estimate may contain any fraction of the rise if `may_be_partial`.
+        `rise` is in the unit of the estimate `value`, with which both hypotheses are compared. `log_deviation`:
+        standard deviation of the logarithm of the true rise about log(`rise`); 0 if the true rise is known to be
+        `rise`. If it is known and `may_be_partial`, the estimate may contain any fraction of the rise.
         """
         if log_deviation > 0.0 and rise > 0.0:
             return self._log_ratio_lognormal(rise, log_deviation)
@@ -192,7 +192,7 @@ class Rise(NamedTuple):
         """Compute the log likelihood ratio of a true rise by `rise` to no rise, robust to outlying estimates.
 
         Each of the two densities of `value` is at least the density at the quantiles `tail` and 1 - `tail` of a healthy
-        recording. Thus an estimate that neither a healthy recording nor the rise predicts is evidence for neither.
+        recording. An estimate that is improbable with the rise and without it is therefore evidence for neither.
         """
         tail_values = [self.threshold(chance) * self.deviation for chance in (tail, 1.0 - tail)]
         min_log_density = min(self._log_density(value) for value in tail_values)
@@ -243,8 +243,8 @@ class Rise(NamedTuple):
         return max(self.value, 0.0) - self.threshold(probability) * self.deviation
 
     def interval(self, probability: float = BOUND_PROBABILITY) -> tuple[float, float]:
-        """Compute the central interval (low, high) that contains the true rise of the leakage with a probability."""
-        tail = 0.5 - 0.5 * probability
+        """Compute the central interval (low, high) that contains the true rise with the given `probability`."""
+        tail = 0.5 - 0.5 * probability  # on either side of the interval
         max_error, min_error = (self.threshold(chance) * self.deviation for chance in (tail, 1.0 - tail))
         return self.value - max_error, self.value - min_error
 
@@ -300,10 +300,10 @@ def _conductance_of_flow(recording: RecordingSums) -> float:
 def rise(judged: RecordingSums, baseline: Sequence[RecordingSums], columns: Sequence[ColumnRoles]) -> Rise:
     """Estimate by how much a recording's leak coefficient exceeds that of healthy recordings of the same machine.
 
-    `judged`: Gram matrices of the recording's volume balance, with its mean flow and pressure; `baseline`: those of the
-    healthy ones; `columns`: for each equation the indices of its columns by role (leak, motion, left side), the same
-    for all recordings. The rise and its standard deviation are in the unit of the leak's coefficient, for the laminar
-    leak m^3/(s Pa).
+    `judged`: summary of the recording, i.e. Gram matrices of its volume balance, mean flow and mean pressure;
+    `baseline`: summaries of the healthy recordings; `columns`: for each equation the indices of its columns by role
+    (leak, motion, left side), the same for all recordings. The rise and its standard deviation are in the unit of the
+    leak's coefficient, for the laminar leak m^3/(s Pa).
     """
     healthy_sums = np.sum([recording.sums for recording in baseline], axis=0)
     count, prior = len(baseline), INFERENCE.scatter
@@ -422,12 +422,14 @@ def _compare_levels(judged: RecordingSums, baseline: Sequence[RecordingSums], es
     unexplained = rises - level * (oil_factor - oil_factor.mean())
     scatter = float(np.median(unexplained.std(axis=1)))
     scale = _LevelScale(level, max(level_error, float(np.median(errors)), scatter, 0.1 * level, min_crossover))
-    steepness = scale.slope(level)
-    relative_slope = steepness * level
+    steepness = scale.slope(level)  # dz/da at the healthy mean
+    relative_slope = steepness * level  # change of z for a relative change of a
     log_condition_excess = sum(condition.log_excess for condition in find_unusual_conditions(judged, baseline))
-    sessions = number_sessions([recording.start_s for recording in recordings], 3600.0 * INFERENCE.oil.shift)
-    max_relative = min(steepness * prior.largest * conductance_of_flow, prior.relative)
-    max_sigma = np.maximum(max_relative, 10.0 * steepness * errors)
+    pause = 3600.0 * INFERENCE.oil.shift  # from hours to seconds
+    sessions = number_sessions([recording.start_s for recording in recordings], pause)
+    # grid of sigma in z, for each row of the estimates: from the standard error to the largest plausible scatter
+    max_scatter = min(steepness * prior.largest * conductance_of_flow, prior.relative)
+    max_sigma = np.maximum(max_scatter, 10.0 * steepness * errors)
     sigma = np.geomspace(steepness * errors, max_sigma, NODES, axis=1)
     judged_z, healthy_z = scale.transform(values), scale.transform(rises)
     # log Jacobian of z, plus log prior of the width
@@ -475,14 +477,15 @@ def _candidate_covariances(
     covariances : array of float, shape (g, n + 1, n + 1)
     log_priors : array of float, shape (g,)
     """
-    # grid of the deviation between sessions over its prior, denser near zero; half-normal prior, times the spacing
+    # grid of the standard deviation between sessions over its prior, denser near zero; the log priors are those of a
+    # half-normal density times the spacing of the grid
     ratios = MAX_SESSION_RATIO * ((np.arange(NODES) + 0.5) / NODES) ** 2
     log_priors = 0.5 * np.log(ratios) - 0.5 * ratios**2
     if len(set(sessions)) == 1:
         ratios, log_priors = np.zeros(1), np.zeros(1)
     oil_deviation = relative_slope * oil.session_deviation  # of z between sessions, by unknown oil
     session_variances = (np.hypot(oil_deviation, session_deviation) * ratios) ** 2
-    # recordings of one session share its deviation
+    # recordings of one session share the deviation of the session
     covariances = session_variances[:, None, None] * np.equal.outer(np.array(sessions), np.array(sessions))
     # the predicted effect of the oil has errors of its slope and of its values
     covariances = covariances + np.outer(oil.thinning, oil.thinning) * (relative_slope * oil.slope_deviation) ** 2
@@ -602,8 +605,8 @@ def leak_deviations_from_mean(recordings: Sequence[RecordingSums], columns: Sequ
     """Compute the deviation of each recording's leak coefficient from the mean of all n recordings, shape (n,).
 
     It is (n - 1)/n times the difference of the recording's coefficient from the common coefficient of the other n - 1
-    recordings. The coefficients of all other terms may differ between recordings within the usual prior, the zero of
-    the flow freely. `columns`: for each equation the indices of its columns by role (leak, motion, left side).
+    recordings. The coefficients of all other terms may differ between recordings within the usual prior, and the flow
+    offset freely. `columns`: for each equation the indices of its columns by role (leak, motion, left side).
     """
     usual_width, columns = np.ones(1), [roles.with_free_zero() for roles in columns]
     all_sums = [eliminate_unshared(recording.sums, columns) for recording in recordings]
@@ -705,27 +708,27 @@ class Population:
         weight = 1.0 / (variance[..., None] + self._eigen)  # (s, g, nodes, n)
         weighted_ones, cross = weight * self._ones, self._cross
         precision = (weighted_ones * self._ones).sum(axis=-1)
-        rotated = np.einsum("gij,si->sgj", self._basis, healthy)[:, :, None]
+        rotated = np.einsum("gij,si->sgj", self._basis, healthy)[:, :, None]  # along the eigenvectors
         mean = (weighted_ones * rotated).sum(axis=-1) / precision
         weighted_residual = weight * (rotated - mean[..., None] * self._ones)
         log_likelihood = 0.5 * (
             np.log(weight).sum(axis=-1) - np.log(precision) - (weighted_residual * rotated).sum(axis=-1)
         )
         log_likelihood += self._log_priors + np.reshape(log_priors, (-1, 1, 1))
-        # prior density of log sigma, times the spacing of its grid
+        # add the log of the prior density of log sigma, times the spacing of its grid
         log_spacing = np.log(np.log(sigma[:, 1:2] / sigma[:, :1]))
         log_likelihood += np.broadcast_to(sigma_log_prior, sigma.shape)[:, None] + log_spacing[:, None]
         centres = mean + (weighted_residual * cross).sum(axis=-1) - values[:, None, None]
-        mean_deficit = 1.0 - (weighted_ones * cross).sum(axis=-1)
+        mean_deficit = 1.0 - (weighted_ones * cross).sum(axis=-1)  # weight of the estimated mean in the prediction
         variances = variance + self._judged_variance - (weight * cross**2).sum(axis=-1) + mean_deficit**2 / precision
         return Mixture(log_likelihood, np.sqrt(variances), centres)
 
 
 def number_sessions(starts: Sequence[float | None], pause: float) -> list[int]:
-    """Assign each recording to a session; a gap above `pause` [s] between two dates begins a new one.
+    """Assign each recording to a session; a gap above `pause` [s] between two dates begins a new session.
 
     `starts` (n,): dates of the recordings [s since 1970], None if unknown. Return the session number of each
-    recording, from 1 on in the order of the dates; -1 if it is undated.
+    recording, from 1 on in the order of the dates; -1 for an undated recording.
     """
     dates = sorted(start for start in starts if start is not None)
     session_starts = [date for before, date in zip([-np.inf, *dates], dates, strict=False) if date - before > pause]
@@ -752,7 +755,8 @@ class _Oil(NamedTuple):
 def predict_thinning(recordings: Sequence[RecordingSums]) -> Array:
     """Predict how much thinner oil raised the logarithm of the leakage of each recording (n + 1,), the judged one last.
 
-    It is relative to the mean over the n healthy recordings, and 0 for all if nothing shows the oil's viscosity.
+    The predictions are relative to the mean over the n healthy recordings. They are all 0 if nothing shows the oil's
+    viscosity.
     """
     return _oil_hypotheses(recordings)[0].thinning
 

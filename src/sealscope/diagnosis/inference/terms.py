@@ -196,11 +196,11 @@ def find_rests(increments: Array, rate: float, limit: float) -> NDArray[np.bool_
     is_known = np.isfinite(increments)
     sums = np.concatenate([[0], np.cumsum(np.where(is_known, increments, 0.0))])
     n_missing = np.concatenate([[0], np.cumsum(~is_known)])
-    # windows by their first sample: slow, and without a missing sample
+    # a window of samples is flagged by its first sample if it is slow on average and no sample is missing
     is_slow = np.abs(sums[window:] - sums[:-window]) <= limit * window / rate
     is_slow &= n_missing[window:] == n_missing[:-window]
     n_moving = np.concatenate([[0], np.cumsum(~_extend_flags(is_slow, window))])
-    is_rest_start = n_moving[min_length:] == n_moving[:-min_length]
+    is_rest_start = n_moving[min_length:] == n_moving[:-min_length]  # no moving sample among the next `min_length`
     return _extend_flags(is_rest_start, min_length)
 
 
@@ -250,8 +250,8 @@ class Term(NamedTuple):
     needs : tuple of str
         Channels from which the increments are computed.
     driver : str
-        "pressure" if a pressure drives the flow, "root" if the square root of a pressure does, else "". Sensor offsets
-        affect the first two.
+        "pressure" if a pressure drives the flow, "root" if the square root of a pressure does, else "". In the first
+        two cases offsets of pressure sensors change the increments.
     """
 
     name: str
@@ -343,8 +343,10 @@ def _conductance_term(
 ) -> Term:
     """Make a term of a flow that is an unknown conductance [m^3/(s Pa)] times a pressure.
 
-    `increments` computes from `Signals` that pressure times the sampling interval [Pa s], shape (n - 1,). The other
-    arguments are fields of `Term`.
+    `name`: name of the term; `increments` computes from `Signals` the pressure times the sampling interval [Pa s],
+    shape (n - 1,); `cause`: cause of a sudden change of the conductance; `needs`: channels that `increments` reads;
+    `drift`: entry of `priors.toml` with the prior on the drift, "" if the conductance is zero unless `cause` is
+    present.
     """
     return Term(name, "m^3/(s Pa)", increments, cause, drift=drift, needs=needs, driver="pressure")
 
@@ -397,6 +399,7 @@ def _free_air_term(rig: Rig, weight_A: Callable[[Signals], Array | float]) -> Te
 
     cylinder = rig.cylinder
     mid_volumes = dict(zip("AB", mid_stroke_volumes(cylinder), strict=True))
+    # change of each volume with the position
     areas = {"A": cylinder.A_A, "B": -cylinder.A_B} if cylinder.volumes == "position" else {"A": 0.0, "B": 0.0}
 
     def expansion(s: Signals, side: str) -> Array:
@@ -429,7 +432,7 @@ def _external_leak_term(side: str, weight: float = 1.0) -> Term:
         """Compute the increments `weight` max(p, 0) dt of the term [Pa s], shape (n - 1,)."""
         return np.asarray(weight * np.maximum(s.mean(p), 0.0) * s.dt)
 
-    return _conductance_term(f"external leak {side}", lost_volume, "external leak", (p,))
+    return _conductance_term(f"external leak {side}", lost_volume, cause="external leak", needs=(p,))
 
 
 def _compensated_leak_term(side: str) -> Term:
@@ -444,7 +447,7 @@ def _compensated_leak_term(side: str) -> Term:
         weight = _interval_means(s.carried_by_A) - float(side == "B")  # 1 or 0 for side A, 0 or -1 for side B
         return np.asarray(weight * np.maximum(s.mean(f"p_{side}"), 0.0) * s.dt)
 
-    return _conductance_term(f"external leak {side}{MADE_UP}", lost_volume, "external leak")
+    return _conductance_term(f"external leak {side}{MADE_UP}", lost_volume, cause="external leak")
 
 
 _START = _sensor_term("start of the drive", "m^3/s", lambda s: s.mean(START) * s.dt, drift="bias", needs=(START,))
@@ -474,7 +477,7 @@ _CYLINDER = (
     _LINES,
     _PUMP,
     _external_leak_term("A"),
-    _external_leak_term("B", -1.0),
+    _external_leak_term("B", weight=-1.0),
     _compensated_leak_term("A"),
     _compensated_leak_term("B"),
     *_LEAKS,
@@ -492,23 +495,23 @@ def _metering_edge_terms(edge: str, upstream: str, downstream: str, sign: float)
     delayed by the lag of the spool. Up to their signs, the unknown coefficients are gain, gain times lag, and overlap.
     """
 
-    def unit_flow(s: Signals) -> Array:
+    def pressure_root(s: Signals) -> Array:
         """Compute sign(dp) sqrt(abs(dp)) [Pa^0.5] of the pressure drop dp over the edge, shape (n - 1,)."""
         return _signed_root(s.mean(upstream) - s.mean(downstream))
 
     def proportional_flow(s: Signals) -> Array:
         """Compute the increments abs(u) sign(dp) sqrt(abs(dp)) dt [V Pa^0.5 s] of the term "edge", shape (n - 1,).
 
-        They are 0 unless u has the sign that opens the edge.
+        The increments are 0 unless u has the sign that opens the edge.
         """
-        return np.asarray(np.maximum(sign * s.mean("u"), 0.0) * unit_flow(s) * s.dt)
+        return np.asarray(np.maximum(sign * s.mean("u"), 0.0) * pressure_root(s) * s.dt)
 
     def overlap_flow(s: Signals) -> Array:
         """Compute the increments sign(dp) sqrt(abs(dp)) dt [Pa^0.5 s] of the term "overlap", shape (n - 1,).
 
-        They are 0 unless u has the sign that opens the edge.
+        The increments are 0 unless u has the sign that opens the edge.
         """
-        return np.asarray((sign * s.mean("u") > 0.0) * unit_flow(s) * s.dt)
+        return np.asarray((sign * s.mean("u") > 0.0) * pressure_root(s) * s.dt)
 
     def make_term(name: str, unit: str, increments: Callable[[Signals], Array]) -> Term:
         """Make a term of the flow over the metering edge: a coefficient, in `unit`, times `increments` (`Term`)."""
@@ -516,7 +519,7 @@ def _metering_edge_terms(edge: str, upstream: str, downstream: str, sign: float)
 
     return (
         make_term("edge", "m^3/(s V Pa^0.5)", proportional_flow),
-        make_term("late edge", "m^3/(V Pa^0.5)", lambda s: np.gradient(proportional_flow(s))),
+        make_term("late edge", "m^3/(V Pa^0.5)", lambda s: np.gradient(proportional_flow(s))),  # gain times lag
         make_term("overlap", "m^3/(s Pa^0.5)", overlap_flow),
     )
 
@@ -537,9 +540,10 @@ def _chamber_equation(side: str, rig: Rig) -> Equation:
         *_metering_edge_terms(f"{side} to T", f"p_{side}", "p_2", -sign),
         *_chamber_terms(side),
         _BIAS,
-        _free_air_term(rig, lambda s: float(is_A)),
-        _external_leak_term("A", float(is_A)),
-        _external_leak_term("B", -float(not is_A)),
+        # each chamber's balance has the same terms of air and external leaks; those of the other chamber are zero
+        _free_air_term(rig, weight_A=lambda s: float(is_A)),
+        _external_leak_term("A", weight=float(is_A)),
+        _external_leak_term("B", weight=-float(not is_A)),
         *_LEAKS,
     )
     return Equation(f"chamber {side}", lambda s: -area * s.step("x"), terms, INFERENCE.healthy.piston, flow_sign=-1.0)
@@ -567,14 +571,15 @@ def equations(rig: Rig, channels: frozenset[str]) -> tuple[Equation, ...]:
         terms.insert(0, _START)
     if source == "q_pump":  # a meter is downstream of the filling loss
         terms.remove(_SPEED_LOSS)
+    # both chambers count alike, but on a single rod only the loaded chamber counts
     single_rod = rig.cylinder.single_rod
-    air = _free_air_term(rig, lambda s: _interval_means(s.carried_by_A) if single_rod else 0.5)
+    air = _free_air_term(rig, weight_A=lambda s: _interval_means(s.carried_by_A) if single_rod else 0.5)
     balance = _insert_before_leaks(Equation(CYLINDER, left, tuple(terms), by_command=source == "u"), air)
     return (_select_recorded_terms(balance, channels | {START}),)  # START is derived, not recorded
 
 
 #: Leaks in a balance without a piston in motion: to the outside, and past piston and pump.
-_STANDSTILL_LEAKS = (_external_leak_term("A"), _external_leak_term("B", -1.0), *_LEAKS)
+_STANDSTILL_LEAKS = (_external_leak_term("A"), _external_leak_term("B", weight=-1.0), *_LEAKS)
 #: Terms of such a balance of both chambers: their compliances, and the leaks.
 _STANDSTILL = (*(_chamber_terms(side)[0] for side in "AB"), *_STANDSTILL_LEAKS)
 
@@ -582,9 +587,9 @@ _STANDSTILL = (*(_chamber_terms(side)[0] for side in "AB"), *_STANDSTILL_LEAKS)
 def circulation(rig: Rig, channels: frozenset[str]) -> Equation | None:
     """Return the volume balance of a pump while the piston displaces no net volume.
 
-    It holds over whole cycles or at standstill, so the position need not be known. An offset of the flow cannot be
-    separated from leakage under a steady load, and is assumed to be zero. Return None if the pump does not feed the
-    chambers, or if its delivery or a chamber's pressure is not recorded.
+    The balance holds over whole cycles or at standstill, so the position need not be known. An offset of the flow
+    cannot be separated from leakage under a steady load, and is assumed to be zero. Return None if the pump does not
+    feed the chambers, or if its delivery or a chamber's pressure is not recorded.
     """
     left = pump_volume(rig, channels)
     if not rig.circuit.pump_feeds_chambers or left is None or not channels.issuperset(_PRESSURES):
@@ -605,9 +610,9 @@ def locked(rig: Rig, channels: frozenset[str]) -> Equation | None:
     """
     if not {"x", *_PRESSURES} <= channels:
         return None
-    if flow_source(channels) is not None and not (rig.circuit.holds_load and "u" in channels):
+    has_flow = flow_source(channels) is not None  # a command, or a flow of the pump
+    if has_flow and not (rig.circuit.holds_load and "u" in channels):
         return None
-
     areas = {"A": rig.cylinder.A_A, "B": rig.cylinder.A_B}
 
     def loaded_side(s: Signals) -> str:
@@ -650,7 +655,7 @@ def pump_volume(rig: Rig, channels: frozenset[str]) -> Callable[[Signals], Array
 def with_rests(equation: Equation) -> Equation:
     """Return a pump's volume balance with three more terms, which are zero in some states of the machine (`STATES`).
 
-    They are inserted before the terms of the leak. Their increments are 0 except for
+    The new terms are inserted before the terms of the leak. Their increments are 0 except for
 
     - (p_A - p_B) dt while the pump moves the piston (`TURNING`),
     - (p_A - p_B) dt while the pump turns and the piston rests, to hold the load (`HOLDING`),
@@ -694,10 +699,9 @@ def _pump_leakage_terms(
         """Compute (p_A - p_B) dt [Pa s] in intervals in which the pump holds the load, else 0, shape (n - 1,)."""
         return s.holding(pump_volume) * s.pressure_difference * s.dt
 
-    return (
-        _conductance_term(TURNING, turning, "pump leak", (), drift),
-        _conductance_term(HOLDING, holding, "pump leak", (), drift),
-    )
+    # no further channels are needed: the balance requires both pressures anyway
+    make_term = partial(_conductance_term, cause="pump leak", needs=(), drift=drift)
+    return make_term(TURNING, turning), make_term(HOLDING, holding)
 
 
 def _insert_before_leaks(equation: Equation, *terms: Term) -> Equation:

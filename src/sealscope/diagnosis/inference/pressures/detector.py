@@ -46,7 +46,7 @@ class PressureResponse:
     def learn(self, recording: Recording) -> Summary | None:
         """Summarise a healthy recording by the mean conductance past the piston [m^3/(s Pa)], with the key "level".
 
-        Return None if the recording is not measured (`reading`).
+        Return None if the leakage of the recording cannot be measured (`reading`).
         """
         leak = self.reading(recording)
         return None if leak is None else {"level": leak.level[0]}
@@ -55,8 +55,9 @@ class PressureResponse:
         """Report on a recording: tests of the response's parameters for a step, and the leakage.
 
         The leakage is compared with the leakage of the healthy recordings in `baseline`. The report also states how
-        much of the recording is judged: the fraction of samples that do not fill a gap, and how far these extend. If
-        the leakage cannot be measured or a leak would not show, the report states only the reason (`lack`).
+        much of the recording is judged: the fraction of samples that do not fill a gap, and the end of the last of
+        these samples. If the leakage cannot be measured or a leak would not show, the report states only the reason
+        (`lack`).
         """
         leak = self.reading(recording)
         if leak is None:
@@ -82,6 +83,6 @@ def score_response_steps(information: Mapping[str, Information]) -> tuple[Observ
         signs = (1.0,) if name == "G" else (1.0, -1.0)
         tests = step_tests(likelihood, signs)
         if tests:
-            test, sign = max(zip(tests, signs, strict=True), key=lambda pair: pair[0].score)
+            test, sign = max(zip(tests, signs, strict=True), key=lambda test_and_sign: test_and_sign[0].score)
             observables.append(Observable.from_test(name, RESPONSE, test, n_tests=float(len(signs)), sign=sign))
     return tuple(sorted(observables, key=lambda observable: -observable.score))

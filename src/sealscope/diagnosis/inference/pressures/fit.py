@@ -44,7 +44,7 @@ class Priors(NamedTuple):
     """Prior on p parameters that vary during a recording, (p,) each.
 
     `centre`, `width`: prior mean and standard deviation of each parameter's average over the recording; `wander`:
-    standard deviation that the parameter's random walk reaches within `blocks.wander` of `priors.toml`, 90 s.
+    standard deviation that the parameter's random walk reaches within the time `blocks.wander` of `priors.toml`, 90 s.
     """
 
     centre: Array
@@ -78,8 +78,9 @@ class Linearisation(NamedTuple):
     """Linearisation of the model's output over n samples about p parameters `theta` (p,).
 
     `rows` (1 + p, n): residual [Pa], and derivative of the output by each parameter [Pa per unit]; `gram`
-    (1 + p, 1 + p): products of these rows, without the mains hum; `ends`: simulated states at the last sample;
-    `squares`: residual sums of squares [Pa^2] of all simulated parameter sets, `theta` being the first.
+    (1 + p, 1 + p): sums over the samples of the products of these rows with each other, after removal of the mains hum;
+    `ends`: simulated states at the last sample; `squares`: residual sums of squares [Pa^2] of all simulated parameter
+    sets, `theta` being the first.
     """
 
     theta: Array
@@ -94,15 +95,17 @@ class Linearisation(NamedTuple):
         `variance`: variance of the noise [Pa^2]; `prior`: prior on the parameters.
         """
         deviations = prior.deviations(self.theta)
+        # gram[0, 0] is the residual sum of squares
         return float(self.gram[0, 0] / variance + deviations @ prior.precision @ deviations)
 
 
 class Block(NamedTuple):
     """Sums over a block of samples, from the linearisation about the block's parameters `theta` (p,).
 
-    `gram` (1 + p, 1 + p): products of the residual and the derivatives by each parameter; `samples`: number of known
-    samples; `scores` (s, 1 + p): products of residual and derivatives with the derivative by the tested parameter, in
-    each of s pieces of the block. The scatter of the scores shows the autocorrelation of the residual.
+    `gram` (1 + p, 1 + p): products of the residual and of the derivatives by each parameter with each other; `samples`:
+    number of known samples; `scores` (s, 1 + p): products of the residual and of the derivatives with the derivative by
+    the tested parameter, in each of s pieces of the block. The scatter of the scores shows the autocorrelation of the
+    residual.
     """
 
     theta: Array
@@ -139,7 +142,7 @@ class Joint:
         prior_gradient = prior_precision @ ((theta - priors.centre) / priors.unit).ravel()
         gram = block_diag(*(block.gram[1:, 1:] for block in blocks))
         gradient = np.concatenate([block.gram[0, 1:] for block in blocks])
-        variance, _ = _estimate_noise(blocks, np.zeros(theta.size), parameter)
+        variance, _ = _estimate_noise(blocks, np.zeros(theta.size), parameter)  # about the linearised parameters
         inflation = 1.0  # white noise at first
         for _ in range(2):  # the fit changes the variance of the noise, which weights the prior
             factor = cho_factor(gram / (variance * inflation) + prior_precision, check_finite=False)
@@ -176,24 +179,24 @@ def _prior_precision(n_blocks: int, priors: Priors, block_s: float) -> Array:
     The parameters are in units of `priors.unit`. Each parameter is a random walk from block to block, and its mean over
     the blocks has the prior standard deviation `priors.width`.
     """
-    steps = np.diff(np.eye(n_blocks), axis=0)
-    walks = np.kron(steps.T @ steps, np.diag(1.0 / priors.wander_variance(block_s)))
-    mean_weights = np.full((n_blocks, n_blocks), 1.0 / n_blocks**2)
+    differences = np.diff(np.eye(n_blocks), axis=0)  # matrix (K - 1, K) of the changes from block to block
+    walks = np.kron(differences.T @ differences, np.diag(1.0 / priors.wander_variance(block_s)))
+    mean_weights = np.full((n_blocks, n_blocks), 1.0 / n_blocks**2)  # of the square of the mean over the blocks
     return np.asarray(walks + np.kron(mean_weights, priors.normal.precision))
 
 
 def _estimate_noise(blocks: Sequence[Block], deviations: Array, parameter: int) -> tuple[float, float]:
-    """Compute the variance of the residual [Pa^2], and its inflation by the correlation of the noise.
+    """Compute the variance of the residual [Pa^2], and its inflation in estimates by the correlation of the noise.
 
     The inflation is the variance of the scores (`Block`) over their variance under white noise, at least 1.
     `deviations` (K p,): deviations of the parameters from `theta` of each block, in multiples of `Priors.unit`;
     `parameter`: index of the tested parameter.
     """
-    # (1, -deviation) times residual and Jacobian is the residual at these deviations
+    # residual at these deviations: (1, -deviations) times the rows of residual and Jacobian
     directions = [np.append(1.0, -deviation) for deviation in deviations.reshape(len(blocks), -1)]
     pairs = list(zip(blocks, directions, strict=True))
     squares = sum(float(direction @ block.gram @ direction) for block, direction in pairs)
-    variance = max(squares, 1.0) / sum(block.samples for block in blocks)
+    variance = max(squares, 1.0) / sum(block.samples for block in blocks)  # never zero
     scores = np.concatenate([block.scores @ direction for block, direction in pairs])
     white_variance = variance * sum(float(block.gram[1 + parameter, 1 + parameter]) for block in blocks)
     return variance, max(1.0, float(scores @ scores) / max(white_variance, np.finfo(float).tiny))

@@ -35,9 +35,9 @@ def conductance_scale_error() -> float:
 
 
 def states_flow(rig: Rig) -> bool:
-    """Return True if the rig's file states the piston areas and the moving mass.
+    """Return True if the rig's file states the sizes that convert a fitted conductance to a flow in L/min.
 
-    They are needed to convert a conductance fitted to the pressures to a flow in L/min.
+    These sizes are the piston areas and the moving mass.
     """
     return rig.states("cylinder.A_A", "cylinder.A_B", "cylinder.M_eq")
 
@@ -100,6 +100,7 @@ class ResponseLeak:
         if self.step is None:
             return Flow(0.0, np.inf)
         size, deviation = self.step.fitted
+        # of the flow over that of a laminar leak, between 1 and the ratio of an orifice
         mean_ratio, half_range = 0.5 * (ORIFICE_RATIO + 1.0), 0.5 * (ORIFICE_RATIO - 1.0)
         law_deviation = half_range * abs(size) / WITHIN_95
         unit = self.flow_per_conductance
@@ -120,7 +121,7 @@ class ResponseLeak:
         if not count:
             return None
         total = sum(self.healthy)
-        # each healthy recording minus the mean of the others, as the judged recording is compared with a mean
+        # each healthy level minus the mean of the others: the judged level is compared with a mean in the same way
         differences = [level - (total - level) / (count - 1) for level in self.healthy] if count > 1 else [0.0]
         judged_level, _ = self.level
         return student_rise(judged_level - total / count, differences, PRESSURE.conductance.level)
@@ -129,8 +130,8 @@ class ResponseLeak:
     def bound_flow(self) -> float:
         """95 % upper bound of the mean flow [m^3/s] of a leak; infinite if nothing was tested.
 
-        With healthy recordings it bounds the leakage above theirs, otherwise a leak that begins within the recording.
-        An orifice is assumed, which has the largest flow for a fitted conductance.
+        With healthy recordings the bound is on the leakage above that of these recordings, otherwise on a leak that
+        begins within the recording. An orifice is assumed, which has the largest flow for a fitted conductance.
         """
         test = self.step if self.rise is None else self.rise
         if test is None:
@@ -142,14 +143,14 @@ class ResponseLeak:
     def step_rise(self) -> LeakRise | None:
         """Leakage above that of healthy recordings, and the evidence that a step within the recording caused it.
 
-        The evidence (`step_log_ratio`) is the log likelihood ratio of the rise of the mean that the step would cause to
-        no rise. None without healthy recordings.
+        The step would raise the mean conductance of the recording by a certain amount. The evidence (`step_log_ratio`)
+        is the log likelihood ratio of such a rise to no rise. None without healthy recordings.
         """
         if self.rise is None:
             return None
         step = self.step
-        mean_step = 0.0 if step is None else step.fitted.size * self._fraction_after(step)
-        return LeakRise(self.rise, self.rise.log_ratio(mean_step))
+        rise_by_step = 0.0 if step is None else step.fitted.size * self._fraction_after(step)
+        return LeakRise(self.rise, step_log_ratio=self.rise.log_ratio(rise_by_step))
 
     def _fraction_after(self, step: StepTest) -> float:
         """Compute the weight of the blocks after a step's onset in the mean conductance of the recording, 0 to 1.
@@ -173,8 +174,8 @@ class ResponseLeak:
         """Return the smallest detectable leak, without the total leakage, which pressures alone do not show.
 
         `detectable_flow`: flow [m^3/s] of the smallest leak that would be detected if it began within the recording,
-        None if that was not tested. It is stated in L/min and as a fraction of the pump's flow (`findable_lpm`,
-        `findable_share`).
+        None if that was not tested. The result states this flow in L/min and as a fraction of the pump's flow
+        (`findable_lpm`, `findable_share`).
         """
         (pump_flow, _), lpm_per_flow = self.pump_flow, self.lpm_per_flow
         return TotalLeakage(

@@ -97,14 +97,16 @@ def _advance_friction(
     Returns the friction force after the step and the friction of steady sliding at the speed v, both [N].
     `friction_0`, `steady_0`: the same two forces before the step.
 
-    Without the damping of the contact, which vanishes when it slides, the law of the friction force F is compliance
-    dF/dt = v - |v| F/magnitude, with the contact's compliance and the magnitude of the steady friction
-    (`_steady_friction`). The step is L-stable and of order 2: with a = h |v|/(compliance magnitude) and the steady
-    friction F_s, or F_s0 before the step, F = (F_0 + (a/2) (F_s0 + (1 + a) F_s)) / (1 + a + a^2/2). Numerator and
-    denominator are both multiplied by (compliance magnitude)^2.
+    The law, without the damping of the contact, is c dF/dt = v - |v| F/F_m for the friction force F, with the contact's
+    compliance c and the magnitude F_m of the steady friction (`_steady_friction`). The step is L-stable and of order 2:
+    with a = h |v|/(c F_m), the steady friction F_s at the speed v, and F_s0 before the step,
+
+        F = (F_0 + (a/2) (F_s0 + (1 + a) F_s)) / (1 + a + a^2/2).
+
+    In the code numerator and denominator are multiplied by (c F_m)^2.
     """
     steady, magnitude, speed = _steady_friction(v, theta, m)
-    slip, stretch = h * speed, theta[COMPLIANCE] * magnitude  # [m]: path in h, deflection at full friction
+    slip, stretch = h * speed, theta[COMPLIANCE] * magnitude  # [m]: h |v|, and c F_m
     numerator = friction_0 * stretch * stretch + 0.5 * slip * (steady_0 * stretch + steady * (stretch + slip))
     return numerator / (stretch * stretch + slip * (stretch + 0.5 * slip)), steady
 
@@ -117,6 +119,7 @@ def _rates(y: State, friction: float, omega_ref: float, theta: Parameters, m: Re
     integral of the speed error [rad], and the position [m]. `friction` [N]; `omega_ref`: commanded speed [rad/s];
     `theta`: fitted parameters; `m`: sizes of the rig.
     """
+    # p_A = p/2 and p_B = -p/2, so p changes twice as fast as p_A; 0.0: no leakage of the pump, no force of an end stop
     p, v, omega, i, integral, x = y
     outflow, viscous = m.A_A * v + laminar_leakage(p, theta[G]), theta[F_V] * v * _direction_factor(v, theta)
     error = omega_ref - omega
@@ -154,7 +157,7 @@ def simulate_response(
     Parameters
     ----------
     command : array of float, shape (n + 1,)
-        Command [V] at the previous sample and at each of n samples; it is linear in between.
+        Command [V] at the sample before the first and at each of n samples; it is linear in between.
     rate : float
         Sampling rate [Hz].
     n_substeps : int
@@ -162,7 +165,8 @@ def simulate_response(
     sets : array of float, shape (p, lanes)
         Parameters, a row for each.
     states : array of float, shape (8, lanes)
-        p, v, omega, i, I, x, friction and reading at the previous sample; on return those at the last sample.
+        p, v, omega, i, I, x (`_rates`), friction and reading at the sample before the first; on return those at the
+        last sample.
     m : Reduced
         Sizes of the reduced rig.
     out : array of float, shape (n, lanes)
@@ -174,8 +178,10 @@ def simulate_response(
     steady = _steady_friction(y[1], theta, m)[0]
     for sample in range(command.size - 1):
         rise = command[sample + 1] - command[sample]
+        # added to gain times command: the bias, and the effect of the lead, by which the linear command comes earlier
         lead_speed = theta[GAIN] * theta[LEAD] * (rise * rate) + theta[BIAS]
         for step in range(n_substeps):
+            # commanded speeds at the start, in the middle and at the end of the step
             speed_0 = theta[GAIN] * (command[sample] + rise * (step / n_substeps)) + lead_speed
             speed_1 = theta[GAIN] * (command[sample] + rise * ((step + 0.5) / n_substeps)) + lead_speed
             speed_2 = theta[GAIN] * (command[sample] + rise * ((step + 1.0) / n_substeps)) + lead_speed
@@ -204,8 +210,8 @@ def response_priors(rig: Rig, law: str = STRIBECK) -> Priors:
     the charge pressure in both chambers.
     """
     friction, gain = rig.friction, rig.motor.omega_per_volt
-    of_difference = friction.coulomb_pressure == "difference"
-    coulomb = coulomb_friction(rig.fluid.p_charge, rig.fluid.p_charge, friction.F_pr, friction.F_cfr, of_difference)
+    p_charge, of_difference = rig.fluid.p_charge, friction.coulomb_pressure == "difference"
+    coulomb = coulomb_friction(p_charge, p_charge, friction.F_pr, friction.F_cfr, of_difference)
     rig_values = {"gain": gain, "bias": gain, "K": rig.fluid.K_oil, "F_C": coulomb}
     rig_values |= {name: getattr(friction, name) for name in ("F_v", "K_brk", "C_c")}
     # centre, width and wander of each parameter, relative to the rig's value if the rig has the parameter
@@ -236,8 +242,9 @@ class Machine(NamedTuple):
     def simulate(self, command: Array, sets: Array, states: Array) -> tuple[Array, Array]:
         """Simulate p_A - p_B [Pa] at n samples for each of up to 16 parameter sets (m, p).
 
-        `command` (n + 1,): command [V] at the previous sample and at each sample; `states` (8, m): states at the
-        previous sample (`simulate_response`). Returns p_A - p_B (m, n), and the states at the last sample (8, m).
+        `command` (n + 1,): command [V] at the sample before the first and at each of the n samples; `states` (8, m):
+        states at the sample before the first (`simulate_response`). Returns p_A - p_B (m, n), and the states at the
+        last sample (8, m).
         """
         lanes = np.minimum(np.arange(SINGLE_WIDTH), len(sets) - 1)  # unused lanes repeat the last set
         theta = np.ascontiguousarray(sets[lanes, : LAG + 1].T, dtype=np.float32)
@@ -266,7 +273,7 @@ class Machine(NamedTuple):
         relative_width = priors.width[K_OIL] / priors.centre[K_OIL]
         n_padded = 4 * _SEGMENT  # samples of a segment with zeros, for a finer grid of frequencies
         middle = n_padded / self.ringing_period(priors.centre[K_OIL])  # bin of the ringing at the centre of the prior
-        bins = np.arange(
+        bins = np.arange(  # of the frequencies that the prior allows
             math.ceil(middle * math.exp(-2.0 * relative_width)),
             min(n_padded // 2, int(middle * math.exp(relative_width))),
         )
@@ -276,7 +283,7 @@ class Machine(NamedTuple):
         spectra = np.fft.rfft(segments * np.hanning(segments.shape[2] + 1)[:-1], n_padded)
         powers = np.mean(np.abs(spectra) ** 2, axis=1)  # Welch's method
         difference_power, total_power = powers
-        excess = np.pad((difference_power - total_power)[bins], 1, constant_values=-np.inf)
+        excess = np.pad((difference_power - total_power)[bins], 1, constant_values=-np.inf)  # so that ends may be peaks
         peaks = np.flatnonzero((excess[1:-1] > excess[:-2]) & (excess[1:-1] >= excess[2:]))
         strongest = np.resize(peaks[np.argsort(-excess[1 + peaks])], 2)  # a single peak is repeated
         # the frequency grows with the root of the stiffness

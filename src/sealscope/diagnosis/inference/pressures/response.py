@@ -73,11 +73,14 @@ def _geometric_grid(middle: float, factor: float, count: int) -> Array:
 class Segment:
     """Consecutive samples of a recording that are fitted with one set of parameters.
 
-    `machine`, `priors`: simulator, and priors of its parameters; `command` (n + 1,): command [V] at the previous sample
-    and at each sample; `dp` (n,): recorded p_A - p_B [Pa]; `states` (8, 12): simulated states at the previous sample,
-    with the parameters, and with each parameter up to `SPRING` increased in turn; `waves` (m, n): waves of the mains
-    hum, which are projected out; `sample_weights` (n,): 0 for samples that are missing or recorded while the drive
-    settles, otherwise 1; `smooth`: width [samples] of a Gaussian that smooths the residual, 0 for no smoothing.
+    - `machine`, `priors`: simulator, and priors of its parameters;
+    - `command` (n + 1,): command [V] at the sample before the first, and at each of the n samples;
+    - `dp` (n,): recorded p_A - p_B [Pa], with the sign reversed if it falls with the command;
+    - `states` (8, 12): states at the sample before the first, as simulated with the parameters (column 0), and with
+      each parameter up to `SPRING` increased in turn;
+    - `waves` (m, n): waves of the mains hum, which are projected out;
+    - `sample_weights` (n,): 0 for samples that are missing or recorded while the drive settles, otherwise 1;
+    - `smooth`: width [samples] of a Gaussian that smooths the residual, 0 for no smoothing.
     """
 
     machine: Machine
@@ -100,7 +103,7 @@ class Segment:
         return np.asarray(np.linalg.pinv(self.waves @ self.waves.T, hermitian=True))
 
     def _project_on_waves(self, rows: Array) -> tuple[Array, Array, Array]:
-        """Smooth rows (m, n) of samples, set samples without a weight to 0, and fit k mains waves to each row.
+        """Smooth rows (m, n) of n samples, set samples without a weight to 0, and fit k waves of mains hum to each row.
 
         Returns the smoothed rows (m, n), their products with the waves (m, k), and the fitted amplitudes of the waves
         (m, k).
@@ -117,7 +120,8 @@ class Segment:
         The residual is recorded minus simulated p_A - p_B, without its mean and the mains hum. The result (m,) is
         infinite for a set whose simulation diverges.
         """
-        simulated, _ = self.machine.simulate(self.command, sets, self.states[:, np.zeros(len(sets), dtype=int)])
+        states = self.states[:, np.zeros(len(sets), dtype=int)]  # column 0, once for each set
+        simulated, _ = self.machine.simulate(self.command, sets, states)
         residual, _, amplitudes = self._project_on_waves(self.dp - sets[:, SCALE, None] * simulated)
         squares = self.dp.size * np.var(residual - amplitudes @ self.waves, axis=1)
         return np.asarray(np.nan_to_num(squares, nan=np.inf))
@@ -126,11 +130,11 @@ class Segment:
         """Linearise the residual of the model about the first of up to 5 parameter sets (m, p).
 
         The residual is dp - scale * simulated response - offset. The rows of the result are the residual of the first
-        set, and the derivatives of scale * response + offset by each parameter, per unit of `priors.unit`. The result
-        also has the residual sum of squares of each set.
+        set, and the derivatives of scale * response + offset by each parameter, per unit of `priors.unit`. The other
+        sets are simulated only for their residual sums of squares, which `squares` of the result contains.
         """
         theta, n_sets = sets[0], len(sets)
-        n_slopes = SPRING + 1  # number of parameters whose derivatives are simulated
+        n_slopes = SPRING + 1  # the derivatives by the first parameters, up to SPRING, are simulated
         # simulated together: theta, theta with each parameter up to SPRING increased by a unit, and the other sets
         simulated = np.concatenate([sets[:1], np.tile(theta, (n_slopes, 1)), sets[1:]])
         simulated[range(1, n_slopes + 1), range(n_slopes)] += self.priors.unit[:n_slopes]
@@ -156,7 +160,7 @@ class Segment:
         """
         change = np.asarray(np.gradient(response))
         change[1:-1] -= np.diff(change, 2) / 6.0  # to fourth order, since the ringing is fast
-        by_lead = theta[SCALE] * self.machine.rate * change
+        by_lead = theta[SCALE] * self.machine.rate * change  # time derivative of the reading
         decay = math.exp(-1.0 / (self.machine.rate * max(theta[LAG], _MIN)))
         # first-order low pass of -by_lead, as the solution of a bidiagonal system
         by_lag = dtbtrs(np.tile([[1.0], [-decay]], by_lead.size), (decay - 1.0) * by_lead, uplo="L")[0]
@@ -172,7 +176,8 @@ class Segment:
         """
         damping = 0.0
         for _ in range(n_steps):
-            variance = noise or self.residual_variance(float(fit.gram[0, 0]))
+            residual_squares = float(fit.gram[0, 0])  # row and column 0 of the Gram matrix belong to the residual
+            variance = noise or self.residual_variance(residual_squares)
             hessian = fit.gram[1:, 1:] / variance + prior.precision
             gradient = fit.gram[0, 1:] / variance - prior.precision @ prior.deviations(fit.theta)
             step = np.linalg.solve(hessian + damping * np.diag(np.diag(hessian)), gradient)
@@ -180,7 +185,8 @@ class Segment:
                 break
             sets = np.clip(fit.theta + _FRACTIONS[:, None] * step * prior.unit, *self.bounds(fit.theta))
             full_step, deviations = self.linearise(sets), prior.deviations(sets)
-            costs = full_step.squares / variance + np.sum(deviations @ prior.precision * deviations, axis=1)  # (5,)
+            # -2 log posterior after each fraction of the step, (5,)
+            costs = full_step.squares / variance + np.sum(deviations @ prior.precision * deviations, axis=1)
             gains = np.nan_to_num(fit.cost(variance, prior) - costs, nan=-np.inf)
             best = int(np.argmax(gains))
             if not gains[best] > 0.0:
@@ -221,12 +227,12 @@ class Segment:
     def block_sums(self, fit: Linearisation) -> Block:
         """Reduce a linearised fit of these samples to the sums for the joint fit of all blocks (`fit.Joint`).
 
-        The scores of a second are the sums over its samples of d_G times the residual, and of d_G times the derivative
-        by each parameter, where d_G is the derivative by the leakage conductance G. They have the shape (s, 1 + p) for
-        s seconds, of which the last may be incomplete. The mains hum is projected out.
+        With d_G, the derivative by the leakage conductance G, the scores of one second are the sums over its samples of
+        d_G times the residual, and of d_G times the derivative by each parameter. The scores have the shape (s, 1 + p)
+        for s seconds, of which the last may be incomplete. The mains hum is projected out.
         """
         rows = fit.rows - (fit.rows @ self.waves.T) @ self._wave_gram_inverse @ self.waves
-        first = np.arange(0, self.dp.size, round(self.machine.rate))
+        first = np.arange(0, self.dp.size, round(self.machine.rate))  # sample of each second
         scores = np.add.reduceat(rows[1 + G] * rows, first, axis=1).T
         return Block(fit.theta, fit.gram, self.n_samples, scores)
 
@@ -244,7 +250,7 @@ def fit_from_priors(segment: Segment, total: Array, noise: float) -> Linearisati
     def rank_starts(section: Segment, theta: Array, n_groups: int, values: dict[int, Array]) -> Array:
         """Sort 16 variants of the parameters `theta` (p,) by their fit to a section, within each of several groups.
 
-        `values`: maps the index of a parameter to its value in each variant (16,). Consecutive variants form
+        `values` maps the index of a varied parameter to its value in each variant (16,). Consecutive variants form
         `n_groups` groups. The result has the shape (16/n_groups, n_groups, p); row 0 contains the variant with the
         smallest residual of each group.
         """
@@ -257,13 +263,15 @@ def fit_from_priors(segment: Segment, total: Array, noise: float) -> Linearisati
     slow_part = replace(segment, smooth=_FOLLOW.slow * segment.machine.ringing_period(priors.centre[K_OIL]))
     gains = priors.centre[GAIN] * _geometric_grid(*PRESSURE.start["gain"], 8)
     springs = priors.centre[SPRING] + priors.width[SPRING] * np.array([0.0, 1.0])
-    slow_starts = rank_starts(slow_part, priors.centre, 1, {GAIN: np.tile(gains, 2), SPRING: np.repeat(springs, 8)})
-    theta = slow_part.descend(slow_part.linearise(slow_starts[0]), priors.normal, _N_STEPS // 2).theta
+    variants = {GAIN: np.tile(gains, 2), SPRING: np.repeat(springs, 8)}  # all 16 combinations
+    best_start, *_ = rank_starts(slow_part, priors.centre, n_groups=1, values=variants)  # (1, p)
+    theta = slow_part.descend(slow_part.linearise(best_start), priors.normal, _N_STEPS // 2).theta
     ringing = segment.machine.ringing_stiffnesses(segment.dp, total, priors)
     stiffnesses = np.append(ringing, priors.centre[K_OIL] * _geometric_grid(*PRESSURE.start["K"], 2))  # (4,)
     breakaways = theta[K_BRK] * _geometric_grid(*PRESSURE.start["K_brk"], 4)
-    starts = rank_starts(segment, theta, 4, {K_OIL: np.repeat(stiffnesses, 4), K_BRK: np.tile(breakaways, 4)})
-    best_starts, second_best_starts, *_ = starts  # breakaway forces, for each stiffness of the oil
+    variants = {K_OIL: np.repeat(stiffnesses, 4), K_BRK: np.tile(breakaways, 4)}
+    # one group for each stiffness of the oil: its best and its second-best breakaway force, (4, p) each
+    best_starts, second_best_starts, *_ = rank_starts(segment, theta, n_groups=4, values=variants)
     fit = fit_from_starts(segment, best_starts, noise, n_best=2)
     if not segment.is_explained(fit.cost(noise, priors.normal)):
         fit = fit_from_starts(segment, [fit.theta, *second_best_starts], noise, n_best=2)
@@ -273,8 +281,8 @@ def fit_from_priors(segment: Segment, total: Array, noise: float) -> Linearisati
 def fit_from_starts(segment: Segment, starts: Sequence[Array] | Array, noise: float, n_best: int) -> Linearisation:
     """Fit the parameters from several starts (s, p), and return the best fit.
 
-    The fit makes a few steps from all starts, and then more steps from the `n_best` best results. `noise`: variance of
-    the noise [Pa^2].
+    The fit makes a few Gauss-Newton steps from all starts, and then more steps from the `n_best` best results. `noise`:
+    variance of the noise [Pa^2].
     """
     fits, prior = [segment.linearise(start[None]) for start in starts], segment.priors.normal
     for n_steps, n_kept in ((_N_STEPS // 6, n_best), (_N_STEPS, 1)):
@@ -287,7 +295,8 @@ def fit_from_starts(segment: Segment, starts: Sequence[Array] | Array, noise: fl
 class Follower:
     """Iterated Kalman filter that tracks the parameters of the pressure response from block to block.
 
-    `machine`: simulator; `priors`: of its parameters; `sense`: 1 if p_A - p_B rises with the command, -1 if it falls.
+    `machine`: simulator; `priors`: priors of its parameters; `sense`: 1 if p_A - p_B rises with the command, -1 if it
+    falls.
     """
 
     def __init__(self, machine: Machine, priors: Priors, sense: float) -> None:
@@ -331,7 +340,10 @@ class Follower:
         return follower
 
     def _converge_on_beginning(self, recording: Recording) -> None:
-        """Refine the parameters by filtering the beginning of a recording, then reset covariance and states."""
+        """Refine the parameters by filtering the beginning of a recording, then reset covariance and simulated states.
+
+        The filter can then start again at the first sample, with better parameters.
+        """
         covariance, states = self.covariance, self.states
         length = round(_FOLLOW.block * recording.rate)
         stop = min(round(_FOLLOW.beginning * recording.rate), len(recording) - length + 1)
@@ -370,7 +382,15 @@ class Follower:
         # hum has the same sign in both pressures, so that its frequencies show best in their sum
         waves = mains_waves(block["p_A"] + block["p_B"], block.rate) * sample_weights
         dp = self.sense * (block["p_A"] - block["p_B"])
-        return Segment(self.machine, self.priors, np.append(self.last, u), dp, self.states, waves, sample_weights)
+        return Segment(
+            self.machine,
+            self.priors,
+            command=np.append(self.last, u),
+            dp=dp,
+            states=self.states,
+            waves=waves,
+            sample_weights=sample_weights,
+        )
 
     def _prior(self, block_s: float, jumped: int | None = None) -> Normal:
         """Compute the prior on the parameters in the next block, which is `block_s` [s] long.
@@ -400,24 +420,25 @@ class Follower:
         cost, fit, prior = fit_candidate(self.theta, self._prior(block_s))
         candidates = [(cost, fit, prior)]
         if not segment.is_explained(cost):
+            # the grid of the conductance after a jump is absolute, that of the stiffness relative to the current one
             for parameter, unit, jump in ((G, 1.0, PRESSURE.jump["G"]), (K_OIL, self.theta[K_OIL], PRESSURE.jump["K"])):
                 sets = np.tile(self.theta, (SINGLE_WIDTH, 1))
                 sets[:, parameter] = unit * _geometric_grid(*jump, SINGLE_WIDTH)
-                best = int(segment.residual_squares(sets).argmin())  # of a grid of values after the jump
-                candidates.append(fit_candidate(sets[best], self._prior(block_s, parameter)))
+                best = int(segment.residual_squares(sets).argmin())
+                candidates.append(fit_candidate(sets[best], self._prior(block_s, jumped=parameter)))
         _, fit, prior = min(candidates, key=lambda candidate: candidate[0])
         return fit, prior
 
     def update(self, block: Recording) -> Block:
         """Fit the next block of samples, and return its sums for a joint fit of all blocks (`fit.Joint`).
 
-        The parameters, their covariance, the simulated states, the last command and `excess` (misfit of the block) are
-        updated.
+        This updates the filter: the parameters, their covariance, the simulated states, the last command, and the
+        misfit `excess` of the block, (chi squared - n) / sqrt(2 n) for n samples.
         """
         segment = self.next_segment(block)
         fit, prior = self._fit_block(segment, block.duration)
-        excess = fit.cost(self.variance, prior) - segment.n_samples
-        self.excess = excess / math.sqrt(2.0 * max(segment.n_samples, 1.0))
+        chi_squared = fit.cost(self.variance, prior)
+        self.excess = (chi_squared - segment.n_samples) / math.sqrt(2.0 * max(segment.n_samples, 1.0))
         parameter_gram = fit.gram[1:, 1:]  # row and column 0 belong to the residual
         self.covariance = np.asarray(np.linalg.inv(parameter_gram / self.variance + prior.precision))
         gradient = fit.gram[0, 1:] / self.variance - prior.precision @ prior.deviations(fit.theta)
@@ -433,7 +454,7 @@ def fit_response(recording: Recording, rig: Rig) -> Joint | None:
     The result is computed only once for a recording.
     """
 
-    def compute(recording: Recording) -> Joint | None:
+    def compute_fit(recording: Recording) -> Joint | None:
         """Track the parameters of the pressure response through all blocks, then fit all blocks together.
 
         Returns None if the fit fails or explains too little of the variance of p_A - p_B.
@@ -450,7 +471,7 @@ def fit_response(recording: Recording, rig: Rig) -> Joint | None:
         max_variance = _FOLLOW.explained * np.var(recording["p_A"] - recording["p_B"])
         return joint if is_finite and joint.variance < max_variance else None
 
-    return compute_once(recording, ("response", rig), compute, ("u", "p_A", "p_B"))
+    return compute_once(recording, ("response", rig), compute_fit, ("u", "p_A", "p_B"))
 
 
 def measure_leak(recording: Recording, rig: Rig) -> ResponseLeak | None:
@@ -466,18 +487,18 @@ def measure_leak(recording: Recording, rig: Rig) -> ResponseLeak | None:
     parameters = parameter_information(joint, middles, recording.duration)
     pressure = np.add.reduceat(dp, edges[:-1]) / np.diff(edges)
     mean_speed = rig.motor.omega_per_volt * float(np.mean(np.abs(recording["u"])))
-    pump_flow = mean_speed * rig.pump.q_b / (2.0 * np.pi)
-    return ResponseLeak(parameters, pressure, (pump_flow, pump_flow), states_flow(rig))
+    mean_flow = mean_speed * rig.pump.q_b / (2.0 * np.pi)
+    return ResponseLeak(parameters, pressure, pump_flow=(mean_flow, mean_flow), stated=states_flow(rig))
 
 
 def parameter_information(joint: Joint, time: Array, seconds: float) -> dict[str, Information]:
     """Compute how well the fit of K blocks determines each parameter of the pressure response in each block.
 
     Returns, by the name of the parameter, the Gaussian likelihood of its K values (`Information`), from which all other
-    parameters are eliminated. It has priors on a linear change and on a random walk of the parameter, whose standard
-    deviations over a recording grow with the root of its length. The priors of the leakage conductance G are those of a
-    healthy machine. `joint`: fit of all blocks; `time` (K,): middles of the blocks [s]; `seconds`: length of the
-    recording [s].
+    parameters are eliminated. The likelihood has priors on a linear change and on a random walk of the parameter. Their
+    standard deviations over a recording grow with the root of the recording's length. The priors of the leakage
+    conductance G are those of a healthy machine. `joint`: fit of all blocks; `time` (K,): middles of the blocks [s];
+    `seconds`: length of the recording [s].
     """
     growth = math.sqrt(seconds / PRESSURE.blocks.wander)  # of a random walk, relative to its change in `blocks.wander`
     wander = growth * joint.priors.wander

@@ -70,6 +70,6 @@ def mains_waves(total: Array, rate: float) -> Array:
         if bins.size:
             fundamentals.append(frequency[bins[np.argmax(spectrum[bins])]])
     waves = np.exp(2j * np.pi / rate * np.outer(fundamentals, np.arange(total.size)))
-    orders = range(1, mains.harmonics + 1)
+    orders = range(1, mains.harmonics + 1)  # the k-th power of a wave is its k-th harmonic
     harmonics = np.concatenate([waves[k * np.array(fundamentals) < 0.5 * rate] ** k for k in orders])
     return np.concatenate([harmonics.real, harmonics.imag])

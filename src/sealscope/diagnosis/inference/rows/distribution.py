@@ -27,8 +27,8 @@ def sorted_part_means(pressure: Array, rate: float) -> Array:
     """Summarise the distribution of a pressure by the means of `PARTS` equal parts of its sorted samples [Pa].
 
     The spread due to white noise is removed first, as described in the module. `pressure` (n,): samples [Pa] at the
-    sampling `rate` [Hz], NaN where missing. Only whole averaging times within whole strides of the weak form count. The
-    means, of shape (PARTS,), are zeros if all samples are missing.
+    sampling `rate` [Hz], NaN where missing. Samples are used in pieces of `SMOOTHED` seconds, and only whole pieces
+    within whole strides of the weak form count. The means, of shape (PARTS,), are zeros if all samples are missing.
     """
     piece = max(1, round(SMOOTHED * rate))  # averaging time [samples]
     stride = min(stride_samples(rate), max(len(pressure), 1))  # [samples]
@@ -42,9 +42,10 @@ def sorted_part_means(pressure: Array, rate: float) -> Array:
         differences = differences[np.isfinite(differences)]
         noise_gain = math.comb(2 * _ORDER, _ORDER)  # variance of a difference of white noise of variance 1
         # not by BLAS (@), whose rounding depends on the number of threads
-        noise = float((differences**2).sum()) / max(len(differences), 1) / noise_gain
-        variance = np.nansum(deviation**2, axis=(1, 2), keepdims=True) / (n_pieces * (piece - 1))
-        deviation *= np.sqrt(1.0 - noise / np.maximum(variance, max(noise, np.finfo(float).tiny)))
+        noise_variance = float((differences**2).sum()) / max(len(differences), 1) / noise_gain
+        variance = np.nansum(deviation**2, axis=(1, 2), keepdims=True) / (n_pieces * (piece - 1))  # in each stride
+        min_variance = max(noise_variance, np.finfo(float).tiny)
+        deviation *= np.sqrt(1.0 - noise_variance / np.maximum(variance, min_variance))
     values = (mean + deviation).ravel()
     values = np.sort(values[np.isfinite(values)])
     # sum of each part from the cumulative sum, interpolated where a part ends between two samples

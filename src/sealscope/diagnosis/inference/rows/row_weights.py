@@ -68,8 +68,8 @@ def eliminate(matrix: Any, count: int) -> None:
     """Eliminate the first `count` unknowns of a positive semidefinite system with appended right sides, in place.
 
     After this Gauss-Jordan elimination the first `count` rows of `matrix` express the unknowns by the other columns,
-    and the other rows contain the reduced system. A small ridge (`RIDGE`) on the diagonal limits rounding errors.
-    Unknowns without information become zero.
+    and the other rows contain the reduced system. The diagonal is first increased by the fraction `RIDGE`, which limits
+    rounding errors. Unknowns without information become zero.
     """
     rows, columns = matrix.shape
     for i in range(count):
@@ -104,7 +104,7 @@ def median(values: Any, n: int) -> float:
             high = j
     if n % 2:
         return float(values[k])
-    above = values[k + 1]
+    above = values[k + 1]  # the smallest value above the lower middle one
     for i in range(k + 2, n):
         above = min(above, values[i])
     return float(0.5 * (values[k] + above))
@@ -114,7 +114,7 @@ def median(values: Any, n: int) -> float:
 def _sum_products(values: Any, begin: int, end: int, weights: Any, gram: Any) -> None:
     """Compute the Gram matrix of the rows `begin` to `end` - 1 of `values` (r, m), with `weights` (r,).
 
-    It is written to `gram` (m, m).
+    The result is written to `gram` (m, m).
     """
     width = values.shape[1]
     for i in range(width):
@@ -150,7 +150,7 @@ def _reweigh(values: Any, ends: Any, column_order: Any, workspace: Any) -> bool:
     """
     count, left, block = len(values), len(column_order) - 1, 0
     for r in range(count):
-        while r >= ends[block]:
+        while r >= ends[block]:  # find the block of row r
             block += 1
         residual = values[r, column_order[left]]
         for i in range(left):

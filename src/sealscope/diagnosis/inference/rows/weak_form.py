@@ -65,7 +65,7 @@ def test_function(rate: float) -> Array:
     is the part of the test function over one stride of samples.
     """
     stride = stride_samples(rate)
-    s = (np.arange(SPAN * stride) + 0.5) * 2.0 / (SPAN * stride) - 1.0
+    s = (np.arange(SPAN * stride) + 0.5) * 2.0 / (SPAN * stride) - 1.0  # -1 to 1 over the support
     phi = (1.0 - s * s) ** 4
     return np.asarray(phi * (rate / phi.sum())).reshape(SPAN, stride)
 
@@ -107,7 +107,7 @@ def weak_form_rows(increments: Sequence[Array], rate: float) -> Rows:
     n_pieces = len(increments[0]) // stride
     n_rows = max(0, n_pieces - SPAN + 1)
     pieces = np.concatenate([increment[: n_pieces * stride] for increment in increments]).reshape(-1, stride)
-    # of each column, over each piece, times each of the SPAN parts of the test function
+    # integrals of each column over each piece, times each of the SPAN parts of the test function
     integrals: Array = (pieces @ _transposed_test_function(rate)).reshape(len(increments), n_pieces, SPAN)
     is_usable = np.asarray((np.abs(integrals) < MAX_READING).all(axis=(0, 2)))  # False for NaN
     integrals[:, ~is_usable] = 0.0

@@ -97,8 +97,8 @@ class BalanceLeak:
     def step_flow(self) -> Flow:
         """Mean flow [m^3/s] of a leak that begins within the recording, from its onset to the end.
 
-        It is averaged over the laws, growths and onsets of the leak, and mixed with the flow that shows while shut
-        valves hold the load (`_mix_with_holds`). Without a step test it is 0 with an infinite standard error.
+        The flow is averaged over the laws, growths and onsets of the leak, and combined with the flow that shows while
+        shut valves hold the load (`_mix_with_holds`). Without a step test it is 0 with an infinite standard error.
         """
         balance, test = self.balance, self.balance.test
         if test is None:
@@ -124,8 +124,8 @@ class BalanceLeak:
     def rise(self) -> Rise | None:
         """Amount by which the mean leakage [m^3/(s Pa)] exceeds that of healthy recordings; None without these.
 
-        It is measured while shut valves hold the load if that is precise enough or shows a leak, else over the whole
-        recording.
+        It is measured in holds, i.e. while shut valves hold the load, if these are precise enough or show a leak, else
+        over the whole recording.
         """
         return self._motion_rise if self._hold_rise is None else self._hold_rise
 
@@ -140,8 +140,8 @@ class BalanceLeak:
     def _hold_rise(self) -> Rise | None:
         """Rise of the leakage over healthy recordings [m^3/(s Pa)], from the times in which shut valves hold the load.
 
-        None without such times (holds), or if it neither is precise enough to replace the rise from the whole recording
-        nor shows a leak.
+        None without such times (holds). Also None if the rise from holds shows no leak and is not precise enough to
+        replace the rise from the whole recording.
         """
         motion_rise = self._motion_rise
         if not self.balance.locked or motion_rise is None:
@@ -149,7 +149,7 @@ class BalanceLeak:
         hold_rise = held_rise(self.balance.recording_sums, self.healthy)
         if hold_rise is None:
             return None
-        # error smaller than the error of the rise from the whole recording, or than that rise itself
+        # its error is smaller than the error, or than the value, of the rise from the whole recording
         is_precise = hold_rise.deviation < max(motion_rise.deviation, motion_rise.value)
         return hold_rise if is_precise or hold_rise.chance < INFERENCE.held_oil.rare else None
 
@@ -161,7 +161,7 @@ class BalanceLeak:
         """
         balance = self.balance
         if self.rise is None:
-            value, low, high = (balance.mean_pressure() * end for end in balance.conductance)
+            value, low, high = (balance.mean_pressure() * conductance for conductance in balance.conductance)
             return self._add_law_uncertainty(Flow(value, (high - low) / (2.0 * WITHIN_95)))
         motion_rise = self._motion_rise
         assert motion_rise is not None
@@ -169,23 +169,23 @@ class BalanceLeak:
         flow = estimate_rise_flow(
             balance.compared_leak,
             self.step,
-            motion_rise.value,
-            (high - low) / (2.0 * WITHIN_95),
-            self._rise_laws(),
-            balance.blocks.moving_flow,
+            value=motion_rise.value,
+            deviation=(high - low) / (2.0 * WITHIN_95),
+            laws=self._rise_laws(),
+            max_flow=balance.blocks.moving_flow,
         )
         return self._add_law_uncertainty(self._mix_with_holds(flow))
 
     def _mix_with_holds(self, flow: Flow) -> Flow:
-        """Combine the flow of a leak over the whole recording with the one during holds, if these show a leak.
+        """Combine the flow of a leak over the whole recording with its flow during holds, if the holds show a leak.
 
-        A hold is a time in which shut valves hold the load. Where the two disagree, holds are right with the
-        probability `held_oil.right` of `priors.toml`.
+        A hold is a time in which shut valves hold the load. The two estimates are averaged; the one from holds has the
+        weight `held_oil.right` of `priors.toml`, the probability that it is right if the two disagree.
         """
         hold_rise, prior = self._hold_rise, INFERENCE.held_oil
         if hold_rise is None or not hold_rise.chance < prior.rare:
             return flow
-        flows, deviations = np.array([flow, self._hold_flow(hold_rise)]).T
+        flows, deviations = np.array([flow, self._hold_flow(hold_rise)]).T  # of the recording, of the holds
         return mixture_flow(np.array([1.0 - prior.right, prior.right]), flows, deviations)
 
     @property
@@ -236,6 +236,7 @@ class BalanceLeak:
             t = recording.t[after_onset]
             difference = (recording["p_A"] - recording["p_B"])[after_onset]
             pressure = np.abs(chambers.pressure_difference(t, difference, conditions.offset))
+            # mean flow for a coefficient of 1
             units.append(float(np.nanmean(pressure**law.exponent * law.growth_factor(t, chambers.end))))
         values, noise_deviations, oil_deviations, _ = np.array([law_fit.fit for law_fit in chambers.law_fits]).T
         log_weights = np.array([law_fit.log_weight for law_fit in chambers.law_fits])
@@ -278,7 +279,8 @@ class BalanceLeak:
         """
         balance = self.balance
         limit, size = healthy_leakage(balance.rig), balance.size
-        # without a measured flow, the drive's droop under load looks like leakage
+        # behind a servo valve (several balances) its edges leak, too; without a measured flow, the drive's droop under
+        # load looks like leakage
         is_measured = len(balance.columns) == 1 and not balance.equations[0].by_command
         if not (limit > 0.0 and self.rise is None and size.stated and is_measured):
             return None
@@ -290,10 +292,10 @@ class BalanceLeak:
     def bound_flow(self) -> float:
         """95 % upper bound of the leak's mean flow over the recording [m^3/s]; infinite if nothing was tested.
 
-        With healthy recordings it bounds the leakage above theirs; without them, a leak that begins within the
-        recording. If the times in which shut valves hold the load show the rise (`rise`), `_hold_bound` computes the
-        bound. The bound is widened by the uncertainty of the scale of the flows (displacement, area or flow meter) and
-        of the leak's law (laminar or orifice).
+        With healthy recordings the bound is on the leakage above that of these recordings; without them, on a leak that
+        begins within the recording. If the times in which shut valves hold the load show the rise (`rise`),
+        `_hold_bound` computes the bound. The bound is widened by the uncertainty of the scale of the flows
+        (displacement, area or flow meter) and of the leak's law (laminar or orifice).
         """
         test = self.step if self._motion_rise is None else self._motion_rise
         if test is None:
@@ -345,8 +347,8 @@ class BalanceLeak:
 
         The evidence (`step_log_ratio`) is the log likelihood ratio of the rise that the step would cause to no rise.
         Holds after the step's onset, in which shut valves hold the load, show the whole step. Without such holds, the
-        mean over the recording shows a part of it. Without a step test there is no such evidence. None without healthy
-        recordings.
+        mean over the recording shows a part of the step. Without a step test there is no such evidence. The result is
+        None without healthy recordings.
         """
         step, total_rise, motion_rise = self.step, self.rise, self._motion_rise
         if total_rise is None:
@@ -355,10 +357,11 @@ class BalanceLeak:
             return LeakRise(total_rise)
         rise_after = self._hold_rise_since(step.onset().value)
         if rise_after is None:
-            mean_rise = step.fitted.size * self._fraction_after(step)
-            return LeakRise(total_rise, motion_rise.log_ratio_within(mean_rise, INFERENCE.scatter.tail))
-        agrees: float = INFERENCE.held_oil.agrees
-        return LeakRise(total_rise, rise_after._replace(may_be_partial=False).log_ratio(step.fitted.size, agrees))
+            mean_rise = step.fitted.size * self._fraction_after(step)  # of the whole recording
+            return LeakRise(total_rise, motion_rise.log_ratio_within(mean_rise, tail=INFERENCE.scatter.tail))
+        log_deviation: float = INFERENCE.held_oil.agrees  # of the ratio of rise and step
+        whole_rise = rise_after._replace(may_be_partial=False)  # after the onset the holds show the whole step
+        return LeakRise(total_rise, whole_rise.log_ratio(step.fitted.size, log_deviation))
 
     def _hold_rise_since(self, onset: float) -> Rise | None:
         """Estimate the rise of the leakage [m^3/(s Pa)] over healthy recordings in the holds after an onset [s].
@@ -424,8 +427,8 @@ class BalanceLeak:
 
         Behind a servo valve, with a balance for each chamber, the flow is not stated, since the valve's edges leak as
         well. `detectable_flow`: flow [m^3/s], by the assumed sizes, of the smallest leak that would be detected if it
-        began within the recording; None if that was not tested. The result repeats it in L/min and as a fraction of the
-        pump's flow (`findable_lpm`, `findable_share`).
+        began within the recording; None if that was not tested. The result repeats this flow in L/min and as a fraction
+        of the pump's flow (`findable_lpm`, `findable_share`).
         """
         balance = self.balance
         size, pressure, pump_flow = balance.size, balance.mean_pressure(), balance.mean_flow
@@ -450,7 +453,8 @@ class BalanceLeak:
     def history(self, onset_s: float | None) -> LeakCourse | None:
         """Return the leakage over time [L/min] with its 95 % interval; None if L/min cannot be stated (`Size.stated`).
 
-        With an onset `onset_s` [s] it is the growth of the leakage since then, without one (None) the total leakage.
+        With an onset `onset_s` [s] of a leak the result is the growth of the leakage since the onset; with None it is
+        the total leakage.
         """
         balance = self.balance
         if not balance.size.stated:

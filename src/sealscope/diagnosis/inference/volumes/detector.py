@@ -119,22 +119,22 @@ class VolumeBalance:
         """Set up the volume balance of a recording; None if its channels or its length allow none.
 
         `odds`: log odds, from healthy recordings, that valves cut the pump off from the cylinder while the pump rests;
-        `is_locked`: true if valves certainly cut it off, whatever this recording shows.
+        `is_locked`: true if valves certainly cut the pump off, whatever this recording shows.
         """
         if not equations(self.rig, frozenset(recording.channels)):
             return self._balance_without_position(recording)
         recorded = self._compute_blocks(recording)
         if recorded is None:
             return None
-        max_odds: float = INFERENCE.rest.alone
+        max_odds: float = INFERENCE.rest.alone  # limit for this recording, in which a leak may look like open valves
         odds = np.inf if is_locked else odds + float(np.clip(recorded.odds, -max_odds, max_odds))
         return self._build_balance(recording, recorded.regime(odds))
 
     def _balance_without_position(self, recording: Recording) -> RecordedBalance | None:
-        """Choose among the volume balances that need no position the one with the smallest upper bound of a leak.
+        """Choose the volume balance with the smallest upper bound of a leak, among those that need no position.
 
-        A balance of holds behind shut valves is always usable, any other balance only if the pump compensates the
-        leakage (`compensates_leakage`). Return None if no balance is usable.
+        A balance of a load that shut valves hold is always usable. Any other balance is usable only if the pump
+        compensates the leakage (`compensates_leakage`). Return None if no balance is usable.
         """
         cycle_balances = compute_once(
             recording, (self.name, self.rig), lambda samples: circulations(samples, self.rig), READ
@@ -158,7 +158,7 @@ class VolumeBalance:
 
         `regime`: the blocks for one assumption on the valves while the pump rests, open or shut.
         """
-        offset = float(regime.blocks.zero[0])
+        offset = float(regime.blocks.zero[0])  # sensor offset that was removed from p_A - p_B [Pa]
         oil_loss = compute_once(
             recording, ("lost oil", self.rig), lambda samples: recorded_oil_loss_tests(samples, self.rig, offset), READ
         )
@@ -193,7 +193,7 @@ class VolumeBalance:
         if recorded is not None and recorded.shut is not None:
             shut_sums = self._build_balance(recording, recorded.shut).recording_sums
             summary |= {"shut_sums": shut_sums.sums, "shut_odds": recorded.odds}
-            hold_odds = replace(balance, locked=True).locked_log_odds()
+            hold_odds = replace(balance, locked=True).locked_log_odds()  # supposing that valves hold the load
             if shut_sums.held is not None and hold_odds is not None:
                 summary |= {"held": shut_sums.held, "held_odds": hold_odds}
                 if shut_sums.held_pump is not None:
@@ -249,8 +249,8 @@ class VolumeBalance:
         if not balance.is_creep or flow_source(balance.recording.channels) is not None:
             return True
         max_odds: float = INFERENCE.rest.alone
-        healthy = np.clip([summary.get("creep_odds", 0.0) for summary in summaries], -max_odds, max_odds)
-        return float(healthy.sum()) > 0.0
+        creep_odds = np.clip([summary.get("creep_odds", 0.0) for summary in summaries], -max_odds, max_odds)
+        return float(creep_odds.sum()) > 0.0
 
     def _columns(self, channels: frozenset[str], shut: bool) -> list[ColumnRoles]:
         """Return for each volume balance the indices of its columns by role: leak, left side, motion and so on.
@@ -272,12 +272,13 @@ class VolumeBalance:
         is_locked = _are_valves_shut(summaries, "shut_odds")
         odds = self._shut_log_odds(summaries, frozenset(recording.channels))
         balance = self.balance(recording, odds, is_locked=is_locked)
-        has_flow = flow_source(recording.channels) is not None
-        if balance is None and (has_flow or "x" not in recording):
-            return Observed(self.name, lack=_NO_BALANCE["x" in recording].format(recording.duration))
+        has_flow, has_position = flow_source(recording.channels) is not None, "x" in recording
+        if balance is None and (has_flow or not has_position):
+            return Observed(self.name, lack=_NO_BALANCE[has_position].format(recording.duration))
         if balance is None or not self._is_held_by_valves(balance, summaries):
             return Observed(self.name, lack=_NO_CREEP.format(self.rig.circuit.needed_channels))
         balance = replace(balance, locked=is_locked or _are_valves_shut(summaries, "held_odds"))
+        # summaries list the terms without those of a pump that valves cut off at rest
         names = [name for name in balance.columns[0].names if name not in (TURNING, HOLDING)]
         comparable = [summary for summary in summaries if summary["terms"] == names]
         healthy = [_sums_from_summary(summary, balance.shut, balance.locked) for summary in comparable]
@@ -292,7 +293,7 @@ class VolumeBalance:
         has_position_balance = bool(equations(self.rig, frozenset(recording.channels)))
         recorded = self._compute_blocks(recording) if has_position_balance else None
         if recorded is None:
-            balances = [self.balance(recording)]
+            balances = [self.balance(recording)]  # without a position, or None
         else:
             regimes = [regime for regime in (recorded.open, recorded.shut) if regime is not None]
             balances = [self._build_balance(recording, regime) for regime in regimes]
@@ -313,12 +314,17 @@ class VolumeBalance:
         # the rows of a block show missing samples, but not without a position, where they also depend on the motion
         has_position = balance.equations[0].name == CYLINDER or len(balance.columns) > 1
         share = float(rows.mean() / max(rows.max(), 1.0)) if has_position else 1.0
+        # end of the last block with rows, over the number of blocks
         judged_until = (np.flatnonzero(rows > 0.0)[-1] + 1.0) / len(rows) if has_position and rows.any() else 1.0
         observables = balance.observables
         if healthy and len(balance.columns) == 1 and has_position:
             observables += tuple(compare_motion(balance.recording_sums, healthy, balance.columns[0]))
             observables += rival_rises(
-                balance.recording_sums, healthy, balance.columns, balance.volume_ratio, balance.outside_unit_flows()
+                balance.recording_sums,
+                healthy,
+                balance.columns,
+                volume_ratio=balance.volume_ratio,
+                unit_flows=balance.outside_unit_flows(),
             )
         return Observed(self.name, observables, leak, share=share, judged_until=float(judged_until))
 
@@ -328,8 +334,9 @@ def compare_motion(
 ) -> Iterator[Observable]:
     """Test whether the piston's motion takes more or less flow for the same speed than in healthy recordings.
 
-    Yields one observable, or nothing if there are too few healthy recordings. A change means another machine or another
-    scale of a sensor. Load and speed outside of the range of the healthy recordings make the comparison less certain.
+    Yields one observable, or nothing if there are too few healthy recordings. A change means that the recording is from
+    another machine, or that the scale of a sensor has changed. Load and speed outside of the range of the healthy
+    recordings make the comparison less certain.
     `judged_sums`, `healthy`: summaries of the judged and of the healthy recordings; `roles`: indices of the columns of
     the volume balance by role (leak, motion, left side).
     """
@@ -341,11 +348,11 @@ def compare_motion(
 
     excess = sum(condition.log_excess for condition in find_unusual_conditions(judged_sums, healthy))
     observable = compare_estimates(
-        "motion",
-        "motion",
-        estimate(judged_sums),
-        [estimate(sums) for sums in healthy],
-        PriorScatter(prior.scatter, prior.recordings, prior.inflation),
+        name="motion",
+        data="motion",
+        judged=estimate(judged_sums),
+        healthy=[estimate(sums) for sums in healthy],
+        prior=PriorScatter(prior.scatter, prior.recordings, prior.inflation),
         further_deviation=INFERENCE.conditions.motion * excess,
     )
     if observable is not None:

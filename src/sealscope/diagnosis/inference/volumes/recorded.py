@@ -140,8 +140,8 @@ class RecordedBalance:
     def running_blocks(self) -> Blocks:
         """Blocks from the first motion on, which are tested for steps.
 
-        Before the first motion the machine may be off with its valves shut. The flow with which the pump afterwards
-        begins to hold the load is not a leak.
+        Before the first motion the machine may be off with its valves shut. If the pump then begins to hold the load,
+        its flow rises without a leak.
         """
         return self.blocks[self._first_motion :]
 
@@ -154,11 +154,11 @@ class RecordedBalance:
     def compared_leak(self) -> Information:
         """Likelihood of the leak's conductance in each of `running_blocks`, as it is compared between recordings.
 
-        If the volume balance has a separate term for the leakage of a pump that holds the load, that term is left out,
-        unlike in `leak`. All rests then have one common leakage.
+        It differs from `leak` if the volume balance has a separate term for the leakage of a pump that holds the load.
+        This term is left out here, so that all rests have one common leakage.
         """
         roles = self.columns[0]
-        return information(self.running_blocks, self.columns, roles.leak, roles.hold_leak)
+        return information(self.running_blocks, self.columns, roles.leak, left_out=roles.hold_leak)
 
     @cached_property
     def test(self) -> StepTest | None:
@@ -214,6 +214,7 @@ class RecordedBalance:
         charge = find_charge_pressure(lower_pressure, rests, recording.rate)
         # absolute minus gauge pressure; larger if sensor offsets would make the least pressure too low
         to_absolute = max(P_ATM, MIN_ABSOLUTE_PRESSURE - float(np.nanmin(lower_pressure)))
+        # time, absolute pressures of A and B, position
         channels = (recording.t, *(values + to_absolute for values in pressures.values()), recording["x"])
         holds = [
             hold
@@ -241,18 +242,21 @@ class RecordedBalance:
         The mean flow is compared with zero and with the typical flow of a pump that holds a load.
         """
         recording = self.recording
-        begin, end = np.searchsorted(recording.t, hold.t[[hold.edges[1], -1]])  # with the valves shut
+        first_shut = hold.edges[1]  # index of the first sample with the valves surely shut
+        begin, end = np.searchsorted(recording.t, hold.t[[first_shut, -1]])
         flow = self._pumped[begin:end] * recording.rate
         flow = flow[np.isfinite(flow)]
+        mean_flow = abs(float(flow.mean()))
         variance = float(flow.var()) / max(flow.size, 1)  # of the mean
         holding_flow = INFERENCE.rest.holding * self.blocks.moving_flow
-        return rest_log_odds(abs(float(flow.mean())), variance, holding_flow, variance) > 0.0
+        # `holding_flow` is given without an error, so that the difference has the same variance
+        return rest_log_odds(mean_flow, holding_flow, rest_variance=variance, difference_variance=variance) > 0.0
 
     def _is_loaded(self, hold: LockedHold) -> bool:
         """Return True if p_A - p_B in a hold almost certainly is a load, not the sensors' offset at equal pressures.
 
-        At equal pressures a leak has no flow, so that the hold would not show it. The largest p_A - p_B counts, in the
-        hold or just before it, since a large leak equalises the pressures while the valves are still shutting.
+        At equal pressures a leak has no flow, so that the hold would not show the leak. The largest p_A - p_B in the
+        hold or just before it counts, since a large leak equalises the pressures while the valves are still shutting.
         """
         oil, t = INFERENCE.held_oil, self.recording.t
         difference = np.abs(self.recording["p_A"] - self.recording["p_B"])
@@ -267,6 +271,7 @@ class RecordedBalance:
 
         All loads up to the largest pressure difference of the recording are equally probable.
         """
+        # minus the log density of an offset is this constant plus half of its cost
         log_offset_norm = float(np.log(INFERENCE.zero.pressure * np.sqrt(2.0 * np.pi)))
         difference = np.abs(self.recording["p_A"] - self.recording["p_B"])
         max_load = float(np.nanquantile(difference, 1.0 - END_QUANTILE))
@@ -291,13 +296,16 @@ class RecordedBalance:
             total, total_deviation = conductance.value, (conductance.high - conductance.low) / (2.0 * WITHIN_95)
         variance = hold_leak.deviation**2
         max_odds: float = INFERENCE.rest.most
-        odds = rest_log_odds(hold_leak.value, variance, total, variance + total_deviation**2)
+        odds = rest_log_odds(
+            hold_leak.value, total, rest_variance=variance, difference_variance=variance + total_deviation**2
+        )
         return float(np.clip(odds, -max_odds, max_odds))
 
     def _cylinder_sides(self) -> CylinderSides | None:
         """Estimate the piston areas and the ends of the recorded stroke; None if they are not determined.
 
-        They are not determined if nothing moves, or if the ratio of the areas is implausible.
+        They are not determined if nothing moves, or if the ratio of the areas is implausible. The ends are quantiles of
+        the position (`END_QUANTILE`).
         """
         area_A, area_B, deviation_A, deviation_B = self._signed_areas()
         x = self.recording["x"][np.isfinite(self.recording["x"])]
@@ -312,52 +320,55 @@ class RecordedBalance:
     def _signed_areas(self) -> tuple[float, float, float, float]:
         """Estimate the piston areas of A and B [m^2], as measured with the assumed displacement of the pump.
 
-        They are followed by the standard deviations of the logarithms of their magnitudes. They are negative if the
-        position x is reversed. The area of a side is the mean of its coefficients of motion in the volume balance,
-        weighted by the sums of squares of their columns, where the side surely carries the load. That of the side with
-        less such motion is corrected for motion that may belong to the other side (`log_area_ratio`). If the rig's
-        file states the areas, these are used instead, scaled to the flows of the volume balance. All are zero if
-        nothing moves.
+        Returns both areas, and the standard deviations of the logarithms of their magnitudes. The areas are negative if
+        the position x is reversed, and zero if nothing moves. The area of a side is the mean of the coefficients of the
+        motion under its load in the volume balance, weighted by the sums of squares of their columns. The main side is
+        the side with more motion in which it surely carries the load. The area of the other side is corrected for
+        motion that may belong to the main side (`log_area_ratio`). If the rig's file states the areas, these are used
+        instead, scaled to the flows of the volume balance.
         """
         roles, total = self.columns[0], self.blocks.gram[:, 0].sum(axis=0)
         nuisance = list(roles.nuisance)
         fitted = solve(total[np.ix_(nuisance, nuisance)], total[nuisance, roles.left])
         coefficients = dict(zip(nuisance, fitted, strict=True))
-        areas, energies = [], []  # an energy is the sum of squares of all columns of motion of a side
+        areas, energies = [], []  # for A and B
         for side in "AB":
             motion = [k for k in roles.motion if roles.names[k].endswith(f"{side} carries")]
             squares = np.diag(total)[motion]
-            energies.append(float(squares.sum()))
-            areas.append(float(squares @ [coefficients[k] for k in motion]) / max(energies[-1], np.finfo(float).tiny))
+            energy = float(squares.sum())
+            areas.append(float(squares @ [coefficients[k] for k in motion]) / max(energy, np.finfo(float).tiny))
+            energies.append(energy)
         shares = self._loaded_shares()
-        main = int(np.argmax(np.array(energies) * shares))
+        main = int(np.argmax(np.array(energies) * shares))  # index of the main side: 0 for A, 1 for B
+        other = 1 - main
         deviation: float = INFERENCE.size.area
         if self.rig.states("cylinder.A_A", "cylinder.A_B") and self.size.stated:
             sign = float(np.sign(areas[main]))
             area_A, area_B = (sign * area / self.size.scale for area in (self.rig.cylinder.A_A, self.rig.cylinder.A_B))
             return area_A, area_B, deviation, deviation
-        recording, measured = self.recording, areas[1 - main] / areas[main] if areas[main] else 0.0
+        measured = areas[other] / areas[main] if areas[main] else 0.0
         # the side that carries the largest load is more probably the one without a rod
-        highest = [float(np.nanquantile(recording[name], 1.0 - END_QUANTILE)) for name in ("p_A", "p_B")]
-        log_ratio = log_area_ratio(measured, shares[1 - main], is_larger=highest[1 - main] > highest[main])
+        highest = [float(np.nanquantile(self.recording[name], 1.0 - END_QUANTILE)) for name in ("p_A", "p_B")]
+        log_ratio = log_area_ratio(measured, shares[other], is_larger=highest[other] > highest[main])
         other_area, other_deviation = areas[main] * np.exp(log_ratio.value), np.hypot(deviation, log_ratio.deviation)
         sides = [(areas[main], deviation), (float(other_area), float(other_deviation))]
         (area_A, deviation_A), (area_B, deviation_B) = sides if main == 0 else sides[::-1]
         return area_A, area_B, deviation_A, deviation_B
 
     def _loaded_shares(self) -> tuple[float, float]:
-        """Compute the fraction of the motion of A and of B, as sums of squared speeds, in which they surely carry.
+        """Compute, for A and for B, the fraction of the motion with this side loaded in which it surely carries a load.
 
-        A sample counts if its p_A - p_B almost certainly is a load, and not an offset of the sensors
-        (`_load_log_odds`). A side that never carries has the fraction 0.
+        A side counts as loaded while its pressure is higher. It surely carries a load if p_A - p_B almost certainly is
+        not an offset of the sensors (`_load_log_odds`). The motion is measured by the sum of squared speeds over the
+        samples. A side that is never loaded has the fraction 0.
         """
         recording = self.recording
         difference = recording["p_A"] - recording["p_B"] - self.pressure_offset
         speed = Signals(dict(recording.channels), recording.rate).speed
         is_load = self._load_log_odds(np.abs(difference)) > INFERENCE.held_oil.loaded
         shares = []
-        for carries in (difference > 0.0, difference <= 0.0):
-            squares = np.where(carries & np.isfinite(speed * difference), speed**2, 0.0)
+        for is_loaded in (difference > 0.0, difference <= 0.0):  # A, B
+            squares = np.where(is_loaded & np.isfinite(speed * difference), speed**2, 0.0)
             shares.append(float(squares[is_load].sum()) / max(float(squares.sum()), np.finfo(float).tiny))
         return shares[0], shares[1]
 
@@ -365,7 +376,7 @@ class RecordedBalance:
     def pressure_offset(self) -> float:
         """Sensor offset of p_A - p_B [Pa], i.e. the recorded difference at equal pressures.
 
-        Only a change of the leak reveals it; without one the estimate stays near 0.
+        Only a change of the leak reveals the offset; without such a change the estimate stays near 0.
         """
         return estimate_offset(self.blocks, self.columns)
 
@@ -389,7 +400,7 @@ class RecordedBalance:
         return self.mean_of_blocks(self.blocks.mean_pressure(self.pressure_offset), since)
 
     def outside_unit_flows(self) -> dict[str, float]:
-        """Compute the mean flow [m^3/s] of each external leak with a conductance of 1 m^3/(s Pa), by its term."""
+        """Compute the mean flow [m^3/s] of an external leak of 1 m^3/(s Pa), for each term of such a leak by name."""
         names, recorded = self.columns[0].names, self.blocks if self.plain is None else self.plain
         return {
             name: recorded.driving_pressure(names, name) * self.size.scale
@@ -401,8 +412,8 @@ class RecordedBalance:
     def mean_flow(self) -> float:
         """Mean magnitude of the pump's flow over the recording [m^3/s].
 
-        If only the creep of a held load is known (`is_creep`), it is the volume that the larger side of the piston
-        displaces per time.
+        If only the creep of a held load is known (`is_creep`), the result is the mean flow that the larger side of the
+        piston displaces.
         """
         if not self.is_creep:
             return self.mean_of_blocks(self.blocks.flow)
@@ -410,7 +421,7 @@ class RecordedBalance:
         return area * float(np.nanmean(np.abs(np.diff(self.recording["x"])))) * self.recording.rate
 
     def mean_of_blocks(self, values: Array, since: float = -np.inf) -> float:
-        """Average `values` (K,) of K blocks over those from the time `since` [s] on, weighted by their numbers of rows.
+        """Average `values` (K,) of K blocks over the blocks from the time `since` [s] on, weighted by numbers of rows.
 
         A block counts if its middle is at `since` or later. If no block is that late, the last block counts.
         """
@@ -451,17 +462,19 @@ class RecordedBalance:
         if not variance > 0.0:
             return 0.0
         max_odds: float = INFERENCE.rest.most
-        return float(np.clip(-rest_log_odds(flow, variance, holding_flow, variance), -max_odds, max_odds))
+        loop_odds = rest_log_odds(flow, holding_flow, rest_variance=variance, difference_variance=variance)
+        return float(np.clip(-loop_odds, -max_odds, max_odds))
 
     @cached_property
     def total_history(self) -> History:
         """Total leakage of pump and piston in each block, as a conductance [m^3/(s Pa)] with its covariance.
 
-        It includes a step of the leakage if a test finds a step with a p-value below `RAREST`.
+        A separate term of the pump's leakage is left out, so that the leak's term contains both. The history includes a
+        step of the leakage if a test finds a step with a p-value below `RAREST`.
         """
         roles = self.columns[0]
         pump = roles.names.index(PUMP) if PUMP in roles.names else None
-        total = information(self.blocks, self.columns, roles.leak, pump)
+        total = information(self.blocks, self.columns, roles.leak, left_out=pump)
         test = step_test(total)
         return fit_history(total, test, with_step=test is not None and test.chance < RAREST)
 
@@ -476,12 +489,12 @@ class RecordedBalance:
 def log_area_ratio(measured: float, loaded_share: float, *, is_larger: bool) -> Estimate:
     """Estimate the logarithm r of the piston area of one side over that of the other, with its standard deviation.
 
-    `measured`: ratio as fitted, in which a part w of the motion of the first side belongs to it, and the rest to the
-    other side, whose area is well known: log `measured` = w r. The unknown w is 1 with the probability
-    `held_oil.sides_told` (`priors.toml`). Otherwise its logarithm is uniform from that of `loaded_share`, the fraction
-    of the motion in which the side surely carries the load, to 0. r has a normal prior (`held_oil.sides` and
-    `sides_deviation`), with a positive mean if `is_larger`, else a negative one. A ratio that is not positive says
-    nothing.
+    `measured`: fitted ratio of the areas, without information if it is not positive. Only a fraction w of the motion
+    that was attributed to the first side belongs to it, and the rest to the other side, whose area is well known; thus
+    log `measured` = w r. The unknown w is 1 with the probability `held_oil.sides_told` (`priors.toml`). Otherwise log w
+    is uniform between log `loaded_share` and 0. `loaded_share`: fraction of that motion in which the first side surely
+    carries the load. r has a normal prior with the mean `held_oil.sides` if `is_larger`, else -`held_oil.sides`, and
+    the standard deviation `held_oil.sides_deviation`.
     """
     prior = INFERENCE.held_oil
     mean, deviation = prior.sides if is_larger else -prior.sides, prior.sides_deviation
@@ -490,7 +503,7 @@ def log_area_ratio(measured: float, loaded_share: float, *, is_larger: bool) -> 
     if measured > 0.0:
         shares = np.geomspace(max(loaded_share, MIN_SHARE), 1.0, N_SHARES)
         share_weights = np.full(N_SHARES, (1.0 - prior.sides_told) / N_SHARES)
-        share_weights[-1] += prior.sides_told
+        share_weights[-1] += prior.sides_told  # w = 1
         misfit = (np.log(measured) - np.outer(shares, ratios)) / INFERENCE.size.area
         log_weights = log_weights + np.log(share_weights)[:, None] - 0.5 * misfit**2
     weights = np.exp(log_weights - log_weights.max()).sum(axis=0)
@@ -502,9 +515,9 @@ def log_area_ratio(measured: float, loaded_share: float, *, is_larger: bool) -> 
 def _flow_scale(balance: RecordedBalance) -> Size:
     """Determine the factor from computed to true flows (`Size`) and its uncertainty, from the sizes in the rig's file.
 
-    - Behind a servo valve, and for a load that shut valves hold, the areas give the flow, and the factor is 1. Beside a
-      creeping load the oil of the loaded side also expands, in proportion to a volume that is not known.
-    - The flow of a flow meter needs no factor either.
+    - Behind a servo valve, and for a load that shut valves hold, the areas give the flow, and the factor is 1. While a
+      held load creeps, the oil of the loaded side also expands, by an unknown volume; this adds to the uncertainty.
+    - The factor is also 1 for a flow meter.
     - A stated displacement gives the factor 1. If a stated area disagrees, the difference is the uncertainty.
     - If only the area is stated, the factor follows from the ratio of displacement to area, which the balance measures.
     """
@@ -524,6 +537,7 @@ def _flow_scale(balance: RecordedBalance) -> Size:
         return Size(1.0, deviation, stated=(is_meter or states_displacement) and has_pressure_unit)
     if is_meter:
         return Size(1.0, prior.meter, stated=has_pressure_unit, area=area.measured)
+    # the ratio is inverse to the measured area, so that its lower end follows from the largest area
     ratio = Interval(*(area.assumed / end for end in (area.measured, area.high, max(area.low, 1e-12))))
     disagreement = abs(1.0 / ratio.value - 1.0)
     both_deviation = float(np.hypot(prior.displacement, prior.area))

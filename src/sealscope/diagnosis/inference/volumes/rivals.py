@@ -134,8 +134,8 @@ def rival_rises(
 def _without_oil(coefficients: Array, thinning: Array) -> Array:
     """Remove the effect of the oil's viscosity from leakage coefficients (n + 1,), the judged one last.
 
-    `thinning` (n + 1,): logarithm by which thinner oil raises each coefficient. Return the coefficients themselves if
-    they scatter less among the n healthy recordings, relative to their mean: the oil does not explain their scatter.
+    `thinning` (n + 1,): logarithm by which thinner oil raises each coefficient. If this correction does not reduce the
+    scatter among the n healthy recordings, relative to their mean, the coefficients are returned unchanged.
     """
     corrected = coefficients * np.exp(-thinning)
     scatters = [
@@ -187,8 +187,8 @@ def _penalise_size(observable: Observable, judged: RecordingSums, unit_flows: Ma
 def _estimate_change(gram: Array, reference: Array, columns: Sequence[ColumnRoles], tested: int) -> tuple[float, float]:
     """Estimate by how much a coefficient of a recording differs from healthy recordings, with the standard error.
 
-    - `gram`, `reference` (E, m, m): Gram matrices of the recording, and sums of those of the healthy recordings, for
-      each equation.
+    - `gram`, `reference` (E, m, m): for each equation the Gram matrix of the recording, and the sum of the Gram
+      matrices of the healthy recordings.
     - `columns`: for each equation the indices of its columns by role (leak, motion, left side).
     - `tested`: index of the column whose coefficient is tested; in the healthy recordings it counts as 0.
 
