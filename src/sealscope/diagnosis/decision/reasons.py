@@ -42,13 +42,12 @@ def text_of(table: str, key: str, **values: Any) -> str:
 
 
 def reason_of(case: Case, evidence: Evidence, alarm: LeakTest | None, bound: float, other: OtherEvent | None) -> str:
-    """Compose the reason of a verdict in words: the leak or the bound of an undetected leak, then remarks.
+    """Compose the reason of a verdict in words.
 
-    Between the bound and the remarks comes the event `other` that explains the change; without it, after an alarm, the
-    events that may explain the change as well as a leak does.
-
-    `alarm`: test that raised the alarm, None if no test did; `bound`: 95 % upper bound of the leak's flow [m^3/s], used
-    only without the verdict `leak`; `other`: event other than a leak that explains a change, or None.
+    - Verdict `leak`: a description of the leak, then remarks. `alarm` is the test that detected the leak.
+    - Other verdicts: the bound of an undetected leak, another cause of a change, then remarks. `bound` is the 95 %
+      upper bound of the leak's flow [m^3/s]. The other cause is the event `other`. If `other` is None, but a test
+      raised an `alarm`, it is the most probable explanation other than a leak.
     """
     if evidence.verdict == LEAK:
         return _leak_text(case, evidence, alarm) + _remarks(case)
@@ -72,7 +71,7 @@ def _leak_text(case: Case, evidence: Evidence, alarm: LeakTest | None) -> str:
     """Describe a detected leak in words; `alarm`: test that detected it.
 
     If leakage is measured, the text states the kind of test, with flows for a level above the limit in the rig's file.
-    Otherwise it states the rarest change that the detector has found.
+    Otherwise it states the change with the smallest p-value that the detector has found.
     """
     if case.leak is None:
         rarest = case.rarest_observable
@@ -81,7 +80,8 @@ def _leak_text(case: Case, evidence: Evidence, alarm: LeakTest | None) -> str:
         percent = 100.0 * abs(np.expm1(rarest.size))
         where = _onset_text(rarest) or _against_text(case.judge.ringing)
         return text_of("leak", "details", what=f"RMS: {rarest.name}", percent=percent, where=where)
-    key = {WITHIN: "within", AGAINST: "against"}.get(alarm.name if alarm else "", "level")
+    test_name = alarm.name if alarm else ""
+    key = {WITHIN: "within", AGAINST: "against"}.get(test_name, "level")
     total = evidence.total_leakage
     if key == "level" and total is not None and total.lpm is not None and total.healthy_lpm is not None:
         return text_of("leak", "level_flow", lpm=total.lpm, healthy=total.healthy_lpm)
@@ -172,8 +172,8 @@ def _against_text(ringing: Ringing | None) -> str:
 def _rivals_text(case: Case, alarm: LeakTest) -> str:
     """Describe the most probable explanation other than a leak, and how to tell this explanation from a leak.
 
-    `alarm`: test that raised the alarm. Of an explanation by several events, the first event is described. Of a change
-    of the operating point, only the time is stated. The text is "" if this time is unknown, or if there is no
+    `alarm`: test that raised the alarm. If the explanation has several events, the first one is described. If this is a
+    change of the operating point, only its time is stated. The text is "" if this time is unknown, or if there is no
     explanation other than a leak.
     """
     leak_probability = case.leak_probability(alarm)
