@@ -105,7 +105,7 @@ class StepDetector:
 
     def is_representable(self, g: float, deviation: float) -> bool:
         """Test whether an estimate `g` and its standard `deviation` > 0 can be squared without overflow."""
-        unit = self._unit or deviation
+        unit = self._unit or deviation  # estimates are stored in the unit of the first block's deviation
         return unit > 0.0 and abs(g) < _MAX_NUMBER * unit and unit / _MAX_NUMBER < deviation < _MAX_NUMBER * unit
 
     def take(self, begin: float, end: float, g: float, deviation: float) -> None:
@@ -113,13 +113,13 @@ class StepDetector:
 
         `begin` and `end` [s] are the limits of the block, and `deviation` is the standard error of `g`. Let e be the
         innovation, i.e. g minus its prediction by the Kalman filter for a random walk. Let S be the variance of e, and
-        f the effect of a unit step on e. Then the sums for each walk and each possible onset are updated by
+        f the effect of a unit step on e. The sums a, b and T for each walk and each possible onset are updated by
 
             a += f e / S,    b += f^2 / S,    T += e^2 / S.
 
         The first block after `forget` only sets the level of the filters.
         """
-        self._unit = self._unit or deviation
+        self._unit = self._unit or deviation  # of the first block; estimates are stored in this unit
         g, variance = g / self._unit, (deviation / self._unit) ** 2
         self._blocks += 1
         elapsed_blocks = (begin - self._end) / (end - begin) + 1.0  # from the end of the last block to that of this one
@@ -136,12 +136,13 @@ class StepDetector:
         response = 1.0 - self._sums[_FOLLOWED]  # f
         if may_begin:  # of a step in this block, the mean over the block
             response[:, -len(PARTS) :] = PARTS
+        square = innovation**2 / innovation_variance
         self._sums[_FOLLOWED] += gain * response
         self._sums[_A] += response / innovation_variance * innovation
         self._sums[_B] += response / innovation_variance * response
-        self._sums[_T] += innovation**2 / innovation_variance
+        self._sums[_T] += square
         self._onsets[:, _N] += 1.0
-        self._update_walks(innovation_variance, innovation**2 / innovation_variance)
+        self._update_walks(innovation_variance, square)
         self._level = self._level + gain * innovation
         self._level_variance = gain * variance
 
@@ -149,7 +150,7 @@ class StepDetector:
         """Update the scale of the noise and the probability of each random walk after a block.
 
         For each walk in `WALKS` a Kalman filter has given the innovation e of the block (measured minus predicted
-        estimate) and its variance S. `variance` (q, 1) is S, and `square` (q, 1) is e^2 / S.
+        estimate) and the variance S of e. `variance` (q, 1) is S, and `square` (q, 1) is e^2 / S.
         """
         square = np.maximum(square, _MIN_SQUARE)
         if self._count >= _N_WARM:
@@ -171,8 +172,8 @@ class StepDetector:
         """
         # with a small probability the walk changes, after which all walks are equally likely
         log_prior = np.logaddexp(np.log1p(-_PRIORS.changes) + self._log_weights, np.log(_PRIORS.changes / len(WALKS)))
-        # the likelihood of all innovations up to a block is T^(-n/2) times the product of their S^(-1/2); divided here
-        # by its value at the onset, it becomes the likelihood since the onset (`_log_likelihoods`)
+        # the likelihood of n innovations with variances S and the sum T of e^2 / S is T^(-n/2) times the product of
+        # S^(-1/2); its value at the onset is divided out here, so that `_log_likelihoods` counts from the onset
         sums = np.zeros((_N_ROWS, len(WALKS), len(PARTS)))
         sums[_T] = self._squares
         sums[_LOG_PRIOR] = log_prior + 0.5 * (self._count * np.log(self._squares) + self._log_variances)
@@ -186,15 +187,15 @@ class StepDetector:
     def log_e(self, min_log_e: float = -np.inf) -> float:
         """Compute the logarithm of the evidence M that the coefficient has risen.
 
-        M is the sum over all possible onsets of the likelihood ratio of a step to no step. It is averaged over the
-        possible random walks of the healthy coefficient (`WALKS`), the prior variances of the step and the fractions of
-        its first block (`PARTS`). In a healthy
-        machine the mean number of blocks until M exceeds A is at least A. The result is minus infinity if no rise can
-        have begun yet, or if a quick upper bound of log M is at most `min_log_e`.
+        M is the sum over all blocks in which the rise may begin, of the likelihood ratio of a step to no step. The
+        ratio is averaged over the possible random walks of the healthy coefficient (`WALKS`), the prior variances of
+        the step (`SIZES`), and the onsets within a block (`PARTS`). In a healthy machine the mean number of blocks
+        until M exceeds a number A is at least A. The result is minus infinity if no rise can have begun yet, or if a
+        quick upper bound of log M is at most `min_log_e`.
         """
         if not len(self._onsets):
             return -np.inf
-        a, b, T = self._sums[_A : _T + 1]
+        a, b, T = self._sums[_A : _T + 1]  # sums of f e / S, f^2 / S and e^2 / S (`take`)
         # fraction of T that a step of the best size explains, less than 1 so that its logarithm is finite
         explained = np.minimum(np.maximum(a, 0.0) ** 2 / (b * T), 1.0 - 1e-15)
         max_log_ratio = -0.5 * float(np.min(self._onsets[:, _N] * np.log1p(-explained)))
@@ -238,14 +239,14 @@ class StepDetector:
     def rise(self) -> LiveRise:
         """Estimate the onset [s] and the size of a rise of the coefficient, in the coefficient's unit.
 
-        Both are averages over the variance of the random walk in a block (`WALKS`), the possible onsets, and the prior
-        variance of the step's size (`SIZES`), weighted by their posterior probabilities. The onset has a 95 % interval,
-        and the size a standard deviation.
+        Both are averages over the possible prior variances v of the step's size (`SIZES`), variances q of the random
+        walk in a block (`WALKS`), and onsets j, weighted by their posterior probabilities. The onset has a 95 %
+        interval, and the size a standard deviation.
         """
         terms = self._log_terms()
         log_e = float(np.logaddexp.reduce(terms.ravel()))
         weights = np.exp(terms - log_e)  # posterior probabilities
-        a, b, T = self._sums[_A : _T + 1]
+        a, b, T = self._sums[_A : _T + 1]  # sums of f e / S, f^2 / S and e^2 / S (`take`)
         # Student's t posterior of the size, for each v, q and j
         precision = b + 1.0 / SIZES[:, None, None]
         sizes = a / precision
@@ -272,7 +273,7 @@ class StepDetector:
         """
         if not len(self._onsets):
             return np.inf
-        a, b, T = self._sums[_A : _T + 1]
+        a, b, T = self._sums[_A : _T + 1]  # sums of f e / S, f^2 / S and e^2 / S (`take`)
         # least-squares size of a step at each onset and for each walk, and its standard error
         sizes = a / b
         residual_squares = np.maximum(T - a * sizes, np.finfo(float).tiny)

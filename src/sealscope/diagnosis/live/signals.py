@@ -91,9 +91,10 @@ class SignalWindow:
 
     @np.errstate(all="ignore")
     def observables(self, since: float) -> tuple[Observable, ...]:
-        """Test each feature for a step in the blocks that begin at `since` [s] or later.
+        """Test each feature for a step in the stored blocks that begin at `since` [s] or later.
 
-        The result is empty if there are fewer than `MIN_BLOCKS` blocks.
+        The features are duty (motion and load), noise, mains hum and mean pressures. The result is empty if there are
+        fewer than `MIN_BLOCKS` blocks.
         """
         rows = self._rows[self._rows[:, _BEGIN] >= since] if self._rows.size else self._rows
         if len(rows) < MIN_BLOCKS:
@@ -115,8 +116,9 @@ class SignalWindow:
         """Test the mean pressures in each direction of motion for steps.
 
         `rows` are the stored features of n blocks, and `time` (n,) the centres of the blocks [s]. The blocks are
-        averaged in groups of equal size, the smallest of `_GROUP_SIZES` with which the machine moves both ways in every
-        group. The result is empty if there is no such size, or if there are fewer than `MIN_BLOCKS` groups.
+        averaged in groups of equal size, which is the smallest of `_GROUP_SIZES` for which the machine moves in both
+        directions in every group. The result is empty if there is no such size, or if there are fewer than `MIN_BLOCKS`
+        groups.
         """
         n_columns = round((rows.shape[1] - _GRAM.start) ** 0.5)  # a row ends with a flattened square Gram matrix
         for size in _GROUP_SIZES:
@@ -125,7 +127,8 @@ class SignalWindow:
                 break
             groups = rows[-n_groups * size :].reshape(n_groups, size, -1)
             gram = groups[:, :, _GRAM].sum(axis=1).reshape(n_groups, n_columns, n_columns)
-            values = fit_pressure_levels(gram, float(groups[:, :, _SAMPLES].sum(axis=1).max()), self._means)
+            max_samples = float(groups[:, :, _SAMPLES].sum(axis=1).max())  # of a group
+            values = fit_pressure_levels(gram, max_samples, self._means)
             if values is not None:  # None if a group moves in one direction only
                 return pattern_tests(time[-n_groups * size :].reshape(n_groups, size).mean(axis=1), values)
         return ()
