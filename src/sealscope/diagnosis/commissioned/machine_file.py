@@ -156,6 +156,7 @@ def write_machine(machine: CommissionedMachine, path: str | os.PathLike[str]) ->
     target = _resolve_target(path)
     with _lock(target):
         if machine.origin is not None and machine.origin.path == target and target.exists():
+            # the tables as they will be read back
             new_tree = parse_toml(_format_text(machine, target), "a machine's file", str(target))
             present, written = _hash_parts(_read_checked(target)), _hash_parts(new_tree)
             change = _find_change(machine.origin, present, written)
@@ -288,10 +289,10 @@ def _hash_parts(tree: Mapping[str, Any]) -> dict[bytes, str]:
 def _find_change(origin: Origin, present: Mapping[bytes, str], written: Mapping[bytes, str]) -> str | None:
     """Find a change of a machine's file since loading that writing would undo; None if there is none.
 
-    `origin` holds the hashes of the file's parts when it was loaded, `present` those of the file now and `written`
-    those about to be written (`_hash_parts`). A change is a present part that is neither in `origin` nor in
-    `written`, or a part in both `origin` and `written` that is no longer present. Returns the description of the
-    first change.
+    `origin` holds the hashes of the file's parts at loading, `present` those of the file now, and `written` those of
+    the file to be written; the last two map a hash to the description of a change (`_hash_parts`). A change is a
+    present part that is neither in `origin` nor in `written`, or a part in both `origin` and `written` that is no
+    longer present. Returns the description of the first change.
     """
     changes = [text for part, text in present.items() if part not in origin.parts and part not in written]
     changes += [text for part, text in written.items() if part in origin.parts and part not in present]
@@ -308,8 +309,8 @@ def _read_checked(path: Path) -> dict[str, Any]:
 def _read_tree(path: Path, place: str) -> dict[str, Any]:
     """Read the tables of a machine's file without checking them.
 
-    `place` is its path for error messages. Keys from before version 0.1 get their present names. Raises InputError if
-    the file cannot be read.
+    `place` is the file's path as stated in error messages. Keys from before version 0.1 get their present names. Raises
+    InputError if the file cannot be read.
     """
     tree = read_toml(path, "a machine's file", place)
     rows = tree.get("healthy")

@@ -163,7 +163,7 @@ class Case:
         leak = self.leak
         if leak is None or leak.step_rise is None or leak.rise_onset is not None:
             return True
-        rise, step_log_ratio = leak.step_rise  # `step_log_ratio`: of a rise by the step to no rise
+        rise, step_log_ratio = leak.step_rise  # log likelihood ratio of a rise by this step to no rise
         within_factor = sum(log_bayes_factor(test.chance) for test in self.tests if test.name == WITHIN)  # 0 or 1 test
         return within_factor + step_log_ratio > log_bayes_factor(rise.chance)
 

@@ -131,7 +131,7 @@ def _leak_evidence(case: Case, alarm: LeakTest) -> Evidence:
             onset = leak.rise_onset if alarm.name == AGAINST else None
         fields = {
             "cause": _leak_cause(case, leak, alarm),
-            "total_leakage": leak.total(detectable_flow=None),  # stated only without a leak
+            "total_leakage": leak.total(detectable_flow=None),  # no detectable flow is stated beside a leak
             "course": leak.history(None if onset is None else onset.value),
             **_size_fields(leak, leak.step_flow if alarm.name == WITHIN else leak.rise_flow),
         }
@@ -160,8 +160,8 @@ def _size_fields(leak: LeakMeasure, flow: Flow | None) -> dict[str, Any]:
 
     `flow`: mean flow of the leak; without a flow (None) there are no fields; `leak`: measured leakage, with the factors
     that convert the flow. The flow is stated relative to the machine (`relative`) and, if a factor to L/min is known,
-    in L/min with a 95 % interval. Otherwise the field `refuses` says that L/min are not stated. The interval includes
-    the smallest and largest ratio of true to stated flow (`leak.flow_factors`).
+    in L/min with a 95 % interval, which allows for the smallest and largest ratio of true to stated flow
+    (`leak.flow_factors`). Otherwise the field `refuses` says that L/min are not stated.
     """
     if flow is None:
         return {}
@@ -247,9 +247,9 @@ def _findable_step(case: Case) -> float | None:
 def _add_tests(case: Case, evidence: Evidence, judging: LeakTest | None) -> Evidence:
     """Add to the evidence what the judging detector reports, and the results of the tests for a leak.
 
-    - Of the detector: name, judged fraction of the recording, and measured ratio of displacement to area.
-    - Of the test `judging`: score, threshold and p-value; no results of tests are added if it is None.
-    - If there are several tests, the evidence of each as `parts`.
+    - Of the detector: name, fraction and end of the judged samples, and measured ratio of displacement to area.
+    - Of the test `judging`: score, threshold and p-value. If it is None, no results of tests are added.
+    - If there are several tests, the evidence of each test, as `parts`.
     """
     judge = case.judge
     evidence = replace(evidence, detector=judge.provider, share=judge.share, judged_until=judge.judged_until)

@@ -77,7 +77,7 @@ def _leak_text(case: Case, evidence: Evidence, alarm: LeakTest | None) -> str:
         rarest = case.rarest_observable
         if rarest.data == "plug-in":
             return text_of("leak", "plug_in", provider=case.judge.provider)
-        percent = 100.0 * abs(np.expm1(rarest.size))
+        percent = 100.0 * abs(np.expm1(rarest.size))  # `size`: change of the logarithm of the RMS
         where = _onset_text(rarest) or _against_text(case.judge.ringing)
         return text_of("leak", "details", what=f"RMS: {rarest.name}", percent=percent, where=where)
     test_name = alarm.name if alarm else ""
@@ -132,12 +132,12 @@ def _ringing_text(evidence: Evidence, ringing: Ringing | None, provider: str) ->
     """
     if ringing is None:
         return text_of("bound", "unseen", provider=provider)
-    percent = -100.0 * np.expm1(-ringing.bound)
+    percent = -100.0 * np.expm1(-ringing.bound)  # for a fall of the logarithm of the RMS by `bound`
     key = "ringing_hidden" if evidence.verdict == CANNOT_TELL else "ringing"
     text = text_of("bound", key, percent=percent, where=_against_text(ringing))
     if ringing.rate < _MIN_RINGING_RATE:
         # unused columns are named first: mapping them helps more than a higher rate
-        names = {"names": join_names(ringing.unused, 4)}
+        names = {"names": join_names(ringing.unused, most=4)}
         key, values = ("unused", names) if ringing.unused else ("slow", {"fast": _MIN_RINGING_RATE})
         text = f"{text_of('bound', key, rate=ringing.rate, **values)}; {text}"
     # without healthy recordings the ringing is compared with that at the start of the recording
@@ -152,7 +152,7 @@ def _changed_ringing_text(case: Case, ringing: Ringing) -> str:
     many healthy recordings the ringing was compared (`ringing.healthy`).
     """
     rarest = case.rarest_observable
-    percent = 100.0 * abs(np.expm1(rarest.size))
+    percent = 100.0 * abs(np.expm1(rarest.size))  # `size`: change of the logarithm of the RMS
     where = _onset_text(rarest) or _against_text(ringing)
     leak = 100.0 * case.leak_probability(case.alarms[0])
     return text_of("bound", "ringing_changed", what=rarest.name, percent=percent, where=where, leak=leak)
@@ -215,8 +215,8 @@ def _observable_text(other: OtherEvent) -> str:
 
 def _rarity_text(chance: float) -> str:
     """State the p-value `chance` of a change in words, as 1 in n healthy recordings, with n up to 10 000."""
-    two_digits = float(f"{1.0 / max(chance, 1e-4):.2g}")
-    return text_of("doubt", "rarity", count=f"{two_digits:,.0f}".replace(",", " "))
+    count = float(f"{1.0 / max(chance, 1e-4):.2g}")  # rounded to two digits
+    return text_of("doubt", "rarity", count=f"{count:,.0f}".replace(",", " "))
 
 
 def _remarks(case: Case) -> str:

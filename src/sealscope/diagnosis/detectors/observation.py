@@ -67,8 +67,8 @@ def observe_rivals(recording: Recording, baseline: Sequence[Healthy], distrust: 
     """Test a recording for changes of duty, noise, mains hum and mean pressures, which may be mistaken for a leak.
 
     The duty is how the machine is moved and loaded. The changes are tested within the recording and against the healthy
-    recordings of `baseline`. `distrust` is the reason why the pressures cannot be judged, None if they can. If it is
-    given, nothing is tested, and the report only states the reason.
+    recordings of `baseline`. If `distrust` states a reason why the pressures cannot be judged, nothing is tested, and
+    the report only states the reason.
     """
     if distrust:
         return Observed(SIGNALS, lack=distrust)
@@ -133,7 +133,7 @@ def healthy_surprisals(recording: Recording, rig: Rig) -> Mapping[str, float]:
     """Compute the surprisal of each change that the detectors test within a healthy recording.
 
     A surprisal is -log of the p-value that a detector states, assuming `rig`. Returns surprisals by the key of the
-    change (`null.null_key`). Keys with the prefix `SHUT` are for results of the volume balance if valves cut the pump
+    change (`null.null_key`). Keys with the prefix `SHUT` are for a volume balance that assumes that valves cut the pump
     off at rest. The result is stored with the recording, and computed only once.
     """
     return compute_once(recording, (SURPRISALS, rig), lambda samples: _compute_surprisals(samples, rig))
@@ -154,7 +154,7 @@ def _compute_surprisals(recording: Recording, rig: Rig) -> Mapping[str, float]:
             with np.errstate(all="ignore"):
                 reports = balance.observe_regimes(recording)
         except Exception as error:
-            log_failure(balance.name, None, error)
+            log_failure(balance.name, distribution=None, error=error)
     for is_shut, report in reports.items():
         prefix = SHUT if is_shut else ""
         surprisals |= {f"{prefix}{key}": surprisal for key, surprisal in _max_surprisals(report).items()}

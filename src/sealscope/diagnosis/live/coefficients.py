@@ -95,9 +95,9 @@ def add_block(model: Any, rows: float, weight: float, has_stepped: bool) -> None
     """Add the products in `model.block` to the sums over earlier blocks, which lose weight exponentially.
 
     `model` is a `Coefficients`, `rows` the number of equations in the block, and `weight` the weight of the block, 0 to
-    1. The leak's coefficient is assumed to take a random step before each block. Its variance is that of the block's
-    estimate of the leak or, if `has_stepped`, infinite. The earlier value of the leak is therefore eliminated. With the
-    sums S, their column S_l of the leak and its diagonal element S_ll, and the block's products B,
+    1. The leak's coefficient is assumed to take a random step before each block, so that its earlier value is
+    eliminated. The variance of this step is that of the block's estimate of the leak or, if `has_stepped`, infinite.
+    With the sums S, their column S_l and diagonal element S_ll of the leak, and the block's products B,
 
         S <- exp(-1/memory) (S - S_l S_l' / (S_ll + B_ll)) + weight B,
 
@@ -106,7 +106,7 @@ def add_block(model: Any, rows: float, weight: float, has_stepped: bool) -> None
     """
     sums, block, size = model.sums, model.block, len(model.block)
     leak = size - 2  # index of the leak's column, before the left side
-    leak_column = model.matrix[0]  # a copy in free memory, as the sums change below
+    leak_column = model.matrix[0]  # free memory, for a copy of the column, as the sums change below
     for i in range(size):
         leak_column[i] = sums[i, leak]
     information = leak_column[leak] + (0.0 if has_stepped else max(block[leak, leak], TINY))
@@ -222,8 +222,8 @@ def estimate_leak(model: Any, rows: float, is_learned: bool) -> tuple[float, flo
     - V: the variance of g due to the errors of the nuisances.
     """
     block, n, numbers = model.block, len(model.matrix), model.numbers
-    # C: normal matrix of the n nuisances c; b: products of the leak's column (index n) with theirs in this block;
-    # the columns of `solution` become c, C^-1 b (for V), and C^-1 (b - b as usual)
+    # C: normal matrix of the n nuisances c; b: products of the leak's column (index n) with theirs in this block; b_u:
+    # usual value of b. The columns of `solution` become c, C^-1 b and C^-1 (b - b_u)
     solution = model.matrix[:, n:]
     # sums of squares of the leak's column, in this block and in the last blocks
     energy, usual_energy = max(block[n, n], TINY), max(numbers[ENERGY], TINY)
@@ -231,6 +231,7 @@ def estimate_leak(model: Any, rows: float, is_learned: bool) -> tuple[float, flo
         solution[i, 1] = block[i, n]
         solution[i, 2] = block[i, n] - energy * (model.leak_products[i] / usual_energy)
     _solve(model)
+    # sums: product of the leak's column with left side less nuisances, (b - b_u)' C^-1 (b - b_u), b' C^-1 b
     moment, unusual, systematic = block[n, n + 1], 0.0, 0.0
     numbers[SHIFT] *= _SHIFT_DECAY
     for i in range(n):
@@ -244,7 +245,7 @@ def estimate_leak(model: Any, rows: float, is_learned: bool) -> tuple[float, flo
     g, weight = moment / energy, 1.0
     if is_learned:
         weight = _learn_block(model, rows, g)
-    # an error of the nuisances adds to the noise of the series only if b differs from its usual value
+    # errors of the nuisances add to the noise of the series only if b differs from b_u
     precision = energy / (OVERLAP * numbers[NOISE] * (1.0 / weight + max(unusual, 0.0) / energy))
     systematic_variance = max(systematic, 0.0) * OVERLAP * numbers[NOISE] * (precision / energy) ** 2
     return precision, precision * g, precision * numbers[SHIFT], systematic_variance

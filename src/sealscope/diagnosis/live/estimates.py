@@ -117,9 +117,9 @@ class WatchedLeak:
 
     @property
     def rarity(self) -> float:
-        """Probability that a healthy machine scores as high, divided by the allowed probability of a false alarm.
+        """Probability that a healthy machine scores as high in the test, over the allowed probability of a false alarm.
 
-        The result is limited to 1e-9 to 1.
+        The result is at least 1e-9 and at most 1.
         """
         log_allowed = LiveRise(self.test, self.threshold).log_chance
         log_ratio = self.estimate.log_chance - log_allowed

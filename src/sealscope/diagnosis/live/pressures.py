@@ -146,6 +146,7 @@ class PressureEstimator:
         """
         # `_held`: value that a pressure has repeated up to the last block, nan if the pressure was not stuck
         holds = [find_holds(samples[row], rate, held) for row, held in zip(_PRESSURES, self._held, strict=True)]
+        # `pending`: index of the first sample whose flag later samples may change
         if min(hold.pending for hold in holds) < n_block:
             return False
         for k, (row, hold) in enumerate(zip(_PRESSURES, holds, strict=True)):
@@ -177,6 +178,7 @@ class PressureEstimator:
         self._misfits = 0
         if is_settling:
             return NotJudged.with_count(end, "settling", restarts)
+        # G: index of the conductance; the covariance is in units of the priors
         g, sd = float(follower.theta[G]), math.sqrt(follower.covariance[G, G]) * float(follower.priors.unit[G])
         if sd > _MAX_SD:
             status = "conductance not resolved" if is_moving(block["u"]) else "at standstill"
@@ -230,13 +232,14 @@ class PressureEstimator:
     def _follow(self, follower: Follower, block: Recording, is_settling: bool) -> bool:
         """Fit the model of the pressures to a block; return True if the model describes the block.
 
-        `follower` is the fit so far. Its sums over the block, and features of the block's signals, are stored. The
-        block also updates the usual variance of the residuals, faster if the fit is settling (`is_settling`) or the
-        model does not describe the block.
+        `follower` is the fit so far. The fit's sums over the block, and features of the signals in the block, are
+        stored. The block also updates the usual variance of the residuals, faster if the fit is settling
+        (`is_settling`) or the model does not describe the block.
         """
         sums = follower.update(block)
         self._signals.take(float(block.t[0]), {name: block[name] for name in _READ}, block.rate)
         row = np.concatenate([[self._end, sums.samples], sums.theta, sums.gram.ravel(), sums.scores.ravel()])
+        # keep the last `_WINDOW` blocks, but none with sums of another size
         stored = self._rows[1 - _WINDOW :] if self._rows.shape[1:] == row.shape else np.empty((0, len(row)))
         self._rows = np.vstack([stored, row])
         # `excess`: chi square of the block above its mean, in standard deviations
@@ -258,7 +261,7 @@ class PressureEstimator:
         rows, seconds = self._rows, self.block_seconds
         if not rows.size or rows[-1, _END] != end or rows[0, _END] - seconds > onset:
             return None
-        rows = rows[rows[:, _END] > since + 0.5 * seconds]
+        rows = rows[rows[:, _END] > since + 0.5 * seconds]  # begin at `since` or later, to half a block
         if len(rows) < MIN_BLOCKS or self._follower is None:
             return ()
         blocks = [
@@ -266,7 +269,7 @@ class PressureEstimator:
             for row in rows
         ]
         try:
-            joint = Joint.fit(blocks, self._follower.priors, seconds, G)
+            joint = Joint.fit(blocks, self._follower.priors, block_s=seconds, parameter=G)
             information = parameter_information(joint, rows[:, _END] - 0.5 * seconds, seconds * len(rows))
             response = score_response_steps(information)
         except np.linalg.LinAlgError:

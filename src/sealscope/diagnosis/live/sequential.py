@@ -128,13 +128,13 @@ class StepDetector:
             self._level[:], self._level_variance[:] = g, variance
             return
         level_variance = self._level_variance + WALKS * max(elapsed_blocks, 1.0)
-        innovation, innovation_variance = g - self._level, level_variance + variance
+        innovation, innovation_variance = g - self._level, level_variance + variance  # e and S
         gain = level_variance / innovation_variance
         may_begin = self._count >= _N_WARM
         if may_begin:
             self._add_onsets(begin, end)
         response = 1.0 - self._sums[_FOLLOWED]  # f
-        if may_begin:  # of a step in this block, the mean over the block
+        if may_begin:  # of a step that begins in this block: its mean over the block
             response[:, -len(PARTS) :] = PARTS
         square = innovation**2 / innovation_variance
         self._sums[_FOLLOWED] += gain * response
@@ -206,7 +206,9 @@ class StepDetector:
     def _log_likelihoods(self) -> Array:
         """Compute the log likelihood (q, j) of each random walk q, given no step since each onset j.
 
-        The prior of the walk at the onset is included. A constant equal for all q is left out.
+        For n innovations with variances S and the sum T of their squares over S, it is -(n log T + sum of log S) / 2.
+        The value at the onset is subtracted, and the log prior of the walk is added (`_add_onsets`). A constant equal
+        for all q is left out.
         """
         n, log_T = self._onsets[:, _N], np.log(self._sums[_T])
         return np.asarray(self._sums[_LOG_PRIOR] - 0.5 * (n * log_T + self._log_variances))
@@ -215,7 +217,7 @@ class StepDetector:
         """Compute the log likelihood ratios (v, q, j) of a rise of the coefficient to no step.
 
         v is the prior variance of the step's size (`SIZES`), q the variance of the random walk in a block (`WALKS`),
-        and j the onset. With n and the sums a, b and T of the module's docstring, which `take` updates,
+        and j the onset. With the number n of innovations and their sums a, b and T (`take`),
 
             R = (1 + v b)^(-1/2) (1 - max(a, 0)^2 / ((b + 1/v) T))^(-n/2).
         """

@@ -76,16 +76,17 @@ class SignalWindow:
             return
         if not self._means.size:
             self._means = np.array([channels["p_A"].mean(), channels["p_B"].mean()])
-        motion = motion_columns(channels, rate)
+        motion = motion_columns(channels, rate)  # speed first; None if no motion is recorded
         speed = 0.0 if motion is None else top_speed(motion)
         max_speed = max(speed, float(self._rows[:, _SPEED].max(initial=0.0)) if self._rows.size else 0.0)
         fraction_moving = 1.0 if motion is None else float(time_in_motion(motion[None, :, 0], max_speed)[0])
-        columns = pressure_level_rows(channels, rate, self._means, max_speed)
+        columns = pressure_level_rows(channels, rate, self._means, max_speed)  # of the fit of mean pressures
         single_block = {name: values[None] for name, values in channels.items()}  # arrays (1, n) of one block
         values = {**dict(log_amplitudes(single_block)), **dict(sensor_features(single_block, rate))}
         features = [float(values[name][0]) if name in values else np.nan for name in FEATURES]
         n_samples, gram = len(channels["p_A"]), columns.T @ columns
         row = np.array([begin, begin + n_samples / rate, n_samples, speed, fraction_moving, *features, *gram.ravel()])
+        # keep the last `WINDOW` blocks, but none with other channels
         stored = self._rows[1 - WINDOW :] if self._rows.shape[1:] == row.shape else np.empty((0, len(row)))
         self._rows = np.vstack([stored, row])
 
@@ -106,7 +107,7 @@ class SignalWindow:
         features = {name: values for name, values in columns if np.isfinite(values).any()}
         duty = {name: features.pop(name) for name in DUTY if name in features}
         sensors = ((name, feature_step_test(moving_time, values)) for name, values in features.items())
-        return run_tests(
+        return run_tests(  # which ends a test whose numbers overflow
             lambda: duty_observables(amplitude_step_tests(moving_time, duty)),
             lambda: sensor_observables((name, test) for name, test in sensors if test is not None),
             lambda: level_observables(self._test_levels(rows, time)),

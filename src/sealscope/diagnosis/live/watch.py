@@ -133,7 +133,7 @@ class Watch:
         """
         rate: float = self.false_alarms_per_1000_h
         fraction_of_alarms = getattr(_PRIORS, test)
-        rate_per_probability: float = 1000.0 / fraction_of_alarms * 3600.0 / seconds  # false alarms in 1000 h
+        rate_per_probability: float = 1000.0 / fraction_of_alarms * 3600.0 / seconds  # tests in 1000 h / fraction
         min_rate, max_rate = 1e-12 * rate_per_probability, 0.05 * rate_per_probability  # supported probabilities
         if not min_rate <= rate <= max_rate:
             raise InputError(f"false_alarms_per_1000_h must be {min_rate:.2g} to {max_rate:.3g}, got {rate:g}")
@@ -146,7 +146,7 @@ class Watch:
 
     @property
     def learned_with(self) -> tuple[Rig, Mapping[str, bool], float]:
-        """Settings with which the baseline is learned, i.e. rig, `litres` of the constructor, and learning time [h]."""
+        """Settings with which the baseline is learned: rig, whether L/min are stated by each method, and time [h]."""
         return self._rig, self._litres, self.learn_hours
 
     @property

@@ -135,9 +135,9 @@ class Diagnosis(Evidence):
     def repair_lpm(self) -> float | None:
         """Repair limit [L/min] to draw in the plot of the leak over time (`course`).
 
-        If the plot shows the total leakage, the leakage of the healthy machine is added to the limit. It is the median
-        of the plotted flow before the onset of the leak. If the leak was open from the start, its flow is subtracted
-        from the median. The result is None if there is no plot, or if limit or healthy leakage is not known as a flow.
+        If the plot shows the total leakage, the leakage of the healthy machine is added to the limit: the median of the
+        plotted flow before the onset of the leak. If the leak was open from the start, its flow is subtracted from the
+        median. The result is None if there is no plot, or if limit or healthy leakage is not known as a flow.
         """
         course, limit = self.course, self.limit_lpm
         if course is None or limit is None:
@@ -177,7 +177,10 @@ class Diagnosis(Evidence):
 
     @property
     def _condition(self) -> str:
-        """Name of the condition in `states.toml` that corresponds to the verdict, such as "leak" or "no change"."""
+        """Name of the condition in `states.toml` that corresponds to the verdict, such as "leak" or "no change".
+
+        For the verdict `no leak` it depends on whether healthy leakage is known, and whether this leakage is usual.
+        """
         if self.verdict != NO_LEAK:
             return self.verdict
         if self.known_healthy:
@@ -196,8 +199,8 @@ class Diagnosis(Evidence):
     @property
     def next_check(self) -> str:
         """Next check to make on the machine, in one or two sentences."""
-        with_bypass = self.machine is not None and self.machine.bypass
-        return action_of(self._condition, self.named_cause, ("bypass",) if with_bypass else ())
+        has_bypass = self.machine is not None and self.machine.bypass
+        return action_of(self._condition, self.named_cause, parts=("bypass",) if has_bypass else ())
 
     @property
     def state(self) -> MachineState:
