@@ -109,6 +109,7 @@ class MachineSummary:
             noise.append(f"{name} {deviation:.2g} {display_unit}")
         seconds = sum(recording.seconds for recording in healthy)
         n_alarms = sum(BY_OTHERS in problem for problem in self.problems)  # recordings unlike the others
+        # the highest score of n + 1 recordings is equally likely that of any of them
         rate = f"1 in {len(healthy) + 1} by the ranks of {len(healthy)} healthy recordings alone, whatever their law"
         rows = [
             ("recordings", f"{len(healthy)} healthy, {seconds:.4g} s in all{span}"),
@@ -249,7 +250,7 @@ def summarise_machine(
     rig = rig or unstated_rig()
     channels = frozenset(with_balance[0].units if with_balance else ())
     if not (summaries and equations(rig, channels)):
-        return MachineSummary({}, noise, None, problems)
+        return MachineSummary(terms={}, noise=noise, smallest=None, problems=problems)
     terms = _estimate_terms([np.asarray(summary["sums"], dtype=float)[0] for summary in summaries], rig, channels)
     smallest = _smallest_leak(VolumeBalance(rig), summaries, channels) if len(summaries) > 1 else None
     return MachineSummary(terms, noise, smallest, problems)
@@ -263,7 +264,7 @@ def _estimate_terms(sums: Sequence[Array], rig: Rig, channels: frozenset[str]) -
     `channels` determine the terms. The scatter is the standard deviation of the estimates from single recordings.
     Returns an estimate for each term with an unknown coefficient, by the name of the term.
     """
-    equation = equations(rig, channels)[0]
+    equation = equations(rig, channels)[0]  # a rig with a servo valve has several; the first one is used
     roles = ColumnRoles(equation)
     units = {term.name: term.unit for term in equation.terms}
     nuisance = list(roles.nuisance)  # columns of the terms with unknown coefficients
@@ -313,7 +314,7 @@ def _smallest_leak(balance: VolumeBalance, summaries: Sequence[Summary], channel
     pressure, flow, scale = (
         float(np.median([summary[name] for summary in summaries])) for name in ("pressure", "flow", "scale")
     )  # `scale`: factor from the balance's flows to the true ones, 0 if unknown
-    smallest = smallest_rise(1)
+    smallest = smallest_rise(n_repeats=1)
     halved_by = next((n for n in _PRIORS.repeats if smallest_rise(n) <= 0.5 * smallest), None)
     share = smallest * pressure / flow if flow > 0.0 else float("nan")
     lpm = smallest * pressure * scale / LITRE_PER_MINUTE if scale > 0.0 else None
@@ -323,8 +324,8 @@ def _smallest_leak(balance: VolumeBalance, summaries: Sequence[Summary], channel
 def _collect_problems(healthy: Sequence[SummarisedRecording]) -> list[str]:
     """List the problems of all healthy recordings, one line for each kind of problem.
 
-    Problems with the same text before the first colon are of one kind. The line shows the alphabetically last text of
-    its kind. It ends with the name of the recording, or with the number of recordings if there are several.
+    Problems with the same text before the first colon are of one kind. The line shows the alphabetically last of these
+    texts. It ends with the name of the recording, or with the number of recordings if several have such a problem.
     """
     by_kind = defaultdict[str, list[tuple[str, str]]](list)
     for recording in healthy:
@@ -351,7 +352,7 @@ def _estimate_noise(values: Array) -> float:
     known = values[np.isfinite(values)]
     if known.size < 3:
         return 0.0
-    deviation = float(np.median(np.abs(np.diff(known, 2)))) / 0.6745 / np.sqrt(6.0)
+    deviation = float(np.median(np.abs(np.diff(known, n=2)))) / 0.6745 / np.sqrt(6.0)
     return _round_to_4_digits(max(deviation, estimate_quantum(known) / np.sqrt(12.0)))
 
 
