@@ -223,6 +223,6 @@ def compare_healthy(baseline: Sequence[Healthy]) -> Iterator[Sequence[Observable
     if len(comparable) < MIN_COMPARED:
         return
     for k, summary in enumerate(comparable):
-        others = comparable[:k] + comparable[k + 1 :]
-        observables, _ = compare_summaries(summary, others, summary["chambers"])  # second: bound of a change
+        other_summaries = comparable[:k] + comparable[k + 1 :]
+        observables, _ = compare_summaries(summary, other_summaries, summary["chambers"])
         yield observables
