@@ -105,20 +105,23 @@ class Examination:
         """
         if name not in self._reports:
             rig = load_rig(self.rig)
-            self._reports[name] = run_detector(name, self.recording, self.baseline, rig, self.distrust)
+            self._reports[name] = run_detector(name, self.recording, self.baseline, rig, distrust=self.distrust)
         return self._reports[name]
 
     @cached_property
     def signals(self) -> Observed:
-        """Changes of duty (motion, load), noise, hum and mean pressures, which may explain an alarm without a leak."""
-        return observe_rivals(self.recording, self.baseline, self.distrust)
+        """Report on changes of duty (motion and load), noise, hum and mean pressures, which may explain an alarm.
+
+        If there is a reason not to trust the pressures (`distrust`), the report states only this reason.
+        """
+        return observe_rivals(self.recording, self.baseline, distrust=self.distrust)
 
     @cached_property
     def null(self) -> HealthyNull:
         """Distribution of the detectors' test results in the healthy recordings (`baseline`).
 
-        The test results of the judged recording are compared with it. If the volume balance found that valves cut the
-        pump off while the judged machine rests, the same is assumed for the healthy recordings.
+        The test results of the judged recording are compared with this distribution. If the volume balance found that
+        valves cut the pump off while the judged machine rests, the same is assumed for the healthy recordings.
         """
         leak = self.report(VOLUME_BALANCE).leak if VOLUME_BALANCE in detectors() else None
         is_shut_at_rest = isinstance(leak, BalanceLeak) and leak.balance.shut
@@ -127,9 +130,9 @@ class Examination:
     def evidence(self, name: str) -> Evidence:
         """Decide from the observations of one detector if the machine leaks; other detectors are not asked.
 
-        `name`: name of the detector. A change may have other causes than a leak, such as a change of duty, for which
-        `self.signals` tests. These causes compete with a leak as explanations, except for the detector `rms change`,
-        whose alarms always count as leaks.
+        `name`: name of the detector. A change may have other causes than a leak, such as a change of duty (motion and
+        load). `self.signals` reports tests for these causes, which compete with a leak as explanations. For the
+        detector `rms change` they do not compete: its alarms always count as leaks.
         """
         return self._decide_by(name, [self.signals], weigh_rivals=name != RMS_CHANGE)
 
@@ -141,24 +144,26 @@ class Examination:
         no recording of the given baseline can be compared (`refusal`).
         """
         names = sorted(detectors(), key=rank)  # the detectors of `ORDER` first
-        # their observables may explain a change otherwise than by a leak, whichever detector decides
+        # whichever detector decides, the test results in these reports may show another cause of a change than a leak
         reports = [self.signals, *(self.report(name) for name in names if name not in ORDER)]
         decisions = dict[str, Evidence]()
         for name in names:
             if name not in ORDER or not any(is_decided(decision) for decision in decisions.values()):
                 decisions[name] = self._decide_by(name, reports)
         failures = [self.report(name).lack for name in ORDER if name in decisions and self.report(name).has_failed]
-        return combine(list(decisions.values()), self.refusal or next(iter(failures), None))
+        refusal = self.refusal or next(iter(failures), None)  # reason not to state "no leak"
+        return combine(list(decisions.values()), refusal)
 
     def _decide_by(self, name: str, reports: Sequence[Observed], *, weigh_rivals: bool = True) -> Evidence:
         """Decide from the observations of the detector called `name` if the machine leaks.
 
-        `reports` are observations of other detectors that may explain an alarm of this one. With `weigh_rivals`,
-        these explanations compete with a leak.
+        `reports` are the observations of other detectors, which may show another cause of an alarm than a leak. With
+        `weigh_rivals`, such causes compete with a leak.
         """
+        probability = self.false_alarm_probability
         with np.errstate(all="ignore"):
-            evidence = decide(self.report(name), reports, self.null, self.false_alarm_probability, weigh_rivals)
-        # the detector states fractions of the examined part: convert them to those of the whole recording
+            evidence = decide(self.report(name), reports, self.null, probability, weigh_rivals=weigh_rivals)
+        # convert fractions of the examined part of the recording, as the detector states them, to those of the whole
         judged_until = self.judged_until * evidence.judged_until
         return replace(evidence, share=self.share * evidence.share, judged_until=judged_until)
 

@@ -90,7 +90,7 @@ def _inspect(recording: Recording, names: Sequence[str]) -> Inspection:
     stuck, if all of them are mostly clipped, or if they are implausible for a hydraulic machine.
     """
     chambers = chambers_of(recording)
-    part, corrections, stuck, share = correct_samples(recording)
+    part, corrections, stuck, share = correct_samples(recording)  # `stuck`: names of channels that repeat one value
     findings = (*inspect(recording.only(names)), *corrections)
     on_chambers = [finding for finding in findings if finding.channel in chambers]
     defects = [finding for finding in on_chambers if finding.code == "constant"]
@@ -150,21 +150,23 @@ def select_comparable(judged: Inspection, baseline: Sequence[Healthy]) -> Baseli
     for (severity, text), indices in left_out.items():
         names = [healthy[k].file or f"number {k + 1}" for k in sorted(indices)]
         count = f"{len(names)} of {len(healthy)} baseline recordings {'is' if len(names) == 1 else 'are'}"
-        note = f"{count} left out: {text} ({join_names(names, 3)})"
-        findings.append(Finding("baseline_left_out", severity, None, count=len(indices), first_t=None, text=note))
+        note = f"{count} left out: {text} ({join_names(names, most=3)})"
+        findings.append(
+            Finding("baseline_left_out", severity, channel=None, count=len(indices), first_t=None, text=note)
+        )
     refusal = None
     if healthy and not index_of_digest:
         _, most_frequent_reason = max(left_out, key=lambda obstacle: len(left_out[obstacle]))
         refusal = f"no baseline recording can be used: {most_frequent_reason}"
-    entries = [healthy[k] for k in sorted(index_of_digest.values())]
+    entries = [healthy[k] for k in sorted(index_of_digest.values())]  # in the order of `baseline`
     parts = tuple(entry.part if isinstance(entry, Inspection) else entry for entry in entries)
     return Baselines(parts, tuple(findings), refusal)
 
 
 def _find_obstacle(entry: Inspection | SummarisedRecording, judged: Inspection) -> tuple[Severity, str] | None:
-    """Find the reason why a baseline cannot be compared with the judged recording; None if it can.
+    """Find the reason why the baseline `entry` cannot be compared with the `judged` recording; None if it can.
 
-    Returns the severity of the finding and the reason as text.
+    Returns the severity of the finding about this baseline, and the reason as text.
     """
     if isinstance(entry, Inspection) and entry.defect is not None:
         return "warning", entry.defect

@@ -14,7 +14,7 @@ from sealscope.diagnosis.decision.explanations import (
     LEAK_EVENTS,
     explain,
     log_bayes_factor,
-    probability_beside_chance,
+    probability_against_chance,
     probability_of,
 )
 from sealscope.diagnosis.decision.null import HealthyNull
@@ -118,11 +118,11 @@ def test_a_rare_change_with_an_improbable_cause_is_by_chance() -> None:
         motion = observable("motion: motion", chance)
         explained = explain([motion])
         assert probability_of(explained, causes=[scale.cause], data_kind="motion") > 0.99
-        beside_chance = probability_beside_chance(explained, ["sensor fault"], "motion")
+        against_chance = probability_against_chance(explained, ["sensor fault"], "motion")
         bound = log_bayes_factor(chance)
         odds = scale.probability * math.exp(bound / (1.0 + 2.0 * DECISION.explanation.misfit * bound))
-        assert beside_chance == pytest.approx(odds / (1.0 + odds), rel=0.1)
-        assert (beside_chance > DECISION.explanation.happened) == happened
+        assert against_chance == pytest.approx(odds / (1.0 + odds), rel=0.1)
+        assert (against_chance > DECISION.explanation.happened) == happened
 
 
 def test_what_an_event_disturbs_speaks_for_it_only_where_it_shows_itself() -> None:

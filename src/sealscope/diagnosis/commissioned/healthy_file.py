@@ -115,11 +115,12 @@ def _check_array(value: Any) -> Any:
 
 
 def _check_statistic(value: Any) -> Any:
-    """Return the value if it is a number or an array of numbers; raise ValueError otherwise.
+    """Return the value if it is a float, or an array of numbers; raise ValueError otherwise.
 
     The numbers must be below 1e100 in magnitude.
     """
-    _check_array(np.array(value) if isinstance(value, float) else value)
+    array = np.array(value) if isinstance(value, float) else value
+    _check_array(array)
     return value
 
 
@@ -129,7 +130,9 @@ def _check_sums(summary: Any) -> Any:
     `sums` (E, m, m) holds for each of E balances the sums of products of its columns over the recording. The m columns
     are the `terms` and, as the last one, the left side, which is a flow. `terms` must include the leak. The leak's
     column and the left side must have positive sums of squares, and their sum of products must obey Cauchy's
-    inequality. The shapes of the other arrays are checked, too.
+    inequality. The other arrays of the summary are checked, too: `shut_sums` (1, m + 2, m + 2) are the sums for a pump
+    that valves cut off at rest, which needs two more columns; `held` are the leaks while valves hold the load; and
+    `drop_per_speed` is the logarithm of a pressure drop over speed, with its standard error.
     """
     size = len(summary.terms) + 1
     if summary.sums.ndim != 3 or not len(summary.sums) or summary.sums.shape[1:] != (size, size):
@@ -289,8 +292,8 @@ _RECORDING = table_type(
 def _pack_arrays(value: Any) -> Any:
     """Convert a value for JSON: drop entries of mappings that are None, and pack arrays compactly, at any depth.
 
-    Arrays of numbers, and lists that begin with a float or a list, become arrays as of `plain_state.plain_array`. Lists
-    with rows of unequal lengths are packed row by row, and arrays of other types become lists.
+    Arrays of numbers, and lists that begin with a float or a list, are packed by `plain_state.plain_array`. Lists with
+    rows of unequal lengths are packed row by row, and arrays of other types become lists.
     """
     if isinstance(value, Mapping):
         return {str(name): _pack_arrays(member) for name, member in value.items() if member is not None}
@@ -342,15 +345,16 @@ def format_summary(recording: SummarisedRecording) -> Line:
 
 
 def parse_summary(line: Line, file: str, place: str) -> SummarisedRecording:
-    """Parse a line of a file of summaries; `file` is the name of the recording that the line summarises.
+    """Parse a line of a file of summaries to the summary of a healthy recording.
 
-    `place` is the path of the file of summaries, for error messages. Raises InputError if the checksum does not match,
-    if a value is not valid, or if the line holds too many single values instead of packed arrays.
+    `file` is the name of the recording, and `place` the path of the file of summaries, for error messages. Raises
+    InputError if the checksum does not match, if a value is not valid, or if the line holds too many single values
+    instead of packed arrays.
     """
     if sha256(line.data).hexdigest() != line.checksum:
         rule = f"must have the SHA-256 {line.checksum[:12]}..., got another"
         raise InputError(f"the summary of {file} {rule}: {_REMEDY} ({place})")
-    n_marks = sum(line.data.count(mark) for mark in b",[{")
+    n_marks = sum(line.data.count(mark) for mark in b",[{")  # each becomes an object in memory
     max_marks = _MAX_MARKS + int(_MAX_FRACTION * len(line.data))
     try:
         if n_marks > max_marks:
@@ -396,7 +400,7 @@ def read_lines(path: Path) -> list[Line]:
 def write_lines(lines: Collection[Line], path: Path) -> None:
     """Write a file of summaries as a whole; raise InputError if it would be too large or cannot be written."""
     size = len(_HEAD) + sum(len(line.data) + _DIGITS + 2 for line in lines)  # with a blank and a line feed
-    max_line = max((len(line.data) + 2 * _DIGITS for line in lines), default=0)
+    max_line = max((len(line.data) + 2 * _DIGITS for line in lines), default=0)  # with a margin
     if size > MAX_SIZE or len(lines) > _MAX_SUMMARIES or max_line > _MAX_LINE:
         limits = f"{_MAX_SUMMARIES} summaries of {_MAX_LINE} bytes and {MAX_SIZE} bytes in all"
         raise InputError(
@@ -422,7 +426,7 @@ def _iter_lines(path: Path) -> Iterator[Line]:
                 raise InputError(f"{noun} must be at most {MAX_SIZE} bytes, got {size} ({path})")
             if file.readline(len(_HEAD)) not in (_HEAD, _OLD_HEAD):
                 raise InputError(f"{noun} must begin with {_HEAD.decode().strip()!r}, got something else ({path})")
-            for _ in range(_MAX_SUMMARIES + 1):
+            for _ in range(_MAX_SUMMARIES + 1):  # the last pass finds the end, unless there are too many lines
                 row = file.readline(_MAX_LINE)
                 if not row:
                     return

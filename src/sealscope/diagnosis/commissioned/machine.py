@@ -151,7 +151,7 @@ class CommissionedMachine:
         return summarise_machine(self.healthy, self.rig, self.left_out)
 
     def read(self, path: str | os.PathLike[str]) -> Recording:
-        """Read a log of the machine with the channel map or, if the log does not fit the map, without it.
+        """Read a log of the machine with the channel map or, if the log does not fit the map, without a map.
 
         Raises UnreadableFile if both attempts fail.
         """
@@ -211,11 +211,11 @@ class CommissionedMachine:
         """Find a confirmed leak that was open between `start_s` and `end_s` [s since 1970]; None if there was none.
 
         An alarm that was judged "valid" or "repaired" is a confirmed leak, which is open from its onset until the next
-        repair. A later judgement "invalid" of an alarm with the same name revokes the confirmation. It does not if the
-        onset of the later alarm is after the time of the confirmation: the alarms are then different ones.
+        repair. A later judgement "invalid" of an alarm with the same name revokes the confirmation, unless the later
+        alarm has its onset after the confirmation and is therefore a different one.
         """
-        for number, leak in enumerate(self.alarms, 1):
-            later_judgements = self.alarms[number:]
+        for k, leak in enumerate(self.alarms):
+            later_judgements = self.alarms[k + 1 :]
             is_revoked = any(
                 later.mark == "invalid" and later.alarm == leak.alarm and later.onset_s <= leak.date_s
                 for later in later_judgements
@@ -249,7 +249,7 @@ class CommissionedMachine:
 
 
 def read_by_map(path: str | os.PathLike[str], channel_map: ChannelMap, rate: float | None) -> Recording:
-    """Read a log with the channel map of its machine or, if the log does not fit the map, without it.
+    """Read a log with the channel map of its machine or, if the log does not fit the map, without a map.
 
     `rate` is the sampling rate [Hz] of a log without a time column. If both attempts fail, the UnreadableFile of the
     first attempt is raised.
@@ -296,7 +296,7 @@ def _is_own_output(file: Path) -> bool:
         with file.open("rb") as content:
             return _OWN_OUTPUT.match(content.read(200)) is not None
     except OSError:
-        return False  # reading it later reports the error
+        return False  # the error is reported when the recording is read
 
 
 def summarise_healthy(recording: Recording, rig: Rig, file: str, checksum: str = "") -> SummarisedRecording:
@@ -310,7 +310,11 @@ def summarise_healthy(recording: Recording, rig: Rig, file: str, checksum: str =
 
 
 def _summarise(recording: Recording, rig: Rig, file: str, checksum: str) -> SummarisedRecording:
-    """Do the work of `summarise_healthy`, with the same arguments and errors, but without a limit on the threads."""
+    """Compute the summaries of a healthy recording by all detectors, without a limit on the number of threads.
+
+    Arguments, result and errors are those of `summarise_healthy`: `file` is the name of the recording, and `checksum`
+    the SHA-256 of its file.
+    """
     from sealscope.diagnosis.commissioned.summary import describe_recording
 
     inspection = inspect_recording(recording)
@@ -327,7 +331,8 @@ def _summarise(recording: Recording, rig: Rig, file: str, checksum: str) -> Summ
                     check_summary(name, summary)
                     summaries[name] = summary
             except Exception as error:  # as in a diagnosis, a method that fails is left out
-                log_failure(name, getattr(factory, "distribution", None), error)
+                distribution = getattr(factory, "distribution", None)  # package of a plug-in, None if built in
+                log_failure(name, distribution, error)
     if not summaries:
         raise InputError(f"a healthy recording must hold channels that a method reads, got none such ({file})")
     if (levels := HealthyLevels().learn(part)) is not None:

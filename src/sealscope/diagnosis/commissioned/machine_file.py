@@ -77,7 +77,7 @@ def parse_moment(text: Any) -> float:
     try:
         moment = datetime.fromisoformat(text)
         seconds = (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
-        datetime.fromtimestamp(seconds, UTC)
+        datetime.fromtimestamp(seconds, UTC)  # raises for a time that could not be written again
     except (TypeError, ValueError, OverflowError, OSError):
         raise ValueError("must be a time as ISO 8601 writes it") from None
     return seconds
@@ -156,8 +156,10 @@ def write_machine(machine: CommissionedMachine, path: str | os.PathLike[str]) ->
     target = _resolve_target(path)
     with _lock(target):
         if machine.origin is not None and machine.origin.path == target and target.exists():
+            # the tables as they will be read back
             new_tree = parse_toml(_format_text(machine, target), "a machine's file", str(target))
-            change = _find_change(machine.origin, _hash_parts(_read_checked(target)), _hash_parts(new_tree))
+            present, written = _hash_parts(_read_checked(target)), _hash_parts(new_tree)
+            change = _find_change(machine.origin, present, written)
             if change is not None:
                 raise InputError(f"a machine's file must be as it was read, got {change}: load it again ({target})")
         _write_files(machine, target)
@@ -169,9 +171,9 @@ def update_machine(
 ) -> CommissionedMachine:
     """Apply a change to a machine's file without losing changes that another process makes at the same time.
 
-    `change` converts the machine that was read into the one to write. It is called a second time if another process
-    has written the file meanwhile. Returns the changed machine. Raises InputError as `read_machine`, `write_machine`
-    and `change` do; the file then stays as it was.
+    `change` converts the machine that was read to the machine to write. If another process has written the file
+    meanwhile, `change` is called a second time, with the machine of the new file. Returns the changed machine. Raises
+    InputError as `read_machine`, `write_machine` and `change` do; the file then stays as it was.
     """
     target = _resolve_target(path)
     machine = read_machine(target)
@@ -186,7 +188,7 @@ def update_machine(
 def _resolve_target(path: str | os.PathLike[str]) -> Path:
     """Follow the links of a path to the file to write.
 
-    Raises InputError if it does not end in .toml or its folder does not exist.
+    Raises InputError if this file's name does not end in .toml, or if its folder does not exist.
     """
     target = _follow_links(path)
     if target.suffix.lower() != ".toml":
@@ -196,7 +198,7 @@ def _resolve_target(path: str | os.PathLike[str]) -> Path:
 
 
 def _follow_links(path: str | os.PathLike[str]) -> Path:
-    """Follow the links of a path to a file; raise InputError if they end in a circle."""
+    """Follow the links of a path to a file; raise InputError if the links end in a circle."""
     try:
         return Path(path).resolve()
     except (OSError, RuntimeError, ValueError) as error:
@@ -205,7 +207,7 @@ def _follow_links(path: str | os.PathLike[str]) -> Path:
 
 
 def _lock(target: Path) -> AbstractContextManager[object]:
-    """Lock a machine's file against other processes that write it.
+    """Lock the machine's file `target` against other processes that write it.
 
     Entering the returned context raises InputError if another process holds the lock for more than 60 s.
     """
@@ -215,9 +217,10 @@ def _lock(target: Path) -> AbstractContextManager[object]:
 def _write_files(machine: CommissionedMachine, target: Path) -> None:
     """Write the files of a machine: first its summaries, then a backup of the present text, then the new text.
 
-    In this order an interruption at any time leaves a complete text with all its summaries. The new file of summaries
-    contains those of the machine, and those that the present text or its backup names. Other present summaries are kept
-    while the total size stays below 5 MB (`_SPARE`). Raises InputError if the new text could not be read back.
+    The text is the TOML file at `target`. In this order an interruption at any time leaves a complete text with all its
+    summaries. The new file of summaries contains those of the machine, and those that the present text or its backup
+    names. Other present summaries are kept while the total size stays below 5 MB (`_SPARE`). Raises InputError if the
+    new text could not be read back.
     """
     data = _format_text(machine, target)
     _convert_tree(parse_toml(data, "a machine's file", str(target)), str(target))
@@ -286,10 +289,10 @@ def _hash_parts(tree: Mapping[str, Any]) -> dict[bytes, str]:
 def _find_change(origin: Origin, present: Mapping[bytes, str], written: Mapping[bytes, str]) -> str | None:
     """Find a change of a machine's file since loading that writing would undo; None if there is none.
 
-    `origin` holds the hashes of the file's parts when it was loaded, `present` those of the file now and `written`
-    those about to be written (`_hash_parts`). A change is a present part that is neither in `origin` nor in
-    `written`, or a part in both `origin` and `written` that is no longer present. Returns the description of the
-    first change.
+    `origin` holds the hashes of the file's parts at loading, `present` those of the file now, and `written` those of
+    the file to be written; the last two map a hash to the description of a change (`_hash_parts`). A change is a
+    present part that is neither in `origin` nor in `written`, or a part in both `origin` and `written` that is no
+    longer present. Returns the description of the first change.
     """
     changes = [text for part, text in present.items() if part not in origin.parts and part not in written]
     changes += [text for part, text in written.items() if part in origin.parts and part not in present]
@@ -306,8 +309,8 @@ def _read_checked(path: Path) -> dict[str, Any]:
 def _read_tree(path: Path, place: str) -> dict[str, Any]:
     """Read the tables of a machine's file without checking them.
 
-    `place` is its path for error messages. Keys from before version 0.1 get their present names. Raises InputError if
-    the file cannot be read.
+    `place` is the file's path as stated in error messages. Keys from before version 0.1 get their present names. Raises
+    InputError if the file cannot be read.
     """
     tree = read_toml(path, "a machine's file", place)
     rows = tree.get("healthy")
@@ -340,8 +343,9 @@ def _named_summaries(tree: Mapping[str, Any]) -> list[str]:
 def _summaries_path(path: Path, tree: Mapping[str, Any]) -> Path:
     """Return the path of the file with the summaries of a machine's healthy recordings.
 
-    It has the path of the machine's file with the suffix `.healthy` or, before version 0.1, `.lessons`. If no such file
-    exists, it is the file that the tables `tree` of the machine's file name.
+    It lies at the `path` of the machine's file, but with the suffix `.healthy` or, before version 0.1, `.lessons`. If
+    neither exists, it is the file that the machine's file states as `summaries` of `[machine]`. `tree` holds the tables
+    of the machine's file.
     """
     machine_table = tree.get("machine")
     name = machine_table.get("summaries") if isinstance(machine_table, dict) else None
@@ -352,7 +356,7 @@ def _summaries_path(path: Path, tree: Mapping[str, Any]) -> Path:
 
 
 def _build_tree(machine: CommissionedMachine, path: Path) -> dict[str, Any]:
-    """Build the nested tables of a machine's file, to be written at `path`."""
+    """Build the nested tables of a machine's file at `path`, from which the name of the file of summaries follows."""
     from importlib.metadata import version
 
     machine_table = {
@@ -367,7 +371,7 @@ def _build_tree(machine: CommissionedMachine, path: Path) -> dict[str, Any]:
     }
     tree: dict[str, Any] = {"machine": machine_table}
     if machine.channel_map:
-        is_auto = isinstance(machine.channel_map, str)
+        is_auto = isinstance(machine.channel_map, str)  # "auto": all channels are found by the names of the columns
         tree["map"] = {REST: machine.channel_map} if is_auto else machine.channel_map
     if machine.rig is not None:
         tree |= machine.rig.as_dict()
@@ -430,7 +434,7 @@ def _format_value(value: Any) -> str:
         return repr(value)
     if isinstance(value, str):  # names of files may contain bytes that are not UTF-8
         value = value.encode("utf-8", "backslashreplace").decode()
-    return json.dumps(value, ensure_ascii=False, default=str).replace("\x7f", "\\u007f")
+    return json.dumps(value, ensure_ascii=False, default=str).replace("\x7f", "\\u007f")  # TOML forbids a bare DEL
 
 
 @checked_call
@@ -484,9 +488,9 @@ def read_machine(path: str | os.PathLike[str]) -> CommissionedMachine:
 def _convert_tree(tree: dict[str, Any], place: str) -> dict[str, Any]:
     """Check the tables of a machine's file and convert their values, for example times to seconds.
 
-    `tree` holds all tables as read. Returns the converted tables `machine`, `map`, `healthy` and `alarms`, without the
-    rig's; `map` is absent if the file has none. Raises InputError if a value is not valid; `place` is the path of the
-    file for the message.
+    `tree` holds all tables as read, and `place` is the path of the file for error messages. Returns the converted
+    tables `machine`, `map`, `healthy` and `alarms`; the rig's tables are left out. `map` is absent if the file has no
+    such table. Raises InputError if a value is not valid.
     """
     try:
         tables: dict[str, Any] = convert_type(_FILE, tree).model_dump(exclude_unset=True)

@@ -108,7 +108,8 @@ class MachineSummary:
             deviation = from_si(value, display_unit, unit) - from_si(0.0, display_unit, unit) if unit else value
             noise.append(f"{name} {deviation:.2g} {display_unit}")
         seconds = sum(recording.seconds for recording in healthy)
-        n_alarms = sum(BY_OTHERS in problem for problem in self.problems)
+        n_alarms = sum(BY_OTHERS in problem for problem in self.problems)  # recordings unlike the others
+        # the highest score of n + 1 recordings is equally likely that of any of them
         rate = f"1 in {len(healthy) + 1} by the ranks of {len(healthy)} healthy recordings alone, whatever their law"
         rows = [
             ("recordings", f"{len(healthy)} healthy, {seconds:.4g} s in all{span}"),
@@ -120,7 +121,7 @@ class MachineSummary:
             ("false alarms", f"{rate}; {n_alarms or 'none'} of them stand out of the others"),
             *(("check", problem) for problem in self.problems),
         ]
-        return "\n".join(paragraphs(rows, 16))
+        return "\n".join(paragraphs(rows, columns=16))
 
     def _smallest_leak_rows(self, n_healthy: int, are_dated: bool) -> list[tuple[str, str]]:
         """Build the table rows on the smallest detectable leak and on the recordings needed to halve it.
@@ -174,6 +175,7 @@ def _format_duty(healthy: Sequence[SummarisedRecording], pressure_unit: str) -> 
     is recorded. `pressure_unit`: unit in which the pressure difference is displayed.
     """
     summaries = [recording.summaries.get(VOLUME_BALANCE, {}) for recording in healthy]
+    # "scale": factor from the flow of the balance to the true flow, 0 if unknown
     flows = [summary.get("flow", 0.0) * summary.get("scale", 0.0) / LITRE_PER_MINUTE for summary in summaries]
     ranges = {
         "L/min": [flow for flow in flows if flow > 0.0],
@@ -223,13 +225,13 @@ def describe_recording(recording: Recording, inspection: Inspection) -> dict[str
 def summarise_machine(
     healthy: Sequence[SummarisedRecording], rig: Rig | None, left_out: Sequence[str] = ()
 ) -> MachineSummary:
-    """Estimate the figures of a machine from the summaries of its healthy recordings.
+    """Estimate the figures of a machine from the summaries of its `healthy` recordings.
 
     The noise of a channel is the median over the recordings. The coefficients of the volume balance are estimated from
-    the recordings with a summary by the volume balance. A recording with other terms than the first of these is not
-    used, and is listed as a problem. The smallest detectable leak is estimated from the same recordings, if there are
-    two or more. `left_out` are texts on recordings that could not be used at all; they become the first problems. `rig`
-    is None if nothing is stated.
+    the recordings with a summary by the volume balance. If a recording has other terms than the first of them, it is
+    not used, and is listed as a problem. The smallest detectable leak is estimated from the same recordings, if there
+    are two or more. `left_out` are texts on recordings that could not be used at all; they become the first problems.
+    `rig` states the machine's sizes; None if nothing is stated.
     """
     problems = [*left_out, *_collect_problems(healthy)]
     noises = defaultdict[str, list[float]](list)
@@ -248,7 +250,7 @@ def summarise_machine(
     rig = rig or unstated_rig()
     channels = frozenset(with_balance[0].units if with_balance else ())
     if not (summaries and equations(rig, channels)):
-        return MachineSummary({}, noise, None, problems)
+        return MachineSummary(terms={}, noise=noise, smallest=None, problems=problems)
     terms = _estimate_terms([np.asarray(summary["sums"], dtype=float)[0] for summary in summaries], rig, channels)
     smallest = _smallest_leak(VolumeBalance(rig), summaries, channels) if len(summaries) > 1 else None
     return MachineSummary(terms, noise, smallest, problems)
@@ -262,7 +264,7 @@ def _estimate_terms(sums: Sequence[Array], rig: Rig, channels: frozenset[str]) -
     `channels` determine the terms. The scatter is the standard deviation of the estimates from single recordings.
     Returns an estimate for each term with an unknown coefficient, by the name of the term.
     """
-    equation = equations(rig, channels)[0]
+    equation = equations(rig, channels)[0]  # a rig with a servo valve has several; the first one is used
     roles = ColumnRoles(equation)
     units = {term.name: term.unit for term in equation.terms}
     nuisance = list(roles.nuisance)  # columns of the terms with unknown coefficients
@@ -290,8 +292,8 @@ def _smallest_leak(balance: VolumeBalance, summaries: Sequence[Summary], channel
     """Estimate the smallest leak that a recording of a later day will show if the machine moves and is loaded as usual.
 
     `balance`: detector that made the `summaries` of the healthy recordings; `channels`: names of the recorded channels.
-    The leakage of a recording is compared with the healthy mean by Student's t test. The smallest leak, which is
-    detected with the probability `power` (`priors.toml`), raises the leakage by
+    The leakage of a recording is compared with the healthy mean by Student's t test. A leak that is detected with the
+    probability `power` (`priors.toml`) raises the leakage by
 
         rise = (threshold of the test + normal quantile of `power`) * deviation,
 
@@ -312,7 +314,7 @@ def _smallest_leak(balance: VolumeBalance, summaries: Sequence[Summary], channel
     pressure, flow, scale = (
         float(np.median([summary[name] for summary in summaries])) for name in ("pressure", "flow", "scale")
     )  # `scale`: factor from the balance's flows to the true ones, 0 if unknown
-    smallest = smallest_rise(1)
+    smallest = smallest_rise(n_repeats=1)
     halved_by = next((n for n in _PRIORS.repeats if smallest_rise(n) <= 0.5 * smallest), None)
     share = smallest * pressure / flow if flow > 0.0 else float("nan")
     lpm = smallest * pressure * scale / LITRE_PER_MINUTE if scale > 0.0 else None
@@ -322,8 +324,8 @@ def _smallest_leak(balance: VolumeBalance, summaries: Sequence[Summary], channel
 def _collect_problems(healthy: Sequence[SummarisedRecording]) -> list[str]:
     """List the problems of all healthy recordings, one line for each kind of problem.
 
-    Problems with the same text before the first colon are of one kind. Of these texts the alphabetically last is shown.
-    The line ends with the name of the file, or with the number of recordings if there are several problems of the kind.
+    Problems with the same text before the first colon are of one kind. The line shows the alphabetically last of these
+    texts. It ends with the name of the recording, or with the number of recordings if several have such a problem.
     """
     by_kind = defaultdict[str, list[tuple[str, str]]](list)
     for recording in healthy:
@@ -350,7 +352,7 @@ def _estimate_noise(values: Array) -> float:
     known = values[np.isfinite(values)]
     if known.size < 3:
         return 0.0
-    deviation = float(np.median(np.abs(np.diff(known, 2)))) / 0.6745 / np.sqrt(6.0)
+    deviation = float(np.median(np.abs(np.diff(known, n=2)))) / 0.6745 / np.sqrt(6.0)
     return _round_to_4_digits(max(deviation, estimate_quantum(known) / np.sqrt(12.0)))
 
 
@@ -368,7 +370,8 @@ def _describe_vacuum(part: Recording, name: str) -> str:
 def _describe_glitches(part: Recording, name: str) -> str:
     """Describe a channel in which single samples stand out from both neighbours by more than the channel's range.
 
-    The result is "" if there are no such samples. The range is the 99 % quantile of the channel minus its 1 % quantile.
+    `name` is the channel of the recording `part`. The result is "" if no sample stands out. The range is the 99 %
+    quantile of the channel minus its 1 % quantile.
     """
     values = part[name]
     if len(values) < 3:

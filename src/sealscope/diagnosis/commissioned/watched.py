@@ -58,10 +58,10 @@ class WatchedMachine:
 
 
 def load_watched(rig: str) -> WatchedMachine:
-    """Load what the monitor needs of an actuator; raise InputError if it cannot be read.
+    """Load what the monitor needs of an actuator: rig, channel map, repair limit and healthy recordings.
 
     `rig` is a packaged rig's name, or the path of a rig's or machine's file, ending in ".toml". Only a machine's file
-    gives repair limit, sampling rate and healthy recordings.
+    gives repair limit, sampling rate and healthy recordings. Raises InputError if the rig or file cannot be read.
     """
     if not rig.endswith(".toml") or "machine" not in read_toml(Path(rig), "a rig file", rig):
         named_rig = load_rig(rig)
@@ -92,13 +92,15 @@ def is_remeasured(rig: Rig, rig_before: Rig) -> bool:
 
 
 def _with_measured_displacement(rig: Rig, healthy: tuple[SummarisedRecording, ...]) -> Rig:
-    """Replace the displacement of a rig by the one measured in healthy recordings, if the rig states only its areas.
+    """Replace the pump's displacement in a rig that states only the piston areas by a measured displacement.
 
-    The new value is the median over the recordings. Without a measurement the rig is returned unchanged.
+    The new value is the median over the `healthy` recordings in which the displacement was measured. Without such
+    recordings the rig is returned unchanged.
     """
     if rig.states(_DISPLACEMENT) or not rig.states(*_AREAS):
         return rig
     summaries = (recording.summaries.get(VOLUME_BALANCE, {}) for recording in healthy)
+    # measured over assumed displacement, 0 if not measured
     scales = [scale for summary in summaries if (scale := float(summary.get("scale", 0.0))) > 0.0]
     if not scales:
         return rig

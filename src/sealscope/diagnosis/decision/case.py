@@ -15,7 +15,7 @@ from sealscope.diagnosis.decision.explanations import (
     Explanation,
     explain,
     log_bayes_factor,
-    probability_beside_chance,
+    probability_against_chance,
     probability_of,
 )
 from sealscope.diagnosis.decision.null import HealthyNull, null_key
@@ -97,14 +97,15 @@ class Case:
         The most probable set comes first. An event is a change of the machine, its sensors or its motion, such as a
         leak.
         """
-        return explain(self.observables, self.null.chance, None if self.leak is None else self.leak.step_rise)
+        rise = None if self.leak is None else self.leak.step_rise  # leakage above that of healthy recordings
+        return explain(self.observables, self.null.chance, rise)
 
     def leak_probability(self, alarm: LeakTest) -> float:
-        """Compute the probability that a leak past piston or pump caused an alarm, rather than another event.
+        """Compute the probability that a leak past piston or pump, rather than another event, caused an alarm.
 
-        It is 1 if other causes are not weighed (`weigh_rivals`). An alarm by the limit in the rig's file (LEVEL) is
-        judged by the alarm for a change within the recording (WITHIN): the result is the probability for that alarm, or
-        1 if there is none.
+        `alarm`: the test that raised the alarm. The result is 1 if other causes are not weighed (`weigh_rivals`). For
+        the test against the limit in the rig's file (LEVEL), it is the probability for the alarm by the test for a
+        change within the recording (WITHIN), or 1 if that test raised no alarm.
         """
         if not self.weigh_rivals:
             return 1.0
@@ -116,17 +117,17 @@ class Case:
     def external_probability(self, alarm: LeakTest) -> float:
         """Compute the probability that oil leaks out of the circuit (external leak), given the data of an alarm.
 
-        It is 0 if other causes are not weighed (`weigh_rivals`).
+        `alarm`: the test that raised the alarm. The result is 0 if other causes are not weighed (`weigh_rivals`).
         """
         if not self.weigh_rivals:
             return 0.0
         return probability_of(self.explanations, causes=["external leak"], data_kind=self._data_kind(alarm))
 
     def _data_kind(self, alarm: LeakTest) -> str:
-        """Return the kind of data (`Observable.data`) by which a test raised its alarm.
+        """Return the kind of data (`Observable.data`) by which the test `alarm` raised its alarm.
 
-        For measured leakage that was compared with healthy recordings, it is `RISE`. Otherwise it is the kind of data
-        of the judging detector's first test result.
+        It is `RISE` if measured leakage was compared with healthy recordings. Otherwise it is the kind of data of the
+        judging detector's first test result.
         """
         if alarm.name == AGAINST and self.leak is not None:
             return RISE
@@ -162,7 +163,7 @@ class Case:
         leak = self.leak
         if leak is None or leak.step_rise is None or leak.rise_onset is not None:
             return True
-        rise, step_log_ratio = leak.step_rise
+        rise, step_log_ratio = leak.step_rise  # log likelihood ratio of a rise by this step to no rise
         within_factor = sum(log_bayes_factor(test.chance) for test in self.tests if test.name == WITHIN)  # 0 or 1 test
         return within_factor + step_log_ratio > log_bayes_factor(rise.chance)
 
@@ -179,8 +180,9 @@ class Case:
             observable: [event for event in named_events if event.affects(observable)]
             for observable in self.observables
         }
-        # each distribution in healthy recordings is one more test that may name an event by mistake
+        # observables with the same distribution in healthy recordings (`null_key`) count as one test
         n_tests = len({null_key(observable) for observable, candidates in candidates_of.items() if candidates})
+        # `heading`: probability of naming an event by mistake, over that of a false alarm
         allowed = DECISION.explanation.heading * self.false_alarm_probability / max(n_tests, 1)
         chances = {observable: self.null.chance(observable) for observable in self.observables}
         for observable in sorted(self.observables, key=chances.__getitem__):
@@ -206,7 +208,7 @@ class Case:
         """
         limits = DECISION.explanation
         by_cause = [probability_of(self.explanations, causes=[cause], data_kind=data_kind) for cause in causes]
-        probability = probability_beside_chance(self.explanations, causes, data_kind)
+        probability = probability_against_chance(self.explanations, causes, data_kind)
         is_named = probability_of(self.explanations, causes=causes, data_kind=data_kind) > limits.named
         is_each_possible = min(by_cause) > 1.0 - limits.sure
         return probability if is_named and is_each_possible and probability > limits.happened else None
@@ -242,14 +244,17 @@ def _leak_tests(case: Case, leak: LeakMeasure) -> tuple[LeakTest, ...]:
     if step is not None:
         probability = reserved if rise is not None else allowed - reserved
         key = step_key(leak.provider)
+        chance = case.null.calibrate(key, step.chance)
         threshold = step.threshold(case.null.uncalibrated_chance(key, probability))
-        tests.append(LeakTest(WITHIN, step.score, threshold, case.null.calibrate(key, step.chance), probability))
+        tests.append(LeakTest(WITHIN, step.score, threshold, chance=chance, probability=probability))
     if rise is not None:
         probability = allowed - reserved
-        tests.append(LeakTest(AGAINST, rise.score, rise.threshold(probability), rise.chance, probability))
-    if excess is not None:  # a z score
+        threshold = rise.threshold(probability)
+        tests.append(LeakTest(AGAINST, rise.score, threshold, chance=rise.chance, probability=probability))
+    if excess is not None:  # in standard deviations, i.e. standard normal without a leak
         probability = reserved or allowed
-        tests.append(LeakTest(LEVEL, excess, float(-ndtri(probability)), float(ndtr(-excess)), probability))
+        threshold, chance = float(-ndtri(probability)), float(ndtr(-excess))
+        tests.append(LeakTest(LEVEL, excess, threshold, chance=chance, probability=probability))
     return tuple(tests)
 
 
@@ -267,9 +272,8 @@ def _change_tests(case: Case) -> tuple[LeakTest, ...]:
     Of the detector's test results (observables) that a leak changes, the one with the smallest p-value gives the score,
     and its calibrated p-value (`HealthyNull.chance`). The result is empty if a leak changes none of them.
 
-    The detector states no threshold. The threshold is estimated as the score for which the calibrated p-value equals
-    the allowed false-alarm probability. For this, scores are taken as proportional to the logarithm of the p-value that
-    the detector states.
+    As the detector states no threshold, it is estimated: the score for which the calibrated p-value equals the allowed
+    false-alarm probability, if scores are proportional to the logarithm of the p-value that the detector states.
     """
     leak = next(event for event in load_events() if event.name == LEAK_EVENTS[0])
     affected = [observable for observable in case.judge.observables if leak.affects(observable)]
@@ -279,6 +283,6 @@ def _change_tests(case: Case) -> tuple[LeakTest, ...]:
     allowed = case.false_alarm_probability
     allowed_chance = case.null.uncalibrated_chance(null_key(rarest), allowed)  # p-value that the detector would state
     rarest_chance = min(max(rarest.chance, 1e-300), 1.0 - 1e-9)  # the logarithm is finite and not 0
-    threshold = rarest.score * np.log(allowed_chance) / np.log(rarest_chance)
-    name = WITHIN if rarest.onset is not None else AGAINST
-    return (LeakTest(name, rarest.score, max(float(threshold), 0.0), case.null.chance(rarest), allowed),)
+    threshold = max(float(rarest.score * np.log(allowed_chance) / np.log(rarest_chance)), 0.0)
+    name = WITHIN if rarest.onset is not None else AGAINST  # only a change within a recording has an onset
+    return (LeakTest(name, rarest.score, threshold, chance=case.null.chance(rarest), probability=allowed),)

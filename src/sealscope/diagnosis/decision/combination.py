@@ -50,10 +50,9 @@ def combine(decisions: Sequence[Evidence], refusal: str | None) -> Evidence:
     """Combine the decisions of several detectors into the decision of the first one, by rank, that decides.
 
     All decisions become the `parts` of the result. The change of RMS decides only if no detector that measures the leak
-    can use the recording. The verdict becomes `cannot tell` if no detector decides, or instead of `no leak` if the end
-    of the recording is not judged or a `refusal` is given. It is the reason why `no leak` must not be stated, else
-    None: a measuring detector failed, or no recording of the given baseline can be compared
-    (`diagnose.decide_by_all`).
+    can use the recording. The verdict is `cannot tell` if no detector decides. It is `cannot tell` instead of `no leak`
+    if the end of the recording is not judged, or if `refusal` states a reason: a measuring detector failed, or no
+    recording of the given baseline can be compared. Without such a reason, `refusal` is None.
     """
     ranked = sorted(decisions, key=lambda decision: rank(decision.detector))
     usable = [decision for decision in ranked if decision.usable]
@@ -74,15 +73,16 @@ def combine(decisions: Sequence[Evidence], refusal: str | None) -> Evidence:
     verdict = CANNOT_TELL if doubts else judge.verdict
     other_parts = [decision for decision in ranked if decision is not judge]
     combined = replace(judge, verdict=verdict, reason="".join([*reasons, *doubts]), parts=(judge, *other_parts))
+    # an onset is stated only of a leak
     return combined if verdict == LEAK else replace(combined, onset_s=None, onset_interval_s=None)
 
 
 def _explain_undecided(ranked: Sequence[Evidence], usable: Sequence[Evidence]) -> Evidence:
     """Make the verdict `cannot tell` with a reason, as no detector decides.
 
-    `ranked`: decisions of all detectors by rank; `usable`: those of detectors that could use the recording. The first
-    usable detector states the reason; if it is the change of RMS, the lack of the volume balance is stated before.
-    If no detector is usable, the last built-in one, which needs the fewest channels, states the reason.
+    `ranked`: decisions of all detectors by rank; `usable`: those of detectors that could use the recording. The reason
+    is that of the first usable detector; if this is the change of RMS, the reason of the volume balance comes before.
+    If no detector is usable, the reason is that of the last built-in one, which needs the fewest channels.
     """
     if usable:
         undecided = usable[0]

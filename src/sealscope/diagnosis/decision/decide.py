@@ -101,15 +101,16 @@ def _evidence_without_leak(case: Case) -> Evidence:
     alarm = next(iter(case.alarms), None)
     leak, other = case.leak, case.other_event
     bound = _leak_bound(case, alarm)
-    verdict = _decide_without_leak(*_bound_and_limit(case, bound))
+    judged_bound, max_bound = _bound_and_limit(case, bound)
+    verdict = _decide_without_leak(judged_bound, max_bound)
     evidence = Evidence(verdict, reason="", cause=None if other is None else other.cause)
     evidence = _add_tests(case, evidence, case.tests[0] if case.tests else None)
     if leak is not None:
         evidence = replace(
             evidence,
             bound_lpm=bound * leak.lpm_per_flow if leak.lpm_per_flow is not None and np.isfinite(bound) else None,
-            total_leakage=leak.total(_findable_step(case)),
-            course=leak.history(None),
+            total_leakage=leak.total(detectable_flow=_findable_step(case)),
+            course=leak.history(onset_s=None),
         )
     return replace(evidence, reason=reason_of(case, evidence, alarm, bound, other))
 
@@ -130,7 +131,7 @@ def _leak_evidence(case: Case, alarm: LeakTest) -> Evidence:
             onset = leak.rise_onset if alarm.name == AGAINST else None
         fields = {
             "cause": _leak_cause(case, leak, alarm),
-            "total_leakage": leak.total(None),
+            "total_leakage": leak.total(detectable_flow=None),  # no detectable flow is stated beside a leak
             "course": leak.history(None if onset is None else onset.value),
             **_size_fields(leak, leak.step_flow if alarm.name == WITHIN else leak.rise_flow),
         }
@@ -143,9 +144,9 @@ def _leak_evidence(case: Case, alarm: LeakTest) -> Evidence:
 def _leak_cause(case: Case, leak: LeakMeasure, alarm: LeakTest) -> Cause:
     """Return the cause of a detected leak, such as "piston or pump leak".
 
-    It is "internal or external leak" if the data that raised the `alarm` do not exclude that oil leaves the circuit.
-    Otherwise it is the cause that the detector states (`leak.cause`). A cause "piston or pump leak" becomes "piston
-    leak" if the pump was tested separately and a pump leak has a negligible probability.
+    `alarm`: the test that raised the alarm. The cause is "internal or external leak" if the data of this test do not
+    exclude that oil leaves the circuit. Otherwise it is the cause that the detector states (`leak.cause`), except that
+    "piston or pump leak" becomes "piston leak" if a separate test of the pump makes a pump leak improbable.
     """
     if case.external_probability(alarm) > 1.0 - DECISION.explanation.sure:
         return "internal or external leak"
@@ -159,7 +160,8 @@ def _size_fields(leak: LeakMeasure, flow: Flow | None) -> dict[str, Any]:
 
     `flow`: mean flow of the leak; without a flow (None) there are no fields; `leak`: measured leakage, with the factors
     that convert the flow. The flow is stated relative to the machine (`relative`) and, if a factor to L/min is known,
-    in L/min with a 95 % interval. Otherwise the field `refuses` says that L/min are not stated.
+    in L/min with a 95 % interval, which allows for the smallest and largest ratio of true to stated flow
+    (`leak.flow_factors`). Otherwise the field `refuses` says that L/min are not stated.
     """
     if flow is None:
         return {}
@@ -176,9 +178,9 @@ def _size_fields(leak: LeakMeasure, flow: Flow | None) -> dict[str, Any]:
 def _leak_bound(case: Case, alarm: LeakTest | None) -> float:
     """Compute the 95 % upper bound of a leak's mean flow [m^3/s].
 
-    `alarm`: first alarm of the tests, None if there is none. If a leak may have caused it, the bound is at least the
-    upper end of that leak's 95 % interval. The bound is infinite if it would reach the pump's mean flow, where this is
-    above 0, or if the leakage was not measured.
+    `alarm`: the first test that raised an alarm, None if no test did. If a leak may have caused the alarm, the bound is
+    at least the upper end of this leak's 95 % interval. The bound is infinite if the leakage was not measured. It is
+    also infinite if the pump's mean flow is above 0, and the bound would be as large.
     """
     leak = case.leak
     if leak is None:
@@ -238,15 +240,16 @@ def _findable_step(case: Case) -> float | None:
     if test is None or case.leak is None or case.leak.step is None:
         return None
     chance = case.null.uncalibrated_chance(step_key(case.leak.provider), test.probability)
-    return case.leak.step.detectable_step(chance) * case.leak.flow_per_conductance
+    conductance = case.leak.step.detectable_step(chance)
+    return conductance * case.leak.flow_per_conductance
 
 
 def _add_tests(case: Case, evidence: Evidence, judging: LeakTest | None) -> Evidence:
     """Add to the evidence what the judging detector reports, and the results of the tests for a leak.
 
-    - Of the detector: name, judged fraction of the recording, and measured ratio of displacement to area.
-    - Of the test `judging`: score, threshold and p-value; no results of tests are added if it is None.
-    - If there are several tests, the evidence of each as `parts`.
+    - Of the detector: name, fraction and end of the judged samples, and measured ratio of displacement to area.
+    - Of the test `judging`: score, threshold and p-value. If it is None, no results of tests are added.
+    - If there are several tests, the evidence of each test, as `parts`.
     """
     judge = case.judge
     evidence = replace(evidence, detector=judge.provider, share=judge.share, judged_until=judge.judged_until)

@@ -166,9 +166,10 @@ def _explain_by_group(group: Sequence[Event], gains_of: Mapping[str, Sequence[_G
 
         log posterior = sum of log priors of the events + sum over kinds of data of the largest log Bayes factor,
 
-    where the largest factor is chosen among the events of the set. For the rise over healthy recordings, the negative
-    factors of events that contradict the rise are added. `gains_of`: log Bayes factors by the name of the event, for
-    each of its possible onsets (`_possible_gains`). The combination of onsets with the largest sum counts.
+    where the largest factor is chosen among the events of the set (`group`). For the leakage's rise over healthy
+    recordings, the negative factors of events that contradict the rise are added. `gains_of`: log Bayes factors by kind
+    of data, in one mapping for each possible onset of an event, by the name of the event (`_possible_gains`). The
+    combination of onsets with the largest sum counts.
     """
     log_prior = float(sum(np.log(event.probability) for event in group))
     best, explained = -np.inf, frozenset[str]()
@@ -208,8 +209,8 @@ def _gains_at_onset(event: Event, factors: Sequence[tuple[Observable, float]]) -
 
     - Of the observables that the event affects, the one with the largest factor gives the time of the event. The other
       ones count if they may have changed at the same time.
-    - Side effects of the event on further data count only if the event has support by its affected observables. Their
-      factors are limited to the largest affected one: a much clearer side effect has another cause.
+    - Side effects of the event on further data count only if an affected observable supports the event. Their factors
+      are limited to the largest factor of an affected observable: a much clearer side effect has another cause.
 
     For each kind of data the largest factor is returned, with the log odds of the prior on the size of the change.
     """
@@ -237,8 +238,9 @@ def _log_factor(observable: Observable, chance: float, rise: LeakRise | None) ->
     """Compute the log Bayes factor of the hypothesis that an observable has changed, against no change.
 
     `chance`: probability that a healthy recording has at least the observable's score; `rise`: leakage above that of
-    healthy recordings. A rise of the leakage makes an alternative description of the same change, such as an external
-    leak, seem to rise as well. The log factor of an observable that is such an alternative is therefore at most
+    healthy recordings. If the leakage rises, an alternative description of the same change, such as an external leak,
+    seems to rise as well. An observable that is an alternative states its log likelihood ratio to the leak
+    (`log_ratio_to_leak`), and its log factor is at most
 
         log factor of the rise + log likelihood ratio of the alternative to the leak.
     """
@@ -262,10 +264,10 @@ def log_bayes_factor(chance: float) -> float:
 
 
 def _coincide(observable: Observable, anchor: Observable) -> bool:
-    """Return True if two observables may have changed at the same time, by the 95 % intervals of their onsets.
+    """Return True if an observable may have changed at the same time as another, `anchor`.
 
-    This is so if the onsets differ by at most half the sum of the widths of the intervals, or if one of the observables
-    has no onset.
+    This is so if their onsets differ by at most half the sum of the widths of the onsets' 95 % intervals, or if one of
+    the two has no onset.
     """
     if observable.onset is None or anchor.onset is None:
         return True
@@ -289,11 +291,13 @@ def probability_of(
     return float(matching / total) if total > 0.0 else 0.0
 
 
-def probability_beside_chance(explanations: Sequence[Explanation], causes: Sequence[str], data_kind: str) -> float:
-    """Compute the probability that an event with one of the causes, rather than chance, has changed a kind of data.
+def probability_against_chance(explanations: Sequence[Explanation], causes: Sequence[str], data_kind: str) -> float:
+    """Compute the probability that an event with one of the `causes` changed a kind of data, against all else.
 
-    Of the sets of events that explain this kind of data (`Observable.data`), it is the sum of the odds of those that
-    contain such an event, over 1 + the sum of the odds of all. The 1 stands for no event: the change is by chance.
+    All else is events with other causes, and chance. Let the odds of a set of events be its probability over that of
+    no event. Over the sets of events (`explanations`) that explain the kind of data `data_kind`, the result is
+
+        sum of the odds of the sets that contain an event with one of the causes / (1 + sum of the odds of all sets).
     """
     relevant = [explanation for explanation in explanations if data_kind in explanation.data]
     matching = sum(explanation.odds for explanation in relevant if explanation.has_cause(*causes))

@@ -42,10 +42,10 @@ class HealthyNull:
     _posteriors: dict[str, tuple[Array, Array]] = field(default_factory=dict, init=False)
 
     def chance(self, observable: Observable) -> float:
-        """Compute the probability that a healthy recording has at least this score of an observable.
+        """Compute the probability that a healthy recording has at least the score of an observable.
 
-        It is the p-value that the detector states, corrected by those of healthy recordings of the machine
-        (`calibrate`).
+        It is the p-value that the detector states for the observable, corrected by the p-values that it states for
+        healthy recordings of the machine (`calibrate`).
         """
         weights, inflations = self._inflation(null_key(observable))
         return min(float(weights @ np.exp(-observable.surprisal / inflations)), 1.0)

@@ -42,13 +42,12 @@ def text_of(table: str, key: str, **values: Any) -> str:
 
 
 def reason_of(case: Case, evidence: Evidence, alarm: LeakTest | None, bound: float, other: OtherEvent | None) -> str:
-    """Compose the reason of a verdict in words: the leak or the bound of an undetected leak, then remarks.
+    """Compose the reason of a verdict in words.
 
-    Between the bound and the remarks comes the event `other` that explains the change; without it, after an alarm, the
-    events that may explain the change as well as a leak does.
-
-    `alarm`: test that raised the alarm, None if no test did; `bound`: 95 % upper bound of the leak's flow [m^3/s], used
-    only without the verdict `leak`; `other`: event other than a leak that explains a change, or None.
+    - Verdict `leak`: a description of the leak, then remarks. `alarm` is the test that detected the leak.
+    - Other verdicts: the bound of an undetected leak, another cause of a change, then remarks. `bound` is the 95 %
+      upper bound of the leak's flow [m^3/s]. The other cause is the event `other`. If `other` is None, but a test
+      raised an `alarm`, it is the most probable explanation other than a leak.
     """
     if evidence.verdict == LEAK:
         return _leak_text(case, evidence, alarm) + _remarks(case)
@@ -72,16 +71,17 @@ def _leak_text(case: Case, evidence: Evidence, alarm: LeakTest | None) -> str:
     """Describe a detected leak in words; `alarm`: test that detected it.
 
     If leakage is measured, the text states the kind of test, with flows for a level above the limit in the rig's file.
-    Otherwise it states the rarest change that the detector has found.
+    Otherwise it states the change with the smallest p-value that the detector has found.
     """
     if case.leak is None:
         rarest = case.rarest_observable
         if rarest.data == "plug-in":
             return text_of("leak", "plug_in", provider=case.judge.provider)
-        percent = 100.0 * abs(np.expm1(rarest.size))
+        percent = 100.0 * abs(np.expm1(rarest.size))  # `size`: change of the logarithm of the RMS
         where = _onset_text(rarest) or _against_text(case.judge.ringing)
         return text_of("leak", "details", what=f"RMS: {rarest.name}", percent=percent, where=where)
-    key = {WITHIN: "within", AGAINST: "against"}.get(alarm.name if alarm else "", "level")
+    test_name = alarm.name if alarm else ""
+    key = {WITHIN: "within", AGAINST: "against"}.get(test_name, "level")
     total = evidence.total_leakage
     if key == "level" and total is not None and total.lpm is not None and total.healthy_lpm is not None:
         return text_of("leak", "level_flow", lpm=total.lpm, healthy=total.healthy_lpm)
@@ -132,12 +132,12 @@ def _ringing_text(evidence: Evidence, ringing: Ringing | None, provider: str) ->
     """
     if ringing is None:
         return text_of("bound", "unseen", provider=provider)
-    percent = -100.0 * np.expm1(-ringing.bound)
+    percent = -100.0 * np.expm1(-ringing.bound)  # for a fall of the logarithm of the RMS by `bound`
     key = "ringing_hidden" if evidence.verdict == CANNOT_TELL else "ringing"
     text = text_of("bound", key, percent=percent, where=_against_text(ringing))
     if ringing.rate < _MIN_RINGING_RATE:
         # unused columns are named first: mapping them helps more than a higher rate
-        names = {"names": join_names(ringing.unused, 4)}
+        names = {"names": join_names(ringing.unused, most=4)}
         key, values = ("unused", names) if ringing.unused else ("slow", {"fast": _MIN_RINGING_RATE})
         text = f"{text_of('bound', key, rate=ringing.rate, **values)}; {text}"
     # without healthy recordings the ringing is compared with that at the start of the recording
@@ -152,7 +152,7 @@ def _changed_ringing_text(case: Case, ringing: Ringing) -> str:
     many healthy recordings the ringing was compared (`ringing.healthy`).
     """
     rarest = case.rarest_observable
-    percent = 100.0 * abs(np.expm1(rarest.size))
+    percent = 100.0 * abs(np.expm1(rarest.size))  # `size`: change of the logarithm of the RMS
     where = _onset_text(rarest) or _against_text(ringing)
     leak = 100.0 * case.leak_probability(case.alarms[0])
     return text_of("bound", "ringing_changed", what=rarest.name, percent=percent, where=where, leak=leak)
@@ -172,8 +172,8 @@ def _against_text(ringing: Ringing | None) -> str:
 def _rivals_text(case: Case, alarm: LeakTest) -> str:
     """Describe the most probable explanation other than a leak, and how to tell this explanation from a leak.
 
-    `alarm`: test that raised the alarm. Of an explanation by several events, the first event is described. Of a change
-    of the operating point, only the time is stated. The text is "" if this time is unknown, or if there is no
+    `alarm`: test that raised the alarm. If the explanation has several events, the first one is described. If this is a
+    change of the operating point, only its time is stated. The text is "" if this time is unknown, or if there is no
     explanation other than a leak.
     """
     leak_probability = case.leak_probability(alarm)
@@ -215,8 +215,8 @@ def _observable_text(other: OtherEvent) -> str:
 
 def _rarity_text(chance: float) -> str:
     """State the p-value `chance` of a change in words, as 1 in n healthy recordings, with n up to 10 000."""
-    two_digits = float(f"{1.0 / max(chance, 1e-4):.2g}")
-    return text_of("doubt", "rarity", count=f"{two_digits:,.0f}".replace(",", " "))
+    count = float(f"{1.0 / max(chance, 1e-4):.2g}")  # rounded to two digits
+    return text_of("doubt", "rarity", count=f"{count:,.0f}".replace(",", " "))
 
 
 def _remarks(case: Case) -> str:

@@ -82,7 +82,7 @@ def make_observable(
     onset : tuple of float, optional
         Time of the change with its 95 % interval [s]: (value, low, high).
     """
-    score = -2.0 * float(np.log(max(chance, np.finfo(float).tiny)))
+    score = -2.0 * float(np.log(max(chance, np.finfo(float).tiny)))  # finite for a chance of 0
     interval = None if onset is None else Interval(*onset)
     return Observable(name=name, data=PLUG_IN, score=score, chance=float(chance), onset=interval, size=float(size))
 
@@ -90,9 +90,9 @@ def make_observable(
 def validate_report(report: Any, name: str) -> Observed:
     """Return a detector's report, with `name` as its provider; raise an error if the report is not valid.
 
-    A single observable counts as a report. Raises TypeError for wrong types, and ArithmeticError for a score that is
-    not finite. Raises ValueError for a chance outside 0 to 1, or if `Observed.lack`, the reason why nothing could be
-    observed, has several lines.
+    `name` is the name of the detector. A single observable counts as a report. Raises TypeError for wrong types, and
+    ArithmeticError for a score that is not finite. Raises ValueError for a chance outside 0 to 1, or if
+    `Observed.lack`, the reason why nothing could be observed, has several lines.
     """
     if isinstance(report, Observable):
         report = Observed(name, (report,))
@@ -113,8 +113,8 @@ def validate_report(report: Any, name: str) -> Observed:
 def log_failure(name: str, distribution: str | None, error: Exception) -> str:
     """Describe the error of the detector `name` in one line, and log it with the traceback, once per process.
 
-    `distribution` is the name of the package that brings the detector, None for a built-in one. An arithmetic error
-    of a built-in detector is due to impossible readings, not to a defect, and is logged at the debug level.
+    `distribution` is the name of the package that brings the detector, None for a built-in detector. An arithmetic
+    error of a built-in detector is due to impossible readings, not to a defect, and is logged at the debug level.
     """
     if distribution is None and isinstance(error, ArithmeticError | np.linalg.LinAlgError):
         _log.debug("%s cannot be computed", name, exc_info=True)

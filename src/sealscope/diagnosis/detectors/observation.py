@@ -67,8 +67,8 @@ def observe_rivals(recording: Recording, baseline: Sequence[Healthy], distrust: 
     """Test a recording for changes of duty, noise, mains hum and mean pressures, which may be mistaken for a leak.
 
     The duty is how the machine is moved and loaded. The changes are tested within the recording and against the healthy
-    recordings of `baseline`. `distrust` is the reason why the pressures cannot be judged, None if they can. If it is
-    given, nothing is tested, and the report only states the reason.
+    recordings of `baseline`. If `distrust` states a reason why the pressures cannot be judged, nothing is tested, and
+    the report only states the reason.
     """
     if distrust:
         return Observed(SIGNALS, lack=distrust)
@@ -80,10 +80,11 @@ def observe_rivals(recording: Recording, baseline: Sequence[Healthy], distrust: 
 def run_detector(
     name: str, recording: Recording, baseline: Sequence[Healthy], rig: Rig, distrust: str | None = None
 ) -> Observed:
-    """Run the registered detector called `name` on a recording and return its report.
+    """Run the registered detector called `name` on a recording and return the detector's report.
 
-    `distrust` is the reason why the pressures cannot be judged, which the report then states; None if they can.
-    Raises KeyError if there is no such detector. An error of the detector is logged and stated in the report.
+    `baseline` are healthy recordings of the same machine, and `rig` is the machine that the detector assumes.
+    `distrust` is the reason why the pressures cannot be judged, which the report then states; None if they can. Raises
+    KeyError if there is no such detector. An error of the detector is logged and stated in the report.
     """
     factory = detectors()[name]
     try:
@@ -93,19 +94,20 @@ def run_detector(
                 raise ValueError(f"its name must be that of its entry point, {name!r}, got {detector.name!r}")
             return _observe(detector, recording, baseline, distrust)
     except Exception as error:  # a plug-in may raise anything
-        distribution = getattr(factory, "distribution", None)
+        distribution = getattr(factory, "distribution", None)  # package of a plug-in, None if built in
         lack = log_failure(name, distribution, error)
         return Observed(name, lack=lack, has_failed=True)
 
 
 def _observe(detector: Detector, recording: Recording, baseline: Sequence[Healthy], distrust: str | None) -> Observed:
-    """Run a detector with the baseline recordings that it can use.
+    """Run a detector on a recording, compared with the baseline recordings that the detector can use.
 
     The report is empty and states the reason in these cases:
 
-    - the pressures cannot be judged; `distrust` is then the reason, otherwise None,
-    - the detector cannot use the recording, or baseline recordings are given and it cannot use any of them,
-    - without a baseline, if a pressure does not move for some time; the volume balance needs no motion and is exempt.
+    - The pressures cannot be judged. The reason is `distrust`, which is None if they can.
+    - The detector cannot use the recording, or it cannot use any of the given baseline recordings.
+    - There is no baseline, and a pressure does not move for some time. The volume balance, which needs no motion, is
+      exempt.
     """
     lack = unusable_reason(detector, recording) or distrust
     if lack is None and not baseline and detector.name not in _AT_REST:
@@ -128,19 +130,21 @@ def _unusable_baseline(detector: Detector, healthy: Healthy) -> str | None:
 
 
 def healthy_surprisals(recording: Recording, rig: Rig) -> Mapping[str, float]:
-    """Compute the surprisal, -log(chance), of each change that the detectors test within a healthy recording.
+    """Compute the surprisal of each change that the detectors test within a healthy recording.
 
-    Returns surprisals by the key of the change (`null.null_key`). Results of the volume balance under the hypothesis
-    that the pump is cut off at rest have keys with the prefix `SHUT`. The result is computed only once for a recording.
+    A surprisal is -log of the p-value that a detector states, assuming `rig`. Returns surprisals by the key of the
+    change (`null.null_key`). Keys with the prefix `SHUT` are for a volume balance that assumes that valves cut the pump
+    off at rest. The result is stored with the recording, and computed only once.
     """
     return compute_once(recording, (SURPRISALS, rig), lambda samples: _compute_surprisals(samples, rig))
 
 
 def _compute_surprisals(recording: Recording, rig: Rig) -> Mapping[str, float]:
-    """Compute the surprisals for `healthy_surprisals`.
+    """Compute the surprisals -log(p-value) of changes within a recording, as `healthy_surprisals` returns them.
 
-    The signals and the volume balance are tested. The pressure response is tested, too, if there is no balance, or if
-    the recording has no channel of the flow, so that valves or a control loop may hold the load.
+    Changes of the signals (duty, noise, hum, mean pressures) and of the volume balance are tested. Changes of the
+    pressure response are tested, too, if there is no balance, or if the recording has no channel of the flow: then
+    valves or a control loop may hold the load. `rig` is the assumed machine.
     """
     surprisals = _max_surprisals(observe_signals(recording))
     balance = VolumeBalance(rig)
@@ -150,7 +154,7 @@ def _compute_surprisals(recording: Recording, rig: Rig) -> Mapping[str, float]:
             with np.errstate(all="ignore"):
                 reports = balance.observe_regimes(recording)
         except Exception as error:
-            log_failure(balance.name, None, error)
+            log_failure(balance.name, distribution=None, error=error)
     for is_shut, report in reports.items():
         prefix = SHUT if is_shut else ""
         surprisals |= {f"{prefix}{key}": surprisal for key, surprisal in _max_surprisals(report).items()}
@@ -160,14 +164,14 @@ def _compute_surprisals(recording: Recording, rig: Rig) -> Mapping[str, float]:
 
 
 def _max_surprisals(report: Observed) -> dict[str, float]:
-    """Collect the largest surprisal of each observable that is tested for a change within the recording.
+    """Collect the largest surprisal of each observable in a report that is tested for a change within the recording.
 
     A surprisal is -log of the p-value that the detector states. Returns surprisals by key (`null.null_key`). The test
     for a step of the leak is included, with the key `case.step_key`.
     """
     surprisals: dict[str, float] = {}
     for observable in report.observables:
-        if observable.onset is not None:
+        if observable.onset is not None:  # otherwise a comparison with other recordings
             key = null_key(observable)
             surprisals[key] = max(observable.surprisal, surprisals.get(key, 0.0))
     if report.leak is not None and report.leak.step is not None:
@@ -178,10 +182,10 @@ def _max_surprisals(report: Observed) -> dict[str, float]:
 def healthy_null(baseline: Sequence[Healthy], rig: Rig, *, shut: bool = False) -> HealthyNull:
     """Collect the surprisals -log(chance) of all tests in healthy recordings, as the null distributions of the tests.
 
-    `chance` is the p-value that a detector states for a test result (observable). A test for a change within a
-    recording has one value from each healthy recording. The tests that compare recordings share one list of values for
-    each kind of data (`Observable.data`): each healthy recording is compared with all others, and its largest surprisal
-    counts. With `shut`, surprisals of the volume balance are those under the hypothesis that valves cut the pump off at
+    `chance` is the p-value that a detector states for a test result (observable), assuming `rig`. A test for a change
+    within a recording has one value from each healthy recording. The tests that compare recordings share one list of
+    values for each kind of data (`Observable.data`): each healthy recording is compared with all others, and the
+    largest surprisal of the comparison counts. With `shut`, the volume balance assumes that valves cut the pump off at
     rest.
     """
     surprisals_by_key = defaultdict[str, list[float]](list)
@@ -202,11 +206,11 @@ def healthy_null(baseline: Sequence[Healthy], rig: Rig, *, shut: bool = False) -
 
 
 def compare_healthy(baseline: Sequence[Healthy]) -> Iterator[Sequence[Observable]]:
-    """Compare the ringing of each healthy recording with the ringing of all others; yield each recording's observables.
+    """Compare the ringing of each healthy recording with that of all others, and yield the test results (observables).
 
     The ringing is an oscillation of the pressures, measured by the RMS of their wavelet details. Only recordings with
     the same chambers and sampling rate as the first usable recording are compared. If there are fewer than
-    `MIN_COMPARED` of them, nothing is yielded.
+    `MIN_COMPARED` such recordings, nothing is yielded.
     """
     detector = RmsChange()
     usable_entries = [entry for entry in baseline if _unusable_baseline(detector, entry) is None]
@@ -219,5 +223,6 @@ def compare_healthy(baseline: Sequence[Healthy]) -> Iterator[Sequence[Observable
     if len(comparable) < MIN_COMPARED:
         return
     for k, summary in enumerate(comparable):
-        observables, _ = compare_summaries(summary, comparable[:k] + comparable[k + 1 :], summary["chambers"])
+        other_summaries = comparable[:k] + comparable[k + 1 :]
+        observables, _ = compare_summaries(summary, other_summaries, summary["chambers"])
         yield observables

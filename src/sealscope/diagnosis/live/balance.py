@@ -87,12 +87,12 @@ class BlockConductance(NamedTuple):
 
     @property
     def lpm(self) -> float:
-        """Factor from a conductance to a flow at the block's mean |p_A - p_B| [L/min per m^3/(s Pa)]."""
+        """Factor from a conductance to the flow at the mean |p_A - p_B| of the block [L/min per m^3/(s Pa)]."""
         return self.pressure / LITRE_PER_MINUTE
 
     @property
     def duty(self) -> tuple[float, float]:
-        """Logarithms of mean |p_A - p_B| [Pa] and mean flow that moves the piston [m^3/s]; finite even for 0."""
+        """Logarithms of the block's mean |p_A - p_B| [Pa] and mean pump flow [m^3/s]; finite even for 0."""
         return math.log(max(self.pressure, TINY)), math.log(max(self.pump_flow, TINY))
 
 
@@ -118,7 +118,11 @@ class NotJudged(NamedTuple):
 
     @classmethod
     def with_count(cls, end: float, status: str, restarts: bool = False) -> NotJudged:
-        """Build the result of a block without an estimate, with the counter "blocks: " and the reason `status`."""
+        """Build the result of a block without an estimate, which increases the counter "blocks: " + `status`.
+
+        `end`: end of the block [s]; `status`: the reason in words; `restarts`: True if later blocks cannot be compared
+        with earlier ones.
+        """
         return cls(end, status, f"blocks: {status}", restarts)
 
 
@@ -136,7 +140,7 @@ def _fit_to_blocks(model: Coefficients, grams: Any, column_order: Any, rows: Any
     """
     for k in range(len(grams)):
         load_block(model, grams[k], column_order)
-        add_block(model, rows[k], 1.0, False)  # full weight, no step of the leak
+        add_block(model, rows[k], weight=1.0, has_stepped=False)
     fit_coefficients(model)
 
 
@@ -185,9 +189,9 @@ class LiveBalance:
             needed = format_ways(rig.circuit.watched_by)
             raise InputError(f"a live balance must have {needed}, got {', '.join(names) or 'nothing'}")
         pump_names = [name for name in ("theta", "omega") if name in names]  # none behind a servo valve
-        needed_names = {"x", "p_A", "p_B", *pump_names[:1]}
+        needed_names = {"x", "p_A", "p_B", *pump_names[:1]}  # the pump's angle, or else its speed
         needed_names |= {name for balance in self._balances for term in balance.terms for name in term.needs}
-        self.names = tuple(name for name in names if name in needed_names)
+        self.names = tuple(name for name in names if name in needed_names)  # channels that the balances read
         self.size_error = size_error(rig)
         self.cause: Cause = "piston or pump leak" if rig.circuit.pump_feeds_chambers else "piston leak"
         self.litres = self.states_flow(rig) if litres is None else litres
@@ -218,10 +222,10 @@ class LiveBalance:
     def take(self, run: SampleRun) -> Iterator[BlockResult]:
         """Process the next samples, and yield the result of each block of the volume balance that they complete.
 
-        A result is the conductances of a block, or the reason why there are none. The next block is processed only when
-        its result is asked for. The first `LEARNED` blocks are estimated together. After a gap, or a change of the
-        sampling rate, the coefficients of the balance are kept, and earlier samples that do not fill a block are
-        dropped.
+        A result is the conductance of a block, or a `NotJudged` with the reason why there is none. The first `LEARNED`
+        blocks are estimated together: the result of the last one has the conductances of all. The next block is
+        processed only when its result is asked for. After a gap, or a change of the sampling rate, the coefficients of
+        the balance are kept, and earlier samples that do not fill a block are dropped.
         """
         stream = self._stream
         if stream is None or not run.follows:
@@ -237,7 +241,10 @@ class LiveBalance:
         yield from self._take_blocks(stream.push({name: run.channels[name] for name in self.names}))
 
     def _make_stream(self) -> BlockStream:
-        """Build the object that divides samples at the present sampling rate into blocks."""
+        """Build the object that divides samples at the present sampling rate into blocks.
+
+        It also stores the samples of each complete block, of which `_take_blocks` computes further features.
+        """
 
         def store_samples(begin: float, samples: Mapping[str, Array]) -> None:
             self._closed_samples.append((begin, samples, self._rate))
@@ -245,7 +252,11 @@ class LiveBalance:
         return BlockStream(self._balances, self._rate, BLOCK_SECONDS, on_samples=store_samples)
 
     def _take_blocks(self, blocks: Blocks | None) -> Iterator[BlockResult]:
-        """Process completed blocks of samples, and yield for each its conductances or why there are none."""
+        """Process complete blocks of samples, and yield the result of each: conductances, or why there are none.
+
+        `blocks` hold the sums of the volume balance, None if no block is complete. The samples of the same blocks have
+        been stored (`_closed_samples`); their features are added to `_signals`.
+        """
         closed_samples, self._closed_samples = self._closed_samples, []
         for block, samples in zip([] if blocks is None else _split(blocks), closed_samples, strict=True):
             self._signals.take(*samples)
@@ -254,10 +265,10 @@ class LiveBalance:
     def _take_block(self, block: Blocks) -> BlockResult:
         """Estimate the leakage conductance in a block, or store the block until the coefficients can be fitted.
 
-        The first `LEARNED` blocks are stored; the last of them completes the conductances of all. The result is a
-        NotJudged
+        The first `LEARNED` blocks are stored, and the last of them gives the conductances of all. The result is a
+        `NotJudged`
 
-        - before that,
+        - for the stored blocks before the last one,
         - for a block with missing values or at standstill,
         - after `N_WAKING` successive blocks that move far more than usual; the coefficients are then learned anew.
         """
@@ -291,10 +302,11 @@ class LiveBalance:
         result.
         """
         for e, (model, column_order) in enumerate(zip(self._models, self._column_orders, strict=True)):
-            _fit_to_blocks(model, np.ascontiguousarray(blocks.gram[:, e]), column_order, blocks.rows)
-        solutions = [self._solve_block(part, is_learned=False) for part in _split(blocks)]
+            grams = np.ascontiguousarray(blocks.gram[:, e])  # of balance e in each block
+            _fit_to_blocks(model, grams, column_order, blocks.rows)
+        solutions = [self._solve_block(block, updates_model=False) for block in _split(blocks)]
         self._precision = float(np.median([precision for precision, *_ in solutions]))
-        estimates = (self._estimate_block(part, is_learned=False) for part in _split(blocks))
+        estimates = (self._estimate_block(block, updates_model=False) for block in _split(blocks))
         return [estimate for estimate in estimates if not isinstance(estimate, NotJudged)]
 
     @property
@@ -308,33 +320,38 @@ class LiveBalance:
 
     def _relative_motion(self, block: Blocks) -> float:
         """Compute the mean square of the measured volume in a block, divided by that in earlier blocks."""
-        return relative_motion(_volume_square(block), float(block.rows[0]), self._models[0].numbers)
+        n_equations = float(block.rows[0])
+        return relative_motion(_volume_square(block), n_equations, self._models[0].numbers)
 
-    def _solve_block(self, block: Blocks, is_learned: bool = True) -> tuple[float, ...]:
+    def _solve_block(self, block: Blocks, updates_model: bool = True) -> tuple[float, ...]:
         """Estimate the leak in a block from all volume balances of the machine together.
 
         Returns (w, w g, w s, w^2 V), each summed over the balances: `_estimate_leak` gives the estimate g by one
-        balance, its precision w, shift s and variance V. With `is_learned`, the block also updates the other
-        coefficients.
+        balance, its precision w, shift s and variance V. With `updates_model`, the block also updates the other
+        coefficients of the balances.
         """
         n_equations = float(block.rows[0])
         results = [
-            _estimate_leak(model, gram, column_order, n_equations, is_learned)
+            _estimate_leak(model, gram, column_order, n_equations, updates_model)
             for model, gram, column_order in zip(self._models, block.gram[0], self._column_orders, strict=True)
         ]
         return tuple(sum(values) for values in zip(*results, strict=True))
 
-    def _estimate_block(self, block: Blocks, is_learned: bool = True) -> BlockConductance | NotJudged:
-        """Estimate the leakage conductance in a block.
+    def _estimate_block(self, block: Blocks, updates_model: bool = True) -> BlockConductance | NotJudged:
+        """Estimate the leakage conductance in a block from the volume balance.
 
-        The estimate is that of the total leakage, if the other coefficients of the volume balance were as learnt, less
-        a shift by what they are in this block. Its error has a part `sd` of this block, and a part `offset` that all
-        blocks have in common. Returns a NotJudged if the machine stands still and the estimate is therefore too
-        uncertain. With `is_learned`, the block also updates the other coefficients.
+        - `total` is the conductance by the latest estimates of the balance's other coefficients.
+        - `g` is `total` minus a shift, which keeps the series of `g` continuous while these estimates improve.
+        - `sd` is the part of the standard error that is due to this block alone, and `offset` the part that is common
+          to all blocks.
+
+        Returns a `NotJudged` if the machine stands still and the estimate is therefore too uncertain. With
+        `updates_model`, the block also updates the other coefficients.
         """
         begin, end = self._sample_times(block)
         at_standstill = self._relative_motion(block) < STANDSTILL
-        precision, weighted_total, weighted_shift, weighted_variance = self._solve_block(block, is_learned)
+        # sums over balances: weights w, w total, w shift, w^2 variance due to errors of the other coefficients
+        precision, weighted_total, weighted_shift, weighted_variance = self._solve_block(block, updates_model)
         min_precision = MIN_REST_PRECISION * self._precision if at_standstill else 0.0
         if not precision > min_precision:
             return NotJudged.with_count(end, "at standstill")
@@ -347,7 +364,8 @@ class LiveBalance:
     def relearn(self, since: float = math.inf) -> None:
         """Drop all learned coefficients of the volume balance, for example after a repair.
 
-        They are then learned anew from the blocks, stored or future, that begin at `since` [s] or later.
+        They are then learned anew from the blocks, stored or future, that begin at `since` [s] or later. By default
+        these are the future blocks.
         """
         for model in self._models:
             for values in model:
@@ -364,7 +382,8 @@ class LiveBalance:
         stored = self._stored
         if stored is None:
             return None
-        if abs(self._sample_times(stored[-1:])[1] - end) > self._half_stride or stored.start[0] > onset:
+        _, stored_end = self._sample_times(stored[-1:])
+        if abs(stored_end - end) > self._half_stride or stored.start[0] > onset:
             return None
         blocks = stored[stored.start >= since - self._half_stride].unpack(self._n_columns)
         if len(blocks) < MIN_BLOCKS:
@@ -413,20 +432,23 @@ def _split(blocks: Blocks) -> list[Blocks]:
 
 def _volume_square(block: Blocks) -> float:
     """Return the sum of squares of the measured volume, the left side of the first volume balance, in a block."""
-    return float(block.gram[0, 0, -1, -1])
+    return float(block.gram[0, 0, -1, -1])  # first block and balance; the left side is the last column
 
 
 def size_error(rig: Rig) -> float:
-    """Return the relative standard error of all flows due to displacement or, behind a servo valve, piston area."""
+    """Return the relative standard error of all flows, due to the size by which the flow is computed.
+
+    This size is the pump's displacement or, behind a servo valve, the piston area.
+    """
     return float(getattr(INFERENCE.size, rig.circuit.flow_size))
 
 
 def live_equations(rig: Rig, names: Sequence[str], with_tested_terms: bool = False) -> list[Equation]:
     """Build the volume balances of a running machine that the channels `names` allow.
 
-    Balances whose flow is computed from the command are left out. So is the term of the pump's leakage, which cannot be
-    distinguished from the piston's. `with_tested_terms` includes terms that are zero in a healthy machine and are only
-    tested for a change.
+    Balances whose flow is computed from the command are left out. The term of the pump's leakage is left out, too, as
+    it cannot be distinguished from the piston's leakage. `with_tested_terms` includes terms that are zero in a healthy
+    machine and are only tested for a change.
     """
     balances = []
     for balance in equations(rig, frozenset(names)):

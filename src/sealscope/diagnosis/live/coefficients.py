@@ -95,17 +95,18 @@ def add_block(model: Any, rows: float, weight: float, has_stepped: bool) -> None
     """Add the products in `model.block` to the sums over earlier blocks, which lose weight exponentially.
 
     `model` is a `Coefficients`, `rows` the number of equations in the block, and `weight` the weight of the block, 0 to
-    1. The leak's coefficient is assumed to take a random step before each block. Its variance is that of the block's
-    estimate of the leak or, if `has_stepped`, infinite. The earlier value of the leak is therefore eliminated. With the
-    sums S, their column S_l of the leak and its diagonal element S_ll, and the block's products B,
+    1. The leak's coefficient is assumed to take a random step before each block, so that its earlier value is
+    eliminated. The variance of this step is that of the block's estimate of the leak or, if `has_stepped`, infinite.
+    With the sums S, their column S_l and diagonal element S_ll of the leak, and the block's products B,
 
         S <- exp(-1/memory) (S - S_l S_l' / (S_ll + B_ll)) + weight B,
 
     where `memory` is a number of blocks (`priors.toml`). If `has_stepped`, B_ll is left out. The other sums in `model`
     are updated with the same memory.
     """
-    sums, block, size, leak = model.sums, model.block, len(model.block), len(model.block) - 2
-    leak_column = model.matrix[0]  # a copy in free memory, as the sums change below
+    sums, block, size = model.sums, model.block, len(model.block)
+    leak = size - 2  # index of the leak's column, before the left side
+    leak_column = model.matrix[0]  # free memory, for a copy of the column, as the sums change below
     for i in range(size):
         leak_column[i] = sums[i, leak]
     information = leak_column[leak] + (0.0 if has_stepped else max(block[leak, leak], TINY))
@@ -130,8 +131,8 @@ def _solve(model: Any) -> None:
     here from the sums, with the leak's column eliminated. They are the products of the unknowns' columns with each
     other and with the left side of the balance, so that the first solution is the least-squares estimate.
     """
-    sums, leak = model.sums, len(model.matrix)
-    n, left_side = leak, leak + 1  # indices of the leak's column and of the equation's left side
+    sums, n = model.sums, len(model.matrix)
+    leak, left_side = n, n + 1  # indices of these columns, after those of the n unknowns
     leak_energy = max(sums[leak, leak], TINY)
     for i in range(n):
         model.matrix[i, n] = sums[i, left_side] - sums[i, leak] * sums[leak, left_side] / leak_energy
@@ -150,7 +151,7 @@ def _sum_residual_squares(sums: Any, solution: Any) -> float:
     """
     n, square, leak_moment = len(solution), 0.0, 0.0
     for i in range(n + 2):
-        residual = sums[i, n + 1]
+        residual = sums[i, n + 1]  # product of column i with the left side less the nuisances
         for j in range(n):
             residual -= sums[i, j] * solution[j, 0]
         if i < n:
@@ -184,23 +185,25 @@ def fit_coefficients(model: Any) -> None:
 def _learn_block(model: Any, rows: float, g: float) -> float:
     """Add the products in `model.block` to the sums over blocks, update the usual noise, and return the block's weight.
 
-    `model` is a `Coefficients`, `rows` the number of equations in the block, and `g` the leak's coefficient in it. The
-    usual noise is the variance of an equation's residual, averaged over earlier blocks with fading memory. The weight
-    is 1 or, if less, `JUMP`^2 times the usual noise over the block's residual variance; this ratio of the variances
-    is stored as `MISFIT`. If g differs from the earlier estimate by more than `JUMP` standard deviations, the leak has
-    stepped and earlier blocks do not constrain it any more.
+    `model` is a `Coefficients`, `rows` the number of equations in the block, and `g` the leak's coefficient in this
+    block. The usual noise is the variance of an equation's residual, averaged over earlier blocks with fading memory.
+    The residual variance of this block over the usual noise is stored as `MISFIT`. The weight of the block is 1, or
+    `JUMP`^2 / MISFIT if this is less. If g differs from its earlier estimate by more than `JUMP` standard deviations,
+    the leak has stepped, and earlier blocks do not constrain it any more.
     """
     sums, numbers, n = model.sums, model.numbers, len(model.matrix)
     variance = max(_sum_residual_squares(model.block, model.matrix[:, n:]), 0.0) / rows
     numbers[MISFIT] = variance / numbers[NOISE]
     weight = min(1.0, JUMP**2 * numbers[NOISE] / max(variance, TINY))
+    # earlier estimate of the leak, from the sums: `n` is the index of the leak's column
     moment, information = sums[n, n + 1], max(sums[n, n], TINY)
     for i in range(n):
         moment -= sums[n, i] * model.matrix[i, n]
+    step = g - moment / information
     energy = max(model.block[n, n], TINY)
-    # the earlier estimate is moment / information; the 2 is for the block's estimate and, equally, the random step
+    # variances of the block's estimate, of the leak's random step, which is assumed as large, and of the earlier one
     step_variance = OVERLAP * numbers[NOISE] * (2.0 / (energy * weight) + 1.0 / information)
-    add_block(model, rows, weight, (g - moment / information) ** 2 > JUMP**2 * step_variance)
+    add_block(model, rows, weight, step**2 > JUMP**2 * step_variance)
     numbers[NOISE] += (1.0 - _MEMORY) * (variance * weight - numbers[NOISE])
     return float(weight)
 
@@ -209,24 +212,30 @@ def _learn_block(model: Any, rows: float, g: float) -> float:
 def estimate_leak(model: Any, rows: float, is_learned: bool) -> tuple[float, float, float, float]:
     """Estimate the leak's coefficient in one block; with `is_learned`, also add the block to the earlier ones.
 
-    `model` is a `Coefficients`, whose `block` holds the block's products, and `rows` the number of equations in it. Let
-    g be the estimate, w its precision, s the shift that is subtracted from g to keep the series of estimates continuous
-    while the other coefficients improve, and V the variance of g due to the errors of these coefficients. Returns (w, w
-    g, w s, w^2 V).
+    `model` is a `Coefficients`, whose `block` holds the products of the block, and `rows` is the block's number of
+    equations. Returns (w, w g, w s, w^2 V) with
+
+    - g: the estimate;
+    - w: its precision;
+    - s: the shift that is subtracted from g to keep the series of estimates continuous while the other coefficients
+      (nuisances) improve;
+    - V: the variance of g due to the errors of the nuisances.
     """
     block, n, numbers = model.block, len(model.matrix), model.numbers
-    # columns after `_solve`: c; C^-1 b_k, for the variance due to c; C^-1 (b_k - its usual value)
+    # C: normal matrix of the n nuisances c; b: products of the leak's column (index n) with theirs in this block; b_u:
+    # usual value of b. The columns of `solution` become c, C^-1 b and C^-1 (b - b_u)
     solution = model.matrix[:, n:]
-    # `energy` is N_k of the module's docstring; `usual_slope`, below, is the slope of the regression of a nuisance's
-    # column on the leak's column over the last blocks
+    # sums of squares of the leak's column, in this block and in the last blocks
     energy, usual_energy = max(block[n, n], TINY), max(numbers[ENERGY], TINY)
     for i in range(n):
         solution[i, 1] = block[i, n]
         solution[i, 2] = block[i, n] - energy * (model.leak_products[i] / usual_energy)
     _solve(model)
+    # sums: product of the leak's column with left side less nuisances, (b - b_u)' C^-1 (b - b_u), b' C^-1 b
     moment, unusual, systematic = block[n, n + 1], 0.0, 0.0
     numbers[SHIFT] *= _SHIFT_DECAY
     for i in range(n):
+        # regression of the nuisance's column on the leak's column over the last blocks
         usual_slope = model.leak_products[i] / usual_energy
         moment -= block[i, n] * solution[i, 0]
         numbers[SHIFT] -= usual_slope * (solution[i, 0] - model.values[i])
@@ -236,7 +245,7 @@ def estimate_leak(model: Any, rows: float, is_learned: bool) -> tuple[float, flo
     g, weight = moment / energy, 1.0
     if is_learned:
         weight = _learn_block(model, rows, g)
-    # an error of the nuisances adds to the noise only if the block's products b_k differ from their usual values
+    # errors of the nuisances add to the noise of the series only if b differs from b_u
     precision = energy / (OVERLAP * numbers[NOISE] * (1.0 / weight + max(unusual, 0.0) / energy))
     systematic_variance = max(systematic, 0.0) * OVERLAP * numbers[NOISE] * (precision / energy) ** 2
     return precision, precision * g, precision * numbers[SHIFT], systematic_variance
@@ -247,8 +256,8 @@ def relative_motion(square: float, rows: float, numbers: Any) -> float:
     """Compute the mean square of the measured volume in a block, divided by that in earlier blocks.
 
     `square` is the sum of squares over the block's `rows` equations. `numbers` (`Coefficients.numbers`) holds the same
-    sum and number of equations over earlier blocks. Returns infinity if only this block moved, and 1 if neither this
-    nor an earlier block moved.
+    sum (`MOTION`) and number of equations (`ROWS`) over earlier blocks. Returns infinity if only this block moved, and
+    1 if neither this nor an earlier block moved.
     """
     usual_square = numbers[MOTION] * rows
     return square * numbers[ROWS] / usual_square if usual_square > 0.0 else (math.inf if square > 0.0 else 1.0)

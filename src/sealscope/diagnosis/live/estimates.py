@@ -106,23 +106,24 @@ class WatchedLeak:
 
     @property
     def estimate(self) -> LiveRise:
-        """The increase of the leakage conductance [m^3/(s Pa)] with its onset, as the test that detected it."""
+        """Result of the test that detected the leak: score, onset, and increase of the conductance [m^3/(s Pa)]."""
         onset = Onset(self.onset_s, *self.onset_interval_s)
         return LiveRise(self.test, self.score, onset, self.rise, self.rise_sd)
 
     @property
     def allowed(self) -> float:
-        """Allowed probability of a false alarm of one test, for which `threshold` was set."""
+        """Probability of a false alarm for which the `threshold` of the test was set."""
         return LiveRise(self.test, self.threshold).chance
 
     @property
     def rarity(self) -> float:
-        """Probability that a healthy machine scores as high, divided by the allowed probability of a false alarm.
+        """Probability that a healthy machine scores as high in the test, over the allowed probability of a false alarm.
 
-        The result is limited to 1e-9 to 1.
+        The result is at least 1e-9 and at most 1.
         """
-        exponent = self.estimate.log_chance - LiveRise(self.test, self.threshold).log_chance
-        return math.exp(min(0.0, max(exponent, math.log(1e-9))))
+        log_allowed = LiveRise(self.test, self.threshold).log_chance
+        log_ratio = self.estimate.log_chance - log_allowed
+        return math.exp(min(0.0, max(log_ratio, math.log(1e-9))))
 
 
 @dataclass(frozen=True)
@@ -177,8 +178,8 @@ def find_level_rise(
     """Test whether a mean conductance exceeds that of the healthy machine, and estimate by how much.
 
     `g` and `deviation` are the mean conductance and its standard error [m^3/(s Pa)], and `onset` is the onset to state
-    in the result. The healthy means are of single recordings or groups of blocks (`HealthyLevel`). Two tests must both
-    be significant at the false-alarm `probability`:
+    in the result. `healthy` describes the mean conductances of healthy recordings, or of healthy groups of blocks. Two
+    tests must both be significant at the false-alarm `probability`:
 
     - g against the lowest healthy mean, increased for the warmest oil (normal distribution),
     - g against the average of the healthy means, given their scatter (Student's t with Welch's degrees of freedom).
@@ -190,7 +191,7 @@ def find_level_rise(
     if healthy.count < 2:
         return None
     max_healthy = INFERENCE.oil.warmest * max(healthy.low, 0.0)
-    scatter = healthy.deviation**2 * (1.0 + 1.0 / healthy.count)
+    scatter = healthy.deviation**2 * (1.0 + 1.0 / healthy.count)  # of one more healthy mean about their average
     variance = deviation**2 + scatter
     degrees_of_freedom = (healthy.count - 1) * (variance / max(scatter, np.finfo(float).tiny)) ** 2
     rise = Rise(g - healthy.level, math.sqrt(variance), min(degrees_of_freedom, 1e9))  # beyond it Student's t is normal
@@ -205,11 +206,11 @@ def find_level_rise(
 
 
 def level_before_leak(leak: WatchedLeak, t: float) -> HealthyLevel:
-    """Return the conductance before a leak began, and the range that it would have at time `t` [s] without the leak.
+    """Return the conductance before a leak began, and its possible range at time `t` [s] if there were no leak.
 
-    The range, `low` to `high` of the result, allows for colder and warmer oil. It reaches from 1/r to r times the
-    conductance before the leak. Here r = warmest^(h / shift), and h is the time since the onset [h] but at most
-    `shift`; `warmest` and `shift` are in the table `oil` of `priors.toml`.
+    The range, `low` to `high` of the result, allows for colder and warmer oil: from 1/r to r times the conductance
+    before the leak, where r = warmest^(h / shift). h is the time since the onset [h], but at most `shift`. `warmest`
+    and `shift` are in the table `oil` of `priors.toml`.
     """
     oil, before = INFERENCE.oil, leak.conductance_before
     hours = max(0.0, t - leak.onset_s) / 3600.0

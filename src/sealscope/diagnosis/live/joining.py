@@ -118,8 +118,8 @@ class SampleJoiner:
     def runs(self, samples: Recording) -> Iterator[SampleRun]:
         """Divide samples into runs without a gap.
 
-        Samples that are late or cannot be used are dropped and counted. Gaps, and changes of the sampling rate or of
-        the set of channels, are counted, too.
+        Samples that are late or cannot be used are dropped and counted (`count`). Gaps, and changes of the sampling
+        rate or of the set of channels, are counted, too.
         """
         names = self._choose_names(samples)
         if reason := _find_lack(samples, names):
@@ -155,9 +155,9 @@ class SampleJoiner:
     def _iter_runs(self, t: Array) -> Iterator[tuple[int, int]]:
         """Yield the index range (first, last + 1) of each run of times `t` (n,) [s] without a gap.
 
-        Only times later than the newest sample are used. Times that are missing, late or repeated are counted. The
-        clock was set back if a time is more than `late_s` before the newest sample; this is counted, too. The caller
-        must update `newest` after each run.
+        Only times later than the newest sample are used. Times that are missing, late or repeated are counted. If a
+        time is more than `late_s` before the newest sample, the clock was set back, which is counted, too. The caller
+        must set `newest` to the last time of each run before asking for the next run.
         """
         with np.errstate(all="ignore"):  # comparisons with NaN are False, which leads to the search below
             is_one_run = t.size > 1 and t[0] > self.newest and bool(are_successive(np.diff(t), self.rate).all())
@@ -195,9 +195,9 @@ _SAVED = ("is_final", "names", "rate", "newest", "changed", "counters")
 
 
 def _find_lack(samples: Recording, names: Sequence[str]) -> str:
-    """Describe why the samples do not suffice to watch an actuator; "" if they do.
+    """Describe why the samples do not suffice to watch an actuator; "" if they suffice.
 
-    `names` are the channels that are needed; if they are empty, the samples do not suffice.
+    `names` are the channels that are needed. If none are stated, the samples do not suffice.
     """
     for name in names:
         if name not in samples:

@@ -112,10 +112,10 @@ class PressureEstimator:
     def take(self, run: SampleRun) -> Iterator[BlockResult]:
         """Process the next samples, and yield the result of each block that they complete.
 
-        A result is the conductance of a block, or the reason why there is none. The next block is processed only when
-        its result is asked for. Before the first block, the model is fitted to `response.begins` (`priors.toml`)
-        seconds of samples. If these cannot be used, the reason is yielded, and the fit is tried again when half as many
-        more have arrived. Samples before a gap that do not fill a block are dropped.
+        A result is the conductance of a block, or a `NotJudged` with the reason why there is none. The next block is
+        processed only when its result is asked for. Before the first block, the model is fitted to `response.begins`
+        (`priors.toml`) seconds of samples. If these cannot be used, the reason is yielded, and the fit is tried again
+        with their second half and as many new samples. Samples before a gap that do not fill a block are dropped.
         """
         if not run.follows:
             self._held[:] = math.nan
@@ -126,7 +126,7 @@ class PressureEstimator:
         while self._follower is None and not is_slow and samples.shape[1] >= n_first:
             beginning = _make_recording(samples[:, :n_first], run.rate)
             if reason := find_unmet_requirement(beginning, self._rig) or describe_hold(beginning):
-                samples = samples[:, n_first // 2 :]  # try again with the second half and the samples after it
+                samples = samples[:, n_first // 2 :]
                 yield NotJudged(float(run.t[-1]), "", f"half minutes before the first block: {reason}")
             else:
                 self._follower = Follower.fit_start(beginning, self._rig)
@@ -141,10 +141,12 @@ class PressureEstimator:
     def _remove_holds(self, samples: Array, n_block: int, rate: float) -> bool:
         """Set stuck pressure readings in the first `n_block` columns of `samples` to nan.
 
-        `samples` (4, n) holds times and channels, and `rate` is the sampling rate [Hz]. Returns False, and changes
-        nothing, if only later samples can show whether a reading is stuck; otherwise True.
+        `samples` (4, n) holds time, p_A, p_B and command, and `rate` is the sampling rate [Hz]. Returns False, and
+        changes nothing, if only later samples can show whether a reading is stuck; otherwise True.
         """
+        # `_held`: value that a pressure has repeated up to the last block, nan if the pressure was not stuck
         holds = [find_holds(samples[row], rate, held) for row, held in zip(_PRESSURES, self._held, strict=True)]
+        # `pending`: index of the first sample whose flag later samples may change
         if min(hold.pending for hold in holds) < n_block:
             return False
         for k, (row, hold) in enumerate(zip(_PRESSURES, holds, strict=True)):
@@ -176,6 +178,7 @@ class PressureEstimator:
         self._misfits = 0
         if is_settling:
             return NotJudged.with_count(end, "settling", restarts)
+        # G: index of the conductance; the covariance is in units of the priors
         g, sd = float(follower.theta[G]), math.sqrt(follower.covariance[G, G]) * float(follower.priors.unit[G])
         if sd > _MAX_SD:
             status = "conductance not resolved" if is_moving(block["u"]) else "at standstill"
@@ -183,19 +186,22 @@ class PressureEstimator:
         pressure = float(np.mean(np.abs(block["p_A"] - block["p_B"])))
         speed = self._rig.motor.omega_per_volt * float(np.mean(np.abs(block["u"])))
         pump_flow = speed * self._rig.pump.q_b / (2.0 * math.pi)
+        # `offset`: the level is not known, as all blocks share the error of the prior
         return [BlockConductance(begin, end, g, sd, total=g, offset=_MAX_SD, pressure=pressure, pump_flow=pump_flow)]
 
     def _reject(self, follower: Follower, end: float, is_settling: bool, restarts: bool) -> NotJudged:
         """Report a block that the model of the pressures does not describe, and restart the fit if it is lost.
 
-        The fit is lost after `response.lost` (`priors.toml`) such blocks in succession, or at once if a parameter is
-        not finite. The uncertainty of its parameters is then widened, it must settle anew, and the report states that
-        later blocks cannot be compared with earlier ones. Otherwise the report is "settling" if the fit had not settled
-        before this block (`is_settling`). If it had, the report is "not described by the model", and the fit must
-        settle for the next `_RESUMING` blocks.
+        The fit (`follower`) is lost after `response.lost` (`priors.toml`) such blocks in succession, or at once if a
+        parameter is not finite. Then the uncertainty of the fit's parameters is widened, the fit must settle anew, and
+        the report states that later blocks cannot be compared with earlier ones. Otherwise there are two cases:
 
-        `follower`: the fit; `end`: end of the block [s]; `restarts`: True if this block cannot be compared with earlier
-        ones (`_resume`), which the report then states.
+        - If the fit had not settled before this block (`is_settling`), the report is "settling".
+        - If the fit had settled, the report is "not described by the model", and the fit must settle for the next
+          `_RESUMING` blocks.
+
+        `end`: end of the block [s]; `restarts`: True if this block cannot be compared with earlier ones (`_resume`),
+        which the report then states.
         """
         self._misfits += 1
         if self._misfits >= _PRIORS.lost or not np.isfinite(follower.theta).all():
@@ -226,16 +232,19 @@ class PressureEstimator:
     def _follow(self, follower: Follower, block: Recording, is_settling: bool) -> bool:
         """Fit the model of the pressures to a block; return True if the model describes the block.
 
-        The fit's sums over the block and its signals are stored. The block also updates the usual variance of the
-        residuals, faster if the fit is settling (`is_settling`) or the model does not describe the block.
+        `follower` is the fit so far. The fit's sums over the block, and features of the signals in the block, are
+        stored. The block also updates the usual variance of the residuals, faster if the fit is settling
+        (`is_settling`) or the model does not describe the block.
         """
         sums = follower.update(block)
         self._signals.take(float(block.t[0]), {name: block[name] for name in _READ}, block.rate)
         row = np.concatenate([[self._end, sums.samples], sums.theta, sums.gram.ravel(), sums.scores.ravel()])
+        # keep the last `_WINDOW` blocks, but none with sums of another size
         stored = self._rows[1 - _WINDOW :] if self._rows.shape[1:] == row.shape else np.empty((0, len(row)))
         self._rows = np.vstack([stored, row])
+        # `excess`: chi square of the block above its mean, in standard deviations
         is_described = bool(np.isfinite(follower.theta).all()) and follower.excess < _PRIORS.described
-        variance = float(sums.gram[0, 0]) / max(sums.samples, 1.0)
+        variance = float(sums.gram[0, 0]) / max(sums.samples, 1.0)  # of the residuals, row 0 of the Gram matrix
         if math.isfinite(variance):
             # a geometric mean with fading memory, in which a block counts with 0.1 to 10 times the earlier mean
             ratio = float(np.clip(max(variance, 1.0) / follower.variance, 0.1, 10.0))
@@ -252,7 +261,7 @@ class PressureEstimator:
         rows, seconds = self._rows, self.block_seconds
         if not rows.size or rows[-1, _END] != end or rows[0, _END] - seconds > onset:
             return None
-        rows = rows[rows[:, _END] > since + 0.5 * seconds]
+        rows = rows[rows[:, _END] > since + 0.5 * seconds]  # begin at `since` or later, to half a block
         if len(rows) < MIN_BLOCKS or self._follower is None:
             return ()
         blocks = [
@@ -260,7 +269,7 @@ class PressureEstimator:
             for row in rows
         ]
         try:
-            joint = Joint.fit(blocks, self._follower.priors, seconds, G)
+            joint = Joint.fit(blocks, self._follower.priors, block_s=seconds, parameter=G)
             information = parameter_information(joint, rows[:, _END] - 0.5 * seconds, seconds * len(rows))
             response = score_response_steps(information)
         except np.linalg.LinAlgError:
@@ -268,7 +277,7 @@ class PressureEstimator:
         return (*response, *self._signals.observables(since))
 
     def relearn(self, since: float = math.inf) -> None:
-        """Make the learned parameters uncertain again, e.g. after a repair; `since` is for `LiveBalance` only."""
+        """Make the learned parameters uncertain again, e.g. after a repair; only `LiveBalance` uses `since`."""
         if self._follower is not None:
             self._follower.interrupt(math.inf)
 

@@ -44,7 +44,7 @@ class LiveRise(NamedTuple):
 
     @property
     def log_chance(self) -> float:
-        """Logarithm of the probability that a healthy machine reaches this score of the test or a higher one.
+        """Logarithm of the probability that a healthy machine has at least this score in the test.
 
         For a step this is an upper bound by Ville's inequality, -score/2. For a level, whose score is a normal
         quantile, it is log Phi(-score) with the normal distribution function Phi.
@@ -55,7 +55,7 @@ class LiveRise(NamedTuple):
 
     @property
     def chance(self) -> float:
-        """Probability that a healthy machine reaches this score or a higher one; for a step an upper bound."""
+        """Probability that a healthy machine has at least this score in the test; for a step an upper bound."""
         return math.exp(self.log_chance)
 
     def threshold(self, chance: float) -> float:
@@ -72,7 +72,10 @@ class LiveRise(NamedTuple):
         return self.interval
 
     def detectable_step(self, chance: float) -> float:
-        """Return infinity: the smallest step that the test can detect depends on the conductance's random walk."""
+        """Return infinity, for any false-alarm probability `chance`: the smallest detectable step is not known.
+
+        It depends on the random walk of the healthy machine's conductance.
+        """
         return math.inf
 
 
@@ -122,21 +125,21 @@ class LiveLeak:
         return self.test.interval
 
     def relative(self, flow: Flow) -> None:
-        """Return None: for a running machine no leak is stated relative to the pump's flow."""
+        """Return None for any leak `flow`: for a running machine no leak is stated relative to the pump's flow."""
 
     def total(self, detectable_flow: float | None) -> None:
-        """Return None: the total leakage is not stated here, as each block's estimate already states it."""
+        """Return None for any `detectable_flow`: each block's estimate already states the total leakage."""
 
     def history(self, onset_s: float | None) -> None:
-        """Return None: the leakage over time is not stated here, as the estimates of the blocks already state it."""
+        """Return None for any `onset_s`: the estimates of the blocks already state the leakage over time."""
 
 
 def decide_on_stream(leak: LiveLeak | None, false_alarm_probability: float, lack: str = "") -> Evidence:
     """Decide from the estimated leakage of a watched machine if it leaks.
 
-    `leak` is the estimate; if it is None, `lack` is the reason why there is no estimate yet, in one line. Other
-    explanations of an increase are not considered here. They are weighed only once, before the test raises an alarm
-    (module `explanation`).
+    `leak` is the estimate; if it is None, `lack` is the reason why there is no estimate yet, in one line.
+    `false_alarm_probability` is that of one test. Other explanations of an increase are not considered here, as they
+    are weighed before a test raises the alarm (module `explanation`).
     """
     report = Observed(WATCH, lack=lack, leak=leak)
     return decide(report, (), HealthyNull(), false_alarm_probability, weigh_rivals=False)

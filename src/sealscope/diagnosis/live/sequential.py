@@ -105,7 +105,7 @@ class StepDetector:
 
     def is_representable(self, g: float, deviation: float) -> bool:
         """Test whether an estimate `g` and its standard `deviation` > 0 can be squared without overflow."""
-        unit = self._unit or deviation
+        unit = self._unit or deviation  # estimates are stored in the unit of the first block's deviation
         return unit > 0.0 and abs(g) < _MAX_NUMBER * unit and unit / _MAX_NUMBER < deviation < _MAX_NUMBER * unit
 
     def take(self, begin: float, end: float, g: float, deviation: float) -> None:
@@ -113,13 +113,13 @@ class StepDetector:
 
         `begin` and `end` [s] are the limits of the block, and `deviation` is the standard error of `g`. Let e be the
         innovation, i.e. g minus its prediction by the Kalman filter for a random walk. Let S be the variance of e, and
-        f the effect of a unit step on e. Then the sums for each walk and each possible onset are updated by
+        f the effect of a unit step on e. The sums a, b and T for each walk and each possible onset are updated by
 
             a += f e / S,    b += f^2 / S,    T += e^2 / S.
 
         The first block after `forget` only sets the level of the filters.
         """
-        self._unit = self._unit or deviation
+        self._unit = self._unit or deviation  # of the first block; estimates are stored in this unit
         g, variance = g / self._unit, (deviation / self._unit) ** 2
         self._blocks += 1
         elapsed_blocks = (begin - self._end) / (end - begin) + 1.0  # from the end of the last block to that of this one
@@ -128,20 +128,21 @@ class StepDetector:
             self._level[:], self._level_variance[:] = g, variance
             return
         level_variance = self._level_variance + WALKS * max(elapsed_blocks, 1.0)
-        innovation, innovation_variance = g - self._level, level_variance + variance
+        innovation, innovation_variance = g - self._level, level_variance + variance  # e and S
         gain = level_variance / innovation_variance
         may_begin = self._count >= _N_WARM
         if may_begin:
             self._add_onsets(begin, end)
         response = 1.0 - self._sums[_FOLLOWED]  # f
-        if may_begin:  # of a step in this block, the mean over the block
+        if may_begin:  # of a step that begins in this block: its mean over the block
             response[:, -len(PARTS) :] = PARTS
+        square = innovation**2 / innovation_variance
         self._sums[_FOLLOWED] += gain * response
         self._sums[_A] += response / innovation_variance * innovation
         self._sums[_B] += response / innovation_variance * response
-        self._sums[_T] += innovation**2 / innovation_variance
+        self._sums[_T] += square
         self._onsets[:, _N] += 1.0
-        self._update_walks(innovation_variance, innovation**2 / innovation_variance)
+        self._update_walks(innovation_variance, square)
         self._level = self._level + gain * innovation
         self._level_variance = gain * variance
 
@@ -149,7 +150,7 @@ class StepDetector:
         """Update the scale of the noise and the probability of each random walk after a block.
 
         For each walk in `WALKS` a Kalman filter has given the innovation e of the block (measured minus predicted
-        estimate) and its variance S. `variance` (q, 1) is S, and `square` (q, 1) is e^2 / S.
+        estimate) and the variance S of e. `variance` (q, 1) is S, and `square` (q, 1) is e^2 / S.
         """
         square = np.maximum(square, _MIN_SQUARE)
         if self._count >= _N_WARM:
@@ -171,8 +172,8 @@ class StepDetector:
         """
         # with a small probability the walk changes, after which all walks are equally likely
         log_prior = np.logaddexp(np.log1p(-_PRIORS.changes) + self._log_weights, np.log(_PRIORS.changes / len(WALKS)))
-        # the likelihood of all innovations up to a block is T^(-n/2) times the product of their S^(-1/2); divided here
-        # by its value at the onset, it becomes the likelihood since the onset (`_log_likelihoods`)
+        # the likelihood of n innovations with variances S and the sum T of e^2 / S is T^(-n/2) times the product of
+        # S^(-1/2); its value at the onset is divided out here, so that `_log_likelihoods` counts from the onset
         sums = np.zeros((_N_ROWS, len(WALKS), len(PARTS)))
         sums[_T] = self._squares
         sums[_LOG_PRIOR] = log_prior + 0.5 * (self._count * np.log(self._squares) + self._log_variances)
@@ -186,15 +187,15 @@ class StepDetector:
     def log_e(self, min_log_e: float = -np.inf) -> float:
         """Compute the logarithm of the evidence M that the coefficient has risen.
 
-        M is the sum over all possible onsets of the likelihood ratio of a step to no step. It is averaged over the
-        possible random walks of the healthy coefficient (`WALKS`), the prior variances of the step and the fractions of
-        its first block (`PARTS`). In a healthy
-        machine the mean number of blocks until M exceeds A is at least A. The result is minus infinity if no rise can
-        have begun yet, or if a quick upper bound of log M is at most `min_log_e`.
+        M is the sum over all blocks in which the rise may begin, of the likelihood ratio of a step to no step. The
+        ratio is averaged over the possible random walks of the healthy coefficient (`WALKS`), the prior variances of
+        the step (`SIZES`), and the onsets within a block (`PARTS`). In a healthy machine the mean number of blocks
+        until M exceeds a number A is at least A. The result is minus infinity if no rise can have begun yet, or if a
+        quick upper bound of log M is at most `min_log_e`.
         """
         if not len(self._onsets):
             return -np.inf
-        a, b, T = self._sums[_A : _T + 1]
+        a, b, T = self._sums[_A : _T + 1]  # sums of f e / S, f^2 / S and e^2 / S (`take`)
         # fraction of T that a step of the best size explains, less than 1 so that its logarithm is finite
         explained = np.minimum(np.maximum(a, 0.0) ** 2 / (b * T), 1.0 - 1e-15)
         max_log_ratio = -0.5 * float(np.min(self._onsets[:, _N] * np.log1p(-explained)))
@@ -205,7 +206,9 @@ class StepDetector:
     def _log_likelihoods(self) -> Array:
         """Compute the log likelihood (q, j) of each random walk q, given no step since each onset j.
 
-        The prior of the walk at the onset is included. A constant equal for all q is left out.
+        For n innovations with variances S and the sum T of their squares over S, it is -(n log T + sum of log S) / 2.
+        The value at the onset is subtracted, and the log prior of the walk is added (`_add_onsets`). A constant equal
+        for all q is left out.
         """
         n, log_T = self._onsets[:, _N], np.log(self._sums[_T])
         return np.asarray(self._sums[_LOG_PRIOR] - 0.5 * (n * log_T + self._log_variances))
@@ -214,7 +217,7 @@ class StepDetector:
         """Compute the log likelihood ratios (v, q, j) of a rise of the coefficient to no step.
 
         v is the prior variance of the step's size (`SIZES`), q the variance of the random walk in a block (`WALKS`),
-        and j the onset. With n and the sums a, b and T of the module's docstring, which `take` updates,
+        and j the onset. With the number n of innovations and their sums a, b and T (`take`),
 
             R = (1 + v b)^(-1/2) (1 - max(a, 0)^2 / ((b + 1/v) T))^(-n/2).
         """
@@ -238,14 +241,14 @@ class StepDetector:
     def rise(self) -> LiveRise:
         """Estimate the onset [s] and the size of a rise of the coefficient, in the coefficient's unit.
 
-        Both are averages over the variance of the random walk in a block (`WALKS`), the possible onsets, and the prior
-        variance of the step's size (`SIZES`), weighted by their posterior probabilities. The onset has a 95 % interval,
-        and the size a standard deviation.
+        Both are averages over the possible prior variances v of the step's size (`SIZES`), variances q of the random
+        walk in a block (`WALKS`), and onsets j, weighted by their posterior probabilities. The onset has a 95 %
+        interval, and the size a standard deviation.
         """
         terms = self._log_terms()
         log_e = float(np.logaddexp.reduce(terms.ravel()))
         weights = np.exp(terms - log_e)  # posterior probabilities
-        a, b, T = self._sums[_A : _T + 1]
+        a, b, T = self._sums[_A : _T + 1]  # sums of f e / S, f^2 / S and e^2 / S (`take`)
         # Student's t posterior of the size, for each v, q and j
         precision = b + 1.0 / SIZES[:, None, None]
         sizes = a / precision
@@ -272,7 +275,7 @@ class StepDetector:
         """
         if not len(self._onsets):
             return np.inf
-        a, b, T = self._sums[_A : _T + 1]
+        a, b, T = self._sums[_A : _T + 1]  # sums of f e / S, f^2 / S and e^2 / S (`take`)
         # least-squares size of a step at each onset and for each walk, and its standard error
         sizes = a / b
         residual_squares = np.maximum(T - a * sizes, np.finfo(float).tiny)

@@ -76,24 +76,26 @@ class SignalWindow:
             return
         if not self._means.size:
             self._means = np.array([channels["p_A"].mean(), channels["p_B"].mean()])
-        motion = motion_columns(channels, rate)
+        motion = motion_columns(channels, rate)  # speed first; None if no motion is recorded
         speed = 0.0 if motion is None else top_speed(motion)
         max_speed = max(speed, float(self._rows[:, _SPEED].max(initial=0.0)) if self._rows.size else 0.0)
         fraction_moving = 1.0 if motion is None else float(time_in_motion(motion[None, :, 0], max_speed)[0])
-        columns = pressure_level_rows(channels, rate, self._means, max_speed)
+        columns = pressure_level_rows(channels, rate, self._means, max_speed)  # of the fit of mean pressures
         single_block = {name: values[None] for name, values in channels.items()}  # arrays (1, n) of one block
         values = {**dict(log_amplitudes(single_block)), **dict(sensor_features(single_block, rate))}
         features = [float(values[name][0]) if name in values else np.nan for name in FEATURES]
         n_samples, gram = len(channels["p_A"]), columns.T @ columns
         row = np.array([begin, begin + n_samples / rate, n_samples, speed, fraction_moving, *features, *gram.ravel()])
+        # keep the last `WINDOW` blocks, but none with other channels
         stored = self._rows[1 - WINDOW :] if self._rows.shape[1:] == row.shape else np.empty((0, len(row)))
         self._rows = np.vstack([stored, row])
 
     @np.errstate(all="ignore")
     def observables(self, since: float) -> tuple[Observable, ...]:
-        """Test each feature for a step in the blocks that begin at `since` [s] or later.
+        """Test each feature for a step in the stored blocks that begin at `since` [s] or later.
 
-        The result is empty if there are fewer than `MIN_BLOCKS` blocks.
+        The features are duty (motion and load), noise, mains hum and mean pressures. The result is empty if there are
+        fewer than `MIN_BLOCKS` blocks.
         """
         rows = self._rows[self._rows[:, _BEGIN] >= since] if self._rows.size else self._rows
         if len(rows) < MIN_BLOCKS:
@@ -105,7 +107,7 @@ class SignalWindow:
         features = {name: values for name, values in columns if np.isfinite(values).any()}
         duty = {name: features.pop(name) for name in DUTY if name in features}
         sensors = ((name, feature_step_test(moving_time, values)) for name, values in features.items())
-        return run_tests(
+        return run_tests(  # which ends a test whose numbers overflow
             lambda: duty_observables(amplitude_step_tests(moving_time, duty)),
             lambda: sensor_observables((name, test) for name, test in sensors if test is not None),
             lambda: level_observables(self._test_levels(rows, time)),
@@ -115,8 +117,9 @@ class SignalWindow:
         """Test the mean pressures in each direction of motion for steps.
 
         `rows` are the stored features of n blocks, and `time` (n,) the centres of the blocks [s]. The blocks are
-        averaged in groups of equal size, the smallest of `_GROUP_SIZES` with which the machine moves both ways in every
-        group. The result is empty if there is no such size, or if there are fewer than `MIN_BLOCKS` groups.
+        averaged in groups of equal size, which is the smallest of `_GROUP_SIZES` for which the machine moves in both
+        directions in every group. The result is empty if there is no such size, or if there are fewer than `MIN_BLOCKS`
+        groups.
         """
         n_columns = round((rows.shape[1] - _GRAM.start) ** 0.5)  # a row ends with a flattened square Gram matrix
         for size in _GROUP_SIZES:
@@ -125,7 +128,8 @@ class SignalWindow:
                 break
             groups = rows[-n_groups * size :].reshape(n_groups, size, -1)
             gram = groups[:, :, _GRAM].sum(axis=1).reshape(n_groups, n_columns, n_columns)
-            values = fit_pressure_levels(gram, float(groups[:, :, _SAMPLES].sum(axis=1).max()), self._means)
+            max_samples = float(groups[:, :, _SAMPLES].sum(axis=1).max())  # of a group
+            values = fit_pressure_levels(gram, max_samples, self._means)
             if values is not None:  # None if a group moves in one direction only
                 return pattern_tests(time[-n_groups * size :].reshape(n_groups, size).mean(axis=1), values)
         return ()

@@ -129,11 +129,11 @@ class Watch:
         """Compute the false-alarm probability of a single test that is made once in `seconds`.
 
         Each `test`, `STEP` or `LEVEL`, has a fraction of the stated rate of false alarms (`priors.toml`). The
-        probability is this part of the rate times `seconds`. Raises InputError unless it is 1e-12 to 0.05.
+        probability is fraction * rate * `seconds`. Raises InputError unless the probability is 1e-12 to 0.05.
         """
         rate: float = self.false_alarms_per_1000_h
         fraction_of_alarms = getattr(_PRIORS, test)
-        rate_per_probability: float = 1000.0 / fraction_of_alarms * 3600.0 / seconds  # false alarms in 1000 h
+        rate_per_probability: float = 1000.0 / fraction_of_alarms * 3600.0 / seconds  # tests in 1000 h / fraction
         min_rate, max_rate = 1e-12 * rate_per_probability, 0.05 * rate_per_probability  # supported probabilities
         if not min_rate <= rate <= max_rate:
             raise InputError(f"false_alarms_per_1000_h must be {min_rate:.2g} to {max_rate:.3g}, got {rate:g}")
@@ -146,7 +146,7 @@ class Watch:
 
     @property
     def learned_with(self) -> tuple[Rig, Mapping[str, bool], float]:
-        """Settings with which the baseline is learned, i.e. rig, `litres` of the constructor, and learning time [h]."""
+        """Settings with which the baseline is learned: rig, whether L/min are stated by each method, and time [h]."""
         return self._rig, self._litres, self.learn_hours
 
     @property
@@ -193,8 +193,8 @@ class Watch:
     def _measure(self, estimator: Estimator, leak: WatchedLeak | None) -> LiveLeak:
         """Convert the detected `leak` to a LiveLeak, from which the verdict is decided (`decide_on_stream`).
 
-        If `leak` is None, the result has the present score of the test for a step, limited to below the threshold, and
-        the 95 % upper bound of an undetected leak. `estimator` states the uncertainty of flows.
+        Without a leak (None) the result has the present score of the test for a step, limited to below the threshold,
+        and the 95 % upper bound of an undetected leak. `estimator` states the uncertainty of flows.
         """
         make_measure = partial(
             LiveLeak,
@@ -203,14 +203,25 @@ class Watch:
             size_deviation=estimator.size_error,
         )
         if leak is not None:
-            # a detected leak needs neither a bound nor the pump's flow
-            return make_measure(leak.estimate, leak.cause, leak.pressure, bound_flow=math.inf, pump_flow=(0.0, 0.0))
+            return make_measure(
+                test=leak.estimate,
+                cause=leak.cause,
+                flow_per_conductance=leak.pressure,
+                bound_flow=math.inf,  # a detected leak needs neither a bound nor the pump's flow
+                pump_flow=(0.0, 0.0),
+            )
         # a rise above the threshold that nothing explains yet must not be a leak
-        max_score = -2.0 * math.log(self._false_alarm_probability(STEP, self.block_seconds)) * (1.0 - 1e-6)
-        test = LiveRise(STEP, min(max(2.0 * self._detector.log_e(), 0.0), max_score))
+        threshold = -2.0 * math.log(self._false_alarm_probability(STEP, self.block_seconds))
+        score = min(max(2.0 * self._detector.log_e(), 0.0), threshold * (1.0 - 1e-6))
         pressure, pump_flow = (float(self._compared[name].mean()) for name in ("pressure", "pump_flow"))
         bound = estimator.orifice_factor * self._detector.bound() * pressure * (1.0 + UPPER_95 * estimator.size_error)
-        return make_measure(test, estimator.cause, pressure, bound_flow=bound, pump_flow=(pump_flow, pump_flow))
+        return make_measure(
+            test=LiveRise(STEP, score),
+            cause=estimator.cause,
+            flow_per_conductance=pressure,
+            bound_flow=bound,
+            pump_flow=(pump_flow, pump_flow),  # over all samples, and while the pump delivers
+        )
 
     def update(self, samples: Recording, *, follows: bool = True) -> list[BlockEstimate]:
         """Process the next samples; the estimates do not depend on how the samples are divided into calls.
@@ -232,10 +243,10 @@ class Watch:
         return [estimate for estimate, _ in self.each(samples, follows=follows)]
 
     def each(self, samples: Recording, *, follows: bool = True) -> Iterator[tuple[BlockEstimate, WatchedLeak | None]]:
-        """Process samples like `update`; yield the estimate of each block and the leak detected by then.
+        """Process the next samples; yield the estimate of each block, and the leak detected by then or None.
 
-        If no leak has been detected, the second item is None. Samples are processed only as the iterator advances; to
-        process all of them, iterate to the end.
+        `follows` is False if the clock starts anew, as at the beginning of a separate file. Samples are processed only
+        as the iterator advances; to process all of them, iterate to the end.
         """
         if not follows:
             self._samples.restart("pauses between samples")
@@ -294,8 +305,8 @@ class Watch:
         """Test the conductances of a block for a leak, and return the estimate of the block.
 
         `result`: the conductances, or a `NotJudged` with the reason why there are none, which the returned estimate
-        then states. The blocks to which the volume balance is fitted first arrive together in one result and count as
-        one block; the estimate is of the last of them.
+        then states. The first blocks, to which the volume balance is fitted, have their conductances in one result.
+        They are all tested; the returned estimate is that of the last one.
         """
         self.blocks += 1
         if isinstance(result, NotJudged):
@@ -313,7 +324,8 @@ class Watch:
         """Test the conductance of a block against those of earlier blocks, and estimate the leak in this block.
 
         The block is added to the baseline, the healthy state, while the baseline is being learned and no leak has been
-        detected. A block with another duty than the baseline has no flows.
+        detected. If the block has another duty (pressure difference and pump flow) than the baseline, no flows are
+        stated. `estimator` is the source of the conductances.
         """
         row = np.array([block], _BLOCK)
         is_small = all(abs(number) < _MAX_NUMBER for number in block)  # False for NaN, too
@@ -346,9 +358,9 @@ class Watch:
     def _add_to_tests(self, block: BlockConductance, row: NDArray[Any], *, has_known_duty: bool) -> None:
         """Add a block to the tests for a leak, which restart after a pause or a change of duty.
 
-        The duty is the mean pressure difference and pump flow. `has_known_duty` tells if it is within the range of the
-        baseline; the duty changes when it leaves this range or returns to it. `row` is the block as an array (1,) of
-        the type `_BLOCK`.
+        The duty is the mean pressure difference and pump flow. `has_known_duty` tells if the duty is in the range of
+        the baseline. A duty that leaves this range or returns to it counts as changed. `row` is the block as an array
+        (1,) of the type `_BLOCK`.
         """
         if not has_known_duty:
             self._samples.count("blocks: another duty")
@@ -375,7 +387,8 @@ class Watch:
         """Test for a step of the conductance up to `block`, and raise the alarm if a leak explains the step.
 
         For `RECENT` blocks after the alarm, a step with a higher score replaces onset and size of the leak. Returns
-        True if a step was found that is not, or not yet, explained by a leak.
+        True if a step was found that a leak does not explain, or not yet. `estimator` is the source of the
+        conductances.
         """
         leak = self.leak
         if leak is not None and (leak.test != STEP or block.end - leak.raised_s > RECENT * self.block_seconds):
@@ -403,11 +416,11 @@ class Watch:
         The other quantities are tested in the stored blocks up to `block`, the present block. The cause is
 
         - unknown if too few blocks have followed the onset,
-        - the start of the machine, if it was shortly before: the tests restart, the start is counted, and the result is
-          `UNKNOWN`,
+        - the start of the machine, if the onset is shortly after it: the tests restart, the start is counted, and the
+          result is `UNKNOWN`,
         - a leak if the blocks around the onset are no longer stored,
-        - else by `explain_rise`. If this is another event than a leak and enough blocks have followed, the event is
-          counted, and tests and estimator restart.
+        - else the cause that `explain_rise` finds. If this is another event than a leak, and enough blocks have
+          followed, the event is counted, and tests and `estimator` restart.
         """
         n_since = int(np.count_nonzero(self._compared["end"] > rise.interval.high))  # blocks since the onset
         if n_since < _EXPLANATION.shows:
@@ -429,11 +442,10 @@ class Watch:
         return explanation
 
     def _test_level(self, estimator: Estimator, block: BlockConductance) -> None:
-        """Test the mean conductance of the last `GROUP` blocks, and raise the alarm if it is too high.
+        """Test the mean conductance of the last `GROUP` blocks, up to `block`, and raise the alarm if it is too high.
 
-        The mean is too high if it exceeds that of the healthy machine (`find_level_rise`). The healthy machine is that
-        of the baseline or, until there is a baseline, of the healthy recordings, if the estimator states levels.
-        Without either there is no test.
+        The mean is compared with the baseline (`find_level_rise`). Until there is a baseline, it is compared with the
+        healthy recordings, if there are any and the `estimator` states levels; otherwise nothing is tested.
         """
         has_baseline = self.baseline is not None
         healthy: HealthyLevel | None = self.baseline if has_baseline or not estimator.states_level else self.healthy

@@ -135,30 +135,30 @@ class Diagnosis(Evidence):
     def repair_lpm(self) -> float | None:
         """Repair limit [L/min] to draw in the plot of the leak over time (`course`).
 
-        If the plot shows the total leakage, the limit is raised by the leakage of the healthy machine. This is the
-        median of the plotted flow before the onset, minus the leak if there is one that was open from the start. The
-        result is None if there is no such plot, or if limit or healthy leakage is not known as a flow.
+        If the plot shows the total leakage, the leakage of the healthy machine is added to the limit: the median of the
+        plotted flow before the onset of the leak. If the leak was open from the start, its flow is subtracted from the
+        median. The result is None if there is no plot, or if limit or healthy leakage is not known as a flow.
         """
         course, limit = self.course, self.limit_lpm
         if course is None or limit is None:
             return None
-        if not course.whole:
+        if not course.whole:  # the plot shows the leak alone
             return limit
         onset = math.inf if self.onset_s is None or not math.isfinite(self.onset_s) else self.onset_s
         lpm_before = course.lpm[(course.t < onset) & np.isfinite(course.lpm)]
         if not lpm_before.size:
             return None
         usual_lpm = float(np.median(lpm_before))
-        if self.verdict == LEAK and self.onset_s is None:  # it leaks from the first sample on
+        if self.verdict == LEAK and self.onset_s is None:  # the leak was open from the first sample on
             return None if self.leak_lpm is None else limit + max(0.0, usual_lpm - self.leak_lpm)
         return limit + usual_lpm
 
     @property
     def measured_ratio(self) -> tuple[float, tuple[float, float]] | None:
-        """Ratio of pump displacement to piston area, as measured over as assumed, and its 95 % interval (low, high).
+        """Measured over assumed value of the ratio of pump displacement to piston area, with 95 % interval (low, high).
 
-        The deciding detector gives it if it has measured the ratio, otherwise the first other detector that has; None
-        if no detector has.
+        The figures are those of the deciding detector if it has measured the ratio, otherwise those of the first other
+        detector that has. The result is None if no detector has.
         """
         for decision in (self, *self.parts):
             if decision.ratio is not None and decision.ratio_interval is not None:
@@ -177,7 +177,10 @@ class Diagnosis(Evidence):
 
     @property
     def _condition(self) -> str:
-        """Name of the condition in `states.toml` that corresponds to the verdict, such as "leak" or "no change"."""
+        """Name of the condition in `states.toml` that corresponds to the verdict, such as "leak" or "no change".
+
+        For the verdict `no leak` it depends on whether healthy leakage is known, and whether this leakage is usual.
+        """
         if self.verdict != NO_LEAK:
             return self.verdict
         if self.known_healthy:
@@ -186,7 +189,7 @@ class Diagnosis(Evidence):
 
     @property
     def named_cause(self) -> str | None:
-        """Cause that the verdict names, either of the leak or of another event; None if it names none.
+        """Cause that the verdict names, either of the leak or of another event; None if the verdict names no cause.
 
         Causes in `LEAKS`, such as "piston leak", are named only with the verdict `leak`. Any other cause is named only
         with another verdict.
@@ -196,8 +199,8 @@ class Diagnosis(Evidence):
     @property
     def next_check(self) -> str:
         """Next check to make on the machine, in one or two sentences."""
-        with_bypass = self.machine is not None and self.machine.bypass
-        return action_of(self._condition, self.named_cause, ("bypass",) if with_bypass else ())
+        has_bypass = self.machine is not None and self.machine.bypass
+        return action_of(self._condition, self.named_cause, parts=("bypass",) if has_bypass else ())
 
     @property
     def state(self) -> MachineState:
@@ -207,7 +210,8 @@ class Diagnosis(Evidence):
         """
         is_over_limit = self.severity is not None and self.severity.level == "repair"
         condition = "leak over the limit" if is_over_limit else self._condition
-        return state_of(condition, self.named_cause, since_s=to_plain(self.onset_s), action=self.next_check)
+        onset_s = to_plain(self.onset_s)  # None if not finite
+        return state_of(condition, self.named_cause, since_s=onset_s, action=self.next_check)
 
     @property
     def known_healthy(self) -> bool:
@@ -223,8 +227,8 @@ class Diagnosis(Evidence):
         """True if the recording may serve as a baseline, as no leak was found and its leakage is usual.
 
         The leakage is usual if at least 1 in 20 healthy recordings scores as high in the comparison with healthy
-        recordings. The result is False without such a comparison, if a cause of a change is stated, or if an undetected
-        leak could make up the whole total leakage.
+        recordings. The result is False without this comparison, if a cause of a change is stated, or if an undetected
+        leak could be the whole total leakage.
         """
         comparison = self._find_test(AGAINST)
         if self.verdict != NO_LEAK or self.cause is not None or comparison is None or not _is_usual(comparison):
@@ -239,13 +243,14 @@ class Diagnosis(Evidence):
     def rises_within(self) -> bool:
         """True if the leakage probably rose within the recording, although no onset is stated.
 
-        The sign of this is that fewer than 1 in 20 healthy recordings score as high in the test for such a rise.
+        A rise is probable if fewer than 1 in 20 healthy recordings score as high in the test for a rise within the
+        recording.
         """
         step_test = self._find_test(WITHIN)
         return self.onset_s is None and step_test is not None and not _is_usual(step_test)
 
     def _find_test(self, name: str) -> Evidence | None:
-        """Find the evidence of a test by the deciding detector; None if it made no test of this name."""
+        """Find the evidence of the test called `name` by the deciding detector; None if it made no such test."""
         tests = self.parts[0].parts if self.parts else ()  # the deciding detector is the first
         return next((test for test in tests if test.detector == name), None)
 

@@ -198,11 +198,12 @@ class Evidence:
 
     @property
     def summary(self) -> str:
-        """The verdict in words, with the cause of the change if this is not a leak past piston or pump."""
+        """The verdict in words, with the cause of the change unless the cause is a leak past piston or pump."""
         if self.cause is None or self.cause in LEAKS or self.verdict == LEAK:
             return self.verdict
         if self.verdict == CANNOT_TELL:
             return f"cannot tell ({self.cause})"
+        # "none" refers to the leak that the name of the cause mentions, as in "external leak"
         return f"{self.cause} ({'none' if self.cause.endswith('leak') else 'no leak'} across the piston)"
 
     @property

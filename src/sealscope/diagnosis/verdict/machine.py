@@ -74,11 +74,14 @@ class AssumedMachine:
 
 
 def assumed_rig(rig: Rig | str | os.PathLike[str] | None, recording: Recording) -> tuple[Rig, AssumedMachine]:
-    """Choose the rig that detectors assume for a recording, and tell if its areas and displacement are stated.
+    """Choose the rig that detectors assume for a recording, and tell who stated its areas and displacement.
 
-    If `rig` is None, the thesis's rig is used. The thesis's rig counts as stated if the recording's provenance names a
-    rig of the same areas and displacement; otherwise all its values are marked as assumptions (`Rig.states`). A given
-    `rig` counts as stated by nobody if it states sizes, but not a whole rig. Raises InputError if `rig` cannot be read.
+    - A given `rig` is used. It counts as stated by the call if it is a whole rig, else by nobody.
+    - If `rig` is None, the thesis's rig is used. It counts as stated by the recording if the recording's provenance
+      names a rig of the same areas and displacement. Otherwise nobody stated it, and all its values are marked as
+      assumptions.
+
+    Raises InputError if `rig` cannot be read.
     """
     used_rig = load_rig(_DEFAULT if rig is None else rig)
     stated_by: StatedBy
@@ -104,7 +107,7 @@ def assumed_rig(rig: Rig | str | os.PathLike[str] | None, recording: Recording) 
 
 def states_rig(rig: Rig) -> bool:
     """Return True if a whole rig was stated; False for the default rig, even with stated areas or displacement."""
-    # the mass shows it, as no user states the mass separately: it is that of the stated rig, or assumed
+    # a user may state areas or displacement alone, but never the mass: a mass that is not assumed is a stated rig's
     return rig.entry("cylinder.M_eq").source != f"{ASSUMED} {_REASON}"
 
 
@@ -117,10 +120,10 @@ def measures_flow(units: Mapping[str, str]) -> bool:
 
 
 def healthy_leakage(rig: Rig) -> float:
-    """Return the largest leakage conductance of a healthy pump [m^3/(s Pa)] by the rig (`pump.G_healthy`); else 0.
+    """Return the largest leakage conductance of a healthy pump [m^3/(s Pa)] by the rig (`pump.G_healthy`).
 
-    A conductance that a rig's file assumes is used if the same file states the displacement of the pump. Otherwise the
-    conductance may belong to another pump, such as that of the default rig, and the result is 0.
+    If the conductance is only assumed in a rig's file, it is used if the same file states the displacement of the pump.
+    Otherwise it may belong to another pump, such as that of the default rig, and the result is 0.
     """
     is_from_same_file = rig.entry("pump.G_healthy").place == rig.entry("pump.q_b").place
     is_of_this_pump = states_rig(rig) and rig.states("pump.q_b") and is_from_same_file

@@ -53,7 +53,8 @@ class RepairLimit:
         """
         if text is None:
             return cls(VERDICT.repair.creep * MM_PER_MINUTE, "creep", stated=False)
-        has_unit = isinstance(text, str) and any(character.isalpha() for character in _EXPONENT.sub("", text))
+        without_exponent = _EXPONENT.sub("", text) if isinstance(text, str) else ""  # its e is no unit
+        has_unit = any(character.isalpha() for character in without_exponent)
         for kind, unit in (("flow", "m^3/s"), ("creep", "m/s")):
             try:
                 value = parse_quantity(text, unit, name="limit")
@@ -136,32 +137,33 @@ class Severity:
 
 
 def severity(evidence: Evidence, limit: RepairLimit) -> Severity | None:
-    """Compute the severity of a detected leak relative to a repair limit.
+    """Compute the severity of the leak that `evidence` states, relative to a repair limit.
 
     The result is None if the verdict is not `leak`, or if the size of the leak is unknown.
     """
     if evidence.verdict != LEAK or (evidence.leak_lpm is None and evidence.relative is None):
         return None
     relative = evidence.relative or RelativeLeak()
-    flow_lpm = evidence.leak_lpm, evidence.leak_interval_lpm
-    creep = relative.creep, relative.creep_interval
+    flow_lpm = evidence.leak_lpm, evidence.leak_interval_lpm  # value and 95 % interval
+    creep = relative.creep, relative.creep_interval  # the same [m/s]
     if limit.kind == "flow":
-        of_limit = _convert_figure(*flow_lpm, LITRE_PER_MINUTE / limit.value)
+        of_limit = _convert_figure(*flow_lpm, factor=LITRE_PER_MINUTE / limit.value)
     else:
-        of_limit = _convert_figure(*creep, 1.0 / limit.value)
+        of_limit = _convert_figure(*creep, factor=1.0 / limit.value)
     return Severity(
-        mL_per_min=_convert_figure(*flow_lpm, LITRE_PER_MINUTE / ML_PER_MINUTE),
+        mL_per_min=_convert_figure(*flow_lpm, factor=LITRE_PER_MINUTE / ML_PER_MINUTE),
         pump_share=_convert_figure(relative.pump_share, relative.pump_share_interval),
-        creep_mm_per_min=_convert_figure(*creep, 1.0 / MM_PER_MINUTE),
+        creep_mm_per_min=_convert_figure(*creep, factor=1.0 / MM_PER_MINUTE),
         of_limit=of_limit,
     )
 
 
 def relative_leak(evidence: Evidence, recording: Recording, machine: AssumedMachine) -> RelativeLeak | None:
-    """Convert a leak in L/min to a fraction of the pump's flow and to a creep speed of the piston.
+    """Convert a leak in L/min to a fraction of the pump's mean flow and to a creep speed of the piston.
 
-    `machine` states the displacement and the piston area. The result is None if the evidence states no L/min. The
-    fraction is None if the pump stands still, or if neither its speed nor its angle is recorded.
+    `evidence` states the leak, and `machine` the displacement and the piston area. The pump's mean speed is computed
+    from the `recording`. The result is None if the evidence states no L/min. The fraction is None if the pump stands
+    still, or if neither its speed nor its angle is recorded.
     """
     if evidence.leak_lpm is None or evidence.leak_interval_lpm is None:
         return None
@@ -185,7 +187,10 @@ def _mean_speed(recording: Recording) -> float:
 
 
 def _convert_figure(value: float | None, interval: tuple[float, float] | None, factor: float = 1.0) -> _Figure:
-    """Multiply a value and its interval by a factor: (value, low, high); None if a number is unknown or not finite."""
+    """Multiply a value and its `interval` (low, high) by a factor.
+
+    Returns (value, low, high), or None if one of these is unknown or not finite.
+    """
     if value is None or interval is None or not all(math.isfinite(number) for number in (value, *interval)):
         return None
     return factor * value, factor * interval[0], factor * interval[1]

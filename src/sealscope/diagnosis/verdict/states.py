@@ -70,9 +70,9 @@ def state_of(
 ) -> MachineState:
     """Return the state of a machine for a condition of `states.toml`; raise KeyError for an unknown condition.
 
-    `cause` is the cause of the change, None if unknown. If `states.toml` lists it, it determines the action and, unless
-    the condition is a leak past piston or pump (`LEAKING`), also the state. `since_s` is the time at which the state
-    began [s]. `action` replaces the action of the table.
+    `cause` is the cause of the change, None if unknown. A cause that `states.toml` lists determines the action and,
+    unless the condition is a leak past piston or pump (`LEAKING`), also the state. `since_s` is the time at which the
+    state began [s]. `action` replaces the action that `states.toml` states.
     """
     tables = _tables()
     name = tables["conditions"][condition]["state"]
@@ -97,10 +97,11 @@ def joint_causes() -> Mapping[str, tuple[str, ...]]:
 
 
 def action_of(condition: str, cause: str | None = None, parts: Sequence[str] = ()) -> str:
-    """Return the action that `states.toml` states for the cause of a change or, if it does not, for the condition.
+    """Return the action of `states.toml` for the cause of a change; without a listed cause, that for the condition.
 
-    `parts` are components of the machine that leak like a worn seal, such as "bypass". If the condition is a leak past
-    piston or pump, checks of these parts come first. Raises KeyError for an unknown condition or part.
+    `parts` are components of the machine that may be mistaken for a worn seal, such as an open "bypass". If the
+    condition is a leak past piston or pump, checks of these parts come first. Raises KeyError for an unknown condition
+    or part.
     """
     tables = _tables()
     row = tables["causes"].get(cause or "", tables["conditions"][condition])
