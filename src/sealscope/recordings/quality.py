@@ -93,7 +93,7 @@ def inspect(recording: Recording) -> tuple[Finding, ...]:
 
 
 def _sample_time(recording: Recording, index: int) -> float | None:
-    """Return the time [s] of the sample with the number `index`; None if it has none."""
+    """Return the time [s] of the sample with the number `index`; None if this sample does not exist or has no time."""
     t = float(recording.t[index]) if index < recording.t.size else np.nan
     return t if np.isfinite(t) else None
 
@@ -106,7 +106,7 @@ def _time_findings(recording: Recording) -> list[Finding]:
     t, findings, step = recording.t, list[Finding](), 1.0 / recording.rate
 
     def add(code: str, indices: NDArray[Any], text: str, severity: Severity = "warning") -> None:
-        """Add a finding on the samples, or intervals, with these indices, unless there are none."""
+        """Add a `Finding` with this code, text and severity on the samples or intervals `indices`, if there are any."""
         if indices.size:
             first_t = _sample_time(recording, int(indices[0]))
             findings.append(Finding(code, severity, None, indices.size, first_t, text))
@@ -190,12 +190,15 @@ class _ChannelReport:
     findings: list[Finding] = field(default_factory=list)
 
     def add(self, code: str, count: int, first: int, text: str, severity: Severity = "warning") -> None:
-        """Add a finding on `count` samples, the first at index `first`."""
+        """Add a `Finding` with this code, text and severity on `count` samples, the first at index `first`."""
         first_t = _sample_time(self.recording, first)
         self.findings.append(Finding(code, severity, self.name, count, first_t, f"{self.name}: {text}"))
 
     def format_value(self, value: float, digits: int = 6, *, is_span: bool = False) -> str:
-        """Format a value in the unit that the channel had in its log; `is_span`: the value is a difference of two."""
+        """Format a value in the unit that the channel had in its log, with `digits` significant digits.
+
+        `is_span`: the value is a difference of two values.
+        """
         return self.recording.format_value(self.name, value, digits, is_span=is_span)
 
 

@@ -75,6 +75,7 @@ class DetailStream:
     def __init__(
         self, channels: int | tuple[int, int] = 1, levels: int = 4, *, wavelet: str = "db8", threads: int = 1
     ) -> None:
+        """Prepare filters, buffers and threads; the class describes the arguments."""
         from sealscope.physics.lanes import WIDTH
         from sealscope.signals.kernels import CHUNK
 

@@ -96,6 +96,7 @@ class RmsStream:
     """
 
     def __init__(self, size: int = WINDOW_SIZE, step: int = WINDOW_STEP, *, skip: int = 0, first: int = 0) -> None:
+        """Start with an empty stream; the class describes the arguments."""
         self.size = require_positive_int(size, "size", unit=" sample")
         self.step = require_positive_int(step, "step", unit=" sample")
         if isinstance(skip, bool) or not isinstance(skip, (int, np.integer)) or skip < 0:

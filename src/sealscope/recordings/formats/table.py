@@ -256,8 +256,8 @@ def _convert_channels(
 ) -> tuple[dict[str, Array], dict[str, str], dict[str, str]]:
     """Convert the chosen channels of a table to SI units or counts.
 
-    Returns three mappings from the names of channels: to values (n,), to units, and to units in the log where these
-    differ. `columns`: column -> values (n,).
+    `choice`: meaning of the columns; `columns`: column -> values (n,). Returns three mappings from the names of
+    channels: to values (n,), to units, and to units in the log where these differ.
     """
     channels, units, log_units = {}, {}, {}
     for name, formula in choice.channels.items():
@@ -274,8 +274,9 @@ def _convert_channels(
 def _join_time(choice: ColumnMap, columns: Mapping[int, NDArray[Any]], label: Label, notes: list[str]) -> NDArray[Any]:
     """Combine the columns that form the time, such as date and hours, and add a line for the history to `notes`.
 
-    `label`: name and unit of the time. If the values of the other columns cannot be parts of this time, the time column
-    is returned unchanged; if it contains hours, InputError is raised instead.
+    `choice`: meaning of the columns; `columns`: column -> values (n,); `label`: name and unit of the time. If the
+    values of the other columns cannot be parts of this time, the time column is returned unchanged. If this column
+    contains the hours, InputError is raised instead.
     """
     assert choice.time is not None
     parts = {part: np.asarray(columns[column], dtype=np.float64) for part, column in choice.parts.items()}

@@ -121,7 +121,10 @@ def _iter_packets(lines: Iterator[tuple[int, str]], delimiter: str, decimal: str
             names = packet.names
 
             def format_place(index: int, number: int = number, names: Sequence[str] = names) -> str:
-                """Format the line, column and file of a cell for messages; `index`: its column."""
+                """Format the line, column and file of a cell for messages.
+
+                `index`: column of the cell; the defaults of the other arguments are those of the present line.
+                """
                 return f"(line {number}, column {names[index]}, {place})"
 
             padded_cells = cells[: len(names)] + [""] * (len(names) - len(cells))
