@@ -50,7 +50,7 @@ def _iter_value(group: str, name: str, value: Any, clock: Clock | None, depth: i
         for number, member in enumerate(value.reshape(-1), start=1):
             yield from _iter_value(group, name if value.size == 1 else f"{name}({number})", member, clock, depth + 1)
     elif isinstance(value, np.ndarray):
-        yield from _iter_columns(group, name, value, None, clock)
+        yield from _iter_columns(group, name, value, unit=None, clock=clock)
 
 
 def _struct_fields(value: Any) -> Mapping[str, Any] | None:
@@ -106,7 +106,7 @@ def _iter_time_series(group: str, name: str, by_name: Mapping[str, Any], clock: 
     if "signals" in by_name:
         for number, signal in enumerate(_list_structs(by_name["signals"]), start=1):
             label = _single_text(signal.get("label")) or f"{name}({number})"
-            yield from _iter_columns("", label, np.asarray(signal.get("values")), None, clock)
+            yield from _iter_columns("", label, np.asarray(signal.get("values")), unit=None, clock=clock)
     elif isinstance(data, np.ndarray):
         info = _struct_fields(by_name.get("datainfo")) or {}
         unit = _single_text(info.get("Units")) or _first_text(by_name, _UNIT_FIELDS)
@@ -123,16 +123,17 @@ def _iter_group(group: str, fields: Mapping[str, Any], clock: Clock | None, dept
     """
     units, column_names = _find_field_units(fields), _find_column_names(fields)
     for key, value in fields.items():
-        head, _, last = key.rpartition("_")
-        header = _struct_fields(fields.get(f"{head}_Header")) if last == "Data" else None
-        if header is not None:  # `Channel_3_Data`, as catman exports it
+        # catman exports `Channel_3_Data` with `Channel_3_Header`
+        channel, _, suffix = key.rpartition("_")
+        header = _struct_fields(fields.get(f"{channel}_Header")) if suffix == "Data" else None
+        if header is not None:
             step, values = single_number(header.get("dt")), np.asarray(value)
             channel_clock = uniform_clock("catman", values.size, step) if step and step > 0.0 else None
             label = _single_text(header.get("SignalName")) or key
             yield from _iter_columns(group, label, values, _single_text(header.get("Unit")) or None, channel_clock)
         elif column_names and isinstance(value, np.ndarray) and value.ndim == 2 and value.shape[1] == len(column_names):
             for number, label in enumerate(column_names):
-                yield from _iter_columns(group, label, value[:, number], None, clock)
+                yield from _iter_columns(group, label, value[:, number], unit=None, clock=clock)
         elif key in units and isinstance(value, np.ndarray):
             yield from _iter_columns(group, key, value, units[key], clock)
         else:
