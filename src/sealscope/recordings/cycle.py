@@ -22,14 +22,13 @@ _EQUAL_PEAKS = 0.05
 def find_cycle(recording: Recording) -> float | None:
     """Find the period of the duty cycle [s], with which the machine's motion repeats; None if nothing repeats.
 
-    The period is estimated (`estimate_period`) from the command if the command moves, else from the difference of the
-    chamber pressures, or the only one. The result is cached with the recording, and shared by its copies with fewer
-    channels (`Recording.only`).
+    The period is estimated (`estimate_period`) from the command if the command moves, else from p_A - p_B or the only
+    chamber pressure. The result is cached; copies of the recording with fewer channels (`Recording.only`) share it.
     """
     names = ("u",) if "u" in recording and is_moving(recording["u"]) else chambers_of(recording)
 
     def compute(recording: Recording) -> float | None:
-        """Estimate the period [s] of the command or the pressure difference; None if nothing repeats."""
+        """Estimate the period [s] of the channels `names`; None if nothing repeats."""
         return estimate_period(duty_signal([recording[name] for name in names]), recording.rate)
 
     return compute_once(recording, "cycle", compute, names) if names else None
@@ -50,7 +49,7 @@ def estimate_period(signal: Array, rate: float) -> float | None:
     negative value, the first that is nearly as high as the highest is taken, and its lag is refined by a parabola. The
     maximum must reach 0.6, and the period must be between 0.2 s and 20 s and at most a fifth of the signal.
     """
-    stride = max(1, int(rate / _CYCLE.rate))
+    stride = max(1, int(rate / _CYCLE.rate))  # samples averaged to one, to save time
     n = signal.size // stride
     if n < _MIN_SAMPLES:
         return None
@@ -58,7 +57,7 @@ def estimate_period(signal: Array, rate: float) -> float | None:
     resampled = resampled - resampled.mean()
     if not np.any(resampled):
         return None
-    spectrum = np.abs(np.fft.rfft(resampled, 2 * n)) ** 2
+    spectrum = np.abs(np.fft.rfft(resampled, 2 * n)) ** 2  # of 2 n samples with zeros: the lags do not wrap around
     correlation = np.fft.irfft(spectrum)[:n] / np.arange(n, 0, -1)  # divided by the number of products at each lag
     correlation = correlation / correlation[0]
     max_lag = min(n // _MIN_REPETITIONS, int(_CYCLE.longest * rate / stride))
@@ -92,5 +91,5 @@ def fundamental_frequency(signal: Array, t: Array, period: float) -> float:
     phasors = demodulated[: n_periods * n_period].reshape(n_periods, n_period).mean(axis=1)  # one for each period
     times = t[: n_periods * n_period].reshape(n_periods, n_period).mean(axis=1)
     phase = np.unwrap(np.angle(phasors))
-    slope, _ = np.polyfit(times, phase, 1, w=np.abs(phasors))
+    slope, _ = np.polyfit(times, phase, 1, w=np.abs(phasors))  # the phase of a small average is uncertain
     return 1.0 / period + float(slope) / (2.0 * np.pi)

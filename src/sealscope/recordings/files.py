@@ -243,8 +243,9 @@ def _unpacked_file(file: Path) -> Iterator[tuple[Path, str]]:
 def _read_unpacked(file: Path, kind: str, request: Request) -> Recording:
     """Read a recording from a file that is not packed in an archive.
 
-    `kind`: format of the file. Formats that are not marked as `safe` in `formats.toml`, i.e. all but text logs and
-    LabVIEW's .lvm files, are read in a subprocess, with limits on time, memory and disk space.
+    `kind`: format of the file; `request`: the user's choice of columns. Formats that are not marked as `safe` in
+    `formats.toml`, i.e. all but text logs and LabVIEW's .lvm files, are read in a subprocess, with limits on time,
+    memory and disk space.
     """
     with raising_unreadable(f"{_FORMATS[kind]['words']} file", file):
         if kind in _SAFE_FORMATS:

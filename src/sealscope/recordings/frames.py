@@ -50,16 +50,17 @@ def read_pandas(frame: pandas.DataFrame, request: Request) -> RecordingFields:
         raise InputError(f"frame must be a pandas.DataFrame, got a {type(frame).__name__}")
     columns = [(str(name), frame.iloc[:, i]) for i, name in enumerate(frame.columns)]
     index = frame.index
-    if index.name is not None or index.dtype.kind in "fmM":
+    if index.name is not None or index.dtype.kind in "fmM":  # floats, time differences, dates
         columns.append(("t" if index.name is None else str(index.name), index.to_series()))
     units = frame.attrs.get("units")
     units = units if isinstance(units, Mapping) else {}
     series = []
     for name, column in columns:
         unit = units.get(name, column.attrs.get("units"))
-        elapsed = "s" if pandas.api.types.is_timedelta64_dtype(column.dtype) else None
-        label = Label.parse(name, unit if isinstance(unit, str) else elapsed)
-        series.append(Series("", label, len(frame), partial(_convert_column, pandas.api.types, column, name)))
+        default_unit = "s" if pandas.api.types.is_timedelta64_dtype(column.dtype) else None
+        label = Label.parse(name, unit if isinstance(unit, str) else default_unit)
+        read_values = partial(_convert_column, pandas.api.types, column, name)
+        series.append(Series(group="", label=label, count=len(frame), values=read_values))
     try:
         description = parse_description({"format": FORMAT_VERSION, **frame.attrs})
     except InputError:  # not written by `to_pandas`

@@ -27,6 +27,7 @@ def find_implausibility(recording: Recording) -> str | None:
     Unit, offset and range of the pressures do not matter. Constant and absent channels are ignored, as one chamber may
     rest at the charge pressure.
     """
+    # the third difference of `_is_noise` needs four samples
     names = [name for name in chambers_of(recording) if len(recording) > 3 and not is_constant(recording[name])]
     signals = {name: recording[name] for name in names}
     if len(names) == 2:
@@ -44,9 +45,9 @@ def find_implausibility(recording: Recording) -> str | None:
 def _describe_speed_mismatch(recording: Recording) -> str | None:
     """Describe a motor speed that differs from the rate of the motor angle by a constant factor, as by a wrong unit.
 
-    The factor is the least-squares ratio of the speed to the rate. None if the factor is between 1 / m and m, with m
-    = `readings.misfit` of `priors.toml`. None, too, if speed and rate do not correlate, if the speed or the angle is
-    absent or in raw counts, or if there are too few samples.
+    The factor is the least-squares ratio of the speed to the rate of the angle. None if the factor is between 1 / m and
+    m, with m = `readings.misfit` of `priors.toml`; if speed and rate do not correlate; if the speed or the angle is
+    absent or in raw counts; or if there are too few samples.
     """
     if not {"theta", "omega"} <= {name for name, unit in recording.units.items() if unit != "count"}:
         return None

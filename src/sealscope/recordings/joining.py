@@ -32,9 +32,9 @@ _TWELVE_HOURS = re.compile(
 def start_seconds(recording: Recording, file: str = "") -> float | None:
     """Find the time of a recording's first sample [s since 1970]; None if it is not known.
 
-    The first time `t` is added to the time of t = 0, which is the start in the provenance, else the date in the name of
-    the file. This name is that in the provenance, else `file`. Dates and times are taken as UTC; a date without a time
-    of day means midnight.
+    The time of t = 0 is the entry `start` of the provenance, else the date in the name of the recording's file; the
+    `t` of the first sample is added. The name of the file is that in the provenance, else the argument `file`. Dates
+    and times are taken as UTC; a date without a time of day means midnight.
     """
     start = parse_epoch(str(recording.provenance.get("start", "")))
     if start is None:
@@ -62,7 +62,7 @@ def _parse_file_name(name: str) -> float | None:
         return None
     fields = match.groupdict()
     hour = int(fields["hour"] or 0)
-    if fields.get("half"):
+    if fields.get("half"):  # AM or PM: 12 AM is midnight, 12 PM is noon
         hour = hour % 12 + (12 if fields["half"].upper() == "P" else 0)
     return parse_epoch(
         f"{fields['year']}-{int(fields['month']):02d}-{int(fields['day']):02d}"
@@ -136,6 +136,7 @@ def join(recordings: Sequence[Recording], *, names: Sequence[str] | None = None)
     starts = [_time_zero(recording) for recording in recordings]
     known_starts = [start for start in starts if start is not None]
     is_dated = len(known_starts) == len(starts) and max(known_starts) - min(known_starts) > _SAME_START
+    # times `t` become relative to the earliest start
     offsets = [start - min(known_starts) for start in known_starts] if is_dated else [0.0] * len(recordings)
     times = [recording.t + offset for recording, offset in zip(recordings, offsets, strict=True)]
     order = sorted(range(len(recordings)), key=lambda number: float(np.nanmin(times[number])))

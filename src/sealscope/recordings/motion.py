@@ -56,8 +56,7 @@ def find_holds(values: Array, rate: float, before: float = math.nan) -> Holds:
 
     A run of equal samples is a hold if it is longer than 1.5 s and 64 samples. Its first sample is a reading and is not
     flagged. `rate` [Hz]: sampling rate; `before`: value of a hold that ends just before `values`, NaN if there is none.
-    A run of this value at the beginning continues that hold, and is flagged as a whole. A run at the end that is still
-    too short may become a hold with later samples.
+    A run of this value at the beginning continues that hold, and is flagged as a whole.
     """
     max_length = max(round(_HOLD.seconds * rate), _HOLD.samples)
     edges = np.concatenate([[0], np.flatnonzero(values[1:] != values[:-1]) + 1, [len(values)]])
@@ -68,13 +67,15 @@ def find_holds(values: Array, rate: float, before: float = math.nan) -> Holds:
     flags = np.repeat(is_hold, lengths)
     first_samples = edges[:-1][is_hold]
     flags[first_samples[1:] if continues else first_samples] = False
-    return Holds(flags, len(values) if is_hold[-1] else min(int(edges[-2]) + 1, len(values)))
+    # the last run may grow into a hold: the flags after its first sample, which stays a reading, may still change
+    pending = len(values) if is_hold[-1] else min(int(edges[-2]) + 1, len(values))
+    return Holds(flags, pending)
 
 
 def describe_hold(recording: Recording) -> str | None:
     """Describe a chamber pressure that does not move, although its noise should move it; None if there is none.
 
-    Such a pressure repeats one value for too long (`find_holds`), and the longest such time is stated; or it is a
+    Such a pressure repeats one value for too long (`find_holds`), and the longest repetition is described; or it is a
     straight line to within `ROUNDING`. No sample may be missing. Short recordings and constant channels, which
     `inspect` reports, are not described.
     """
@@ -84,6 +85,7 @@ def describe_hold(recording: Recording) -> str | None:
             continue
         if len(holds := find_runs(find_holds(values, recording.rate).flags)):
             first, length = holds[np.argmax(holds[:, 1])]  # the longest
+            # the sample before the flagged ones is the reading that they repeat
             start, stop = (float(recording.t[k]) for k in (first - 1, first + length - 1))
             return f"{name} does not move from {start:.4g} s to {stop:.4g} s"
         if np.abs(np.diff(values, 2)).max() <= ROUNDING * np.abs(values).max():
@@ -110,7 +112,7 @@ def smallest_step(values: Array) -> float:
 def estimate_quantum(values: Array) -> float:
     """Estimate the quantisation step of a channel (n,), the smallest difference of two of its values.
 
-    At most `_QUANTUM_SAMPLES` of its samples are compared.
+    Of a long channel only some `_QUANTUM_SAMPLES` evenly spaced samples are compared.
     """
     return smallest_step(np.unique(values[:: max(1, values.size // _QUANTUM_SAMPLES)]))
 
@@ -142,7 +144,7 @@ def find_stuck(values: Array) -> NDArray[np.intp]:
     def unchanged_fraction(begin: NDArray[Any], end: NDArray[Any]) -> Array:
         """Estimate the fraction of samples between the indices `begin` and `end` (k,) that equal the one before.
 
-        It is (m + 1) / (n + 2) for m of n samples.
+        If m of n samples do, the estimate is (m + 1) / (n + 2), which is neither 0 nor 1.
         """
         begin, end = np.maximum(begin, 0), np.minimum(end, is_same.size)
         return np.asarray((n_unchanged[end] - n_unchanged[begin] + 1) / (end - begin + 2), dtype=np.float64)

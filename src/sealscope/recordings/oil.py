@@ -10,8 +10,8 @@ from sealscope.recordings.recording import Recording
 def oil_temperature(recording: Recording) -> float | None:
     """Compute the mean oil temperature [deg C] of a recording; None if it is not known.
 
-    The channel T_oil is averaged, without readings that no hydraulic oil can have (`oil` in `priors.toml`). Without
-    such readings the temperature in the file's header is taken.
+    Readings of the channel T_oil that hydraulic oil can have (`oil` in `priors.toml`) are averaged. If there are none,
+    the temperature in the header of the file is returned.
     """
     if "T_oil" in recording and recording.units["T_oil"] == "K":
         limits = RECORDINGS.oil

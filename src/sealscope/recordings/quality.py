@@ -93,7 +93,7 @@ def inspect(recording: Recording) -> tuple[Finding, ...]:
 
 
 def _sample_time(recording: Recording, index: int) -> float | None:
-    """Return the time [s] of the sample with the number `index`; None if it has none."""
+    """Return the time [s] of the sample with the number `index`; None if this sample does not exist or has no time."""
     t = float(recording.t[index]) if index < recording.t.size else np.nan
     return t if np.isfinite(t) else None
 
@@ -106,7 +106,7 @@ def _time_findings(recording: Recording) -> list[Finding]:
     t, findings, step = recording.t, list[Finding](), 1.0 / recording.rate
 
     def add(code: str, indices: NDArray[Any], text: str, severity: Severity = "warning") -> None:
-        """Add a finding on the samples, or intervals, with these indices, unless there are none."""
+        """Add a `Finding` with this code, text and severity on the samples or intervals `indices`, if there are any."""
         if indices.size:
             first_t = _sample_time(recording, int(indices[0]))
             findings.append(Finding(code, severity, None, indices.size, first_t, text))
@@ -133,7 +133,7 @@ def _time_findings(recording: Recording) -> list[Finding]:
             add("rate_mismatch", timed[:1], text, "fatal")
             step = median_step
         gaps = np.flatnonzero(steps > _MAX_STEP * step)
-        n_lost = np.round(steps[gaps] / step - 1.0).sum()
+        n_lost = np.round(steps[gaps] / step - 1.0).sum()  # infinite if a time is absurd
         samples = format_count(int(n_lost), "sample") if n_lost < 1e15 else f"{n_lost:.3g} samples"
         longest = float(steps[gaps].max(initial=0.0))
         add("gap", timed[gaps], f"{format_count(gaps.size, 'gap')}, about {samples} lost, the longest {longest:g} s")
@@ -157,11 +157,11 @@ def _format_repetitions(count: int) -> str:
 
 
 def _creep_findings(recording: Recording) -> list[Finding]:
-    """Find a steady drift of the mean chamber pressure over a whole recording, which a sealed circuit does not show.
+    """Find a steady drift of (p_A + p_B)/2 over a whole recording, which a sealed circuit does not show.
 
     The recording is cut into equal parts. The steps of the mean pressure from part to part must be alike, and the drift
-    fast enough (`creep` in `priors.toml`). The list is empty if there is no drift, if the recording is too short, or if
-    a chamber pressure is absent or not in Pa.
+    fast enough (`creep` in `priors.toml`). The list is empty if there is no such drift, if the recording is too short,
+    or if a chamber pressure is absent or not in Pa.
     """
     duration = len(recording) / recording.rate
     if duration < _CREEP.seconds or any(recording.units.get(name) != "Pa" for name in ("p_A", "p_B")):
@@ -190,12 +190,15 @@ class _ChannelReport:
     findings: list[Finding] = field(default_factory=list)
 
     def add(self, code: str, count: int, first: int, text: str, severity: Severity = "warning") -> None:
-        """Add a finding on `count` samples, the first at index `first`."""
+        """Add a `Finding` with this code, text and severity on `count` samples, the first at index `first`."""
         first_t = _sample_time(self.recording, first)
         self.findings.append(Finding(code, severity, self.name, count, first_t, f"{self.name}: {text}"))
 
     def format_value(self, value: float, digits: int = 6, *, is_span: bool = False) -> str:
-        """Format a value in the unit that the channel had in its log; `is_span`: the value is a difference of two."""
+        """Format a value in the unit that the channel had in its log, with `digits` significant digits.
+
+        `is_span`: the value is a difference of two values.
+        """
         return self.recording.format_value(self.name, value, digits, is_span=is_span)
 
 
@@ -204,7 +207,7 @@ def _channel_findings(recording: Recording, name: str, values: Array) -> list[Fi
     report = _ChannelReport(recording, name)
     unit = recording.units[name]
     is_pressure = name.startswith("p_")
-    may_rest = name in ("u", "q_leak", "q_comp")
+    may_rest = name in ("u", "q_leak", "q_comp")  # channels that may stay constant for long
     if is_pressure and unit == COUNTS:
         text = f"is in raw counts: state the unit (--map '{name}=COLUMN bar'), or a leak's size stays relative"
         report.add("raw_counts", values.size, 0, text, "note")
@@ -223,7 +226,7 @@ def _channel_findings(recording: Recording, name: str, values: Array) -> list[Fi
     if readings.size < 2:
         return report.findings
     if is_constant(readings):
-        # a command may be constant, and a flow meter on a closed bypass reads one value; a pressure never does
+        # a flow meter on a closed bypass reads one value; a pressure never does
         text = f"is constant at {report.format_value(readings[0])}"
         report.add("constant", readings.size, int(present[0]), text, "note" if may_rest else "warning")
         return report.findings
@@ -348,12 +351,12 @@ def is_mostly_clipped(values: Array) -> bool:
 def find_rails(values: Array, stuck: NDArray[np.intp] | None = None, low_end: bool = True) -> list[Rail]:
     """Find the ends of a channel's range at which its finite values (n,) are clipped.
 
-    With `low_end` False only the high end is examined. An end is clipped in two cases:
+    The range is that of the values. With `low_end` False only its high end is examined. An end is clipped in two cases:
 
     - Far more samples have this value than any of the five nearest values, and the signal enters or leaves the longest
       run of them by a jump of more than 3.5 quantisation steps, or 1.5 for a long run. This excludes the crest of a
       slow quantised signal, whose nearest values have nearly as many samples, and a square wave.
-    - One of the runs `stuck` (first index and length, as from `find_stuck`) has this value.
+    - One of the runs `stuck` (k, 2), first index and length of each as from `find_stuck`, has this value.
     """
     if not values.size:
         return []
@@ -367,6 +370,7 @@ def find_rails(values: Array, stuck: NDArray[np.intp] | None = None, low_end: bo
         return []
     quantum = smallest_step(distinct)
     rails = []
+    # index of the end among the distinct values, and slice of the five nearest ones
     for side, index, nearest in (("high", -1, slice(-6, -1)), ("low", 0, slice(1, 6))):
         if side == "low" and not low_end:
             continue

@@ -141,13 +141,15 @@ class Recording:
             raise InputError(f"rate must be > 0 Hz, got {self.rate}")
         if bridged is not None:
             bridged.setflags(write=False)
+            bridged = bridged if bridged.any() else None
         units = MappingProxyType({name: self.units[name] for name in channels})
-        frozen = {"t": t, "channels": MappingProxyType(channels), "units": units, "rate": rate}
+        frozen = {"t": t, "channels": MappingProxyType(channels), "units": units, "rate": rate, "bridged": bridged}
         frozen |= {"provenance": MappingProxyType(dict(self.provenance)), "history": tuple(self.history)}
-        for name, value in (frozen | {"bridged": bridged if bridged is not None and bridged.any() else None}).items():
+        for name, value in frozen.items():  # a frozen dataclass cannot set its fields in the usual way
             object.__setattr__(self, name, value)
 
     def __reduce__(self) -> tuple[Any, ...]:
+        """Return the class and its arguments for pickling, as plain dicts: mapping proxies cannot be pickled."""
         channels, units, provenance = map(dict, (self.channels, self.units, self.provenance))
         return type(self), (self.t, channels, units, self.rate, provenance, self.history, self.bridged)
 
@@ -246,10 +248,7 @@ class Recording:
         return replace(self, t=self.t[rows], channels=channels, history=(*self.history, note), bridged=bridged)
 
     def only(self, names: Iterable[str]) -> Recording:
-        """Return a recording with the named channels only, which shares the cached results of this recording.
-
-        The results are those of `compute_once`.
-        """
+        """Return a recording with the named channels only; both share the results that `compute_once` caches."""
         part = replace(self, channels={name: self[name] for name in names})
         object.__setattr__(part, "_results", self._results)
         return part

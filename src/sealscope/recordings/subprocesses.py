@@ -79,7 +79,7 @@ class _Process:
         """
         process = self._process
         assert process.stdin is not None and process.stdout is not None
-        # kills the process if its own alarm does not end it; a fresh one also needs time to start
+        # kills the process if the alarm of `_set_limits` does not; a fresh process also needs time to start
         killer = Timer(limit + 1.0 + _MAX_START_TIME * self._is_fresh, process.kill)
         killer.daemon = True
         killer.start()
@@ -161,9 +161,9 @@ def run_on_file(work: Callable[..., T], file: Path, *arguments: Any, **limits: A
 
 
 def _set_limits(seconds: float, memory: int, disk: int) -> None:
-    """Limit the time, memory [bytes] and size of written files (`disk`) [bytes] of this process.
+    """Limit the time, the `memory` [bytes] and the size of written files, `disk` [bytes], of this process.
 
-    `seconds`: time [s] after which a timer of the operating system ends the process, even if its parent is dead; 0 for
+    `seconds`: time after which a timer of the operating system ends the process, even if its parent is dead; 0 for
     no limit. On a system without such limits nothing is limited.
     """
     with suppress(ImportError, AttributeError, OSError, ValueError):
@@ -205,7 +205,7 @@ def _serve() -> None:
             work, arguments, limits = pickle.load(sys.stdin.buffer)
             _set_limits(*limits)
             value, error_traceback = _run_work(work, arguments)
-            _set_limits(0.0, MAX_MEMORY, MAX_UNPACKED)
+            _set_limits(seconds=0.0, memory=MAX_MEMORY, disk=MAX_UNPACKED)  # until the next request
             responses.write(pickle.dumps((value, error_traceback), protocol=5))
             del work, arguments, value
             pickle.dump(_is_spent(), responses)

@@ -82,7 +82,7 @@ class Details:
 
         `level`: 1 for d_1, or None for the samples that do not depend on padding in any level.
         """
-        before, after = self.edges[(level or self.levels) - 1]
+        before, after = self.edges[(level or self.levels) - 1]  # the deepest level has the longest edges
         return slice(int(before), self.values.shape[1] - int(after))
 
 
@@ -102,6 +102,7 @@ def edge_samples(wavelet: str = "db8", levels: int = 4, transform: Transform = "
         return stationary
     if transform == "decimated":
         step = 2 ** np.arange(1, levels + 1, dtype=np.int64)
+        # -(-a // b) is a / b, rounded up
         before = -(-2 * stationary[:, 0] // step) * step - stationary[:, 0]
         return np.stack([before, stationary[:, 1]], axis=1)
     total_reach = stationary.sum(axis=1)
@@ -111,10 +112,10 @@ def edge_samples(wavelet: str = "db8", levels: int = 4, transform: Transform = "
 def min_samples(wavelet: str = "db8", levels: int = 4, transform: Transform = "stationary") -> int:
     """Compute how many samples a signal needs, so that each level has a sample that does not depend on padding.
 
-    The deepest level decides, since padding affects most samples there. The result is 226 for db8 to level 4 and the
-    stationary transform.
+    The result is 226 for db8 to level 4 and the stationary transform.
     """
-    return int(edge_samples(wavelet, levels, transform)[-1].sum()) + 1
+    deepest_edges = edge_samples(wavelet, levels, transform)[-1]  # the largest of all levels
+    return int(deepest_edges.sum()) + 1
 
 
 def details(

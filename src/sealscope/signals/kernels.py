@@ -114,7 +114,7 @@ def advance_details(
     channels, actuators, n = block.shape
     levels, capacity = buffers.shape[2], buffers.shape[3]
     flat_details, flat_buffers = details.reshape(-1), buffers.reshape(-1)
-    filled = fill
+    filled = fill  # used rows of the current channel's buffers; all channels end with the same number
     for g in range(groups[0], groups[1]):
         lanes = min(WIDTH, actuators - WIDTH * g)  # actuators of the group; the last group may have fewer
         for c in range(channels):

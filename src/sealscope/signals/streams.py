@@ -75,6 +75,7 @@ class DetailStream:
     def __init__(
         self, channels: int | tuple[int, int] = 1, levels: int = 4, *, wavelet: str = "db8", threads: int = 1
     ) -> None:
+        """Prepare filters, buffers and threads; the class describes the arguments."""
         from sealscope.physics.lanes import WIDTH
         from sealscope.signals.kernels import CHUNK
 
@@ -91,6 +92,7 @@ class DetailStream:
         self.settling = self.first + self.delay
         dilations = 2 ** np.arange(self.levels)
         level_delays = len(low) // 2 * (2**self.levels - 2 * dilations)  # so that all levels lag like the deepest
+        # number of earlier samples that the filters of all levels need
         self._history = max(self.delay, int(np.max(level_delays + (len(low) - 1) * dilations)))
         groups = -(-self._shape_2d[1] // WIDTH)
         self.taps = low, high  # each (taps, WIDTH), as the kernels take them
@@ -99,6 +101,7 @@ class DetailStream:
         self._fill = self._history  # number of used rows in the buffers
         self.samples = 0
         n_parts = min(self.threads, groups)
+        # (first, last + 1) of the groups of signals that each thread filters
         self._parts = list(pairwise(groups * i // n_parts for i in range(n_parts + 1)))
         self._workspaces = [aligned_zeros((self.levels, CHUNK, WIDTH)) for _ in self._parts]
 
@@ -170,8 +173,10 @@ class DetailStream:
     def state_dict(self) -> dict[str, Any]:
         """Return the state of the stream as plain values and arrays, from which `from_state` continues.
 
-        `history` (rows of the table, levels, samples, columns of the table): last inputs of each level's filters.
+        The entry `history` has the last inputs of each level's filters, as an array (rows, levels, samples, columns)
+        for signals in a table of rows and columns.
         """
+        # the columns of the table are in groups (first axis) of WIDTH (last axis): bring both axes together
         history = np.moveaxis(self.buffers[:, :, :, self._fill - self._history : self._fill], 0, -2)
         return {
             "channels": self.channels,
@@ -194,7 +199,7 @@ class DetailStream:
         history = require_numbers(state, "history", shape)
         stream.samples = require_count(state, "samples")
         groups, width = stream.buffers.shape[0], stream.buffers.shape[-1]
-        # the signals (last axis), filled up with zeros to whole groups and divided into groups
+        # the columns of the table (last axis), filled up with zeros to whole groups and divided into groups
         lanes = np.pad(history, [(0, 0)] * 3 + [(0, groups * width - shape[-1])]).reshape(*shape[:3], groups, width)
         stream.buffers[:, :, :, : stream._history] = np.moveaxis(lanes, -2, 0)
         return stream

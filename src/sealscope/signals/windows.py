@@ -96,11 +96,12 @@ class RmsStream:
     """
 
     def __init__(self, size: int = WINDOW_SIZE, step: int = WINDOW_STEP, *, skip: int = 0, first: int = 0) -> None:
-        self.size = require_positive_int(size, "size", " sample")
-        self.step = require_positive_int(step, "step", " sample")
+        """Start with an empty stream; the class describes the arguments."""
+        self.size = require_positive_int(size, "size", unit=" sample")
+        self.step = require_positive_int(step, "step", unit=" sample")
         if isinstance(skip, bool) or not isinstance(skip, (int, np.integer)) or skip < 0:
             raise InputError(f"skip must be a whole number >= 0 samples, got {skip!r}")
-        self._piece = math.gcd(self.size, self.step)
+        self._piece = math.gcd(self.size, self.step)  # samples in a piece; windows consist of whole pieces
         self._skip = int(skip)
         self._next_end = int(first) + self.size
         self._rest: Array | None = None  # samples of an incomplete piece, (..., fewer than piece)
@@ -136,7 +137,7 @@ class RmsStream:
         n_omitted = min(self._skip, x.shape[-1])
         self._skip -= n_omitted
         x = np.concatenate([self._rest, x[..., n_omitted:]], axis=-1)
-        n_full = x.shape[-1] // self._piece * self._piece
+        n_full = x.shape[-1] // self._piece * self._piece  # samples in whole pieces, of which windows consist
         self._rest = x[..., n_full:].copy()
         sums = np.concatenate([self._sums, _piece_sums(x[..., :n_full], self._piece)], axis=-1)
         n_skipped = min(self._n_unused, sums.shape[-1])
@@ -144,7 +145,7 @@ class RmsStream:
         sums = sums[..., n_skipped:]
         values = _rms_of_pieces(sums, self.size, self.step)
         n_windows = values.shape[-1]
-        n_finished = n_windows * (self.step // self._piece)  # pieces before the next window; some may be still to come
+        n_finished = n_windows * (self.step // self._piece)  # pieces before the next window; some may not be here yet
         self._n_unused += max(0, n_finished - sums.shape[-1])
         self._sums = sums[..., n_finished:].copy()
         ends = self._next_end + self.step * np.arange(n_windows, dtype=np.int64)

@@ -48,6 +48,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
         check_folder(target)
         if target.is_dir():
             raise InputError(f"a file to write must not be a folder, got {target}")
+        # the name tells `remove_temporaries` which process of which computer fills the file
         handle, name = tempfile.mkstemp(
             prefix=f".{target.name[:_MAX_NAME]}.{_computer_hash()}-{os.getpid()}.", suffix=".part", dir=target.parent
         )
@@ -72,7 +73,7 @@ def _file_mode(target: Path) -> int:
     """Return the permission bits of the file `target`, or those of a new file (by the umask) if it does not exist."""
     with suppress(FileNotFoundError):
         return target.stat().st_mode & 0o777
-    mask = os.umask(0)
+    mask = os.umask(0)  # the mask can be read only by setting it
     os.umask(mask)
     return 0o666 & ~mask
 

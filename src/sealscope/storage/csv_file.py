@@ -25,7 +25,7 @@ def guard_cell(value: Any) -> Any:
     """
     if not isinstance(value, str):
         return value
-    text = "".join(
+    text = "".join(  # escapes as Python writes them, such as \x1b, without quotation marks
         character if character.isprintable() or character == "\n" else repr(character)[1:-1] for character in value
     )
     return f"'{text}" if value.startswith(_FORMULA_BEGINNINGS) and not _NUMBER.fullmatch(value) else text

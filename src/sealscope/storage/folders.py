@@ -23,7 +23,7 @@ def make_folder(folder: Path) -> None:
 
 
 def make_inner_folder(folder: Path, *names: str) -> Path:
-    """Create the nested folders `names` within `folder`, one in the other, and return the innermost one.
+    """Create the nested folders `names[0]/names[1]/...` within `folder`, and return the innermost one.
 
     Other users may write to `folder`, and a link within it could lead elsewhere. Raises InputError if one of these
     nested folders is a link, or if a folder cannot be created.
@@ -56,7 +56,7 @@ def iter_inner_files(folder: Path, paths: Iterable[Path]) -> Iterator[Path]:
 
 
 def numeric_sort_key(name: str) -> list[str | int]:
-    """Build a sorting key that puts "day_2" before "day_10": the texts and whole numbers of which a name consists."""
+    """Build a sorting key that puts "day_2" before "day_10": the list of the texts and whole numbers in `name`."""
     return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)]
 
 
@@ -70,9 +70,9 @@ def lock_file(file: Path, busy: str | None, wait: float = 0.0) -> Iterator[None]
     """
     from filelock import FileLock, Timeout
 
-    lock = FileLock(file, timeout=-1 if busy is None else wait)
+    lock = FileLock(file, timeout=-1 if busy is None else wait)  # -1: no limit
     try:
-        open_inner(file, "a lock", "ab+").close()
+        open_inner(file, "a lock", mode="ab+").close()  # creates the file, or raises an error if it is a link
         lock.acquire(poll_interval=0.01)
     except Timeout:
         raise InputError(str(busy)) from None

@@ -24,8 +24,8 @@ _KINDS = (
 
 
 def is_file_path(text: str | os.PathLike[str]) -> bool:
-    """Return True if a text is the path of an existing file; False also if it cannot be a path at all."""
-    return os.path.isfile(text)  # noqa: PTH113 - pathlib raises for these until Python 3.14
+    """Return True if a text is the path of an existing file; False also for a text that cannot be a path."""
+    return os.path.isfile(text)  # noqa: PTH113 - pathlib raises for texts that cannot be paths until Python 3.14
 
 
 def special_kind(mode: int) -> str | None:

@@ -136,8 +136,8 @@ def restore_attributes(
 ) -> None:
     """Set the attributes of `owner` called `names` to the values that `save_attributes` saved in `state`.
 
-    - An array must have its present shape, except that an axis of length 0 may get any length. If `owner` is a named
-      tuple, its arrays are filled in place.
+    - A saved array must have the shape of the present one, except where the present one has an axis of length 0. If
+      `owner` is a named tuple, its arrays are filled in place.
     - An attribute with a method `load_state` restores itself.
     - A saved None leaves an attribute unchanged if its present value is a float or None.
     - Any other value must have the type that `kinds` states, by default the type of the present value.
@@ -154,7 +154,7 @@ def restore_attributes(
                 length not in (saved_length, 0) for saved_length, length in zip(value.shape, present.shape, strict=True)
             ):
                 raise InputError(f"saved state's {key} must have the shape {present.shape}, got {value.shape}")
-            if dtype.names:  # a structured array: its columns are the last axis
+            if dtype.names:  # turn the last axis into the named columns of a structured array
                 value = value.view(dtype)[:, 0]
         elif hasattr(present, "load_state"):  # an object with a state restores itself
             present.load_state(value)

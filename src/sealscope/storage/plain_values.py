@@ -76,21 +76,21 @@ _PLAIN_RULES = {
 def format_error(error: ValidationError, entry_name: Callable[[str], str] = str, unit: str = "") -> str:
     """Format one of pydantic's errors as a line such as "ENTRY must be ..., got ...".
 
-    It is the error of the first unknown entry if there is one, else the first error. The line starts with the name of
-    the outermost entry ("" for the whole value), which `entry_name` converts, and the names of the entries within it.
+    Of several errors, the first about an unknown entry is chosen, else the first. The line starts with the path to the
+    wrong entry, such as `line.V_1`; `entry_name` converts the first name of this path ("" if the whole value is wrong).
     `unit`: text that is appended to the broken rule.
     """
     errors = error.errors(include_url=False)
-    first = next((detail for detail in errors if _PLAIN_RULES.get(detail["type"]) == "is not known"), errors[0])
+    chosen = next((detail for detail in errors if _PLAIN_RULES.get(detail["type"]) == "is not known"), errors[0])
     # pydantic appends "[key]" if the key of an entry is wrong, rather than its value
-    entry, *path = (str(part) for part in first["loc"] or ("",) if part != "[key]")
+    entry, *path = (str(part) for part in chosen["loc"] or ("",) if part != "[key]")
     inner_names = [f"[{int(part) + 1}]" if part.isdigit() else f".{part}" for part in path]  # items count from 1
     place = entry_name(entry) + "".join(inner_names)
-    if plain_rule := _PLAIN_RULES.get(first["type"]):
+    if plain_rule := _PLAIN_RULES.get(chosen["type"]):
         return f"{place} {plain_rule}"
-    rule = re.sub(r"^\w+ should", "must", first["msg"].removeprefix("Value error, ")).replace("tuple", "list") + unit
-    # the text of a ValueError of a validator of this project states the value itself
-    value = "" if first["type"] == "value_error" else f", got {repr(first['input'])[:60]}"
+    rule = re.sub(r"^\w+ should", "must", chosen["msg"].removeprefix("Value error, ")).replace("tuple", "list") + unit
+    # the validators of this project state the value in their own text
+    value = "" if chosen["type"] == "value_error" else f", got {repr(chosen['input'])[:60]}"
     separator = "" if not place else " " if rule.startswith("must ") else ": "
     return f"{place}{separator}{rule}{value}"
 

@@ -47,7 +47,7 @@ def read_rows(
     rows: dict[str, Row] = {}
     try:
         with open_inner(path, f"{what}'s file of rows") as file:
-            for number, line in enumerate(iter(lambda: file.readline(_MAX_LINE), b""), 1):
+            for number, line in enumerate(iter(lambda: file.readline(_MAX_LINE), b""), start=1):
                 if not line.endswith(b"\n") and len(line) < _MAX_LINE:  # cut by a power loss
                     break
                 try:

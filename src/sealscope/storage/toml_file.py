@@ -48,7 +48,10 @@ def read_toml(path: Path, what: str, place: str, max_size: int = MAX_SIZE) -> di
 
 
 def parse_toml(data: bytes, what: str, place: str, max_size: int = MAX_SIZE) -> dict[str, Any]:
-    """Parse the bytes of a TOML file; arguments, errors and limits are those of `read_toml`."""
+    """Parse the content `data` of a TOML file; errors and limits are those of `read_toml`.
+
+    `what` ("a rig file") and `place` name the file in error messages; `max_size` [bytes] is the largest permitted size.
+    """
     if len(data) > max_size:
         raise InputError(f"{what} must be at most {max_size} bytes, got more ({place})")
     try:
@@ -118,8 +121,9 @@ def _parse_table(rows: Mapping[str, Any], kind: Any, place: str) -> Any:
     is_mapping = get_origin(kind) is not None  # such as Mapping[str, float]
     optional: tuple[str, ...] = ()
     if is_mapping:
-        names, value_kind = get_args(kind)
-        kinds = dict.fromkeys(get_args(names) if get_origin(names) is Literal else rows, value_kind)
+        key_kind, value_kind = get_args(kind)
+        # a Literal states the keys that the table must have; otherwise any keys are permitted
+        kinds = dict.fromkeys(get_args(key_kind) if get_origin(key_kind) is Literal else rows, value_kind)
     else:
         kinds = get_type_hints(kind)
         optional = tuple(name for name in kinds if hasattr(kind, name))  # keys with a default
@@ -159,7 +163,7 @@ def _parse_number(value: Any, kind: type, place: str) -> Any:
 def _check_keys(rows: Collection[str], names: Collection[str], optional: Collection[str], place: str) -> None:
     """Check that a table has all keys in `names`, except perhaps those in `optional`, and no other keys.
 
-    `rows`: keys of the table; `place` names it in errors. Raises InputError otherwise.
+    Raises InputError otherwise. `rows`: keys of the table; `place`: name of the table in the message.
     """
     for name in rows:
         if name not in names:

@@ -29,9 +29,9 @@ def resample_evenly(recording: Recording) -> Recording:
     """Resample a recording to evenly spaced times, with NaN in rows that the logger has lost.
 
     A recording with even spacing is returned unchanged. If the intervals are whole numbers of sampling steps, to an rms
-    deviation of `clock.scatter` of `priors.toml`, the samples stay, and rows of NaN are inserted; else the samples are
-    interpolated linearly. Rows without a time are dropped, and so are rows that are not later than all rows before. If
-    the times step back or leap because the file contains several recordings, only the longest recording is used.
+    deviation of `clock.scatter` of `priors.toml`, the samples stay, and rows of NaN are inserted for lost ones; else
+    the samples are interpolated linearly. Rows without a time are dropped, and so are rows that are not later than all
+    rows before. If the times show that the file contains several recordings, only the longest is used.
     """
     rows = _ordered_rows(recording.t)
     rows = rows[_longest_dense_stretch(recording.t[rows], recording.rate)]
@@ -70,12 +70,12 @@ def _longest_dense_stretch(t: Array, rate: float) -> slice:
 
     `t` (n,): increasing times [s]; `rate` [Hz]: number of samples that a complete recording has per second.
     """
-    # number of rows since the first one, less the fewest permitted: a stretch is dense enough if its last row has at
-    # least the surplus of its first row
+    # rows before a row, less the fewest permitted before it: a stretch is dense enough if the surplus of its last row
+    # is not below that of its first row
     first_time = t[:1].sum()  # 0 if there are no rows
     surplus = np.arange(t.size) - (1.0 - MAX_GAP_FRACTION) * rate * (t - first_time)
     max_later_surplus = np.maximum.accumulate(surplus[::-1])[::-1]
-    # for each first row, the last row of the longest stretch that is dense enough
+    # for each first row, the last row whose surplus is not below its own
     last = np.searchsorted(-max_later_surplus, -surplus, side="right") - 1
     first = int(np.argmax(last - np.arange(t.size))) if t.size else 0
     return slice(first, int(last[first]) + 1 if t.size else 0)

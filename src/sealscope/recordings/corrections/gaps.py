@@ -86,6 +86,7 @@ def bridge(recording: Recording, needed: Sequence[str]) -> Recording:
     is_complete = np.all([np.isfinite(recording[name]) for name in needed], axis=0)
     if not len(recording) or is_complete.all() or not is_complete.any():
         return recording
+    # copies of the channels, in which infinite values are missing, too
     channels = {name: np.where(np.isfinite(values), values, np.nan) for name, values in recording.channels.items()}
     stretches = uniform_segments(recording, needed)
     longest_stretch = max(stretches, key=lambda stretch: stretch.stop - stretch.start, default=None)
@@ -157,7 +158,8 @@ def flag_holes(recording: Recording) -> Flags:
     if recording.bridged is not None:
         max_gap = max(_GAPS.hole, MAX_INTERVAL / recording.rate)
         for first, length in find_runs(recording.bridged).tolist():
-            flags[first : first + length] = length + 1 > max_gap * recording.rate
+            n_steps = length + 1  # sampling steps from the reading before the gap to that after it
+            flags[first : first + length] = n_steps > max_gap * recording.rate
     return flags
 
 
@@ -170,11 +172,13 @@ def _finite_mean(values: Array) -> float:
 def _copy_other_cycle(channels: dict[str, Array], needed: Sequence[str], first: int, stop: int, period: float) -> bool:
     """Fill a gap in all channels, in place, from a nearby cycle of motion; return False if no cycle is similar enough.
 
-    The gap has the samples `first` to `stop` - 1. `period`: length of a cycle [samples], known to within `_SLACK`. The
-    nearest two cycles on either side of the gap are tried. A cycle is similar enough if the motion around the gap
-    differs from that in the cycle by at most `_MAX_MISMATCH` (`_cycle_mismatch`). Otherwise nothing is filled.
+    `channels`: name -> values (n,); the gap has the samples `first` to `stop` - 1; `needed`: names of the channels that
+    must be complete in the other cycle; `period`: length of a cycle [samples], known to within `_SLACK`. The nearest
+    two cycles on either side of the gap are tried. A cycle is similar enough if its motion differs from that around the
+    gap by at most `_MAX_MISMATCH` (`_cycle_mismatch`). Otherwise nothing is filled.
     """
     half_cycle = round(0.5 * period)
+    # the gap, and half a cycle beside it, must not overlap the copied samples
     min_cycles = math.ceil((stop - first + half_cycle) / period)
     for shift in (sign * round(n_cycles * period) for n_cycles in (min_cycles, min_cycles + 1) for sign in (-1, 1)):
         shifts = range(shift - _SLACK, shift + _SLACK + 1)
@@ -192,11 +196,11 @@ def _cycle_mismatch(
 ) -> float:
     """Compute how much the machine's motion around a gap differs from its motion `shift` samples later.
 
-    The motion is that in the command, else in p_A - p_B or the only chamber pressure (`duty_signal`). Two stretches of
+    The motion is seen in the command, else in p_A - p_B or the only chamber pressure (`duty_signal`). Two stretches of
     this signal are compared: one has the gap, i.e. the samples `first` to `stop` - 1, and up to `half_cycle` samples on
-    either side; the other is shifted by `shift`. The result is the rms difference of the stretches, after their means
-    are removed, divided by the standard deviation of the shifted stretch. It is infinite if too few samples are known,
-    or if a `needed` channel lacks samples to copy.
+    either side; the other begins `shift` samples later. The result is the rms difference of the stretches, after their
+    means are removed, divided by the standard deviation of the later stretch. It is infinite if too few samples are
+    known, or if one of the `needed` channels (name -> values (n,) in `channels`) lacks samples to copy into the gap.
     """
     n = next(iter(channels.values())).size
     # half a cycle on either side of the gap, as far as both stretches lie within the recording

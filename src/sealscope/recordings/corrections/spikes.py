@@ -52,8 +52,8 @@ def find_spikes(values: Array) -> NDArray[np.intp]:
 
     Such a sample lies above both neighbours, or below both. The smaller of the two changes must be several times
     (`spike.times` of `priors.toml`) larger than usual changes, other leaps nearby and the local slope. Such samples are
-    taken for errors of the data logger, whose number has a Poisson distribution with the fraction `spike.share` of the
-    samples as its mean. If they are more than this makes plausible, the signal itself leaps, and the result is empty.
+    taken for errors of the data logger: their number should have a Poisson distribution with the mean `spike.share`
+    times the number of samples. If it is improbably large, the signal itself leaps, and the result is empty.
     """
     known = np.flatnonzero(np.isfinite(values))
     if known.size < _MIN_SAMPLES:
@@ -62,9 +62,10 @@ def find_spikes(values: Array) -> NDArray[np.intp]:
     step_sizes = np.abs(steps)
     # for a sample that leaps and returns, the smaller of its two changes; 0 for other samples
     jumps = np.where(steps[:-1] * steps[1:] < 0.0, np.minimum(step_sizes[:-1], step_sizes[1:]), 0.0)
-    usual_step = float(np.quantile(step_sizes[:: max(1, step_sizes.size // _N_CHANGES)], 0.9))
+    thinned_sizes = step_sizes[:: max(1, step_sizes.size // _N_CHANGES)]  # enough for a quantile
+    usual_step = float(np.quantile(thinned_sizes, 0.9))
     threshold = _PRIORS.times * usual_step + _MIN_QUANTA * estimate_quantum(values[known])
-    # changes before and after the leap; the slope is the largest of these and of the mean change across the leap
+    # larger change just before or after the leap; the slope also counts the mean change across the leap
     outer_steps = np.maximum(np.append(0.0, step_sizes[:-2]), np.append(step_sizes[2:], 0.0))
     slopes = np.maximum(0.5 * np.abs(steps[:-1] + steps[1:]), outer_steps)
     rows = []
@@ -72,13 +73,13 @@ def find_spikes(values: Array) -> NDArray[np.intp]:
         nearby_jumps = np.r_[jumps[max(k - _NEIGHBOURS, 0) : k], jumps[k + 1 : k + 1 + _NEIGHBOURS]]
         if jumps[k] > _PRIORS.times * max(slopes[k], nearby_jumps.max(initial=0.0)):
             rows.append(known[k + 1])
-    # more than a logger's errors explain: the channel itself leaps
+    # more leaps than the errors of a logger explain
     is_signal = _probability_of_at_least(len(rows), _PRIORS.share * known.size) < _PRIORS.tail
     return np.array([] if is_signal else rows, dtype=np.intp)
 
 
 def _probability_of_at_least(count: int, mean: float) -> float:
-    """Compute the probability of at least `count` events by Poisson's distribution with a `mean` number of them."""
+    """Compute the probability of `count` or more events if their number has a Poisson distribution with this `mean`."""
     from scipy.special import pdtrc
 
-    return float(pdtrc(count - 1, mean)) if count > 0 else 1.0
+    return float(pdtrc(count - 1, mean)) if count > 0 else 1.0  # probability of more than count - 1

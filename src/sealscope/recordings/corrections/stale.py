@@ -64,10 +64,10 @@ def interpolate_stale_samples(recording: Recording) -> tuple[Recording, list[Fin
 def flag_stuck_rows(recording: Recording, name: str) -> NDArray[np.bool_]:
     """Flag the rows (n,) in which the chamber pressure `name` repeats one value for too long while the machine moves.
 
-    The time is too long for the way in which the pressure changes around it (`motion.find_stuck`). Motion is seen in
-    the position, else in the pump's angle, else in the other chamber pressure, although this pressure may also change
-    while valves hold the cylinder. If no such channel is recorded, the machine is assumed to move. Rows at the smallest
-    or largest value of the channel are clipped, and not flagged.
+    `motion.find_stuck` finds the repetitions that are too long. Motion is seen in the position, else in the pump's
+    angle, else in the other chamber pressure, although this pressure may also change while valves hold the cylinder. If
+    no such channel is recorded, the machine is assumed to move. Rows at the smallest or largest value of the channel
+    are clipped, and not flagged.
     """
     values, flags = recording[name], np.zeros(len(recording), dtype=bool)
     known = np.flatnonzero(np.isfinite(values))
@@ -90,13 +90,14 @@ def flag_frozen_rows(recording: Recording) -> NDArray[np.bool_]:
     """
     flags = np.zeros(len(recording), dtype=bool)
     pressures = [recording[name] for name in CHAMBERS if name in recording]
-    if len(pressures) < len(CHAMBERS) or len(recording) < _PRIORS.runs:
+    if len(pressures) < len(CHAMBERS) or len(recording) < _PRIORS.runs:  # too short to tell
         return flags
     holds_a, holds_b = (find_runs(find_holds(values, recording.rate).flags) for values in pressures)
     begins_b, ends_b = holds_b[:, 0], holds_b.sum(axis=1)
     channels = list(recording.channels.values())
     for first, length in holds_a.tolist():
         stop = first + length
+        # p_B is held in the same rows as p_A, to within a few at the ends
         coincide = np.any((np.abs(begins_b - first) <= _MAX_REPEAT) & (np.abs(ends_b - stop) <= _MAX_REPEAT))
         inner = slice(first + _MAX_REPEAT, stop - _MAX_REPEAT)
         if (
@@ -177,8 +178,8 @@ def estimate_holding_period(t: Array, values: Array) -> float | None:
 def _flag_held(t: Array, values: Array, period: float) -> NDArray[np.bool_]:
     """Flag the samples (n,) that repeat the previous one, in a channel with a new reading every `period` [s].
 
-    A sample is flagged if it equals the one before, and both are in the same period since the run of equal values
-    began. `t` (n,): times [s]; `values` (n,): samples of the channel, NaN where missing.
+    A run of equal values is divided into periods from its first sample on. A sample is flagged if the sample before it
+    is in the same run and period. `t` (n,): times [s]; `values` (n,): samples of the channel, NaN where missing.
     """
     known = np.flatnonzero(np.isfinite(values))
     starts, _ = _find_equal_runs(values[known])
@@ -186,7 +187,6 @@ def _flag_held(t: Array, values: Array, period: float) -> NDArray[np.bool_]:
     run_start = times[starts][np.searchsorted(starts, np.arange(known.size), side="right") - 1]
     period_index = np.floor((times - run_start) / period + 1e-6)  # 1e-6: rounding of the times
     is_held = np.zeros(t.size, dtype=bool)
-    # a sample in the same run and period as the one before repeats it
     is_held[known[1:]] = (period_index[1:] == period_index[:-1]) & (run_start[1:] == run_start[:-1])
     return is_held
 

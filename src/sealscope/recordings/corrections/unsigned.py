@@ -44,6 +44,7 @@ def restore_speed_sign(recording: Recording) -> tuple[Recording, list[Finding]]:
         if sign is None:
             continue
         values = recording[name]
+        # sign of the side of zero on which the channel stays
         main_side = 1.0 if np.nanmax(values) >= -np.nanmin(values) else -1.0
         channels[name] = _draw_noise_signs(main_side * values, recording.rate) * sign
         text = f"{name}: the {quantity} has no sign while the piston moves both ways: taken from {source}"
@@ -97,9 +98,9 @@ def _piston_speed(x: Array, rate: float) -> Array:
 
 
 def _moves_both_ways(values: Array) -> bool:
-    """Return True if a signal (n,) has enough motion in both directions.
+    """Return True if a piston speed or a command (n,) has enough motion in both directions.
 
-    Its positive values are summed, and so are the magnitudes of its negative ones. The smaller sum must exceed the
+    The positive values are summed, and so are the magnitudes of the negative ones. The smaller sum must exceed the
     larger one times `unsigned.least` of `priors.toml`.
     """
     smaller, larger = sorted(float(np.nansum(np.maximum(signed, 0.0))) for signed in (values, -values))
@@ -136,7 +137,8 @@ def _fit_signs(recording: Recording, speed: Array, magnitude: Array) -> Array:
     cost_of_change += max(0.0, np.log(recording.rate / _PRIORS.changes))
     speed_variance = _noise_variance(speed, recording.rate)
     sign = np.where(speed < 0.0, -1.0, 1.0)
-    leak_flow = magnitude * np.sign(difference)  # at first all flow without motion replaces leakage
+    # at first all flow replaces leakage; in motion, where this is wrong, the variance is large
+    leak_flow = magnitude * np.sign(difference)
     for _ in range(_MAX_ITERATIONS):
         # the pump moves the piston and replaces leakage, so that no coefficient is negative
         areas = np.maximum(np.linalg.lstsq(motion, sign * magnitude, rcond=None)[0], 0.0)
@@ -159,9 +161,9 @@ def _fit_signs(recording: Recording, speed: Array, magnitude: Array) -> Array:
 def _noise_variance(speed: Array, rate: float) -> float:
     """Estimate the noise variance [(m/s)^2] of a piston speed (n,) sampled at `rate` [Hz].
 
-    Speeds are compared that are so far apart in time that they are computed from different positions (`_piston_speed`).
-    The variance is half the mean square of their difference. The mean square is taken over a short time around each
-    sample, and the median of the mean squares makes the estimate robust to motion.
+    Two speeds far enough apart in time are computed from different positions (`_piston_speed`), so that the variance is
+    half the mean square of their difference. The mean square is taken over a short time around each sample, and the
+    median of the mean squares makes the estimate robust to motion.
     """
     n_lag = max(1, round(2.0 * _PRIORS.half * rate))
     steps = speed[n_lag:] - speed[:-n_lag]
@@ -184,18 +186,20 @@ def _draw_noise_signs(values: Array, rate: float) -> Array:
     """Restore the zero mean of noise that is recorded without its sign, by random signs; return values (n,).
 
     Noise alone is recorded where the local mean of the `values` (n,), sampled at `rate` [Hz], is at most sqrt(2 / (pi -
-    2)) = 1.32 times their local standard deviation, as for the magnitude of normal noise, plus the error of that ratio
-    for so few samples. The standard deviation is that of second differences, which hardly contain the motion. Elsewhere
-    the values are returned as they are. The signs are the same in every call.
+    2)) = 1.32 times their local standard deviation, as for the magnitude of normal noise, plus the error of this ratio.
+    The standard deviation is estimated from second differences, which hardly contain the motion. Elsewhere the values
+    are returned as they are. The signs are the same in every call.
     """
     if values.size < 3:
         return values
     known = np.isfinite(values)
     values = np.where(known, values, 0.0)
     mean = _average_nearby(values, rate)
-    squares = np.pad(np.diff(values, 2) ** 2, 1, mode="edge") / 6.0  # white noise: six times its variance
+    # the mean square of the second difference of white noise is six times the variance
+    squares = np.pad(np.diff(values, 2) ** 2, 1, mode="edge") / 6.0
     deviation = np.sqrt(_average_nearby(squares, rate))
     n_nearby = 2 * max(1, round(_PRIORS.nearby * rate)) + 1
+    # the root is the standard error of mean / deviation from `n_nearby` samples
     max_ratio = _FOLDED_RATIO + _TOLERANCE * np.sqrt((1.0 + 0.5 * _FOLDED_RATIO**2) / n_nearby)
     is_noise = mean <= max_ratio * deviation
     signs = np.where(np.random.default_rng(0).random(values.size) < 0.5, -1.0, 1.0)

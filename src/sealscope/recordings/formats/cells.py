@@ -110,8 +110,8 @@ def _parse_number(cell: str, cell_with_point: str, decimal: str) -> float:
 def has_prefixes(rows: Sequence[Sequence[str]]) -> bool:
     """Test whether the numbers in `rows` of cells end in SI prefixes, such as `170.3m`, and not in units.
 
-    They do if numbers in one column have different endings, also if some have an ending and others, not zero, have
-    none; or if an ending is `k` or `u`, which are not units.
+    An ending such as `k` or `u`, which are not units, is a prefix. So are the endings of a column in which they differ
+    from number to number, or in which some numbers other than zero have none.
     """
     prefixes_by_column: dict[int, set[str]] = {}
     for row in rows:
@@ -146,7 +146,7 @@ def _trailing_unit(cell: str) -> str | None:
 def find_cell_units(rows: Sequence[Sequence[str]]) -> dict[int, str]:
     """Find the units that are written after the numbers in the columns of a log: column -> most frequent unit.
 
-    `rows`: cells of each line of a log. A column is included if over half of its cells are numbers with a known unit.
+    `rows`: cells of each line of the log. A column is included if over half of its cells are numbers with known units.
     """
     is_known: dict[str, bool] = {}
     counts: dict[int, Counter[str]] = {}
@@ -199,8 +199,8 @@ def strip_unit(cells: Sequence[str], unit: str, is_cut: bool, format_place: Call
             result[index] = text[: -len(unit)].rstrip()
         elif is_cut and index == len(cells) - 1:
             result[index] = ""
+        # another unit, or a number without a unit that has a digit other than 0
         elif _trailing_unit(text) is not None or (text[:1] in "+-\u2212.,0123456789" and text.strip("+-\u22120.,")):
-            # another unit, or a number other than zero without a unit
             place = format_place(index)
             raise InputError(f"a cell must be in {unit}, as others of its column, got {text[:40]!r} {place}")
     return result

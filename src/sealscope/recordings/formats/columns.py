@@ -170,13 +170,13 @@ def reconstruct_map(provenance: Mapping[str, object]) -> dict[str, str]:
 
 
 def _find_unit(label: Label, channel: str) -> str | None:
-    """Find the unit of a column in its heading, or at the end of its name; None if there is none.
+    """Find the unit of a column in its heading `label`, or at the end of its name; None if there is none.
 
-    A unit at the end of the name must be one that the channel can have.
+    A unit at the end of the name counts only if `channel`, which the column is to become, can have this unit.
     """
-    ending = split_unit(label.name)[1] if label.unit is None else None
-    is_possible = ending is not None and same_dimension(ending, "s" if channel == "t" else CHANNEL_UNITS[channel])
-    return ending if is_possible else label.unit
+    name_unit = split_unit(label.name)[1] if label.unit is None else None
+    is_possible = name_unit is not None and same_dimension(name_unit, "s" if channel == "t" else CHANNEL_UNITS[channel])
+    return name_unit if is_possible else label.unit
 
 
 def _format_columns(labels: Sequence[Label]) -> str:
@@ -185,14 +185,14 @@ def _format_columns(labels: Sequence[Label]) -> str:
 
 
 def _find_column(labels: Sequence[Label], name: str, description: str, mapped: bool = False) -> int | None:
-    """Find the index, from 0, of the column with a name, or with a number such as `#4`, counted from 1.
+    """Find the index, from 0, of the column called `name`, which may be a number such as `#4`, counted from 1.
 
-    A name is compared by several criteria; the strictest that any column meets counts. If `mapped`, the last words of a
-    column's name are enough, such as `ch2`. None if there is no such column. Raises InputError if several columns meet
-    the criterion; `description` begins the message.
+    Names are compared by several criteria, from strict to loose; the first that a column meets decides. With `mapped`,
+    the last words of a column's name are enough, such as `ch2`. None if there is no such column. Raises InputError if
+    several columns meet the deciding criterion; the message begins with `description`.
     """
     folded = name.casefold()
-    for matches_name in (  # from strict to loose
+    for matches_name in (
         lambda label: label.whole == name,
         lambda label: label.name == name,
         lambda label: label.called and label.called == name,
@@ -207,9 +207,9 @@ def _find_column(labels: Sequence[Label], name: str, description: str, mapped: b
             )
         if matches:
             return matches[0]
-    number = name[1:].lstrip("0") if name.startswith("#") else ""
-    is_number = number.isascii() and number.isdigit() and len(number) <= _MAX_DIGITS
-    return int(number) - 1 if is_number and int(number) <= len(labels) else None
+    digits = name[1:].lstrip("0") if name.startswith("#") else ""
+    is_number = digits.isascii() and digits.isdigit() and len(digits) <= _MAX_DIGITS
+    return int(digits) - 1 if is_number and int(digits) <= len(labels) else None
 
 
 def _parse_mapping(labels: Sequence[Label], channel: str, column_text: str) -> Formula[int]:
@@ -221,7 +221,7 @@ def _parse_mapping(labels: Sequence[Label], channel: str, column_text: str) -> F
     """
     description = f"{column_text}, mapped to {channel},"
     name_before_blank, _, unit_after_blank = column_text.rpartition(" ")
-    # without a unit, as `name [unit]`, and as `name unit`
+    # try the text as a name without a unit, as `name [unit]`, and as `name unit`
     for name, unit in ((column_text, None), split_square_brackets(column_text), (name_before_blank, unit_after_blank)):
         column = _find_column(labels, name, description) if name else None
         if column is not None:
@@ -349,7 +349,7 @@ def _find_time(labels: Sequence[Label]) -> int | None:
 
 
 def _choose_time_columns(choice: ColumnMap) -> None:
-    """Choose the time of a table if it is in several columns, or in columns whose names do not mean the time.
+    """Choose the time of a table if it is in several columns, or in a column whose name does not mean a time.
 
     The result is stored in `choice`:
 
@@ -363,7 +363,7 @@ def _choose_time_columns(choice: ColumnMap) -> None:
     if "hour" in parts and choice.time in (None, *parts.values()):
         dates = [i for i in _date_columns(choice) if i not in parts.values()]
         time = parts["hour"] if choice.time is None else choice.time
-        time = dates[0] if dates and "year" not in parts else time
+        time = dates[0] if dates and "year" not in parts else time  # the date to which the parts are added
         names = ", ".join(labels[i].whole for i in dict.fromkeys((time, *parts.values())))
         choice.time_label = Label(names, names, "s" if choice.time is not None else None)
         choice.time, choice.parts = time, parts
@@ -389,7 +389,7 @@ def _date_columns(choice: ColumnMap) -> list[int]:
 def _note_unused(choice: ColumnMap, used: Container[int | None]) -> None:
     """Add a note on unused columns to `choice`, and collect those with measured quantities in `choice.unused`.
 
-    `used`: numbers of the used columns. The note proposes a map with which unused columns would be read.
+    `used`: numbers of the used columns. The note proposes a map by which some of the unused columns could be read.
     """
     unused = [label for i, label in enumerate(choice.labels) if i not in used and label.whole]
     choice.unused = tuple(label.whole for label in unused if is_measured(label))

@@ -90,9 +90,9 @@ def _check_links(file: Any) -> None:
 
 
 def _read_streams(file: Any) -> Iterator[Series]:
-    """Yield the signals of an open HDF5 file that stores them as streams of doubles.
+    """Yield the signals of an open HDF5 file that stores the samples of each signal as a stream of doubles.
 
-    For each signal, `CompressedTime` contains first time, step and number of samples, and `DataR2` the number of the
+    Of each signal, `CompressedTime` contains first time, step and number of samples, and `DataR2` the number of its
     stream.
     """
     import h5py
@@ -107,7 +107,7 @@ def _read_streams(file: Any) -> Iterator[Series]:
             continue
         data, count = stream["#data#"], int(stream["#length#"][0])
         name, unit = (_decode_utf16(item.get(path)) for path in ("Name", "Values/DataUnits/Value"))
-        clock = uniform_clock("stream", count, float(times[1]), float(times[0]))
+        clock = uniform_clock("stream", count, step=float(times[1]), first=float(times[0]))
         yield Series("", Label.parse(name.strip("<>"), unit or None), count, partial(_read_doubles, data, count), clock)
 
 

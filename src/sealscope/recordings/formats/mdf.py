@@ -69,10 +69,11 @@ def _open_file(MDF: Any, path: Path) -> Any:
 
 
 def _read_values(file: Any, group: int, index: int) -> NDArray[Any]:
-    """Read the samples (n,) of the channel `index` of a `group` in the file.
+    """Read the samples (n,) of a channel of an open MDF file.
 
-    A conversion may give a few texts among the numbers, such as `SNA`; these become NaN. With more than the fraction
-    `MAX_WORD_FRACTION` of texts the samples are returned as texts.
+    `group`: number of the channel's group; `index`: number of the channel in the group. A conversion to physical values
+    may give a few texts among the numbers, such as `SNA`; these become NaN. With more than the fraction
+    `MAX_WORD_FRACTION` of texts the samples are returned as they are.
     """
     values = np.asarray(file.get(group=group, index=index).samples)
     if values.dtype.kind not in "OSU":

@@ -53,10 +53,9 @@ def read_netcdf(path: Path, request: Request) -> RecordingFields:
         for name in names:
             data = file[name]
             group, _, leaf = name.rpartition("/")
-            if not data.dtype.names:
-                series.append(
-                    Series(group, _parse_label(leaf, data), data.size, partial(_read_values, data, name, size))
-                )
+            if not data.dtype.names:  # not a data set of records
+                read_values = partial(_read_values, data, name, size)
+                series.append(Series(group, _parse_label(leaf, data), data.size, read_values))
                 continue
             series += [
                 Series(name, Label.parse(field), data.size, partial(_read_field, data, name, field))

@@ -58,7 +58,9 @@ def read_parquet(path: Path, request: Request) -> RecordingFields:
 def _read_remarks(schema: Any) -> dict[str, str]:
     """Read the remarks in a table's metadata, without empty texts and the JSON that libraries write for themselves."""
     pairs = ((name.decode(errors="replace"), text) for name, text in (schema.metadata or {}).items())
-    return collect_remarks((name, text.decode(errors="replace")) for name, text in pairs if text[:1] not in b"{")
+    return collect_remarks(
+        (name, text.decode(errors="replace")) for name, text in pairs if text and not text.startswith(b"{")
+    )
 
 
 def _list_series(schema: Any, read_column: Callable[[int], Any], n_rows: int) -> list[Series]:
@@ -75,7 +77,8 @@ def _list_series(schema: Any, read_column: Callable[[int], Any], n_rows: int) ->
         label = Label.parse(field.name, "s" if is_time else unit)
         if field.name.startswith("__index_level_") and is_time:  # the index of a data frame, without a name
             label = Label(field.name, "time", "s")
-        series.append(Series("", label, n_rows, partial(_read_values, partial(read_column, number), field, n_rows)))
+        read_values = partial(_read_values, partial(read_column, number), field, n_rows)
+        series.append(Series(group="", label=label, count=n_rows, values=read_values))
     return series
 
 
@@ -93,7 +96,7 @@ def _read_values(read_column: Callable[[], Any], field: Any, n_rows: int) -> NDA
     from pyarrow import compute, types
 
     if _is_text(field):
-        check_texts(n_rows, 1, field.name)
+        check_texts(n_rows, width=1, name=field.name)  # refuses too many texts before they are read
         cells = read_column()
         chunks = [chunk.dictionary if isinstance(chunk, pyarrow.DictionaryArray) else chunk for chunk in cells.chunks]
         max_width = max((compute.max(compute.binary_length(chunk)).as_py() or 0 for chunk in chunks), default=0)

@@ -85,7 +85,10 @@ def _read_sheet(sheet: Any, request: Request, place: str) -> RecordingFields:
 
 
 def _format_cell(value: Any) -> str:
-    """Format a cell as text: numbers with all digits, dates and times in ISO form, durations in seconds."""
+    """Format a cell as text: numbers with all digits, dates and times in ISO form, durations in seconds.
+
+    The text of an empty cell, and of a truth value, is empty.
+    """
     if isinstance(value, bool | None):
         return ""
     if isinstance(value, float | int):
@@ -94,4 +97,4 @@ def _format_cell(value: Any) -> str:
         return repr(value.total_seconds())
     if isinstance(value, dt.datetime | dt.date | dt.time):
         return value.isoformat()
-    return str(value).translate(str.maketrans("\t\r\n", "   "))
+    return str(value).translate(str.maketrans("\t\r\n", "   "))  # these separate cells and rows

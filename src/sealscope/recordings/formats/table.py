@@ -154,7 +154,7 @@ def build_fields(
     - `rate` [Hz]: sampling rate stated by the file, for series without sampling times (`Series.clock`).
     - `description`: rate, provenance and history in a file that Sealscope has written.
     - `prepare`: function that reads all used columns together, before their values are needed.
-    - `size`: size of a file that may be compressed [bytes], for `check_size`.
+    - `size` [bytes]: size of a file that may be compressed, from which `check_size` limits the number of values.
     """
     candidates, notes = _make_names_unique(_assign_clocks(series))
     labels = [member.label for member in candidates]
@@ -202,8 +202,9 @@ def convert_columns(
 
     - `choice`: meaning of the columns.
     - `columns`: column -> values (n,), doubles or, for the time, datetime64.
-    - `kind`, `request`, `remarks`, `description`: as for `build_fields`.
+    - `kind`: format of the file in words; `request`: the user's choices; `remarks`: entries in the file's header.
     - `notes`: lines for the history.
+    - `description`: rate, provenance and history in a file that Sealscope has written; None for other files.
     - `state`: state of the time column after the previous part of a text log, which is updated; None for a whole log.
 
     Raises InputError if there are no rows, or only dates in place of times.
@@ -255,8 +256,8 @@ def _convert_channels(
 ) -> tuple[dict[str, Array], dict[str, str], dict[str, str]]:
     """Convert the chosen channels of a table to SI units or counts.
 
-    Returns three mappings from the names of channels: to values (n,), to units, and to units in the log where these
-    differ. `columns`: column -> values (n,).
+    `choice`: meaning of the columns; `columns`: column -> values (n,). Returns three mappings from the names of
+    channels: to values (n,), to units, and to units in the log where these differ.
     """
     channels, units, log_units = {}, {}, {}
     for name, formula in choice.channels.items():
@@ -273,8 +274,9 @@ def _convert_channels(
 def _join_time(choice: ColumnMap, columns: Mapping[int, NDArray[Any]], label: Label, notes: list[str]) -> NDArray[Any]:
     """Combine the columns that form the time, such as date and hours, and add a line for the history to `notes`.
 
-    `label`: name and unit of the time. If the values of the other columns cannot be parts of this time, the time column
-    is returned unchanged; if it contains hours, InputError is raised instead.
+    `choice`: meaning of the columns; `columns`: column -> values (n,); `label`: name and unit of the time. If the
+    values of the other columns cannot be parts of this time, the time column is returned unchanged. If this column
+    contains the hours, InputError is raised instead.
     """
     assert choice.time is not None
     parts = {part: np.asarray(columns[column], dtype=np.float64) for part, column in choice.parts.items()}
@@ -301,22 +303,22 @@ def _has_time_of_day(time: NDArray[Any]) -> bool:
 
 
 def _assign_clocks(series: Sequence[Series]) -> list[Series]:
-    """Give the series without sampling times the times in the time series (column of times) of their group.
+    """Give the series without sampling times the times in the column of times of their group.
 
-    Returns the series without the time series. If a file has only one time series, it is kept, as the time column of
-    the whole file, and no times are assigned. A series with a name such as `data` or `value` that is alone in its group
-    gets the name of the group.
+    Returns the series without these columns of times. If only one group has a column of times, it is kept, as the time
+    column of the whole file, and no times are assigned. A series with a name such as `data` or `value` that is alone in
+    its group gets the name of the group.
     """
-    time_series: dict[str, Series] = {}
+    time_of_group: dict[str, Series] = {}
     for member in series:
         if member.clock is None and is_time(member.label):
-            time_series.setdefault(member.group, member)
-    time_series = time_series if len(time_series) > 1 else {}  # a single one is the time column of the file
-    members = [member for member in series if member is not time_series.get(member.group)]
+            time_of_group.setdefault(member.group, member)
+    time_of_group = time_of_group if len(time_of_group) > 1 else {}
+    members = [member for member in series if member is not time_of_group.get(member.group)]
     group_sizes = Counter(member.group for member in members)
     result = []
     for member in members:
-        group, label, time = member.group, member.label, time_series.get(member.group)
+        group, label, time = member.group, member.label, time_of_group.get(member.group)
         if label.name.casefold() in WORDS["generic"] and group and group_sizes[group] == 1:
             group_label = Label.parse(group.rpartition("/")[2], label.unit)
             member = replace(member, label=replace(group_label, whole=label.whole))  # noqa: PLW2901
@@ -328,10 +330,10 @@ def _assign_clocks(series: Sequence[Series]) -> list[Series]:
 
 
 def read_times(time: Series, start: np.datetime64 | None = None) -> tuple[Array, np.datetime64 | None]:
-    """Read the times (n,) [s] of a series that contains times, and the time stamp of 0 s.
+    """Read the series `time`, a column of times; return the times (n,) [s] and the time stamp of 0 s.
 
-    If the series contains date stamps, the times count from the first stamp, which is also the time stamp of 0 s; for a
-    series in a group None is returned instead. If the series contains numbers or timedelta64, the time stamp of 0 s is
+    If the column contains date stamps, the times count from the first stamp, which is also the time stamp of 0 s; for a
+    column in a group None is returned instead. If the column contains numbers or timedelta64, the time stamp of 0 s is
     `start`, None if it is not known. Raises InputError if no row has a time.
     """
     values = time.values()
@@ -355,9 +357,9 @@ def timedelta_seconds(times: Any) -> Array:
 def _make_names_unique(series: Sequence[Series]) -> tuple[list[Series], list[str]]:
     """Give each series of a file a unique name; return the series, and lines for the history.
 
-    If several groups have series of one name, the group with most series named like channels keeps the name; of groups
-    with equally many, that with most samples. The other series are called by their paths, `group/name`. A file without
-    groups is returned unchanged.
+    Of several series with one name, that in the group with most series named like channels keeps the name; of groups
+    with equally many, that in the group with most samples. The others are called by their paths, `group/name`. Series
+    without groups are returned unchanged.
     """
     if all(member.group == "" for member in series):
         return list(series), []
@@ -367,8 +369,7 @@ def _make_names_unique(series: Sequence[Series]) -> tuple[list[Series], list[str
     for member in series:
         n_samples[member.group] += member.count
     names = [member.label.name.casefold() for member in series]
-    preferred: dict[str, Series] = {}
-    # a name goes to the series in the group with most channels, then with most samples
+    preferred: dict[str, Series] = {}  # name -> the series that keeps it
     for member in sorted(series, key=lambda member: (-n_channels[member.group], -n_samples[member.group])):
         preferred.setdefault(member.label.name.casefold(), member)
     ambiguous = {name for name, count in Counter(names).items() if count > 1} & channel_names
@@ -412,10 +413,10 @@ def _read_samples(series: Series, *, as_time: bool = False) -> NDArray[Any]:
 def _align_clocks(choice: ColumnMap, used: dict[int, Series]) -> tuple[dict[int, NDArray[Any]], list[str]]:
     """Resample the columns to read to common sampling times, those of the chamber pressures.
 
-    Without chamber pressures these are the times of the pressures at the pump, or of the longest series. `used`: column
-    -> series. Returns column -> values (n,), including the time, and lines for the history. Raises InputError if no
-    series has sampling times. A series without sampling times must have as many samples as the common times, else
-    InputError is raised.
+    Without chamber pressures these are the times of the pressures at the pump, or of the longest series. `choice`:
+    meaning of the columns; `used`: column -> series. Returns column -> values (n,), including the time, and lines for
+    the history. Raises InputError if no series has sampling times, or if a series without them has another number of
+    samples than the common times.
     """
     channel_of = choice.channel_of
     rank = {channel: number for number, channel in enumerate(_BASE_CHANNELS)}
@@ -448,7 +449,7 @@ def _align_clocks(choice: ColumnMap, used: dict[int, Series]) -> tuple[dict[int,
 
 
 def _resample(values: Array, member: Series, t: Array, start: np.datetime64 | None) -> tuple[Array, str]:
-    """Resample the samples `values` of the series `member` to the times `t` (n,) [s] after `start`.
+    """Resample the samples `values` of the series `member` to the times `t` (n,) [s] after the stamp `start`, if known.
 
     Also returns a note for the history, which is empty if the series is sampled at these times already. A series with
     the same or a lower sampling rate is interpolated linearly, except within long intervals, where the result is NaN. A
@@ -476,7 +477,8 @@ def _resample(values: Array, member: Series, t: Array, start: np.datetime64 | No
     # no values within long intervals
     next_sample = np.clip(np.searchsorted(times, t), 1, times.size - 1)
     interval = times[next_sample] - times[next_sample - 1]
-    result[(interval > _MAX_INTERVAL * float(np.median(np.diff(times)))) & (times[next_sample] != t)] = np.nan
+    is_long = interval > _MAX_INTERVAL * float(np.median(np.diff(times)))
+    result[is_long & (times[next_sample] != t)] = np.nan
     return result, f"at {rate:g} Hz: interpolated linearly to {base_rate:g} Hz"
 
 
@@ -486,9 +488,9 @@ def _average(values: Array, times: Array, t: Array, step: float) -> Array:
     The result is NaN for an interval without values.
     """
     begin, end = np.searchsorted(times, t - 0.5 * step), np.searchsorted(times, t + 0.5 * step)
-    total = np.concatenate(([0.0], np.cumsum(values)))
+    sum_before = np.concatenate(([0.0], np.cumsum(values)))  # sum of the values before each index
     with np.errstate(invalid="ignore"):
-        return np.asarray((total[end] - total[begin]) / np.where(end > begin, end - begin, np.nan))
+        return np.asarray((sum_before[end] - sum_before[begin]) / np.where(end > begin, end - begin, np.nan))
 
 
 def _find_long_columns(labels: Sequence[Label]) -> dict[str, int] | None:
@@ -557,7 +559,8 @@ class _LongTable:
             return fields.t, np.datetime64(round(provenance["start_epoch_s"] * 1e9), "ns")
         if "start" in provenance:
             return fields.t, np.datetime64(provenance["start"]).astype("datetime64[ns]")
-        is_time_of_day = times.dtype.kind == "M" and times.size > 0  # without a date, hence without a start
+        # stamps of which the provenance states no start are times of day without a date
+        is_time_of_day = times.dtype.kind == "M" and times.size > 0
         return fields.t, np.nanmin(times) if is_time_of_day else None
 
 
@@ -566,9 +569,10 @@ def _pivot_long_table(
 ) -> tuple[list[Series], list[str]]:
     """Make a series for each channel of a table in which each row is one sample of a named channel.
 
-    `series`: columns of the table; `column_by_kind`: as from `_find_long_columns`; `prepare`: as for `build_fields`.
-    Samples that the file calls invalid become NaN. Also returns lines for the history. Raises InputError if there is no
-    time, or if there are too many names.
+    `series`: columns of the table; `column_by_kind`: number of the columns "name", "value" and, if they exist, "unit"
+    and "valid"; `prepare`: function that reads all used columns before their values are needed, or None. Samples that
+    the file calls invalid become NaN. Also returns lines for the history. Raises InputError if there is no time, or if
+    there are too many names.
     """
     value_column, validity_column = column_by_kind["value"], column_by_kind.get("valid")
     text_columns = [column_by_kind[kind] for kind in ("name", "unit") if kind in column_by_kind]
@@ -592,28 +596,29 @@ def _pivot_long_table(
         note = f"{format_count(int(np.count_nonzero(invalid)), 'value')} that the file calls invalid read as missing"
         notes += [note] if invalid.any() else []
     texts = [np.array([str(cell).strip() for cell in series[column].values().tolist()]) for column in text_columns]
-    keys = np.char.add(np.char.add(texts[0], "\n"), texts[1]) if len(texts) > 1 else texts[0]  # name, unit
-    names, first_rows, name_of_row = np.unique(keys, return_index=True, return_inverse=True)
-    if len(names) > _MAX_NAMES:
+    # a name with different units is several channels: join name and unit
+    row_keys = np.char.add(np.char.add(texts[0], "\n"), texts[1]) if len(texts) > 1 else texts[0]
+    keys, first_rows, key_of_row = np.unique(row_keys, return_index=True, return_inverse=True)
+    if len(keys) > _MAX_NAMES:
         raise InputError(f"a long table must have at most {_MAX_NAMES} names, got more")
-    # the rows of the first name, then of the second, ...
-    rows_by_name = np.split(np.argsort(name_of_row, kind="stable"), np.cumsum(np.bincount(name_of_row))[:-1])
+    # the rows of the first key, then of the second, ...
+    rows_by_key = np.split(np.argsort(key_of_row, kind="stable"), np.cumsum(np.bincount(key_of_row))[:-1])
     table = _LongTable(choice, request, columns, value_column, choice.time)
     result = []
-    for number in np.argsort(first_rows).tolist():
-        name, _, unit = str(names[number]).partition("\n")
+    for number in np.argsort(first_rows).tolist():  # in the order of their first rows
+        name, _, unit = str(keys[number]).partition("\n")
         if name or unit:
             label = Label.parse(name[:200], unit[:40] or None)
-            result.append(table.make_series(number, label, rows_by_name[number]))
-    n_rows, n_names = format_count(len(name_of_row), "row"), format_count(len(result), "name")
+            result.append(table.make_series(number, label, rows_by_key[number]))
+    n_rows, n_names = format_count(len(key_of_row), "row"), format_count(len(result), "name")
     return result, [*notes, f"long table: {n_rows} of {n_names}"]
 
 
 def check_size(n_rows: int, n_columns: int, file_size: int | None = None) -> None:
     """Raise InputError if a table has more than `MAX_VALUES` values, or more than its file can hold.
 
-    A file can hold as many doubles as fit into `_MAX_EXPANSION` times its size `file_size` [bytes], or into
-    `_MIN_LIMIT` bytes if these are more; with None only the number of values is checked.
+    A file of `file_size` [bytes], which may be compressed, can hold as many doubles as fit into `_MAX_EXPANSION` times
+    this size, or into `_MIN_LIMIT` bytes if these are more. With None only the number of values is checked.
     """
     if n_rows * n_columns > MAX_VALUES:
         raise InputError(

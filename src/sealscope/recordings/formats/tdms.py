@@ -60,4 +60,5 @@ def _waveform_clock(properties: Mapping[str, Any], count: int) -> Clock | None:
     moment = None if start is None else np.datetime64(start).astype("datetime64[ns]")
     if moment is not None and (np.isnat(moment) or moment < np.datetime64("1971-01-01")):
         moment = None  # a logger without a clock writes 1904
-    return uniform_clock("waveform", count, float(step), float(properties.get("wf_start_offset", 0.0)), moment)
+    first = float(properties.get("wf_start_offset", 0.0))
+    return uniform_clock("waveform", count, float(step), first=first, start=moment)

@@ -98,12 +98,12 @@ def read_text(path: Path, request: Request) -> RecordingFields:
 def read_text_parts(path: Path, request: Request, every: float) -> Iterator[RecordingFields]:
     """Yield a text log in parts of `every` [s], each as the fields of a recording, in bounded memory.
 
-    All parts have the same number of rows: `every` times the sampling rate of the first block of rows. The last part
-    may have fewer. Three kinds of logs are a single part, as is any log for `every` = inf:
+    `request`: the user's choice of columns. All parts have the same number of rows, `every` times the sampling rate of
+    the first rows; the last part may have fewer. The log is a single part if `every` = inf, or if it is:
 
-    - logs with a time column for each channel;
-    - logs that begin with the last sample;
-    - long tables, in which each row is one sample of a named channel.
+    - a log with a time column for each channel;
+    - a log that begins with the last sample;
+    - a long table, in which each row is one sample of a named channel.
     """
     layout = read_layout(path)
     description = None if layout.description is None else parse_description(layout.description)
@@ -120,10 +120,10 @@ def read_text_parts(path: Path, request: Request, every: float) -> Iterator[Reco
         else:
             yield table
             return
-    log = _Log(path, layout, choice.columns, choice.date)
+    log = _Log(path, layout, kinds=choice.columns, date=choice.date)
 
     def make_part(blocks: list[_Block], state: TimeState, more_notes: Sequence[str] = ()) -> RecordingFields:
-        """Convert the rows of some blocks to the fields of a recording.
+        """Convert the rows of one part of the log to the fields of a recording.
 
         `state`: state of the time column after the previous part, which is updated; `more_notes`: further lines for
         the history.
@@ -154,8 +154,8 @@ def read_text_parts(path: Path, request: Request, every: float) -> Iterator[Reco
 def _read_several_clocks(path: Path, layout: Layout, time_columns: Sequence[int], request: Request) -> RecordingFields:
     """Read a log whose channels have sampling times of their own.
 
-    `time_columns`: numbers of the time columns, each of which stands before its channels. If there are none, the log is
-    read as a long table, in which each row is one sample of a named channel.
+    `layout`: as from `read_layout`; `time_columns`: numbers of the time columns, each of which stands before its
+    channels. If there are none, the log is read as a long table, in which each row is one sample of a named channel.
     """
     cells_by_column: dict[int, NDArray[Any]] = {}
     columns = [column for column in range(len(layout.labels)) if column not in time_columns]
@@ -182,6 +182,7 @@ def _read_several_clocks(path: Path, layout: Layout, time_columns: Sequence[int]
 
     start = scope_start(layout.remarks)
     clocks = {time: Clock(time, partial(read_times, make_series(time), start)) for time in time_columns}
+    # the index of a series is that of its column in `columns`
     members = [make_series(column, clocks[time_of_column[column]] if time_columns else None) for column in columns]
     return build_fields(members, request, layout.kind, layout.remarks, layout.rate, prepare=prepare)
 
@@ -192,7 +193,7 @@ def _find_channel_times(labels: Sequence[Label]) -> list[int]:
     Returns the numbers of the time columns; empty for other logs. The names of the time columns may differ only in a
     number at the end.
     """
-    names = [_NUMBER_SUFFIX.sub("", label.name.casefold()) for label in labels]
+    names = [_NUMBER_SUFFIX.sub("", label.name.casefold()) for label in labels]  # without the numbers
     if names.count(names[0]) < 2 or not is_time(labels[0]):
         return []
     times = [column for column, label in enumerate(labels) if is_time(label)]
@@ -228,7 +229,7 @@ def read_layout(path: Path) -> Layout:
         encoding = detect_encoding(head)
         if encoding is None:
             raise InputError("a recording must be text, NetCDF, HDF5 or Parquet, got other binary data")
-        if head.startswith(DESCRIPTION_MARK.encode()):  # read a long description and SNIFF bytes after it
+        if head.startswith(DESCRIPTION_MARK.encode()):  # read a long first line and SNIFF bytes after it
             while b"\n" not in head[:-SNIFF] and len(head) < _MAX_DESCRIPTION and (data := file.read(SNIFF)):
                 head += data
         is_complete = not file.read(1)
@@ -359,7 +360,7 @@ class _Log:
         """Read the rows of a block of bytes by pyarrow, and count them.
 
         `first_line`: number of the block's first line; `end`: number of bytes up to the end of its last complete line.
-        None, and no rows counted, unless all cells to read are plain finite numbers or missing.
+        Returns None, and counts no rows, unless all cells to read are plain finite numbers or missing.
         """
         from pyarrow import ArrowInvalid, csv, float64, py_buffer
 
@@ -375,7 +376,8 @@ class _Log:
             return None  # carriage returns inside a line
         names = [str(column) for column in self.kinds]
         table = None
-        for nulls in (self.null_values, ["NaN", *MISSING]):  # the short list is faster; after it fails, the long stays
+        # marks of missing samples: the short list is faster; once it fails, the long one stays
+        for nulls in (self.null_values, ["NaN", *MISSING]):
             with suppress(ArrowInvalid):
                 table = csv.read_csv(
                     py_buffer(block).slice(start, end - start),
@@ -402,7 +404,7 @@ class _Log:
     def _select_samples(self, lines: Sequence[str], first: int) -> list[int]:
         """List the indices of the lines that contain samples, from index `first` on.
 
-        Comments, blank lines and repeated headings are left out; the latter are counted.
+        Comments, blank lines and repeated headings are left out; repeated headings are counted in `n_repeated`.
         """
         blank = " " if self.layout.delimiter == "\t" else None  # a line of tabs is a row of missing samples
         content = [
@@ -425,6 +427,7 @@ class _Log:
             return [split_at_blanks(line) for line in lines]
         if not any('"' in line for line in lines):
             return [line.split(delimiter) for line in lines]
+        # a cell with an open quotation mark in the last line continues in the empty line, which shows it
         reader = csv.reader([*lines, ""], delimiter=delimiter, skipinitialspace=True)
         rows: list[list[str]] = []
         for line, row in enumerate(reader):
@@ -504,8 +507,8 @@ class _Log:
     def _is_stamped(self, cells: Sequence[str], rows: Sequence[Sequence[str]]) -> bool:
         """Return True if the time column contains date stamps, as its first cell in the log shows.
 
-        `cells`: cells of the time column in `rows`. This first cell also decides `has_stamps` and `has_date`; the
-        latter is True if the stamps are times of day, and the cell in the date column is a date.
+        `cells`: cells of the time column in `rows`. The first cell that is not missing sets `has_stamps` for the whole
+        log, and `has_date`: True if the stamps are times of day, and the cell in the date column is a date.
         """
         index = next((i for i, cell in enumerate(cells) if not is_missing(cell)), None)
         if self.has_stamps is None and index is not None:
@@ -530,7 +533,8 @@ class _Log:
     def _format_place(self, index: int, line_numbers: Sequence[int], column: int) -> str:
         """Format the line, column and file of a cell for messages.
 
-        `index`: row of the cell in its block; `line_numbers`: line number of each of the block's rows.
+        `index`: row of the cell in its block; `line_numbers`: line number of each of the block's rows; `column`: number
+        of the cell's column.
         """
         return f"(line {line_numbers[index]}, column {self.layout.labels[column].whole}, {self.place})"
 
@@ -564,10 +568,10 @@ class _Log:
     def _detect_day_first(self) -> bool:
         """Detect if the day precedes the month in the dates of the log, such as 05/06/2024.
 
-        The log is read up to the first date that decides this. Without such a date, the order is guessed
+        The log is read up to the first date with a number over 12. Without such a date, the order is guessed
         (`is_day_first`), and `order_note` says so.
         """
-        log = _Log(self.path, self.layout, self.kinds, self.date)
+        log = _Log(self.path, self.layout, self.kinds, self.date)  # reads ahead without changing this reader
         columns = [column for column, kind in self.kinds.items() if kind == "time"]
         dates: list[dict[str, None]] = [{} for _ in columns]
         with suppress(InputError), self.path.open("rb") as file:  # errors are raised when the row is read again
@@ -642,8 +646,8 @@ def _iter_line_blocks(
 ) -> Iterator[tuple[int, bytes, int, bool]]:
     """Yield a text file in blocks of lines: (number of the first line, bytes, end, is_cut).
 
-    The bytes before `end` are complete lines; the bytes after it come again in the next block. Only the last block may
-    have an incomplete last line, without a line end: then `is_cut` is True, and `end` is the number of its bytes.
+    The bytes before index `end` are complete lines; the bytes from `end` on come again in the next block. Only the last
+    block may have an incomplete last line, without a line end: then `is_cut` is True, and `end` is the block's length.
     `place`: path of the file for messages; `n_bytes`: function that returns the number of bytes to read next. Raises
     InputError for binary data, and for a line that is too long.
     """
@@ -673,9 +677,9 @@ def _iter_line_blocks(
 
 
 def _last_newline(block: bytes, newline: bytes) -> int:
-    """Find the index of the last newline in a block of bytes; -1 if there is none.
+    """Find the index of the last `newline` in a block of bytes; -1 if there is none.
 
-    In UTF-16 the index is a multiple of a character's two bytes.
+    In UTF-16 each character has two bytes, so that only an even index counts.
     """
     end = block.rfind(newline)
     while end >= 0 and end % len(newline):
@@ -715,7 +719,8 @@ def write_text(
 def _arrow_values(cells: Any) -> Array:
     """Convert a pyarrow ChunkedArray of doubles to an array (n,), NaN for null.
 
-    The array's method `to_numpy` would load pandas.
+    The method `to_numpy` of `cells` would load pandas. The buffers of each chunk are read instead: bits, which are 1
+    for known values, and the values.
     """
     parts = []
     for chunk in cells.chunks:

@@ -139,7 +139,7 @@ def split_cells(line: str, delimiter: str) -> list[str]:
 
 
 def _used_width(row: Sequence[str]) -> int:
-    """Count the cells of a row up to the last one that is not empty."""
+    """Count the cells of a row without the empty cells at its end."""
     width = len(row)
     while width and not row[width - 1].strip():
         width -= 1
@@ -149,8 +149,9 @@ def _used_width(row: Sequence[str]) -> int:
 def _detect_dialect(body: Sequence[str]) -> tuple[str, str, int]:
     """Detect (delimiter, decimal separator, number of cells in a row) from some lines of a log.
 
-    All pairs of `_DIALECTS` are tried. The best is the one with which the largest fraction of the present cells are
-    values, i.e. numbers or time stamps, in rows of one width. Lines without values have commas, points and one cell.
+    All pairs of `_DIALECTS` are tried. The best is the one with which the largest fraction of the cells that are not
+    missing are values, i.e. numbers or time stamps, in rows of one width. For lines without values the result is (",",
+    ".", 1).
     """
     ranks: dict[tuple[str, str, int], tuple[float, float, bool, int]] = {}
     text = "\n".join(body)
@@ -167,6 +168,7 @@ def _detect_dialect(body: Sequence[str]) -> tuple[str, str, int]:
             cells = [cell for row, count in zip(rows, counts, strict=True) if count for cell in row]
             n_present = sum(not is_missing(cell) for cell in cells)
             n_grouped = sum(is_grouped(cell, decimal) for cell in cells)  # prefer dialects without separated thousands
+            # the first number decides, the others only between equals
             rank = n_values[width] / n_present, -n_grouped / n_present, delimiter != " ", width
             ranks[delimiter, decimal, width] = rank
     return max(ranks, key=ranks.__getitem__, default=(",", ".", 1))
@@ -175,8 +177,8 @@ def _detect_dialect(body: Sequence[str]) -> tuple[str, str, int]:
 def _split_heading(line: str, delimiter: str, width: int = 0) -> list[str]:
     """Split the heading line of a log into the names of columns.
 
-    If the delimiter is a blank, a unit in brackets stays with its name. Names may then contain single blanks, if
-    wider spaces separate exactly `width` names, but single blanks do not.
+    If the delimiter is a blank, a unit in brackets stays with its name. The line is then split at wider spaces only, if
+    this gives `width` names, the number of columns, and splitting at all blanks does not.
     """
     if delimiter == " ":
         names = _SPACED_LABEL.findall(line)
@@ -213,7 +215,7 @@ def _parse_heading(
         None if the number of names does not fit the number of columns, or if the line has values instead of names.
         """
         cells = _split_heading(line, delimiter, width)
-        if cells and not cells[-1]:  # drop empty cells beyond the width
+        if cells and not cells[-1]:  # drop empty cells at the end, beyond the width
             cells = cells[: max(_used_width(cells), min(width, len(cells)))]
         fits_width = abs(len(cells) - width) <= 1 or (len(cells) >= width > 1)
         names = [cell for cell in cells if cell]
@@ -274,10 +276,10 @@ def _parse_stacked_rows(rows: Sequence[Sequence[str]]) -> tuple[list[Label], int
     them, and names of groups of columns on top; the name of a group is put before the names of its columns. Returns
     (labels of the columns, number of rows).
     """
-    n_skipped = next((i for i, row in enumerate(rows[:-1]) if not _is_ruler(row)), len(rows) - 1)
-    row, *rows_above = rows[n_skipped:]
+    n_rulers = next((i for i, row in enumerate(rows[:-1]) if not _is_ruler(row)), len(rows) - 1)
+    row, *rows_above = rows[n_rulers:]
     names = list(row)
-    n_rows = n_skipped + 1
+    n_rows = n_rulers + 1
     units = (_parse_graphtec_units(row) or _parse_unit_row(row)) if rows_above else None
     if units is not None:  # units below the names
         names, rows_above, n_rows = list(rows_above[0]), rows_above[1:], n_rows + 1
@@ -415,6 +417,7 @@ def _find_first_row(lines: Sequence[str], body: Sequence[str], delimiter: str, d
         for i in range(width)
         if 2 * sum(row[i] for row in is_value_cell) > sum(not is_missing(row[i]) for row in rows)
     ]
+    # True if some rows of samples begin with a word, such as the name of a state
     may_begin_with_word = any(
         not flags[0] and not is_missing(row[0]) for row, flags in zip(rows, is_value_cell, strict=True)
     )
@@ -432,6 +435,7 @@ def _find_first_row(lines: Sequence[str], body: Sequence[str], delimiter: str, d
 
 def _has_prefixes(body: Sequence[str]) -> bool:
     """Test whether the numbers in lines of a log end in SI prefixes, with any of the usual delimiters."""
+    # the quick search for a number with letters after it spares most logs the rest
     return any(map(_QUANTITY.search, body)) and any(
         has_prefixes([split_cells(line, delimiter) for line in body]) for delimiter in "\t;|,"
     )
@@ -452,6 +456,6 @@ def _find_units(body: Sequence[str]) -> dict[int, str]:
 
     The delimiter is the one with which most columns have a unit.
     """
-    if not any(map(_QUANTITY.search, body)):
+    if not any(map(_QUANTITY.search, body)):  # no number has letters after it
         return {}
     return max((find_cell_units([split_cells(line, delimiter) for line in body]) for delimiter in "\t;|,"), key=len)

@@ -95,9 +95,9 @@ class TimeState:
 
 
 def _parse_stamp(text: str) -> dict[str, str | None] | None:
-    """Split a date stamp or time of day into its parts by name (`year`, `clock`, ...); None for any other text.
+    """Split a date stamp or time of day into its parts, name -> text or None; None for any other text.
 
-    Parts that the stamp lacks are None.
+    The names are those of the groups in `_DATES` and `_STAMPS`, such as `year`, `clock` and `half` (AM or PM).
     """
     text = text.strip()
     if len(text) > _MAX_STAMP or (_BARE_NUMBER.fullmatch(text) and len(text) != len("20240531")):
@@ -158,11 +158,11 @@ def ambiguous_dates(cells: Iterable[str]) -> dict[str, None]:
 def explicit_order(dates: Iterable[str]) -> bool | None:
     """Decide from dates such as 05/06/2024 if the day precedes the month.
 
-    The first date in which exactly one of the two numbers is over 12 decides. The result is True if that is the first
-    number, as in 31/12/2024, else False; None if there is no such date.
+    The first date in which exactly one of the two numbers is over 12 decides. The result is True if this is the first
+    number, as in 31/12/2024, False if it is the second; None if there is no such date.
     """
     over_12 = ((first > _LAST_MONTH, second > _LAST_MONTH) for first, second, _ in map(_date_numbers, dates))
-    return next((first for first, second in over_12 if first != second), None)
+    return next((is_first_over for is_first_over, is_second_over in over_12 if is_first_over != is_second_over), None)
 
 
 def is_day_first(columns: Collection[Iterable[str]]) -> bool:
@@ -171,10 +171,10 @@ def is_day_first(columns: Collection[Iterable[str]]) -> bool:
     `columns`: the `ambiguous_dates` of columns with the same format. These criteria are applied in turn until one
     decides:
 
-    - a number over 12 (`explicit_order`);
-    - with one of the two orders only, no column goes back in time;
-    - the dates span a shorter time with one order than with the other;
-    - the day comes first with hyphens, the month with slashes.
+    - A date has a number over 12 (`explicit_order`).
+    - No column goes back in time with one order, but some column does with the other.
+    - The dates span a shorter time with one order than with the other.
+    - The day comes first in dates with hyphens, the month in dates with slashes.
     """
     known_order = next((order for order in map(explicit_order, columns) if order is not None), None)
     if known_order is not None:
@@ -219,7 +219,7 @@ def _is_datetime(text: str) -> bool:
 def counts_from_1970(clock: float) -> bool:
     """Test whether a clock reading [s] counts from 1970, rather than from the start of a machine.
 
-    It does if it then means a time between March 1973 and the year 5138.
+    A reading counts from 1970 if it then means a time between March 1973 and the year 5138.
     """
     return _MIN_EPOCH < clock < _MAX_EPOCH
 
@@ -260,7 +260,10 @@ def _format_clock(text: str) -> str:
 
 
 def _iso_date(parts: Mapping[str, str | None], day_first: bool) -> str:
-    """Format the date of a stamp, given by its parts, in ISO form; 1970-01-01 for a time of day without a date."""
+    """Format the date of a stamp, given by its parts, in ISO form; 1970-01-01 for a time of day without a date.
+
+    `day_first`: True if the day precedes the month in dates such as 05/06/2024.
+    """
     if days := parts.get("days"):  # a duration
         return str(np.datetime64(_NO_DATE) + int(days))
     year, month, day = (parts.get(name) for name in ("year", "month", "day"))
@@ -303,11 +306,11 @@ def is_falling(times: NDArray[Any]) -> bool:
 
 
 def _convert_stamps(values: NDArray[np.datetime64], name: str, state: TimeState) -> _Seconds:
-    """Convert date stamps (n,) of a time column to seconds from the first of them.
+    """Convert date stamps (n,) of a time column to seconds from the first stamp.
 
     Returns (times (n,) [s], provenance of the start, lines for the history). Times of day without a date continue from
     part to part of a log, from the last time in `state`; their jumps back at midnight or at the full hour are removed.
-    In stamps with a date, a single jump by an hour in the night, as of daylight saving time, is removed. `name`: the
+    From stamps with a date, a single jump by an hour in the night, as of daylight saving time, is removed. `name`: the
     column in messages. Raises InputError if no row has a stamp.
     """
     nanoseconds = values.astype("datetime64[ns]")
@@ -363,9 +366,9 @@ def _convert_numbers(values: Array, unit: str | None, name: str, state: TimeStat
     """Convert a time column of numbers (n,) to seconds.
 
     Returns (times (n,) [s], provenance of the start, lines for the history). `unit`: unit of the column, which may also
-    state an origin, as in `days since 1899-12-30`, or None to guess the unit from the magnitude of the numbers. Only
-    then are used `name`, the column's name in messages, and `state`, the state of the column after the previous part of
-    the log, which is updated. Raises InputError if no row has a number.
+    state an origin, as in `days since 1899-12-30`; None if it is to be guessed from the magnitude of the numbers. Only
+    this guess uses `name`, the name of the column in messages, and `state`, the state of the column after the previous
+    part of the log, and updates `state`. Raises InputError if no row has a number.
     """
     finite = values[np.isfinite(values)]
     if not finite.size:
@@ -391,13 +394,14 @@ def _convert_numbers(values: Array, unit: str | None, name: str, state: TimeStat
 def _convert_without_unit(values: Array, finite: Array, name: str, state: TimeState) -> _Seconds:
     """Convert a time column of numbers (n,) without a unit to seconds.
 
-    Returns (times (n,) [s], provenance of the start, lines for the history). The size and the steps of the `finite`
-    numbers show if they are days or seconds, and since when. `name`: the column in messages; `state`: state of the
-    column after the previous part of the log, which is updated. Raises InputError if the numbers count rows.
+    Returns (times (n,) [s], provenance of the start, lines for the history). `finite` (m,): the finite `values` of this
+    part of the log. The size and the steps of those in the first part show if they are days or seconds, and since when.
+    `name`: the column in messages; `state`: state of the column after the previous part, which is updated. Raises
+    InputError if the numbers count rows.
     """
     first = float(finite[0])
     is_first_part = state.head is None
-    head = finite if state.head is None else state.head
+    head = finite if state.head is None else state.head  # all parts are read as the first one
     state.head = head
     if (days := _detect_days(head)) is not None:
         origin, meaning = days
@@ -417,7 +421,7 @@ def _convert_without_unit(values: Array, finite: Array, name: str, state: TimeSt
     if unit is None:
         return values, {}, [f"column {name} has no unit: taken as s"]
     epoch, year = to_si(first, unit, "s"), 1970
-    if _SINCE_1904 <= epoch < _SINCE_1904 + 1e9:
+    if _SINCE_1904 <= epoch < _SINCE_1904 + 1e9:  # until 2039
         epoch, year = epoch - _FROM_1904_TO_1970, 1904
     return to_si(values - first, unit, "s"), {"start_epoch_s": epoch}, [f"column {name} read as {unit} since {year}"]
 
@@ -484,11 +488,11 @@ def _space_shared_times(t: Array, state: TimeState) -> tuple[float, Array] | Non
     """Spread samples that share a time, because the times of the log have coarse steps, evenly over these steps.
 
     `t` (n,): times [s]. Returns (step [s], new times (n,)). None if a time is missing, if the times step back, or if
-    the steps do not have about equally many samples, two or more. A part of a log that is too short for estimating the
-    step uses the step and the rate in `state`, unless it has a gap.
+    the steps do not have about equally many samples, two or more. If a part of a log is too short for estimating the
+    step, step and rate are those in `state`, unless the part has a gap.
     """
     steps = np.diff(t)
-    changes = np.flatnonzero(steps)
+    changes = np.flatnonzero(steps)  # indices of the last samples before the time changes
     if not np.isfinite(t).all() or (steps < 0).any():
         return None
     if t.size >= _MIN_SHARED and changes.size >= 3:
@@ -500,11 +504,11 @@ def _space_shared_times(t: Array, state: TimeState) -> tuple[float, Array] | Non
         samples_per_step = float(n_samples.sum() / n_steps.sum())
         if samples_per_step < 2.0 or np.abs(n_samples / n_steps - samples_per_step).max() > 1.0:
             return None
-        rate = _shortest_decimal(samples_per_step / resolution, 1.0 / float(n_samples.sum()))
+        rate = _shortest_decimal(samples_per_step / resolution, slack=1.0 / float(n_samples.sum()))
     elif state.resolution is not None and state.rate is not None and steps.max(initial=0.0) < 1.5 * state.resolution:
         resolution, rate = state.resolution, state.rate
     else:
         return None
-    # a stamp is the time of its first sample, to within one interval
+    # each new time is that of its first sample, with the index `changes` + 1, to within one interval
     first_time = float(np.median(t[changes + 1] - (changes + 1) / rate)) if changes.size else float(t[0])
     return resolution, first_time + np.arange(t.size) / rate

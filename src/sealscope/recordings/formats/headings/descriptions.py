@@ -50,7 +50,10 @@ def _fold(text: str) -> str:
 
 
 def _column_key(label: Label) -> str:
-    """Return the last word of a column's name, in lower case; the name of a group may precede this word."""
+    """Return the last word of a column's name, in lower case, by which its description is found.
+
+    The words before it may be the name of a group of columns.
+    """
     return _fold(label.name.rpartition(" ")[2] or label.name)
 
 
@@ -69,11 +72,12 @@ def _rename_label(label: Label, description: str) -> Label:
 def parse_scope_heading(lines: Sequence[str], delimiter: str) -> tuple[list[Label], int] | None:
     """Parse the heading of a TwinCAT Scope export to (labels of the columns, number of heading lines).
 
-    None for any other text. `lines`: the lines above the first sample. The heading has a row for each property, such as
-    name and unit. In this row, the property is named above each time column, and has its value above each channel.
-    Times are in milliseconds since the start of the export.
+    None for any other text. `lines`: the lines above the first sample; `delimiter`: separator of cells. Each row of the
+    heading has one property, such as the unit: above each time column the name of the property, and above each channel
+    its value. Times are in milliseconds since the start of the export.
     """
     rows = [[cell.strip() for cell in line.split(delimiter)] for line in lines]
+    # the last row of names; a row of two cells is a remark on the file
     begin = max((index for index, row in enumerate(rows) if row[0] == "Name" and len(row) > 2), default=None)
     if begin is None or not any(row[0] in _SCOPE_ROWS for row in rows):
         return None

@@ -70,7 +70,7 @@ def parse_formula(text: str) -> Formula[str]:
     """
     if len(text) > _MAX_LENGTH:
         raise InputError(f"{_RULE}, got {len(text)} signs")
-    for end in sorted({match.start() for match in _END.finditer(text)}, reverse=True):
+    for end in sorted({match.start() for match in _END.finditer(text)}, reverse=True):  # the longest formula first
         names: list[str] = []
 
         def replace_name(match: re.Match[str], names: list[str] = names) -> str:
@@ -95,7 +95,7 @@ def _parse_linear(tree: ast.expr, names: list[str]) -> Formula[str]:
 
     The name `columnN` in the tree stands for the column `names[N]`.
     """
-    empty = Formula[str]({})
+    empty = Formula[str]({})  # `empty.plus(formula, number)` is `formula` times `number`
     match tree:
         case ast.Name(id=name):
             return Formula({names[int(name.removeprefix("column"))]: 1.0})

@@ -75,7 +75,7 @@ def _split_brackets_or_slash(text: str) -> tuple[str, str | None]:
     parts = text.split("/")
     for count in (2, 1):  # `name / m/s`, `name / s`
         unit = "/".join(parts[-count:])
-        end = len(text) - len(unit) - 1
+        end = len(text) - len(unit) - 1  # position of the slash, which must have blanks on both sides
         if end > 1 and text[end - 1].isspace() and unit[:1].isspace() and all(unit[1:].split("/")):
             splits.append((text[: end - 1].rstrip(), unit.strip()))
     depth = n_opened = 0

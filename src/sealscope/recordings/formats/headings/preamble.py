@@ -48,7 +48,7 @@ def stated_rate(remarks: Mapping[str, str]) -> float | None:
         default_unit = "Hz" if is_rate else "s"
         unit = label.unit or quantity["unit"].strip("\"'[]();,") or default_unit
         value = float(quantity["number"].replace(",", "."))
-        with suppress(InputError):  # an unknown unit: take the default one
+        with suppress(InputError):  # a number in an unknown unit is taken as Hz or s
             in_hertz = parse_unit(unit).powers == parse_unit("Hz").powers  # an interval may be stated as a rate
             value, is_rate = to_si(value, unit, "Hz" if in_hertz else "s"), in_hertz
         if value > 0.0:
@@ -124,8 +124,9 @@ def stated_oil_temperature(provenance: Mapping[str, object]) -> float | None:
         match = _TEMPERATURE.search(text if unit_of_name is None else f"{text} {unit_of_name[1]}")
         if match is None:
             continue
-        value, unit = float(match["value"].replace(",", ".")), match["unit"].upper().replace("℃", "C")[-1]
+        value = float(match["value"].replace(",", "."))
+        unit = match["unit"].upper().replace("℃", "C")[-1]  # C, F or K
         celsius = (value - 32.0) / 1.8 if unit == "F" else value - 273.15 if unit == "K" else value
-        if -60.0 < celsius < 200.0:  # otherwise no oil has this temperature
+        if -60.0 < celsius < 200.0:  # temperatures that oil can have
             return celsius
     return None

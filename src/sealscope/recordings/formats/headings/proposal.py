@@ -59,10 +59,10 @@ def proposed_map(labels: Sequence[Label]) -> dict[str, str]:
     contain only the time.
     """
     channel_names = {label.name.casefold() for label in labels} & {name.casefold() for name in CHANNEL_UNITS}
-    head = _find_head_side(labels)
+    head_side = _find_head_side(labels)
     candidates: dict[str, list[tuple[Label, _Guess]]] = {}
     for label in labels:
-        guess = None if label.name.casefold() in channel_names else _guess_meaning(label, head)
+        guess = None if label.name.casefold() in channel_names else _guess_meaning(label, head_side)
         if guess is None or (_is_named_time(label) and guess.kind != "time"):  # X_Value is a time, not a position
             continue
         if guess.channel is not None:
@@ -153,9 +153,9 @@ def ends_in(name: str, words: str) -> bool:
 
     For example, `ADC1_Channel_2` ends in `ch2`, and `Main_Pa` in `Pa`.
     """
-    tokens = ([token.casefold() for token in _TOKEN.findall(_strip_accents(text))] for text in (name, words))
+    token_lists = ([token.casefold() for token in _TOKEN.findall(_strip_accents(text))] for text in (name, words))
     # `ch`, `channel` and the like are equal
-    name_tokens, ending = (["channel" if token in WORDS["input"] else token for token in text] for text in tokens)
+    name_tokens, ending = (["channel" if word in WORDS["input"] else word for word in tokens] for tokens in token_lists)
     return words[:1].isalpha() and 0 < len(ending) <= len(name_tokens) and name_tokens[-len(ending) :] == ending
 
 
@@ -217,26 +217,27 @@ def _split_words(name: str) -> set[str]:
 def _find_head_side(labels: Sequence[Label]) -> str:
     """Find the chamber, "A" or "B", that columns called "head" mean; "" if that is not known.
 
-    The chamber is A if another column is called rod or the like, else B if another one is called cap or the like.
+    The chamber is A if some column is called rod or the like, else B if some column is called cap or the like.
     """
     words = {word for label in labels if len(label.name) <= _MAX_NAME for word in _split_words(label.name)}
     if not words & _SIDE["head"]:
         return ""
+    # the letters alone do not name a rod or a cap
     return "A" if words & (_SIDE["B"] - {"b"}) else "B" if words & (_SIDE["A"] - {"a"}) else ""
 
 
-def _guess_meaning(label: Label, head: str = "") -> _Guess | None:
+def _guess_meaning(label: Label, head_side: str = "") -> _Guess | None:
     """Guess the meaning of a column from its name and unit; None if it is not known.
 
-    The unit is that of the heading, else that at the end of the name. `head`: the chamber, "A" or "B", that the word
-    "head" means, or "".
+    The unit is that of the heading, else that at the end of the name. `head_side`: the chamber, "A" or "B", that the
+    word "head" means in this file, or "" if that is not known.
     """
     if len(label.name) > _MAX_NAME:
         return None
     name, unit = split_unit(label.name)
     words = _split_words(name if label.unit is None and unit is not None else label.name)
     unit = label.unit if label.unit is not None else unit
-    side = head if words & _SIDE["head"] and head else _find_side(words)
+    side = head_side if words & _SIDE["head"] and head_side else _find_side(words)
     if unit is not None and same_dimension(unit, "Pa"):
         return None if words & (_KIND["other"] | _KIND["wanted"]) else _Guess("pressure", side, unit)
     if unit is not None and words & _KIND["oil"] and same_dimension(unit, "K"):  # before `other`, which has oil, too

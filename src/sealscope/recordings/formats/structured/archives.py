@@ -73,9 +73,9 @@ def unpack(path: Path, kind: str, max_bytes: int) -> Iterator[Path]:
 
 
 def _unpack(path: Path, kind: str, folder: Path, max_bytes: int) -> Path:
-    """Unpack the single file of an archive into a folder, and return its path.
+    """Unpack the single file of an archive into a folder, and return the path of the unpacked file.
 
-    Raises UnreadableFile if it has more than `max_bytes`.
+    `kind`: kind of the archive, such as "zip". Raises UnreadableFile if the file has more than `max_bytes`.
     """
     name = path.stem if path.suffix.lower() in _SUFFIXES else path.name
     with _open_member(path, kind) as (source, member, size):

@@ -49,7 +49,8 @@ def is_json(head: bytes) -> bool:
     try:
         json.loads(first)
     except json.JSONDecodeError as error:
-        return error.pos >= len(first) - 1  # `[2024-05-31 12:00] started` is a remark
+        # an array that goes on in the next line fails at its end, a remark such as `[2024-05-31 12:00] started` before
+        return error.pos >= len(first) - 1
     except (ValueError, RecursionError):
         return False
     return True
@@ -106,10 +107,9 @@ def _read_members(text: str, place: str) -> tuple[list[Any], bool]:
 def _iter_members(text: str) -> Iterator[Any]:
     """Yield the values that stand one after the other in a JSON text, such as one record on each line.
 
-    Between the values may be white space, commas and record separators. The members of an array of arrays or objects
-    are yielded one by one, so that the members before a truncated one are still read. All other arrays are yielded as
-    a whole: those within these members, and any other outer array, such as a row of numbers. Raises
-    json.JSONDecodeError where the text is damaged or truncated.
+    Between the values may be white space, commas and record separators. The members of an outer array of arrays or
+    objects are yielded one by one, so that those before a truncated member are still read. Any other value is yielded
+    as a whole, such as a row of numbers. Raises json.JSONDecodeError where the text is damaged or truncated.
     """
     position, in_array = 0, False
     while (position := _SEPARATORS.match(text, position).end()) < len(text):  # type: ignore[union-attr]
@@ -145,8 +145,9 @@ def _iter_cells(group: str, name: str, value: Any, depth: int) -> Iterator[tuple
         if name and set(value) == {"value", "unit"} and _is_cell(value["value"]) and isinstance(unit, str):
             yield group, name, value["value"], unit
             return
-        for inner, cell in value.items():
-            yield from _iter_cells(f"{group}/{name}" if group and name else group or name, inner, cell, depth + 1)
+        inner_group = f"{group}/{name}" if group and name else group or name
+        for inner_name, inner_value in value.items():
+            yield from _iter_cells(inner_group, inner_name, inner_value, depth + 1)
     elif isinstance(value, list) and depth < _MAX_DEPTH and len(value) <= _MAX_VECTOR:
         for number, cell in enumerate(value, start=1):
             yield from _iter_cells(group, f"{name}({number})", cell, depth + 1)
@@ -182,9 +183,10 @@ def _parse_records(members: Sequence[Any], place: str) -> list[Series]:
                     continue
             if len(member) > len(row_names):
                 raise InputError(f"a row must have {len(row_names)} values, got {len(member)} {where}")
-            cell_iterators = [_iter_cells("", name, value, 1) for name, value in zip(row_names, member, strict=False)]
+            named_values = zip(row_names, member, strict=False)
+            cell_iterators = [_iter_cells(group="", name=name, value=value, depth=1) for name, value in named_values]
         elif isinstance(member, Mapping):
-            cell_iterators = [_iter_cells("", "", member, 0)]
+            cell_iterators = [_iter_cells(group="", name="", value=member, depth=0)]
         else:
             raise InputError(f"JSON must hold objects or arrays, got {str(member)[:40]!r} {where}")
         for group, name, cell, unit in chain.from_iterable(cell_iterators):

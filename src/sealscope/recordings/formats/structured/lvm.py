@@ -102,9 +102,9 @@ def read_lvm(path: Path, request: Request) -> RecordingFields:
 def _iter_packets(lines: Iterator[tuple[int, str]], delimiter: str, decimal: str, place: str) -> Iterator[_Packet]:
     """Yield the packets of samples in a LabVIEW measurement file, from its numbered lines.
 
-    A packet is yielded when the names of its columns are read; its rows are added while the next packet is searched
-    for. `delimiter`, `decimal`: separators of cells and of decimals; `place`: the file, for messages. Raises InputError
-    for a word in place of a number.
+    A packet is yielded as soon as the names of its columns are read; its rows are added later, on the way to the next
+    packet. `delimiter`, `decimal`: separators of cells and of decimals; `place`: the file, for messages. Raises
+    InputError for a word in place of a number.
     """
     head: dict[str, list[str]] = {}
     packet: _Packet | None = None
@@ -121,7 +121,10 @@ def _iter_packets(lines: Iterator[tuple[int, str]], delimiter: str, decimal: str
             names = packet.names
 
             def format_place(index: int, number: int = number, names: Sequence[str] = names) -> str:
-                """Format the line, column and file of a cell for messages; `index`: its column."""
+                """Format the line, column and file of a cell for messages.
+
+                `index`: column of the cell; the defaults of the other arguments are those of the present line.
+                """
                 return f"(line {number}, column {names[index]}, {place})"
 
             padded_cells = cells[: len(names)] + [""] * (len(names) - len(cells))
@@ -132,8 +135,10 @@ def _iter_packets(lines: Iterator[tuple[int, str]], delimiter: str, decimal: str
             if len(packet.rows) % 2**16 == 0:  # before a long file fills the memory
                 check_size(len(packet.rows), len(names))
         elif in_head:
-            texts = cells[1:]  # every second cell is empty where each channel has a time
-            head[cells[0].casefold()] = texts[::2] if len(texts) > 2 and texts[2] and not any(texts[1::2]) else texts
+            texts = cells[1:]
+            # if each channel has a column of times, every second cell is empty
+            has_time_cells = len(texts) > 2 and texts[2] and not any(texts[1::2])
+            head[cells[0].casefold()] = texts[::2] if has_time_cells else texts
         else:
             packet = _Packet(head, cells[:-1] if cells[-1].casefold() == "comment" else cells)
             yield packet
@@ -190,9 +195,9 @@ def _compute_times(packet: _Packet, index: int, count: int) -> Array:
 def _packet_offsets(packets: Sequence[_Packet], day_first: bool) -> list[float]:
     """Compute the time [s] from the first packet of samples to each packet.
 
-    The times are differences of the date stamps in the headers. All are 0 if the start times `X0` increase from packet
-    to packet, because the sampling times then continue, or if the date of a packet is not known. `day_first`: True if
-    the day precedes the month in dates.
+    The results are differences of the date stamps in the headers. All are 0 if the date of a packet is not known, or if
+    the start times `X0` increase from packet to packet, because the sampling times then continue by themselves.
+    `day_first`: True if the day precedes the month in dates.
     """
     moments = [packet.moment(0, day_first) for packet in packets]
     first_times = [packet.number("x0", 0) for packet in packets]

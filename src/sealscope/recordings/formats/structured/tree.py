@@ -30,6 +30,7 @@ def iter_series(fields: Mapping[str, Any]) -> Iterator[Series]:
 
     `fields`: name -> value, which is an array (n,) or (n, m), a struct as a mapping, a table or an object.
     """
+    # `depth` counts structs, of which the file itself is none
     yield from _iter_struct(group="", name="", fields=fields, clock=None, depth=-1)
 
 
@@ -49,7 +50,7 @@ def _iter_value(group: str, name: str, value: Any, clock: Clock | None, depth: i
         for number, member in enumerate(value.reshape(-1), start=1):
             yield from _iter_value(group, name if value.size == 1 else f"{name}({number})", member, clock, depth + 1)
     elif isinstance(value, np.ndarray):
-        yield from _iter_columns(group, name, value, None, clock)
+        yield from _iter_columns(group, name, value, unit=None, clock=clock)
 
 
 def _struct_fields(value: Any) -> Mapping[str, Any] | None:
@@ -72,7 +73,8 @@ def _iter_struct(group: str, name: str, fields: Mapping[str, Any], clock: Clock 
     """Yield the series of samples in a struct: a time series, a signal, or a group of other values.
 
     A time series has samples and their times. A signal has samples and a unit or, in a Simulink log, the fields `name`
-    and `values`. `fields`: the fields of the struct by name; other arguments as for `_iter_value`.
+    and `values`. `name`, `fields`: name of the struct, and its fields by name; `group`, `depth`: names and number of
+    the structs around it; `clock`: times of series that state none, None if unknown.
     """
     by_name = {key.rstrip("_").casefold(): value for key, value in fields.items()}
     unit = _first_text(by_name, _UNIT_FIELDS)
@@ -97,14 +99,14 @@ def _iter_time_series(group: str, name: str, by_name: Mapping[str, Any], clock: 
     - MATLAB's `timeseries`: field `data` with an array.
     - Other time series: field `data` with a struct or another value that contains the series.
 
-    `by_name`: the fields of the struct by their names in lower case; `clock`: the times; other arguments as for
-    `_iter_value`.
+    `name`, `by_name`: name of the struct, and its fields by their names in lower case; `group`, `depth`: names and
+    number of the structs around it; `clock`: the times.
     """
     data = by_name.get("data")
     if "signals" in by_name:
         for number, signal in enumerate(_list_structs(by_name["signals"]), start=1):
             label = _single_text(signal.get("label")) or f"{name}({number})"
-            yield from _iter_columns("", label, np.asarray(signal.get("values")), None, clock)
+            yield from _iter_columns("", label, np.asarray(signal.get("values")), unit=None, clock=clock)
     elif isinstance(data, np.ndarray):
         info = _struct_fields(by_name.get("datainfo")) or {}
         unit = _single_text(info.get("Units")) or _first_text(by_name, _UNIT_FIELDS)
@@ -116,21 +118,22 @@ def _iter_time_series(group: str, name: str, by_name: Mapping[str, Any], clock: 
 def _iter_group(group: str, fields: Mapping[str, Any], clock: Clock | None, depth: int) -> Iterator[Series]:
     """Yield the series of samples in each field of a struct, with names and units from fields such as `units`.
 
-    `group`: names of the struct and of the structs around it, with slashes between; other arguments as for
-    `_iter_value`.
+    `fields`: the fields by name; `group`: names of the struct and of the structs around it, with slashes between;
+    `depth`: number of structs around it; `clock`: times of series that state none, None if unknown.
     """
     units, column_names = _find_field_units(fields), _find_column_names(fields)
     for key, value in fields.items():
-        head, _, last = key.rpartition("_")
-        header = _struct_fields(fields.get(f"{head}_Header")) if last == "Data" else None
-        if header is not None:  # `Channel_3_Data`, as catman exports it
+        # catman exports `Channel_3_Data` with `Channel_3_Header`
+        channel, _, suffix = key.rpartition("_")
+        header = _struct_fields(fields.get(f"{channel}_Header")) if suffix == "Data" else None
+        if header is not None:
             step, values = single_number(header.get("dt")), np.asarray(value)
             channel_clock = uniform_clock("catman", values.size, step) if step and step > 0.0 else None
             label = _single_text(header.get("SignalName")) or key
             yield from _iter_columns(group, label, values, _single_text(header.get("Unit")) or None, channel_clock)
         elif column_names and isinstance(value, np.ndarray) and value.ndim == 2 and value.shape[1] == len(column_names):
             for number, label in enumerate(column_names):
-                yield from _iter_columns(group, label, value[:, number], None, clock)
+                yield from _iter_columns(group, label, value[:, number], unit=None, clock=clock)
         elif key in units and isinstance(value, np.ndarray):
             yield from _iter_columns(group, key, value, units[key], clock)
         else:
@@ -193,7 +196,7 @@ def _read_struct_times(by_name: Mapping[str, Any]) -> NDArray[np.float64] | None
 
 def _list_structs(value: Any) -> list[Mapping[str, Any]]:
     """List the structs in an array of structs, or a single struct, as mappings of their fields."""
-    fields = _struct_fields(value) or {}
+    fields = _struct_fields(value) or {}  # of an array: `(1)`, `(2)`, ...
     members = [member for field in fields.values() if (member := _struct_fields(field)) is not None]
     return members if members and all(key.startswith("(") for key in fields) else [fields]
 
@@ -201,9 +204,10 @@ def _list_structs(value: Any) -> list[Mapping[str, Any]]:
 def _iter_columns(
     group: str, name: str, value: NDArray[Any], unit: str | None, clock: Clock | None
 ) -> Iterator[Series]:
-    """Yield the series of a vector, or one for each column of a matrix, with names such as `name(:,1)`.
+    """Yield the series of a vector `value`, or one for each column of a matrix, with names such as `name(:,1)`.
 
-    Arrays of other types or shapes, or with too many columns, are left out.
+    `group`, `unit`, `clock`: group, unit and sampling times of the series, None if unknown. Arrays of other types or
+    shapes, or with too many columns, are left out.
     """
     if value.dtype.kind not in "fiubmMU":
         return
@@ -211,14 +215,17 @@ def _iter_columns(
     if flat.ndim == 1 and flat.size > 1:
         yield Series(group, Label.parse(name, unit), flat.size, partial(np.asarray, flat), clock)
     elif flat.ndim == 2 and min(flat.shape) <= _MAX_COLUMNS:
-        tall = flat if flat.shape[0] >= flat.shape[1] else flat.T
+        tall = flat if flat.shape[0] >= flat.shape[1] else flat.T  # the longer axis is that of the samples
         for number, column in enumerate(tall.T, start=1):
             label = Label(f"{name}(:,{number})", f"{name}(:,{number})", unit)
             yield Series(group, label, column.size, partial(np.asarray, column), clock)
 
 
 def _iter_table(group: str, frame: Any) -> Iterator[Series]:
-    """Yield the columns of a table as series of the `group`, sampled at the row times if it is a timetable."""
+    """Yield the columns of a table, a data frame, as series of the `group`.
+
+    If the index of `frame` contains times, these are the sampling times.
+    """
     units = [str(unit) for unit in frame.attrs.get("VariableUnits", frame.attrs.get("varUnits", ()))]
     clock, index = None, np.asarray(frame.index)
     if index.dtype.kind in "mM" and index.size:
