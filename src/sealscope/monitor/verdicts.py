@@ -134,7 +134,7 @@ class RecordingVerdict:
     def neutral_after_mark(self, mark: str) -> RecordingVerdict:
         """Build the verdict that is shown after a person has marked the alarm, until the next recording is judged.
 
-        It is `cannot tell`, for the same file and times, and quotes the `mark` ("invalid" or "repaired").
+        This verdict is `cannot tell`, for the same file and times, and quotes the `mark` ("invalid" or "repaired").
         """
         state, start_s, end_s = state_of("watched").as_dict(), self.start_s, self.end_s
         texts: dict[str, Any] = {"summary": f"marked {mark}", "reason": "the next recording is judged anew"}
@@ -144,8 +144,8 @@ class RecordingVerdict:
     def restate_block(self, block: BlockEstimate) -> BlockEstimate:
         """Replace the leak in the estimate of a block by the leak of the whole recording.
 
-        Before the onset, or if the recording has no leak, the block gets no leak. Its interval is then from 0 to
-        `bound_lpm`, the 95 % upper bound of a leak in the recording, or None if there is no such bound.
+        Before the onset, or if the recording has no leak, the block gets no leak. The interval of the leak is then from
+        0 to `bound_lpm`, the 95 % upper bound of a leak in the recording, or None if this bound is None.
         """
         is_before_onset = self.onset_s is not None and block.t < self.onset_s
         if self.leaks and not is_before_onset:

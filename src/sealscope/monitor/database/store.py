@@ -57,7 +57,10 @@ class StoredRows:
     old_estimates: dict[str, int] = field(default_factory=dict)
 
     def add_estimates(self, actuator: str, estimates: Iterable[BlockEstimate], oil_celsius: float | None) -> None:
-        """Add the estimates of an actuator's blocks, each with the oil temperature [deg C], None if unknown."""
+        """Add the leakage estimates of an actuator's blocks, and the oil temperature [deg C], None if unknown, to each.
+
+        `actuator`: name of the actuator.
+        """
         for estimate in estimates:
             total_ends = estimate.total_interval_lpm or (None, None)
             leak_ends = estimate.leak_interval_lpm or (None, None)
@@ -204,7 +207,7 @@ class MonitorStore:
             return connection.execute(query).all()
 
     def _value(self, query: Any) -> int:
-        """Execute a query for a single number, and return it; return 0 if there is none."""
+        """Execute a query for a single number, and return the number; return 0 if the query gives none."""
         with self.engine.connect() as connection:
             return int(connection.execute(query).scalar() or 0)
 
@@ -273,7 +276,7 @@ class MonitorStore:
         if connection.execute(table.update().where(*is_row), values).rowcount < len(rows):
             if len(rows) == 1:
                 connection.execute(table.insert(), rows)
-            else:  # which ones are missing is not known
+            else:  # it is not known which rows are missing: try each
                 for row in rows:
                     self.upsert(connection, table, [row])
 
@@ -374,7 +377,7 @@ class MonitorStore:
             newest = select(columns.t).where(is_chosen).order_by(columns.number.desc()).limit(1).scalar_subquery()
             is_chosen &= columns.t.between(newest - seconds, newest)
         n_averaged = max(1, -(-self._value(select(func.count()).where(is_chosen)) // max_rows))  # rounded up
-        group = columns.number - columns.number % n_averaged
+        group = columns.number - columns.number % n_averaged  # running number with which the group of a row begins
         query = select(*(func.avg(columns[name]).label(name) for name in ("t", *tables.FIGURES)))
         return [dict(row._mapping) for row in self._rows(query.where(is_chosen).group_by(group).order_by(group))]
 
@@ -400,8 +403,8 @@ class MonitorStore:
     def deliver(self, output: str, send: Callable[[dict[str, Any]], bool]) -> None:
         """Send the events of alarms that an output has not sent yet, in order and at most 1000 of them.
 
-        `output`: name of the output; `send`: function that sends an event, and returns False to try it again in the
-        next call. The number of each sent event is stored, so the next call continues after it.
+        `output`: name of the output; `send`: function that sends an event, and returns False if the next call must try
+        this event again. The number of each sent event is stored, so the next call continues with the following event.
         """
         for number, event in self.events_since(self.position(output)):
             if not send(event):
@@ -410,7 +413,7 @@ class MonitorStore:
 
 
 def outage_reason(error: BaseException) -> str | None:
-    """Describe an outage of the database in one line; return None if `error` is of another kind.
+    """Describe the database outage that an error reports in one line; return None for an error of another kind.
 
     A value that the database cannot store (DataError) is not an outage: waiting would not help.
     """

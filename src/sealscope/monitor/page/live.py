@@ -119,7 +119,7 @@ class LiveSamples:
                     del self._n_viewers[name], self._windows[name]
 
     def push(self, name: str, samples: Recording | None) -> None:
-        """Add new samples of an actuator to its window, if anybody views it."""
+        """Add new samples of an actuator to its window, if anybody views the actuator; do nothing for None."""
         if samples is None or name not in self._windows:
             return
         with self._lock:
@@ -176,10 +176,10 @@ def _round_to_json(values: Array, digits: int = 3) -> list[float | None]:
 def _envelope(t: Array, series: dict[str, Array]) -> dict[str, list[float | None]]:
     """Reduce long series to the minimum and maximum in each bin, in the order in which they occur.
 
-    A bin is a group of successive samples; there are at most `_BINS` bins of equal size. The last one ends with the
-    last sample, and earlier samples that fill no bin are left out. Series with at most two samples per bin are not
-    reduced. `series`: values (n,) by name, at the times `t` (n,) [s]. Returns the times of the bins' first and middle
-    samples as "t", and the reduced series by name, rounded.
+    A bin is a group of successive samples; there are at most `_BINS` bins of equal size. The last bin ends with the
+    last sample, and the first samples are left out if they do not fill a bin. Series with at most two samples per bin
+    are not reduced. `series`: values (n,) by name, at the times `t` (n,) [s]. Returns the times of the bins' first and
+    middle samples as "t", and the reduced series by name, rounded.
     """
     bin_size = -(-t.size // _BINS)  # rounded up
     if bin_size <= 2:
@@ -199,12 +199,14 @@ def _detail_curves(t: Array, signal: Array | None, pressure: str, detail_form: s
     """Compute the curves of the wavelet details [kPa] of a pressure, or of their RMS, as plain values.
 
     `signal` [Pa]: the pressure over the times `t` [s], None if it is not recorded; `pressure`: its name;
-    `detail_form`: "details" or "rms". Only the samples after the last missing one are used. If they are fewer than
-    needed, the curves are empty, and `needs` and `has` state these numbers.
+    `detail_form`: "details" or "rms". Only the samples after the last missing sample are used. If there are fewer of
+    these than the wavelet transform needs, the curves are empty. The entry `needs` is the needed number of samples,
+    and `has` the present one.
     """
     samples = np.empty(0) if signal is None else signal / _KILOPASCAL
     missing_indices = np.flatnonzero(~np.isfinite(samples))
-    samples = samples[missing_indices[-1] + 1 if missing_indices.size else 0 :]
+    first = missing_indices[-1] + 1 if missing_indices.size else 0
+    samples = samples[first:]
     header: dict[str, Any] = {"of": pressure, "drawn": detail_form, "needs": min_samples() + WINDOW_SIZE - 1}
     if samples.size < header["needs"]:
         return {**header, "t": [], "has": int(samples.size)}

@@ -113,7 +113,7 @@ class WatchedFolder:
             is_read = identity in self._read_ahead
             samples, reason = self._read_ahead.pop(identity) if is_read else self._read(file.path)
             if reason and self._may_be_incomplete(file):
-                self._unreadable.add(identity)
+                self._unreadable.add(identity)  # tried again later
                 continue
             if not reason:
                 reason = self._find_refusal_reason(samples, file)
@@ -152,14 +152,14 @@ class WatchedFolder:
     def _start_time(self, file: _FoundFile) -> float:
         """Find the time of a file's first sample [s since 1970], or the time of its last change if it is unreadable.
 
-        The file is read for this. Its recording is kept for `blocks`, if there is room in `_READ_AHEAD_BYTES`; else
-        `blocks` reads the file again.
+        The file is read to find the time. The recording is kept for `blocks` if there is room in `_READ_AHEAD_BYTES`;
+        otherwise `blocks` reads the file again.
         """
         modified_s, path, identity = file
         if identity not in self._starts:
             samples, reason = self._read(path)
             n_bytes = sum(count_bytes(recording) for recording, _ in self._read_ahead.values() if recording is not None)
-            if samples is None or n_bytes + count_bytes(samples) < _READ_AHEAD_BYTES:  # else it is read again later
+            if samples is None or n_bytes + count_bytes(samples) < _READ_AHEAD_BYTES:
                 self._read_ahead[identity] = samples, reason
             if reason:
                 return modified_s
@@ -176,11 +176,11 @@ class WatchedFolder:
             return None, f"{_printable(path.name)}: {describe_error(error)}"
 
     def _find_refusal_reason(self, samples: Recording | None, file: _FoundFile) -> str:
-        """Return the reason to refuse a recording that starts before the newest one watched so far, or "" to accept it.
+        """Return the reason to refuse a recording that starts before the newest recording so far, or "" to accept it.
 
         After a restart the last stored sample stands for the start of the newest recording. A recording of the same day
         that states no time of day is accepted. If the newest recording is dated in the future, all are accepted. A file
-        that is dated in the future is logged.
+        that is dated in the future is logged. `samples`: the recording, None if it has no samples; `file`: its file.
         """
         if samples is None:
             return ""
@@ -300,7 +300,8 @@ def watch_folders(service: BlockReceiver, *, once: bool) -> None:
 
     while not service.stopping.is_set():
         succeeded = [folder_part.attempt(partial(submit_blocks, folder)) for folder_part, folder in folders.items()]
-        if once and (all(succeeded) or part(DATABASE).since is None):  # tried again in an outage of the database
+        # in an outage of the database the folders are tried again
+        if once and (all(succeeded) or part(DATABASE).since is None):
             return
         service.stopping.wait(_LOOK_S)
 
@@ -311,8 +312,8 @@ def _printable(name: str) -> str:
 
 
 def _is_midnight_before(start: float, newest: float) -> bool:
-    """Return True if `start` is the midnight (UTC) at which the day of `newest` begins; both are in seconds since 1970.
+    """Return True if `start` is the midnight (UTC) at which the day of `newest` begins.
 
-    A recording that is dated without a time of day starts at midnight.
+    Both are starts of recordings [s since 1970]. A recording that is dated without a time of day starts at midnight.
     """
     return start % DAY == 0.0 and start <= newest < start + DAY

@@ -48,10 +48,10 @@ class _Channel:
         A missing sample repeats the value before it, NaN if there is none.
         """
         known_indices = sorted(k for k in self.values if k < stop)
-        n_known = np.searchsorted(known_indices, np.arange(first, stop), side="right")  # up to each sample
+        n_known = np.searchsorted(known_indices, np.arange(first, stop), side="right")  # known values up to each sample
         previous = math.nan if self.previous is None else self.previous
         known_values = np.array([previous, *(self.values.pop(k) for k in known_indices)])
-        samples = known_values[n_known]
+        samples = known_values[n_known]  # the last known value, or `previous` if none is known yet
         self.previous = float(samples[-1])
         return samples
 
@@ -84,8 +84,9 @@ class ValueGatherer:
         is an unknown value. Values without a finite time, and too many values at once, are dropped. If the time jumps
         forward by more than `_AHEAD_S`, the blocks continue after the pause with each channel's last value. If it jumps
         back by more than `_AHEAD_S`, all earlier values are discarded. Only the first value of a channel may be so old:
-        the channel then counts as constant since.
+        the channel then counts as constant since the time of this value.
         """
+        # a double resolves the number of a sample up to 2^52
         if not math.isfinite(t) or abs(t * self.rate) > 2**52 or not 0 < len(values) <= MAX_SAMPLES:
             self._count("values without a clock, or too many")
             return []
@@ -123,7 +124,7 @@ class ValueGatherer:
             else:
                 target.values[k] = value
         while self._start is None and len(target.values) > self._max_lead:
-            target.previous = target.values.pop(next(iter(target.values)))
+            target.previous = target.values.pop(next(iter(target.values)))  # the one added first
         last = first + len(values) - 1
         self._newest = last if self._newest is None else max(self._newest, last)
         target.newest = last if target.newest is None else max(last, target.newest)

@@ -109,8 +109,11 @@ class _OpcUaSession:
                 nodes = {client.get_node(node): channel for channel, node in actuator.nodes.items()}
                 self._channels.update({node.nodeid: (actuator.name, channel) for node, channel in nodes.items()})
                 rate = float(actuator.rate or 1.0)
+                queue_size = math.ceil(2.0 * rate * self._settings.block_s)  # the samples of two blocks
                 results = await subscription.subscribe_data_change(
-                    [*nodes], queuesize=math.ceil(2.0 * rate * self._settings.block_s), sampling_interval=1e3 / rate
+                    [*nodes],
+                    queuesize=queue_size,
+                    sampling_interval=1000.0 / rate,  # [ms]
                 )
                 for (node, channel), result in zip(nodes.items(), results, strict=True):
                     if not isinstance(result, int):
@@ -121,10 +124,11 @@ class _OpcUaSession:
                 await asyncio.sleep(_POLL_S)
 
     def datachange_notification(self, node: Any, value: Any, data: Any) -> None:
-        """Add a value of a subscription, and queue the blocks that it completes; asyncua calls this.
+        """Add a value of a subscription, and queue the blocks that are then complete; called by the library asyncua.
 
-        The value is a number or an array of samples. Samples that are not finite or not of good quality count as
-        unknown (NaN). Any other value is dropped and counted.
+        `node`: the node of a channel; `value`: number or array of samples; `data`: time and quality of the value.
+        Samples that are not finite or not of good quality count as unknown (NaN). Any other value is dropped and
+        counted.
         """
         name, channel = self._channels[node.nodeid]
         data_value = data.monitored_item.Value
@@ -147,7 +151,10 @@ class _OpcUaSession:
                 self._service.count(_NO_ROOM)
 
     def _submit(self) -> None:
-        """Submit the queued blocks until the service stops, in a thread of its own, because `submit` may wait."""
+        """Submit the queued blocks until the service stops.
+
+        This runs in a separate thread, because the service's `submit` waits while its queue is full.
+        """
         while not self._service.stopping.is_set():
             for block in self._waiting.pop(1, _POLL_S):
                 self._service.submit(block)
