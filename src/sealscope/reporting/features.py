@@ -134,7 +134,8 @@ def parts_to_compare(diagnosis: Diagnosis, recording: Recording) -> Parts:
         return Parts(low, high, ("Before", "After"), text)
     if len(recording) < 2 * (WINDOW_SIZE + (HALF_WINDOWS - 1) * WINDOW_STEP):
         text = "No onset was found, and the recording is too short to be parted."
-        return Parts(np.inf, np.inf, ("Whole", "Later"), text)
+        # all times lie before the end inf of the first part
+        return Parts(end=np.inf, start=np.inf, heads=("Whole", "Later"), text=text)
     middle = float(t[0] + t[-1]) / 2
     text = f"No onset was found: the first half is set against the second, parted at {middle:.1f} s."
     return Parts(middle, middle, ("First half", "Second half"), text)

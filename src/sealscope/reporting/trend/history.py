@@ -94,12 +94,12 @@ def history_pictures(ordered: Sequence[Judged]) -> dict[str, Picture] | None:
     has_dates = all(entry.start_s is not None for entry in ordered)
     days = [(entry.start_s or 0.0) / DAY if has_dates else float(k + 1) for k, entry in enumerate(ordered)]
     limit = ordered[-1].diagnosis.limit_lpm
-    # values above `max_shown` would flatten the others; they are drawn as a symbol at the top
+    # values above 8 times the median would flatten the others; they are drawn as a symbol at the top
     max_shown = 8.0 * float(np.median([lpm for lpm, *_ in known_levels])) or math.inf
     shown_values = [value for lpm, _, high in known_levels for value in (lpm, high)]
     shown_values = [value for value in shown_values if value <= max_shown and value < math.inf]
     shown_values += [] if limit is None or limit > max_shown else [limit]
-    top = 1.08 * max(shown_values, default=0.0) or 1.0
+    top = 1.08 * max(shown_values, default=0.0) or 1.0  # 8 % margin
 
     def format_day(day: float) -> str:
         """Format a value of the time axis as a date, or if there are no dates, as the number of a recording.
@@ -132,9 +132,9 @@ def history_pictures(ordered: Sequence[Judged]) -> dict[str, Picture] | None:
 
 
 def _leak_level(diagnosis: Diagnosis) -> _Level | None:
-    """Return the leak of a diagnosis as (estimate, low, high), or its bound as (bound, None, bound), in L/min.
+    """Return the leak of a diagnosis as (estimate, low, high), or a leak's upper bound as (bound, None, bound) [L/min].
 
-    Returns None if the diagnosis states neither.
+    Returns None if the diagnosis states neither a leak flow nor a bound.
     """
     leak, bound = diagnosis.leak_lpm, diagnosis.bound_lpm
     if diagnosis.verdict != "leak":
@@ -146,7 +146,7 @@ def _leak_level(diagnosis: Diagnosis) -> _Level | None:
 
 
 def _dates(ordered: Sequence[Judged]) -> list[str]:
-    """Format the start of each recording as a date; a dash if it is unknown.
+    """Format the start of each recording as a date, with a dash for an unknown start.
 
     The time of day is added if all recordings start within less than three days.
     """
@@ -156,11 +156,11 @@ def _dates(ordered: Sequence[Judged]) -> list[str]:
 
 
 def _draw_comparison(ordered: Sequence[Judged]) -> tuple[list[charts.Chart], charts.DrawnCharts | None, list[str]]:
-    """Draw the channels of the newest recording and of an earlier one in the same charts, from a common start.
+    """Draw the channels of the newest and of an earlier recording in the same charts, from a common start.
 
-    The earlier recording is the last one with the verdict `no leak` or, without such a recording, the last one before
-    the newest. Returns the charts, the charts as drawn, and the names of the two files. Returns ([], None, []) if there
-    is no earlier recording, no common channel, or a clock that does not increase.
+    `ordered`: recordings in order of their starts. The earlier recording is the last one with the verdict `no leak` or,
+    if there is none, the last but one. Returns the charts, the charts as drawn, and the names of the two files. Returns
+    ([], None, []) if there is no earlier recording, no common channel, or a clock that does not increase.
     """
     *earlier, newest = ordered
     healthy = [entry for entry in earlier if entry.diagnosis.verdict == "no leak"]
