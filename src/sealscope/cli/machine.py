@@ -18,7 +18,7 @@ def commission(
         list[Path], typer.Argument(metavar="FILE...", help="Healthy recordings of the machine, or a folder of them.")
     ],
     output: Annotated[Path, typer.Option("--output", "-o", help="The machine's file to write (.toml).")],
-    stated: StatedMachine,
+    stated: StatedMachine,  # built from the options that the decorator adds
     add: Annotated[
         bool,
         typer.Option(

@@ -83,7 +83,7 @@ def declared_option(name: str, *, option: str = "", several: bool = False, **set
 
 
 def _argument_text(name: str) -> str:
-    """Return the help text of an argument of `Experiment.of`."""
+    """Return the help text of the argument `name` of `Experiment.of`."""
     return str(Arguments.__dataclass_fields__[name].metadata["text"])
 
 

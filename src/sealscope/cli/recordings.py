@@ -55,7 +55,7 @@ class DiagnosedRecording(NamedTuple):
 def diagnose(
     context: Context,
     files: Annotated[list[Path], Argument(metavar="FILE...", help="Recordings of any format; `-`: standard input.")],
-    stated: opt.StatedMachine,
+    stated: opt.StatedMachine,  # built from the options that the decorator adds
     output: Annotated[Literal["text", "jsonl"], Option("--format", help="Text, or one JSON object a line.")] = "text",
     join: opt.JoinOption = False,
     false_alarm: opt.FalseAlarmOption = opt.FALSE_ALARM_PROBABILITY,
@@ -248,7 +248,7 @@ def report(
     output: Annotated[
         Path, Option("--output", "-o", help="The page (.html, .pdf) or its card (.png), or a folder for several files.")
     ],
-    stated: opt.StatedMachine,
+    stated: opt.StatedMachine,  # built from the options that the decorator adds
     join: opt.JoinOption = False,
     false_alarm: opt.FalseAlarmOption = opt.FALSE_ALARM_PROBABILITY,
 ) -> None:
@@ -394,7 +394,7 @@ def _resolve_map(channel_map: ChannelMap, file: Path, recording: Recording) -> d
 def convert(
     source: Annotated[Path, Argument(help="Recording to read.")],
     target: Annotated[Path, Argument(help="Recording to write; its suffix tells the format.")],
-    stated: opt.StatedMachine,
+    stated: opt.StatedMachine,  # built from the options that the decorator adds
     every: Annotated[str | None, Option("--every", metavar="TIME", help=_EVERY)] = None,
 ) -> None:
     """Rewrite a recording in another format, with Sealscope's channel names and units."""
@@ -415,7 +415,10 @@ def convert(
 
 
 def _convert_parts(source: Path, folder: Path, stated: opt.StatedMachine, every: str) -> None:
-    """Write a long recording as parts of the length `every`, such as 1h, to files in a new or empty folder."""
+    """Write a long recording as parts of the length `every`, such as 1h, to files in a new or empty folder.
+
+    `source`: file of the recording; `stated`: its channel map and sampling rate.
+    """
     from sealscope.paragraphs import format_count
     from sealscope.recordings import inspect, read_parts, write
     from sealscope.units import parse_quantity

@@ -31,7 +31,7 @@ _EVERY = "Time from one recording to the next (1d, 12h), of files that state non
 def trend(
     context: Context,
     files: Annotated[list[Path], Argument(metavar="FILE...", help=_FILES)],
-    stated: opt.StatedMachine,
+    stated: opt.StatedMachine,  # built from the options that the decorator adds
     form: Annotated[Literal["text", "json", "csv"], Option("--format", help="Text, a JSON object, a table.")] = "text",
     output: Annotated[Path | None, Option("--output", "-o", help=_OUTPUT)] = None,
     healthy: Annotated[int | None, Option(help=_HEALTHY)] = None,

@@ -306,7 +306,7 @@ class WatchedActuators:
         return actuator
 
     def _load_checkpoint(self, actuator: _Actuator, stored: StoredCheckpoint) -> bool:
-        """Restore an actuator from its checkpoint in the database, and judge the samples since then again.
+        """Restore an actuator from its checkpoint `stored` in the database, and judge the samples since then again.
 
         The detector (`watch`) starts anew if another version saved its state, or if it learned with another rig or
         learning time. Returns True if a new checkpoint must be saved, because the detector starts anew or the

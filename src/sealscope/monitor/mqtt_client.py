@@ -82,7 +82,7 @@ class MqttLink:
             raise RuntimeError("the thread of the connection to the broker has ended")
 
     def publish(self, topic: str, payload: bytes | str, **options: Any) -> bool:
-        """Publish a message; return True if it was sent within `_PUBLISH_TIMEOUT_S`.
+        """Publish `payload` as a message under `topic`; return True if it was sent within `_PUBLISH_TIMEOUT_S`.
 
         `options`: arguments of paho's `publish`; with `qos` 1 the broker must also acknowledge the message in time.
         """

@@ -185,5 +185,8 @@ def _decode_metric(entry: Any) -> SparkplugMetric:
 
 
 def topic_of(group: str, kind: str, node: str, device: str | None = None) -> str:
-    """Build the MQTT topic of a Sparkplug message of a node or of its device; `kind`: its type, such as ``NBIRTH``."""
+    """Build the MQTT topic of a Sparkplug message of a node in a group, or of the node's device.
+
+    `kind`: type of the message, such as ``NBIRTH``.
+    """
     return "/".join([NAMESPACE, group, kind, node, *([] if device is None else [device])])

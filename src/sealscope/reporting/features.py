@@ -84,7 +84,7 @@ def chamber_details(recording: Recording, channel: str) -> tuple[ChamberDetails 
             ends, window_rows = windowed_rms(rows[:, inside], first=inside.start)
         except InputError as error:  # such as pressures of 1e300, whose squares overflow
             return None, f"No details of {channel}: {error}."
-        for name, row, level in zip(QUANTITIES, rows, (1, 2, 3, 4, 4), strict=True):  # d3d4 reaches as far as d4
+        for name, row, level in zip(QUANTITIES, rows, (1, 2, 3, 4, 4), strict=True):  # d3d4 is affected where d4 is
             unaffected_samples = transform.inside(level)
             values[name][part][unaffected_samples] = row[unaffected_samples]
         if ends.size:

@@ -300,6 +300,7 @@ def how_sure(diagnosis: Diagnosis) -> str:
     odds = "" if odds is None else f"{odds}; "
     relation = "over" if diagnosis.score > diagnosis.threshold else "not over"
     if diagnosis.verdict != "leak" and found_cause is not None and diagnosis.alarmed:
+        # the alarm has another cause than a leak
         odds, relation = f"that something changed: {odds}", f"for {found_cause}, over"
     detector = diagnosis.methods[0].detector if diagnosis.methods else ""  # the deciding one is first
     return say(
@@ -444,7 +445,7 @@ def format_leak_flow(diagnosis: Diagnosis) -> str:
     If the flow or the bound is not known, the text says that no flow is stated.
     """
     if diagnosis.verdict == "leak" and diagnosis.leak_lpm is not None:
-        low, high = diagnosis.leak_interval_lpm or (diagnosis.leak_lpm,) * 2
+        low, high = diagnosis.leak_interval_lpm or (diagnosis.leak_lpm, diagnosis.leak_lpm)
         return f"{number(diagnosis.leak_lpm, 2)} L/min ({number(low, 2)} to {number(high, 2)})"
     if diagnosis.verdict != "leak" and diagnosis.bound_lpm is not None:
         return f"none above {number(diagnosis.bound_lpm, 2)} L/min"

@@ -103,7 +103,7 @@ def _is_complete_pdf(data: bytes) -> bool:
 
 
 def _is_complete_png(data: bytes, width: int, height: int) -> bool:
-    """Return True if the bytes of a PNG have this size in pixels and end with the chunk IEND and its checksum."""
+    """Return True if a PNG has `width` x `height` pixels, and its bytes end with the chunk IEND and its checksum."""
     # signature, then the chunk IHDR: length 13, name, width and height
     head = struct.pack(">8sL4sLL", b"\x89PNG\r\n\x1a\n", 13, b"IHDR", width, height)
     return data.startswith(head) and data.endswith(b"\0\0\0\0IEND\xaeB`\x82")

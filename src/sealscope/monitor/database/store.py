@@ -266,7 +266,10 @@ class MonitorStore:
             self.write_rows(connection, rows)
 
     def upsert(self, connection: sa.Connection, table: sa.Table, rows: list[dict[str, Any]]) -> None:
-        """Write rows to a table: update the stored rows with the same primary keys, and insert the missing ones."""
+        """Write rows to a table: update the stored rows with the same primary keys, and insert the missing ones.
+
+        `connection`: connection with an open transaction, in which the rows are written.
+        """
         if not rows:
             return
         key = table.primary_key.columns.keys()

@@ -15,7 +15,7 @@ def dashboard() -> dict[str, Any]:
     for number, (title, kind, query, legend, unit, width, height) in enumerate(tables["panels"], 1):
         if x + width > 24:  # the panel begins a new row
             x, y, row_height = 0, y + row_height, 0
-        expression = query.replace("%s", 'actuator=~"$actuator"')
+        expression = query.replace("%s", 'actuator=~"$actuator"')  # the filter by the chosen actuator
         panels.append(
             {
                 "id": number,

@@ -188,7 +188,7 @@ class SparkplugNode:
     def _send_device_birth(self, actuator: str, summary: dict[str, Any], alarm: dict[str, Any]) -> None:
         """Send the birth message of an actuator's device, which states all its metrics.
 
-        `alarm`: its latest alarm as plain values, {} if there is none.
+        `summary`: summary of the actuator; `alarm`: its latest alarm as plain values, {} if there is none.
         """
         values = _metric_values("summary", summary)
         metrics = _build_metrics("summary", values, _milliseconds(summary["t"]))
@@ -198,7 +198,7 @@ class SparkplugNode:
         self._sent_values[actuator] = values
 
     def _send(self, kind: str, metrics: list[spb.SparkplugMetric], actuator: str | None = None) -> bool:
-        """Send a message of the node, or of an actuator's device, with the next sequence number.
+        """Send a message with `metrics` of the node, or of an actuator's device, with the next sequence number.
 
         `kind`: type of the message, such as "DDATA"; `actuator`: None for a message of the node. Returns True if the
         message was sent.

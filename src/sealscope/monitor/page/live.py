@@ -89,7 +89,7 @@ class LiveSamples:
 
     @contextmanager
     def viewing(self, name: str) -> Iterator[bool]:
-        """Keep the samples of an actuator while the context lasts, and yield True.
+        """Keep the samples of the actuator `name` while the context lasts, and yield True.
 
         The last stored samples are shown until new ones arrive. If `MAX_ACTUATORS` others are viewed already, nothing
         is kept, and False is yielded.
@@ -133,7 +133,7 @@ class LiveSamples:
         return frozenset(self._windows)
 
     def version(self, name: str) -> int:
-        """Return a number that increases when an actuator gets new samples, 0 if it is not viewed or has none."""
+        """Return a number that increases when a viewed actuator gets samples, 0 for other actuators."""
         window = self._windows.get(name)
         return 0 if window is None else window.version
 
@@ -276,5 +276,5 @@ def describe_rig(rig: str) -> dict[str, Any]:
         "valve": circuit.valve,
         "stroke": loaded_rig.cylinder.L / _MILLIMETRE,
         "area": 0.5 * (loaded_rig.cylinder.A_A + loaded_rig.cylinder.A_B) * _MILLIMETRE / LITRE_PER_MINUTE,
-        "displacement": loaded_rig.pump.q_b * 1e3,
+        "displacement": loaded_rig.pump.q_b * 1e3,  # from m^3 to L
     }

@@ -153,7 +153,7 @@ class _Connection:
         return self._state_message(online=False)
 
     def _state_message(self, *, online: bool) -> tuple[str, str]:
-        """Build topic and payload of the STATE message of a Sparkplug primary host."""
+        """Build topic and payload of the message STATE, in which a Sparkplug primary host is online or offline."""
         state = json.dumps({"online": online, "timestamp": self._connected_ms})
         return f"{NAMESPACE}/STATE/{self._settings.host_id}", state
 

@@ -199,7 +199,8 @@ class WatchedFolder:
         The samples are corrected for the defects of loggers, and their times converted to seconds since 1970. A
         recording with a date only, without a time of day, begins `_GAP_S` after the previous recording of this day.
         An oil temperature in the file's header becomes the channel `T_oil`. If no samples remain, there is no verdict.
-        Raises PartAway if the file of the machine cannot be read; the recording is then tried again later.
+        `path`: file of the recording. Raises PartAway if the file of the machine cannot be read; the recording is then
+        tried again later.
         """
         start = file_seconds(recording, path)
         # long gaps, which the correction fills in, become NaN again
@@ -224,7 +225,7 @@ class WatchedFolder:
     ) -> RecordingVerdict | None:
         """Judge a whole recording by its machine's healthy recordings; log any error, and then return None.
 
-        `shift` [s]: added to the recording's times to give seconds since 1970.
+        `path`: file of the recording; `shift` [s]: added to the recording's times to give seconds since 1970.
         """
         try:
             return judge_recording(machine, recording, _printable(path.name), shift, limit_lpm=self._limit_lpm)

@@ -112,7 +112,7 @@ class ValueGatherer:
             self._channels[name] = _Channel(previous=old_channel.last_value(), arrival=old_channel.arrival)
 
     def _add_values(self, target: _Channel, first: int, values: Sequence[float]) -> None:
-        """Add values to a channel from index `first` of the time axis on; drop those before the next block.
+        """Add values to the channel `target` from index `first` of the time axis on; drop those before the next block.
 
         `_start` is the index at which the next block begins. It is None until every channel has values, and the first
         block begins. Until then a channel keeps only its newest `_max_lead` values, so that memory stays bounded if
@@ -157,7 +157,7 @@ class ValueGatherer:
                 first_indices = [min(min(channel.values) for channel in channels if channel.values)]
             self._start = max(first_indices)
         newest = [channel.newest for channel in channels if channel.arrival >= self._now() - SILENT_S]
-        if not newest or None in newest:
+        if not newest or None in newest:  # all channels are silent, or one has no value on the time axis
             return []
         blocks: list[Recording] = []
         known_stop = min(index for index in newest if index is not None) + 1

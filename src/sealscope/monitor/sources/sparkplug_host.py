@@ -181,7 +181,8 @@ class SparkplugHost:
     def receive(self, topic: str, data: bytes) -> SourceBlock | None:
         """Process a message of a node; return the block of its samples, or None if it has no samples.
 
-        Raises RefusedMessage if the message breaks the protocol or its samples cannot be used.
+        `topic`: MQTT topic of the message; `data`: its payload. Raises RefusedMessage if the message breaks the
+        protocol or its samples cannot be used.
         """
         match topic.split("/"):
             case [_, _, "NCMD" | "DCMD", *_]:
@@ -223,8 +224,9 @@ class SparkplugHost:
         """Update the state of a node with the birth, death or sequence number of a message of `kind`.
 
         The birth of a node (NBIRTH) begins its session, and the death (NDEATH) ends it; both discard the births of its
-        devices. A gap in the sequence is counted and the birth requested. Raises RefusedMessage if the message has no
-        sequence number, comes before the birth, or is the death of an earlier connection.
+        devices. A gap in the sequence is counted and the birth requested. `group`, `node`: names of the node and its
+        group; `payload`: contents of the message. Raises RefusedMessage if the message has no sequence number, comes
+        before the birth, or is the death of an earlier connection.
         """
         state = self._nodes[group, node]
         if kind in ("NBIRTH", "NDEATH"):

@@ -98,8 +98,9 @@ def _format_knowledge(known: PriorKnowledge | None) -> str:
 def _format_a90(pod: DetectorPod | None) -> tuple[str, str]:
     """Format the leak sizes a90 and a90/95 of a detector.
 
-    The size a90 is detected with a probability of 90 %, and a90/95 is its upper 95 % confidence bound. A size above the
-    largest tested size is written "> LARGEST"; a dash stands for an unknown size.
+    The size a90 is detected with a probability of 90 %, and a90/95 is its upper 95 % confidence bound. `pod`: the
+    probability of detection (POD) over the leak size, None if unknown. A size above the largest tested size is written
+    "> LARGEST"; a dash stands for an unknown size.
     """
     if pod is None or pod.curve is None:
         return "–", "–"
@@ -290,7 +291,8 @@ def _detector_section(pod: DetectorPod, judgement: Judgement, unit: str) -> dict
 
     The section has the detector's plots, the areas under its ROC curves, and a table of its fractions of alarms, with a
     row for each combination of the factors' levels and a column for each leak size. The table is empty without factors,
-    or if there are too many sizes. `unit`: unit of the leak sizes.
+    or if there are too many sizes. `pod`: the detector's probability of detection (POD) over the leak size;
+    `judgement`: the results of all detectors; `unit`: unit of the leak sizes.
     """
     name = pod.detector
     rocs = [roc for roc in judgement.rocs if roc.detector == name]
@@ -347,8 +349,9 @@ class _PlotCurve(NamedTuple):
 def _pod_plot(pod: DetectorPod, unit: str) -> dict[str, Any] | None:
     """Draw a detector's fraction of detections over the size of the leak, on a logarithmic axis.
 
-    The picture has the fractions with their intervals, the fitted curve with its band, and the sizes a90 and a90/95.
-    Returns its `title` and the `picture`, or None if there are fewer than two sizes. `unit`: unit of the sizes.
+    The picture has the fractions with their intervals, the fitted curve with its band, and the sizes a90 (detected with
+    a probability of 90 %) and a90/95 (upper bound of a90). `pod`: the probability of detection (POD) over the leak
+    size; `unit`: unit of the sizes. Returns `title` and `picture`, or None if there are fewer than two sizes.
     """
     if len(pod.sizes) < 2:
         return None
