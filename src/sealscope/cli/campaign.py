@@ -66,7 +66,7 @@ def run(
 
     loaded_plan = load_plan(plan)
     target = _campaign_folder(loaded_plan, folder)
-    if not isinstance(loaded_plan, SimulatedPlan):
+    if not isinstance(loaded_plan, SimulatedPlan):  # a plan over recordings, which are only judged
         if batch:
             raise InputError(
                 f"a plan in batches must simulate its records; run it without --batch ({loaded_plan.place})"

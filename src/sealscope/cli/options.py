@@ -417,7 +417,7 @@ def say_wrapped(text: str, head: str = "") -> None:
 
     Lines after the first are indented by the length of `head`, or by 2 columns without a head.
     """
-    say(paragraph(text, head, len(head) or 2))
+    say(paragraph(text, head, indent=len(head) or 2))
 
 
 def complain(message: object) -> None:

@@ -233,7 +233,7 @@ def _start_seconds(result: DiagnosedRecording) -> float | None:
 def _run_collecting_messages(
     work: Callable[[Sequence[Path]], Iterator[DatedDiagnosis | None]], files: Sequence[Path]
 ) -> tuple[str, list[DatedDiagnosis | None]]:
-    """Diagnose files by the function `work`, and collect its messages for standard error.
+    """Diagnose files by the function `work`, and collect the messages that it prints on standard error.
 
     Returns the messages as text, and the list of the dated diagnoses, with None for an unreadable file.
     """
@@ -351,12 +351,12 @@ def inspect(
     from sealscope.reporting.overview import overview_text
 
     _reads_standard_input(files)
-    stated = opt.StatedMachine.of(None, maps, rate, rig)
+    stated = opt.StatedMachine.of(maps=maps, rate=rate, rig=rig)
     if save_map and (rig is None or not stated.channel_map):
         raise InputError("--save-map must stand with --rig and its file, and with the --map options to be saved")
     machine = stated if stated.has_map else replace(stated, channel_map="auto")
     is_complete = True
-    columns: dict[str, str] | None = None  # channel -> column; in the first readable file if the map is `auto`
+    columns: dict[str, str] | None = None  # by channel: its column, in the first readable file if the map is `auto`
     for file, recording in machine.read_all(files, joined=join):
         if recording is None:
             is_complete = False

@@ -76,7 +76,7 @@ def trend(
         raise UnreadableFile("no recording could be read, so there is no trend")
     if healthy is None:
         n_known = 0 if stated.commissioned is None else _count_known(readings, stated.commissioned)
-        healthy = max(1, n_known)  # the first recording must be taken as healthy
+        healthy = max(1, n_known)  # the first recording is always taken as healthy
     result = trend_of(readings, healthy=healthy, limit=stated.limit, years=years, every=spacing)
     formatters = {
         "text": lambda: trend_text(result, whole=opt.is_verbose(context)),
@@ -98,8 +98,8 @@ def trend(
 def _count_known(readings: Sequence[LeakReading], machine: CommissionedMachine) -> int:
     """Count the first recordings, in the order of their dates, that the machine's file lists as healthy.
 
-    `readings`: leakage in each recording; `machine`: with its healthy recordings. The count ends at the first recording
-    that is not healthy. Recordings without a date come before all others, and copies of a recording count once.
+    `readings`: leakage in each recording; `machine`: the machine of this file. The count ends at the first recording
+    that is not listed. Recordings without a date come before all others, and copies of a recording count once.
     """
     known = {recording.digest for recording in machine.healthy}
     by_date = sorted(readings, key=lambda reading: -math.inf if reading.start is None else reading.start)

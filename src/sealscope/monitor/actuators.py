@@ -285,8 +285,8 @@ class WatchedActuators:
     def _restore(self, settings: ActuatorSettings) -> _Actuator:
         """Restore an actuator from its last checkpoint in the database and the samples since, or create a new one.
 
-        Its leak detector (`watch`) starts anew if the rig or the learning time changed since the checkpoint, or if
-        another version stored it.
+        The leak detector (`watch`) starts anew if the rig or the learning time changed since the checkpoint, or if
+        another version stored the checkpoint.
         """
         name = settings.name
         machine = load_watched(settings.rig)
@@ -325,7 +325,7 @@ class WatchedActuators:
         stored_settings = _parse_settings(stored.settings)
         for samples, follows, verdict in stored.pending:  # with the settings that they were judged by
             actuator.judge_samples(samples, follows=follows, settings=stored_settings or settings, verdict=verdict)
-        actuator.watch.false_alarms_per_1000_h = settings.false_alarms_per_1000_h  # needs no new baseline
+        actuator.watch.false_alarms_per_1000_h = settings.false_alarms_per_1000_h  # may change without a new baseline
         if actuator.watch.healthy is not None:  # None after a person has marked a repair
             actuator.watch.healthy = fresh.healthy
         if _has_same_learning_settings(actuator.watch, fresh):
@@ -363,11 +363,11 @@ class WatchedActuators:
     def _store_once(self, blocks: Sequence[SourceBlock]) -> None:
         """Judge and store those blocks that are not in the database yet.
 
-        Repeated blocks are rare, so the database is searched for them only after it has refused one.
+        Repeated blocks are rare: the database is searched for repeated blocks only after it has refused a block.
         """
         if not blocks:
             return
-        # of two blocks with one identity the first is kept: reversed, it replaces the other
+        # of two blocks with the same identity the first is kept: in reversed order the first replaces the second
         by_identity = {(block.actuator, block.identity): block for block in reversed(blocks)}
         new_blocks = [block for block in blocks if by_identity[block.actuator, block.identity] is block]
         try:
@@ -506,7 +506,7 @@ class WatchedActuators:
     def false_alarms_per_1000_h(self) -> float:
         """Upper limit of the expected number of false alarms in 1000 h of operation, of all actuators together.
 
-        It applies if all of them run and are healthy.
+        The limit applies if all actuators run and are healthy.
         """
         return sum(settings.false_alarms_per_1000_h for settings in self.settings.values())
 

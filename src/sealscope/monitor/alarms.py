@@ -132,10 +132,10 @@ class AlarmJudge:
         baseline; `settings`: thresholds [L/min], and how many successive blocks must lie beyond a threshold before the
         alarm changes (`debounce_blocks`).
 
-        An alarm is raised while a leak is found and its flow reaches the threshold of a warning or an error. It ends,
-        or an error becomes a warning, when the flow is below `return_share` times the threshold of its level. A leak
-        without a flow in L/min is a warning. A leak that comes back before anybody has acknowledged its alarm raises
-        the same alarm again. After a restart of the detector `leak` is None during an alarm; the alarm then stays,
+        An alarm is raised while a leak is found and its flow reaches the threshold of a warning or an error. The alarm
+        ends, or an error becomes a warning, when the flow is below `return_share` times the threshold of its level. A
+        leak without a flow in L/min is a warning. A leak that comes back before anybody has acknowledged its alarm
+        raises the same alarm again. If the detector is restarted during an alarm, `leak` is None; the alarm then stays,
         because the leak may last.
         """
         if not estimate.judged:

@@ -151,7 +151,7 @@ class Service:
                 self.page.leave()
             deadline = time.monotonic() + _END_S
             for thread in threads:
-                if thread.name != _LINES:  # it may wait for a line for ever
+                if thread.name != _LINES:  # the source of lines may wait for ever
                     thread.join(max(0.0, deadline - time.monotonic()))
             if self.page is not None:
                 self.page.close()
@@ -176,9 +176,9 @@ class Service:
     def _start_outputs(self) -> list[threading.Thread]:
         """Start the threads that send events and states to the outputs in the settings, and return them."""
         repeat = self.supervisor.repeat
-        threads = [repeat("standard output", self._write_events, _POLL_S, last=self._write_events)]
+        threads = [repeat("standard output", self._write_events, every_s=_POLL_S, last=self._write_events)]
         outputs = open_outputs(self.actuators, self.settings)
-        threads.extend(repeat(output.part, output.deliver, _POLL_S, last=output.end) for output in outputs)
+        threads.extend(repeat(output.part, output.deliver, every_s=_POLL_S, last=output.end) for output in outputs)
         return threads
 
     def _store_queued(self) -> None:

@@ -120,7 +120,7 @@ class ActuatorSettings(WatchSettings):
         limit becomes `error_lpm` [L/min]. The units are those in the column headings of the machine's logs. They are
         used only for Sparkplug and OPC UA, whose values need not state units.
         """
-        if not isinstance(values, dict):
+        if not isinstance(values, dict):  # refused later, by the check of the types
             return values
         machine_file = values.get("machine")
         is_machine = isinstance(machine_file, str)
@@ -251,7 +251,7 @@ class MonitorSettings(_Table):
         `values`: the tables of all settings. Raises ValueError if the fleet has a false-alarm rate and an actuator or
         the defaults state another.
         """
-        if not isinstance(values, dict):
+        if not isinstance(values, dict):  # refused later, by the check of the types
             return values
         defaults, actuators = values.get("defaults", {}), values.get("actuator")
         if not (isinstance(defaults, dict) and isinstance(actuators, list)):
@@ -333,7 +333,7 @@ def topic_level(name: str) -> str:
 
 
 def read_settings(path: Path) -> MonitorSettings:
-    """Read the settings of a monitor from a TOML file; paths in it are relative to its folder.
+    """Read the settings of a monitor from a TOML file; the paths in this file are relative to its folder.
 
     Raises InputError, with a message of one line, if the file cannot be read or breaks a rule.
     """

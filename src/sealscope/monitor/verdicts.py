@@ -110,8 +110,8 @@ class RecordingVerdict:
     def decides(self) -> bool:
         """True if the condition of the machine follows from this verdict on a whole recording.
 
-        Otherwise it follows from the verdicts on the blocks of the stream. The verdicts `leak` and `no leak` decide,
-        and so does `cannot tell` after a person has marked the alarm.
+        Otherwise the condition follows from the estimates of the single blocks of samples. The verdicts `leak` and
+        `no leak` decide, and so does `cannot tell` after a person has marked the alarm.
         """
         return self.leaks or self.clears or self.mark != ""
 
@@ -127,7 +127,7 @@ class RecordingVerdict:
 
     @property
     def by_chance_per_1000_h(self) -> float | None:
-        """Expected number of scores as high as this in 1000 h of healthy recordings, None if it is not known."""
+        """Expected number of equally high scores in 1000 h of healthy recordings, None if it is not known."""
         hours = (self.end_s - self.start_s) / 3600.0
         return None if self.chance is None or hours <= 0.0 else 1000.0 * self.chance / hours
 

@@ -390,7 +390,7 @@ def render_still(
         else:
             picture.box(style, begin, end)
     if chart.band:
-        _value, low_end, high_end, *_ = lines
+        _value, low_end, high_end, *_ = lines  # the estimate, and the ends of its interval
         picture.area("interval", t, low_end, high_end)
     if chart.level is not None and chart.level <= high:
         picture.level("level", chart.level)

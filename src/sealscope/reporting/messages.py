@@ -218,6 +218,7 @@ def other_sizes(diagnosis: Diagnosis) -> str | None:
     if severity is None:
         return None
     creep = severity.creep_mm_per_min
+    # each quantity has a value, which is stated, and an interval
     parts = [
         None if severity.mL_per_min is None else f"{number(severity.mL_per_min[0], 2)} mL/min",
         None if diagnosis.leak_lpm is None else _pump_fraction(diagnosis),
@@ -245,8 +246,9 @@ def total_leakage(diagnosis: Diagnosis, *, basis: bool = True) -> str | None:
     if basis and diagnosis.verdict != "leak" and (machine := flow_basis(diagnosis)) is not None:
         text += f" ({machine})"
     text += "" if leakage.healthy_lpm is None else say("leakage.healthy", lpm=number(leakage.healthy_lpm, 2))
-    step = f"{number(leakage.findable_lpm, 2)} L/min"
-    return text + ("" if leakage.findable_lpm is None else say("leakage.findable", size=step))
+    if leakage.findable_lpm is None:
+        return text
+    return text + say("leakage.findable", size=f"{number(leakage.findable_lpm, 2)} L/min")
 
 
 def _leakage_fraction(leakage: TotalLeakage, pressure: str) -> str:
@@ -259,9 +261,9 @@ def _leakage_fraction(leakage: TotalLeakage, pressure: str) -> str:
     text = say(f"leakage.{key}", share=_format_percent(leakage.pump_share), pressure=pressure)
     if leakage.findable_share is None:
         return text
-    step = _format_percent(leakage.findable_share) + ("" if is_known else " of the pump's flow")
-    step += "" if leakage.findable_lpm is None else f", {number(leakage.findable_lpm, 2)} L/min"
-    return text + say("leakage.findable", size=step)
+    change = _format_percent(leakage.findable_share) + ("" if is_known else " of the pump's flow")
+    change += "" if leakage.findable_lpm is None else f", {number(leakage.findable_lpm, 2)} L/min"
+    return text + say("leakage.findable", size=change)
 
 
 def leakage_in_short(diagnosis: Diagnosis) -> str | None:
@@ -302,7 +304,7 @@ def how_sure(diagnosis: Diagnosis) -> str:
     if diagnosis.verdict != "leak" and found_cause is not None and diagnosis.alarmed:
         # the alarm has another cause than a leak
         odds, relation = f"that something changed: {odds}", f"for {found_cause}, over"
-    detector = diagnosis.methods[0].detector if diagnosis.methods else ""  # the deciding one is first
+    detector = diagnosis.methods[0].detector if diagnosis.methods else ""  # the deciding method is first
     return say(
         "how_sure.score", odds=odds, score=number(diagnosis.score), relation=relation,
         threshold=number(diagnosis.threshold), judge=f" of {detector}" if detector else "",
@@ -327,7 +329,7 @@ def false_alarms(diagnosis: Diagnosis) -> str:
 def next_steps(diagnosis: Diagnosis) -> tuple[str, ...]:
     """List the recommended next steps as sentences, most useful first."""
     severity_level = None if diagnosis.severity is None else diagnosis.severity.level
-    deciding_detector = diagnosis.methods[0].detector if diagnosis.methods else ""  # the deciding one is first
+    deciding_detector = diagnosis.methods[0].detector if diagnosis.methods else ""  # the deciding method is first
     step_once_confirmed = say(f"once_confirmed.{severity_level or 'plan'}", limit=diagnosis.limit)
     has_named_cause = diagnosis.named_cause is not None
     if diagnosis.verdict == "leak":
@@ -421,6 +423,7 @@ def diagnosis_text(diagnosis: Diagnosis, *, width: int = WIDTH) -> str:
         figures = method.reason if method.score is None and method.reason else figures
         rows.append(("method", f"{method.detector}: {method.summary} ({figures})"))
     rows += [(finding.severity, finding.text) for finding in diagnosis.quality]
+    # only the first of the steps has a label
     rows += [("" if k else "next", step) for k, step in enumerate(next_steps(diagnosis)[:2])]
     return _format_lines(diagnosis, rows, width)
 

@@ -164,7 +164,7 @@ def render_card(
         date=particulars.get("Date", ""),
         subtitle=" · ".join(text for text in subtitle if text),
         charts=card_charts,
-        drawn=charts.draw(recording, [], card_charts, diagnosis, all_marks),
+        drawn=charts.draw(recording, chambers=[], charts=card_charts, diagnosis=diagnosis, marks=all_marks),
         width=WIDTH,
         height=HEIGHT,
     )
@@ -249,7 +249,7 @@ def _change_rows(
         before, after = (None if value is None else value / scale for value in (change.before, change.after))
         label = charts.detail_label(change.name)
         rows.append((change.channel, label, unit, before, after, change.percent))
-    max_change = max([10.0, *(abs(percent) for *_, percent in rows if percent is not None)])
+    max_change = max([10.0, *(abs(percent) for *_, percent in rows if percent is not None)])  # at least 10 %
     bar_limit = min(100.0, 10.0 * ceil(max_change / 10.0))  # rounded up to tens of percent
     return {"changes": rows, "bar_limit": bar_limit, "parts": parts}
 

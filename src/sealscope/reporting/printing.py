@@ -36,7 +36,7 @@ def print_page(page: str, path: str | os.PathLike[str]) -> str:
             return Path(browser).name
         try:
             from weasyprint import HTML
-        except (ImportError, OSError) as error:  # OSError: its C libraries are not installed
+        except (ImportError, OSError) as error:  # OSError: the C libraries of WeasyPrint are not installed
             raise MissingExtra(
                 "a PDF needs Chromium or WeasyPrint, got neither: install one of them (pip install weasyprint), or "
                 f"write .html ({path})"

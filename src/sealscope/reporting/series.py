@@ -60,7 +60,7 @@ def _interleave(first: Array, second: Array, sizes: NDArray[np.int64]) -> Array:
     """
     pairs = np.stack([first, second], axis=1)
     is_point = np.stack([np.ones(sizes.size, dtype=bool), sizes > 1], axis=1)
-    return np.asarray(pairs[is_point])
+    return np.asarray(pairs[is_point])  # row by row
 
 
 def ordered_time(t: Array, rate: float) -> tuple[Array, bool]:
@@ -120,7 +120,7 @@ def encode_values(values: Array) -> dict[str, Any]:
     codes = np.full(values.shape, _MISSING, dtype="<i2")
     if step > 0:
         codes[is_finite] = np.clip(np.rint((values[is_finite] - low) / step) - 32767, -32767, 32767)
-    else:
+    else:  # all values are `low`
         codes[is_finite] = -32767
     return {"low": low, "step": step, "q": b64encode(codes.tobytes()).decode()}
 

@@ -57,9 +57,9 @@ class StoredRows:
     old_estimates: dict[str, int] = field(default_factory=dict)
 
     def add_estimates(self, actuator: str, estimates: Iterable[BlockEstimate], oil_celsius: float | None) -> None:
-        """Add the leakage estimates of an actuator's blocks, and the oil temperature [deg C], None if unknown, to each.
+        """Add the leakage estimates of blocks of samples, each with the oil temperature [deg C], None if unknown.
 
-        `actuator`: name of the actuator.
+        `actuator`: name of the actuator from which the samples are.
         """
         for estimate in estimates:
             total_ends = estimate.total_interval_lpm or (None, None)
@@ -231,7 +231,8 @@ class MonitorStore:
     def insert_blocks(self, connection: sa.Connection, blocks: Iterable[tuple[str, str, int]]) -> None:
         """Store the identities of blocks, each given as (actuator, identity, running number in the actuator's blocks).
 
-        Raises IntegrityError, which ends the transaction, if one of the blocks is stored already.
+        `connection`: has an open transaction. Raises IntegrityError, which ends the transaction, if one of the blocks
+        is stored already.
         """
         names = ("actuator", "identity", "number")
         connection.execute(tables.blocks.insert(), [dict(zip(names, block, strict=True)) for block in blocks])
@@ -247,7 +248,7 @@ class MonitorStore:
             delete_pending = tables.pending.delete().where(tables.pending.c.actuator == actuator)
             connection.execute(delete_pending, [{"name": name} for name in rows.actuators])
         if rows.events and self.engine.dialect.name == "postgresql":
-            # commit events in the order of their numbers: an output that has passed a number never reads earlier ones
+            # commit events in the order of their numbers: outputs never read an event with a smaller number later
             connection.execute(sa.text("lock table events in exclusive mode"))
         for table in (tables.estimates, tables.pending, tables.events):
             if new_rows := getattr(rows, table.name):
@@ -268,7 +269,7 @@ class MonitorStore:
     def upsert(self, connection: sa.Connection, table: sa.Table, rows: list[dict[str, Any]]) -> None:
         """Write rows to a table: update the stored rows with the same primary keys, and insert the missing ones.
 
-        `connection`: connection with an open transaction, in which the rows are written.
+        `connection`: has an open transaction, in which the rows are written.
         """
         if not rows:
             return
@@ -352,6 +353,7 @@ class MonitorStore:
         if actuator is not None:
             query = query.where(columns.actuator == actuator)
         values = [json.loads(text) for (text,) in self._rows(query)]
+        # an alarm's id ends in "-" and a running number
         return sorted(values, key=lambda alarm: (alarm["actuator"], -int(alarm["id"].rpartition("-")[2])))
 
     def events_since(self, number: int, max_events: int = 1000) -> list[tuple[int, dict[str, Any]]]:
@@ -469,7 +471,10 @@ def _event_from_row(row: Any) -> dict[str, Any]:
 
 
 def _prepare_sqlite(connection: Any, record: object) -> None:
-    """Set the options of a new connection to SQLite: sizes, waiting time for locks, WAL mode, full synchronisation."""
+    """Set the options of a new connection to SQLite: sizes, waiting time for locks, WAL mode, full synchronisation.
+
+    SQLAlchemy calls this for each connection of the driver; `record`: its record of the connection, not used.
+    """
     # a page has room for a second of samples, the cache for all pages of a transaction
     settings = "page_size=16384", "cache_size=-32000", "busy_timeout=5000", "foreign_keys=ON"
     for setting in (*settings, "journal_mode=WAL", "synchronous=FULL"):

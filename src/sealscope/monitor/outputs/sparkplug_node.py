@@ -99,8 +99,8 @@ class SparkplugNode:
         if time.monotonic() >= self._next_update:
             self._next_update = time.monotonic() + self._settings.every_s
             for actuator, summary in self._summaries().items():
-                if actuator not in self._sent_values:
-                    self._send_device_birth(actuator, summary, {})
+                if actuator not in self._sent_values:  # its birth was not sent yet
+                    self._send_device_birth(actuator, summary, alarm={})
                     continue
                 sent_values, present_values = self._sent_values[actuator], _metric_values("summary", summary)
                 changed_values = {name: value for name, value in present_values.items() if value != sent_values[name]}

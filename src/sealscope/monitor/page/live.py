@@ -186,7 +186,8 @@ def _envelope(t: Array, series: dict[str, Array]) -> dict[str, list[float | None
         return {"t": _round_to_json(t, 4), **{name: _round_to_json(values) for name, values in series.items()}}
     n_bins = t.size // bin_size
     first = t.size - n_bins * bin_size
-    curves = {"t": _round_to_json(t[first:].reshape(n_bins, bin_size)[:, [0, bin_size // 2]].ravel(), 4)}
+    bin_times = t[first:].reshape(n_bins, bin_size)[:, [0, bin_size // 2]]  # of the first and middle samples
+    curves = {"t": _round_to_json(bin_times.ravel(), 4)}
     for name, values in series.items():
         bins = values[first:].reshape(n_bins, bin_size)
         ends = np.stack([bins.min(axis=1), bins.max(axis=1)], axis=1)

@@ -65,8 +65,8 @@ _ASKED_AGAIN = "messages of QoS 1 that found no room and were asked for again"
 def broker_source(settings: BrokerSettings) -> Callable[[BlockReceiver], None]:
     """Build a source that submits the messages of a broker as blocks, and publishes alarms to it.
 
-    Returns a function that takes the receiver of the blocks, and runs until it stops. Raises InputError if a secret
-    cannot be read, and MissingExtra if the MQTT library is not installed.
+    Returns a function that takes the receiver of the blocks, and runs until the receiver stops. Raises InputError if a
+    secret cannot be read, and MissingExtra if the MQTT library is not installed.
     """
     password = read_secret(settings.password_file, "mqtt.password_file")
     check_mqtt()
@@ -117,7 +117,7 @@ class _Connection:
             while not self._service.stopping.wait(_POLL_S):
                 self._link.check_thread()
                 alarms.attempt(self._deliver)
-            self._states_due = 0.0
+            self._states_due = 0.0  # publish the last states at once
             alarms.attempt(self._deliver)
         finally:
             self._ended.set()
@@ -153,7 +153,7 @@ class _Connection:
         return self._state_message(online=False)
 
     def _state_message(self, *, online: bool) -> tuple[str, str]:
-        """Build topic and payload of the message STATE, in which a Sparkplug primary host is online or offline."""
+        """Build topic and payload of the message STATE, which tells whether a Sparkplug primary host is `online`."""
         state = json.dumps({"online": online, "timestamp": self._connected_ms})
         return f"{NAMESPACE}/STATE/{self._settings.host_id}", state
 
@@ -194,8 +194,8 @@ class _Connection:
     def _submit_received(self) -> None:
         """Decode and submit the queued messages in their order until the service stops.
 
-        If a connection left messages unacknowledged because the queue was full, it is closed once the queue is empty;
-        the broker then sends them again.
+        If a connection left messages unacknowledged because the queue was full, the connection is closed once the queue
+        is empty; the broker then sends these messages again.
         """
         while not (self._service.stopping.is_set() or self._ended.is_set()):
             queue_entries = self._received.pop(max_items=1, timeout=0.5)

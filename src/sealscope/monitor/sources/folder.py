@@ -99,7 +99,7 @@ class WatchedFolder:
         stored, and the file is not read again. A recording that is older than the samples watched so far is refused
         too. Raises PartAway if the folder cannot be read.
         """
-        files = sorted(self._files())
+        files = sorted(self._files())  # by the time of their last change
         self._first_found = {file.identity: self._first_found.get(file.identity, time.monotonic()) for file in files}
         self._submitted &= self._first_found.keys()
         self._unreadable &= self._first_found.keys()
@@ -190,6 +190,7 @@ class WatchedFolder:
             _log.warning("%s: %s is dated in the future", self.actuator, _printable(path.name))
         if start >= self._newest_s or self._newest_s > now + _AHEAD_S or _is_midnight_before(start, self._newest_s):
             return ""
+        # [:19]: without the time zone
         dates = (datetime.fromtimestamp(t, UTC).isoformat(" ", "seconds")[:19] for t in (start, self._newest_s))
         return "{} must not be older than what was watched, got {} after {}".format(_printable(path.name), *dates)
 

@@ -78,7 +78,7 @@ class ValueGatherer:
         self._newest: int | None = None
 
     def push(self, channel: str, t: float, values: Sequence[float]) -> list[Recording]:
-        """Add successive samples of a channel, in SI units; return the blocks of all channels that they complete.
+        """Add successive samples of a channel, in SI units; return the blocks of all channels that are then complete.
 
         `t` [s]: time of the first sample, rounded to the sampling interval; the others follow at the sampling rate. NaN
         is an unknown value. Values without a finite time, and too many values at once, are dropped. If the time jumps
@@ -133,8 +133,7 @@ class ValueGatherer:
     def discard_values(self) -> None:
         """Discard the values of all channels that are in no block yet, and the last value of each.
 
-        The time axis begins anew with the next value. This is needed after values were lost with the connection, or if
-        the clock was set back.
+        The time axis begins anew with the next value, as after a lost connection or if the clock was set back.
         """
         self._channels = {name: _Channel() for name in self._channels}
         self._start = self._newest = None
@@ -147,9 +146,8 @@ class ValueGatherer:
         """
         channels = self._channels.values()
         if self._start is None:
-            if any(channel.last_value() is None for channel in channels) or not any(
-                channel.values for channel in channels
-            ):
+            has_new_values = any(channel.values for channel in channels)
+            if not has_new_values or any(channel.last_value() is None for channel in channels):
                 return []
             # start at the first index at which every channel has a value
             first_indices = [min(channel.values) for channel in channels if channel.previous is None]

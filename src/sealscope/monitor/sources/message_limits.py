@@ -55,7 +55,7 @@ class MessageLimit(ValueError):  # noqa: N818 (names what is exceeded)
 
 
 def check_cbor(payload: bytes) -> int:
-    """Check how many and how deeply nested the items of a CBOR message are; return its number of key-value pairs.
+    """Check how many and how deeply nested the items of a CBOR message are; return the number of key-value pairs.
 
     Raises MessageLimit if lists, containers, pairs or texts are too many, too long or too deep, if an item is of a
     type that is not allowed, or if the message is incomplete.
@@ -67,7 +67,7 @@ def check_cbor(payload: bytes) -> int:
 
 
 def check_json(payload: bytes) -> int:
-    """Check that a JSON message does not have too many quotation marks or brackets; return its number of colons.
+    """Check that a JSON message does not have too many quotation marks or brackets; return the number of colons.
 
     `check_json_keys` needs this number, which includes colons within texts, to find repeated keys. Raises MessageLimit
     if there are more than `_MAX_QUOTES` quotation marks or `_MAX_BRACKETS` opening brackets and braces.
@@ -86,7 +86,7 @@ def check_json_keys(values: Any, payload: bytes, n_colons: int) -> None:
     `values`: the decoded message; `payload`: its bytes; `n_colons`: number of colons that `check_json` counted. Each
     pair has a colon outside texts; if a key is repeated, `values` has fewer pairs than there are such colons.
     """
-    if _count_shallow_pairs(values) != n_colons:  # quick test: unequal also if a text contains a colon
+    if _count_shallow_pairs(values) != n_colons:  # a quick test: unequal, too, if a text contains a colon
         unquoted = payload.replace(b"\\\\", b"").replace(b'\\"', b"").split(b'"')[::2]  # the parts outside texts
         check_keys(values, sum(part.count(b":") for part in unquoted))
 

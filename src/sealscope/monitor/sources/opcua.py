@@ -39,8 +39,8 @@ _NO_NUMBER = "OPC UA values that are no number"
 def opcua_source(settings: OpcUaSettings) -> Callable[[BlockReceiver], None]:
     """Build a source that submits the values of an OPC UA server as blocks.
 
-    Returns a function that takes the receiver of the blocks, and runs until it stops. Raises MissingExtra if the
-    library asyncua is not installed, and InputError if a secret cannot be read.
+    Returns a function that takes the receiver of the blocks, and runs until the receiver stops. Raises MissingExtra if
+    the library asyncua is not installed, and InputError if a secret cannot be read.
     """
     if find_spec("asyncua") is None:  # before the service starts
         raise MissingExtra("OPC UA needs asyncua: pip install 'sealscope[opcua]'")
@@ -77,7 +77,7 @@ class _OpcUaSession:
         submitting = self._service.supervisor.start("OPC UA blocks", self._submit)
         while not stopping.wait(self._server.pause_s):
             self._server.attempt(lambda: asyncio.run(self._connect()))
-            for gatherer in self._gatherers.values():
+            for gatherer in self._gatherers.values():  # values were lost with the connection
                 gatherer.discard_values()
         submitting.join()
 
@@ -156,5 +156,5 @@ class _OpcUaSession:
         This runs in a separate thread, because the service's `submit` waits while its queue is full.
         """
         while not self._service.stopping.is_set():
-            for block in self._waiting.pop(1, _POLL_S):
+            for block in self._waiting.pop(max_items=1, timeout=_POLL_S):
                 self._service.submit(block)

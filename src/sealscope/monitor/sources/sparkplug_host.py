@@ -156,7 +156,8 @@ class SparkplugHost:
     @property
     def topics(self) -> list[str]:
         """MQTT topic filters that include all messages of the nodes."""
-        return [f"{spb.topic_of(group, '+', node)}/#" for group, node in self._nodes]  # the parent level is included
+        # "/#" matches the topic before it, too
+        return [f"{spb.topic_of(group, '+', node)}/#" for group, node in self._nodes]
 
     def request_all_births(self) -> None:
         """Request from every node a birth message, which states all its metrics.
@@ -224,8 +225,8 @@ class SparkplugHost:
         """Update the state of a node with the birth, death or sequence number of a message of `kind`.
 
         The birth of a node (NBIRTH) begins its session, and the death (NDEATH) ends it; both discard the births of its
-        devices. A gap in the sequence is counted and the birth requested. `group`, `node`: names of the node and its
-        group; `payload`: contents of the message. Raises RefusedMessage if the message has no sequence number, comes
+        devices. A gap in the sequence is counted and the birth requested. `group`, `node`: names of the group and the
+        node; `payload`: contents of the message. Raises RefusedMessage if the message has no sequence number, comes
         before the birth, or is the death of an earlier connection.
         """
         state = self._nodes[group, node]

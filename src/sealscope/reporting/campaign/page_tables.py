@@ -99,7 +99,7 @@ def cause_tables(judgement: Judgement) -> list[CauseTable]:
         rows = [
             (name, int(counts.sum()), [*map(_format_fraction, shares)])
             for name, counts, shares in confusion_rows
-            if counts.any()
+            if counts.any()  # else no record has this cause
         ]
         right, covered = percent(confusion.accuracy), percent(causes.covered)
         tables.append(CauseTable(causes.detector, confusion.columns, rows, right, covered))

@@ -117,18 +117,19 @@ def history_pictures(ordered: Sequence[Judged]) -> dict[str, Picture] | None:
         """
         for entry, day, level in zip(ordered, days, levels, strict=True):
             if level is None:
-                picture.symbol("absent", day, picture.height - 4.0)
+                picture.symbol("absent", day, down=picture.height - 4.0)
                 continue
             lpm, low, high = level
             title = f"{Path(entry.diagnosis.file).name}: {messages.format_leak_flow(entry.diagnosis)}"
             if lpm > top:
-                picture.symbol("beyond", day, 6.0, title)
+                picture.symbol("beyond", day, down=6.0, title=title)
             elif low is None:
-                picture.symbol("bound", day, float(picture.y(lpm)), title)
+                picture.symbol("bound", day, down=float(picture.y(lpm)), title=title)
             else:
                 picture.point("point", day, lpm, (low, min(high, top)), title)
 
-    return level_pictures((days[0], days[-1]), (0.0, top), limit, format_day, draw_levels)
+    ends = (days[0], days[-1])
+    return level_pictures(ends, levels=(0.0, top), limit=limit, format_day=format_day, draw=draw_levels)
 
 
 def _leak_level(diagnosis: Diagnosis) -> _Level | None:
@@ -178,6 +179,7 @@ def _draw_comparison(ordered: Sequence[Judged]) -> tuple[list[charts.Chart], cha
             continue
         pressure_unit = latest.pressure_unit
         unit, values = charts.display_values(latest, name, pressure_unit)
+        # the other recording at the times of the newest one
         samples = np.interp(latest.t, other_t, other[name], left=np.nan, right=np.nan)
         resampled = replace(latest, channels={name: samples})  # to be displayed in the units of the newest recording
         other_values = charts.display_values(resampled, name, pressure_unit)[1]
@@ -185,4 +187,5 @@ def _draw_comparison(ordered: Sequence[Judged]) -> tuple[list[charts.Chart], cha
         comparison.append(charts.Chart(f"over-{name}", "channels", name, unit, lines))
     if not comparison:
         return [], None, []
-    return comparison, charts.draw(latest, [], comparison, newest.diagnosis, []), files
+    drawn = charts.draw(latest, chambers=[], charts=comparison, diagnosis=newest.diagnosis, marks=[])
+    return comparison, drawn, files

@@ -112,7 +112,7 @@ def _draw_trend(trend: Trend, picture: Picture) -> None:
         picture.mark("mark other", point.day)
     for point in trend.points:
         if point.value is None:
-            picture.symbol("absent", point.day, picture.height - 4.0)
+            picture.symbol("absent", point.day, down=picture.height - 4.0)
             continue
         # another style for a recording with a note, and for one that is not comparable with the first group
         style = "point apart" if point.note else "point" if point.group == 0 else "point other"
