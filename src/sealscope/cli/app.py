@@ -95,14 +95,14 @@ def spread_baselines(arguments: Sequence[str]) -> list[str]:
 
     In this way `--baseline FILE...` of the commands diagnose and report accepts wildcards; the arguments of other
     commands stay unchanged. All arguments after `--baseline` up to the next option are baselines. If the call has no
-    other files, only the first file after each `--baseline` is a baseline, and the others are the files to diagnose.
+    other files, only the first file after each `--baseline` is a baseline, and the other files after it are diagnosed.
     Raises InputError if no file follows `--baseline`.
     """
     if "--baseline" not in arguments or arguments[0] not in ("diagnose", "report"):
         return list(arguments)
     end = list(arguments).index("--") if "--" in arguments else len(arguments)
     baselines: list[list[str]] = []  # the files after each `--baseline`
-    remaining: list[str] = []
+    remaining: list[str] = []  # all other arguments
     in_baseline = False
     for argument in arguments[1:end]:
         if argument == "--baseline":
@@ -174,7 +174,7 @@ def main() -> None:
 
 @contextmanager
 def _repeating_lost_interrupts() -> Iterator[None]:
-    """Repeat an interrupt (Ctrl-C) that Python ignored, within the `with` block.
+    """Repeat each interrupt (Ctrl-C) that Python ignores within the `with` block.
 
     Python ignores exceptions in code that cannot pass them on, such as a finalizer of the compiler.
     """

@@ -26,7 +26,7 @@ campaign = Typer(
 
 
 def _packaged_plans() -> Sequence[str]:
-    """List the names of the packaged plans, for completion."""
+    """List the names of the packaged plans, for completion by the shell."""
     from sealscope.campaigns.plans.reader import plan_names
 
     return plan_names()
@@ -66,7 +66,7 @@ def run(
 
     loaded_plan = load_plan(plan)
     target = _campaign_folder(loaded_plan, folder)
-    if not isinstance(loaded_plan, SimulatedPlan):
+    if not isinstance(loaded_plan, SimulatedPlan):  # a plan over recordings, which are only judged
         if batch:
             raise InputError(
                 f"a plan in batches must simulate its records; run it without --batch ({loaded_plan.place})"
@@ -109,9 +109,9 @@ def report(plan: PlanArgument, folder: FolderOption = None, data: DataOption = N
 
 
 def _campaign_folder(plan: AnyPlan, stated: Path | None) -> Path:
-    """Choose the folder of a campaign: `stated`, or by default `sealscope-campaigns/NAME`.
+    """Choose the folder of a campaign: `stated`, or for None `sealscope-campaigns/NAME`.
 
-    Raises InputError if the default folder is a link.
+    Raises InputError if this default folder, or the folder that contains it, is a link.
     """
     if stated is not None:
         return stated
@@ -123,7 +123,7 @@ def _campaign_folder(plan: AnyPlan, stated: Path | None) -> Path:
 
 
 def _format_progress(state: CampaignProgress) -> str:
-    """Format the numbers of records done and failed, the computing time per record, and the computing time left."""
+    """Format the numbers of records done and failed, and the computing time on one core: per record, and all left."""
     text = f"records: {state.done} of {state.records} done"
     if state.failed:
         text += f", {state.failed} of them failed"
@@ -148,9 +148,9 @@ def _show_progress() -> Iterator[ProgressCallback]:
 def _write_report(plan: AnyPlan, folder: Path, data: Path | None) -> int:
     """Write the tables and the page of a campaign, print its main table, and return the number of failed records.
 
-    The first five failed records are also printed, on standard error. `folder`: folder of the campaign, which contains
-    the results of simulated records, and to which the files are written; `data`: folder of the recordings for a plan
-    over recordings, else None.
+    The first five failed records are also printed, on standard error. `folder`: folder of the campaign, which receives
+    the files, and contains the results of simulated records; `data`: folder of the recordings that a plan over
+    recordings needs, else None.
     """
     from sealscope.campaigns.results import write_result
     from sealscope.reporting.campaign.page import PAGE, campaign_text, write_campaign_page

@@ -48,7 +48,8 @@ def fmu(
         max_step = None if step is None else parse_quantity(step, "s", name="step")
         max_error = ERROR if error is None else parse_quantity(error, "Pa", name="error")
         variables = write_fmu(output, **options, error=max_error, step=max_step)
-        timing = f"steps of at most {next(v.start for v in variables if v.name == 'step'):.3g} s"
+        longest_step_s = next(variable.start for variable in variables if variable.name == "step")
+        timing = f"steps of at most {longest_step_s:.3g} s"
     else:
         for name, value in (("--step", step), ("--error", error)):
             if value is not None:
@@ -57,5 +58,5 @@ def fmu(
         variables = write_sensor_fmu(output, **options, sensor=sensor, rate=rate_hz)  # type: ignore[arg-type]
         timing = f"samples at {rate_hz:g} Hz"
     kinds = ("input", "parameter", "output")
-    counts = ", ".join(f"{sum(v.causality == kind for v in variables)} {kind}s" for kind in kinds)
+    counts = ", ".join(f"{sum(variable.causality == kind for variable in variables)} {kind}s" for kind in kinds)
     echo(f"{output}: FMI {version} for co-simulation,\n{counts}, {timing}")

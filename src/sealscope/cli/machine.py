@@ -18,7 +18,7 @@ def commission(
         list[Path], typer.Argument(metavar="FILE...", help="Healthy recordings of the machine, or a folder of them.")
     ],
     output: Annotated[Path, typer.Option("--output", "-o", help="The machine's file to write (.toml).")],
-    stated: StatedMachine,
+    stated: StatedMachine,  # built from the options that the decorator adds
     add: Annotated[
         bool,
         typer.Option(
@@ -56,7 +56,7 @@ def commission(
             raise InputError(
                 "--rig, --area and other options of the machine must not stand beside --add: its file states them"
             )
-        repair = None if since is None else _parse_date(since)
+        repair_s = None if since is None else _parse_date(since)
         paths = recordings_in(files)
 
         def add_recordings(machine: CommissionedMachine) -> CommissionedMachine:
@@ -65,12 +65,12 @@ def commission(
             If `--since` states the date of a repair, it is noted in the machine, and recordings before it are
             dropped.
             """
-            if repair is not None:
-                repair_mark = JudgedAlarm(alarm="", mark="repaired", date_s=repair, onset_s=repair)
+            if repair_s is not None:
+                repair_mark = JudgedAlarm(alarm="", mark="repaired", date_s=repair_s, onset_s=repair_s)
                 machine = replace(machine, alarms=(*machine.alarms, repair_mark))
             for path in paths:
                 machine = machine.with_healthy(machine.read(path), file=path.name, checksum=checksum_of(path))
-            return machine if repair is None else machine.since(repair)
+            return machine if repair_s is None else machine.since(repair_s)
 
         machine = update_machine(output, add_recordings)
     else:

@@ -40,7 +40,7 @@ _log = logging.getLogger(__name__)
 
 
 def make_completion(names: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
-    """Build the function by which the shell completes a partly typed name; `names`: function that returns all names."""
+    """Build a function that completes a partly typed name for the shell; `names`: function that returns all names."""
 
     def complete(incomplete: str) -> list[str]:
         """List the names that begin with the typed text; typer requires the name `incomplete`."""
@@ -50,16 +50,16 @@ def make_completion(names: Callable[[], Iterable[str]]) -> Callable[[str], list[
 
 
 def _rig_names() -> Sequence[str]:
-    """List the names of the packaged rigs, for completion."""
+    """List the names of the packaged rigs, for completion by the shell."""
     from sealscope.parameters import rig_names
 
     return rig_names()
 
 
 def _override_names() -> list[str]:
-    """List the parameters of a rig for completion, as `NAME=`.
+    """List the parameters of a rig as `NAME=`, for completion by the shell.
 
-    The list has the dotted names, and the symbols that belong to only one parameter.
+    The list has the dotted names, and each symbol (last part of a dotted name) that belongs to only one parameter.
     """
     from sealscope.parameters import declared_names
 
@@ -83,7 +83,7 @@ def declared_option(name: str, *, option: str = "", several: bool = False, **set
 
 
 def _argument_text(name: str) -> str:
-    """Return the help text of an argument of `Experiment.of`."""
+    """Return the help text of the argument `name` of `Experiment.of`."""
     return str(Arguments.__dataclass_fields__[name].metadata["text"])
 
 
@@ -169,7 +169,7 @@ class StatedMachine:
         limit: LimitOption = None,
         baseline: BaselineOption = None,
     ) -> StatedMachine:
-        """Build the machine from the options of a command.
+        """Build the machine from the values of the options of a command, which are None if they are not given.
 
         The types of the parameters declare the command-line options and their help texts. Raises InputError for an
         invalid option, and for any other option together with `--machine`.
@@ -209,8 +209,9 @@ class StatedMachine:
     def read(self, file: Path) -> Recording:
         """Read the recording in a file, or on standard input for the file `-`.
 
-        A commissioned machine reads it in its own way. Otherwise the rig's channel map is applied only to files that
-        have its columns. Raises UnreadableFile for a folder or an unreadable file.
+        A commissioned machine reads the file by the channel map and rate in the machine's file. Otherwise the options
+        of the call apply, and the channel map of the rig, but only to files that have the columns of this map. Raises
+        UnreadableFile for a folder or an unreadable file.
         """
         if self.commissioned is not None:
             return self.commissioned.read(file)
@@ -229,9 +230,9 @@ class StatedMachine:
                 raise UnreadableFile(str(error).replace(str(path), path.name)) from error
 
     def _read(self, file: Path) -> Recording:
-        """Read the recording in a file by the channel map of the call or, if it has none, of the rig's file.
+        """Read the recording in a file by the channel map of the call or, if the call has none, of the rig's file.
 
-        The rig's map is applied only to files that have its columns.
+        The channel map of the rig is applied only to files that have the columns of this map.
         """
         if not self._rig_map:
             from sealscope.recordings import read
@@ -254,15 +255,15 @@ class StatedMachine:
         from sealscope.recordings import join
 
         parts = [recording for _, recording in recordings if recording is not None]
-        is_complete = len(parts) == len(files)
+        is_complete = len(parts) == len(files)  # no part is unreadable
         yield files[0], join(parts, names=[file.name for file in files]) if is_complete else None
 
     def diagnose(self, recording: Recording, baseline: Sequence[Recording], file: Path, **settings: Any) -> Diagnosis:
         """Diagnose a recording of this machine.
 
-        `baseline`: healthy recordings, may be empty; not used with a commissioned machine, which has learned its own.
-        `file`: name of the recording in the diagnosis; `settings`: further arguments of `sealscope.diagnose`, or of the
-        commissioned machine's `diagnose`.
+        `baseline`: healthy recordings, may be empty; a commissioned machine uses the healthy recordings in its own file
+        instead. `file`: name of the recording in the diagnosis; `settings`: further arguments of `sealscope.diagnose`,
+        or of the commissioned machine's `diagnose`.
         """
         from dataclasses import replace
 
@@ -300,6 +301,7 @@ def with_experiment_options(command: Callable[..., None]) -> Callable[..., None]
     for argument in fields(Arguments):
         if argument.name == "drifts":
             continue
+        # a number may be given with a unit, so its option is a text
         default = f"{argument.default:g}" if isinstance(argument.default, float) else argument.default
         kind = str | None if default is None else type(default)
         annotation = special_options.get(argument.name, Annotated[kind, declared_option(argument.name)])
@@ -348,9 +350,10 @@ def _replace_parameter(
 
 
 def _build_assumed_rig(name: str | None, area: Sequence[str] | None, displacement: str | None) -> Rig | None:
-    """Build the rig named by `--rig`, with the values of `--area` and `--displacement`; None without these options.
+    """Build the rig that `--rig`, `--area` and `--displacement` describe; return None without these options.
 
-    Without `--rig`, values that are not stated are assumed. Raises InputError for an invalid option.
+    `name`: rig by name or file; `area`: piston area, or those of the sides A and B; `displacement`: of the pump; each
+    as text, None if not given. Without `--rig` all other values are assumed. Raises InputError for an invalid option.
     """
     from sealscope.diagnosis.verdict.machine import unstated_rig
     from sealscope.parameters import load_rig
@@ -361,7 +364,7 @@ def _build_assumed_rig(name: str | None, area: Sequence[str] | None, displacemen
     if area:
         if len(area) > 2:
             raise InputError(f"--area must be given once, or twice for sides A and B, got {len(area)} times")
-        areas = [parse_quantity(text, "m^2", name="--area") for text in area]  # of side A, and of B if it differs
+        areas = [parse_quantity(text, "m^2", name="--area") for text in area]  # one, or those of the sides A and B
         rig = (rig or unstated_rig()).with_areas(areas[0], areas[-1], source=source)
     if displacement is not None:
         overrides = {"pump.q_b": parse_quantity(displacement, "m^3/rev", name="--displacement")}
@@ -410,11 +413,11 @@ def say(text: str) -> None:
 
 
 def say_wrapped(text: str, head: str = "") -> None:
-    """Print a paragraph on standard output, `head` and the text, wrapped at 80 columns.
+    """Print a paragraph on standard output, which begins with `head`, wrapped at 80 columns.
 
-    Lines after the first are indented by the length of `head`, or by 2 if it is empty.
+    Lines after the first are indented by the length of `head`, or by 2 columns without a head.
     """
-    say(paragraph(text, head, len(head) or 2))
+    say(paragraph(text, head, indent=len(head) or 2))
 
 
 def complain(message: object) -> None:
@@ -442,7 +445,7 @@ def attempt(file: Path, work: Callable[[], T]) -> T | None:
 def check_folder(file: Path) -> None:
     """Check before a long run that the folder of the file to write exists; raise InputError otherwise.
 
-    Temporary files are removed that earlier calls left when they were stopped while writing this file.
+    Also remove temporary files that earlier calls left in the folder, if they were stopped while they wrote this file.
     """
     from sealscope.storage import atomic
 
@@ -474,8 +477,8 @@ def say_jobs(jobs: int | None) -> None:
 def progress(noun: str = "") -> Iterator[Callable[[str, float], None]]:
     """Show progress bars on standard error within the `with` block; yield a function of (task, fraction done).
 
-    Each task has its own bar, unless `noun` is given: all tasks then share one bar, which counts things with this name.
-    If standard error is not a terminal, there are no bars; with a `noun` a line is printed once a minute instead.
+    A task is a text; each has its own bar. If `noun`, the name of counted things, is given, all texts describe the same
+    bar. If standard error is not a terminal, there are no bars; with a `noun` a line is printed once a minute instead.
     """
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -489,11 +492,8 @@ def progress(noun: str = "") -> Iterator[Callable[[str, float], None]]:
         tasks: dict[str, Any] = {}
 
         def update(task: str, fraction: float) -> None:
-            """Show the completed fraction (0 to 1) of a task in its progress bar.
-
-            With a `noun` all tasks share one bar.
-            """
-            key = noun or task
+            """Show the completed fraction (0 to 1) of a task in its progress bar."""
+            key = noun or task  # with a `noun` all tasks share one bar
             if key not in tasks:
                 tasks[key] = bar.add_task(task, total=1.0)
             bar.update(tasks[key], completed=fraction, description=task)
@@ -517,7 +517,8 @@ def _minute_reporter() -> Callable[[str, float], None]:
             start_fraction = fraction
         if now - last_print >= 60.0 and fraction > start_fraction:
             last_print = now
-            remaining_s = (now - start) / (fraction - start_fraction) * (1.0 - fraction)
+            seconds_per_fraction = (now - start) / (fraction - start_fraction)
+            remaining_s = seconds_per_fraction * (1.0 - fraction)
             echo(f"{task}, about {format_duration(remaining_s)} left", err=True)
 
     return update

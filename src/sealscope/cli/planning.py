@@ -50,6 +50,7 @@ def plan(
         commissioned_machine = read_machine(machine)
         if overrides:
             raise InputError(f"--set must not stand beside --machine, whose file states the rig ({machine})")
+        # the mass shows whether a whole rig was stated, as nobody states the mass alone
         if commissioned_machine.rig is None or not commissioned_machine.rig.states("cylinder.M_eq"):
             smallest = commissioned_machine.summary.smallest
             hint = "" if smallest is None else f"; another recording like the healthy ones shows {smallest}"

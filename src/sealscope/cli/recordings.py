@@ -55,7 +55,7 @@ class DiagnosedRecording(NamedTuple):
 def diagnose(
     context: Context,
     files: Annotated[list[Path], Argument(metavar="FILE...", help="Recordings of any format; `-`: standard input.")],
-    stated: opt.StatedMachine,
+    stated: opt.StatedMachine,  # built from the options that the decorator adds
     output: Annotated[Literal["text", "jsonl"], Option("--format", help="Text, or one JSON object a line.")] = "text",
     join: opt.JoinOption = False,
     false_alarm: opt.FalseAlarmOption = opt.FALSE_ALARM_PROBABILITY,
@@ -84,7 +84,7 @@ def diagnose(
             form = "table"
     work = partial(_iter_dated_diagnoses, machine=stated, joined=join, false_alarm_probability=false_alarm)
     is_piped = _reads_standard_input([*files, *stated.baseline])
-    # a baseline is read once per process, and only this process has standard input
+    # one process: others would read each baseline again, and have no standard input
     is_serial = join or is_piped or stated.baseline or stated.commissioned or len(files) < _MIN_PARALLEL_FILES
     results: Iterable[tuple[str, Iterable[DatedDiagnosis | None]]]
     results = [("", work(files))] if is_serial else _diagnose_in_parallel(work, files)
@@ -113,8 +113,8 @@ def _diagnose_in_parallel(
     """Diagnose files in parallel processes, and yield the results in the order of the files.
 
     `work`: function that yields the dated diagnoses of some files, with None for an unreadable file. Each result is a
-    pair of the messages for standard error and the dated diagnoses of one file; if the process died, they are [None].
-    On a single core this process diagnoses all files, and yields one pair for all of them.
+    pair of the messages for standard error and the list of the file's dated diagnoses, which is [None] if the process
+    died. On a single core this process diagnoses all files, and yields one pair for all of them.
     """
     from sealscope.campaigns.execution.workers import cores, iter_results_in_order
 
@@ -122,6 +122,7 @@ def _diagnose_in_parallel(
     if jobs == 1:
         yield "", work(files)
         return
+    # each process gets a list of one file at a time
     for (file,), result in iter_results_in_order(
         jobs, partial(_run_collecting_messages, work), [[file] for file in files]
     ):
@@ -151,14 +152,16 @@ def _matches_fail_on(reason: str, diagnosis: Diagnosis) -> bool:
     `reason`: the value, either a verdict or a level of severity (`_LEVELS`), which the leak must reach or exceed.
     """
     level = None if diagnosis.severity is None else diagnosis.severity.level
-    return reason == diagnosis.verdict or (reason in _LEVELS and level in _LEVELS[_LEVELS.index(reason) :])
+    if reason in _LEVELS:  # in rising order
+        return level in _LEVELS[_LEVELS.index(reason) :]
+    return reason == diagnosis.verdict
 
 
 def _is_time_series(files: Sequence[Path], starts: Sequence[float | None]) -> bool:
     """Return True if files are recordings of one machine over time.
 
-    There must be at least `_MIN_SERIES_FILES`, their names may differ only in numbers, and all `starts` [s since
-    1970] must be known and at least an hour apart.
+    There must be at least `_MIN_SERIES_FILES` files, whose names differ only in numbers. All `starts` of recordings [s
+    since 1970] must be known and at least an hour apart.
     """
     known = sorted(start for start in starts if start is not None)
     if len(known) < max(_MIN_SERIES_FILES, len(files)):
@@ -168,7 +171,7 @@ def _is_time_series(files: Sequence[Path], starts: Sequence[float | None]) -> bo
 
 
 def _reads_standard_input(files: Iterable[Path]) -> bool:
-    """Return True if standard input, `-`, is among the files; raise InputError if it is there more than once."""
+    """Return True if standard input, `-`, is among the files; raise InputError if `-` is given more than once."""
     count = sum(file == opt.STANDARD_INPUT for file in files)
     if count > 1:
         raise InputError(f"standard input (-) must be given once, got it {count} times")
@@ -180,10 +183,10 @@ def _iter_diagnoses(
 ) -> Iterator[DiagnosedRecording | None]:
     """Yield each recording with its diagnosis, or None if the file cannot be read or diagnosed.
 
-    If a baseline, i.e. a leak-free recording for comparison, cannot be read, one None is yielded first. `machine`: the
-    machine that the options describe, with its baselines. A file never serves as its own baseline. `joined`: the files
-    are parts of a single recording; `settings`: further arguments of `sealscope.diagnose`. Raises InputError if the
-    only baseline of a file is the file itself, and UnreadableFile if no baseline can be read.
+    If a baseline, i.e. a leak-free recording for comparison, cannot be read, None is yielded first, once. A file never
+    serves as its own baseline. `machine`: the machine that the options describe, with its baselines; `joined`: True if
+    the files are parts of a single recording; `settings`: further arguments of `sealscope.diagnose`. Raises InputError
+    if the only baseline of a file is the file itself, and UnreadableFile if no baseline can be read.
     """
     baseline = machine.baseline
     for file in files:
@@ -218,8 +221,8 @@ def _iter_dated_diagnoses(files: Sequence[Path], **options: Any) -> Iterator[Dat
 def _start_seconds(result: DiagnosedRecording) -> float | None:
     """Find the time of the first sample of a diagnosed recording [s since 1970].
 
-    It is taken from the recording, the name of its file, or the time of the file's last change. None if a recording
-    from standard input states no date.
+    The time is taken from the recording, the name of its file, or the time of the file's last change. Returns None if a
+    recording from standard input states no date.
     """
     from sealscope.recordings.joining import file_seconds, start_seconds
 
@@ -230,7 +233,7 @@ def _start_seconds(result: DiagnosedRecording) -> float | None:
 def _run_collecting_messages(
     work: Callable[[Sequence[Path]], Iterator[DatedDiagnosis | None]], files: Sequence[Path]
 ) -> tuple[str, list[DatedDiagnosis | None]]:
-    """Diagnose files by the function `work`, and collect its messages for standard error.
+    """Diagnose files by the function `work`, and collect the messages that it prints on standard error.
 
     Returns the messages as text, and the list of the dated diagnoses, with None for an unreadable file.
     """
@@ -245,7 +248,7 @@ def report(
     output: Annotated[
         Path, Option("--output", "-o", help="The page (.html, .pdf) or its card (.png), or a folder for several files.")
     ],
-    stated: opt.StatedMachine,
+    stated: opt.StatedMachine,  # built from the options that the decorator adds
     join: opt.JoinOption = False,
     false_alarm: opt.FalseAlarmOption = opt.FALSE_ALARM_PROBABILITY,
 ) -> None:
@@ -303,7 +306,9 @@ def report(
 def _report_machine(files: Sequence[Path], machine: opt.StatedMachine, output: Path, false_alarm: float) -> None:
     """Write the page of a commissioned machine, with its newest verdict and all its recordings over time.
 
-    Raises UnreadableFile if no recording can be read, and ends with the exit status 1 if some cannot.
+    `files`: recordings and folders of them; `output`: the page; `false_alarm`: probability of the verdict `leak` for a
+    leak-free recording. Raises UnreadableFile if no recording can be read, and ends the command with the exit status 1
+    if some recordings cannot be read.
     """
     from sealscope.diagnosis.commissioned.machine import recordings_in
     from sealscope.paragraphs import format_count
@@ -346,12 +351,12 @@ def inspect(
     from sealscope.reporting.overview import overview_text
 
     _reads_standard_input(files)
-    stated = opt.StatedMachine.of(None, maps, rate, rig)
+    stated = opt.StatedMachine.of(maps=maps, rate=rate, rig=rig)
     if save_map and (rig is None or not stated.channel_map):
         raise InputError("--save-map must stand with --rig and its file, and with the --map options to be saved")
     machine = stated if stated.has_map else replace(stated, channel_map="auto")
     is_complete = True
-    columns: dict[str, str] | None = None  # channel -> column; in the first readable file if the map is `auto`
+    columns: dict[str, str] | None = None  # by channel: its column, in the first readable file if the map is `auto`
     for file, recording in machine.read_all(files, joined=join):
         if recording is None:
             is_complete = False
@@ -370,10 +375,10 @@ def inspect(
 
 
 def _resolve_map(channel_map: ChannelMap, file: Path, recording: Recording) -> dict[str, str]:
-    """Return a map, channel -> column, in which `auto` is replaced by the columns that it has chosen in a recording.
+    """Return a map, channel -> column, in which `auto` is replaced by the columns chosen by their names in a recording.
 
-    A map without `auto` is returned as it is. `file`: file from which the `recording` was read. With `auto` the result
-    is empty if the recording was converted from another file, because it then states the columns of that file.
+    A map without `auto` is returned unchanged. `file`: file from which the `recording` was read. With `auto` the result
+    is empty if the file was converted from another one, because the recording then states the columns of the other.
     """
     from sealscope.recordings.formats.columns import explicit_columns, reconstruct_map, uses_names
 
@@ -389,7 +394,7 @@ def _resolve_map(channel_map: ChannelMap, file: Path, recording: Recording) -> d
 def convert(
     source: Annotated[Path, Argument(help="Recording to read.")],
     target: Annotated[Path, Argument(help="Recording to write; its suffix tells the format.")],
-    stated: opt.StatedMachine,
+    stated: opt.StatedMachine,  # built from the options that the decorator adds
     every: Annotated[str | None, Option("--every", metavar="TIME", help=_EVERY)] = None,
 ) -> None:
     """Rewrite a recording in another format, with Sealscope's channel names and units."""
@@ -410,7 +415,10 @@ def convert(
 
 
 def _convert_parts(source: Path, folder: Path, stated: opt.StatedMachine, every: str) -> None:
-    """Write a long recording as parts of the length `every`, such as 1h, to files in a new or empty folder."""
+    """Write a long recording as parts of the length `every`, such as 1h, to files in a new or empty folder.
+
+    `source`: file of the recording; `stated`: its channel map and sampling rate.
+    """
     from sealscope.paragraphs import format_count
     from sealscope.recordings import inspect, read_parts, write
     from sealscope.units import parse_quantity

@@ -88,9 +88,9 @@ def new(
 
 
 def _ask_size(label: str, unit: str) -> str:
-    """Ask the user at the terminal for a dimension of the machine, such as its bore; return the answer as text.
+    """Ask the user at the terminal for a size of the machine, such as the stroke; return the answer as text.
 
-    `label`: name of the dimension, which is shown with its default `unit`.
+    `label`: name of the size, which is shown with the `unit` of an answer that states none.
     """
     return str(prompt(f"{label} [{unit}]"))
 

@@ -26,7 +26,7 @@ _MAP = "The unit's own name of a channel or an input; repeat."
 @opt.with_experiment_options
 def simulate(
     output: Annotated[Path, Option("--output", "-o", help="Recording to write (.nc, .h5, .csv, .parquet).")],
-    experiment: Experiment,
+    experiment: Experiment,  # built from the options that the decorator adds
     prove: Annotated[bool, Option("--prove", help=_PROVE)] = False,
     truth: Annotated[Path | None, Option(help="Write what was put in (leaks, onset) to this JSON file.")] = None,
     fmu: Annotated[Path | None, Option(help=_FMU)] = None,
@@ -51,7 +51,7 @@ def simulate(
         if fmu is None:
             run = simulate_experiment(experiment, report, prove=prove)
             recording = run.recording
-            source, *lines = run.lines()
+            source, *lines = run.lines()  # the solver; leaks and faults
         else:
             from sealscope.fmu.recording import record_fmu
 

@@ -31,7 +31,7 @@ _EVERY = "Time from one recording to the next (1d, 12h), of files that state non
 def trend(
     context: Context,
     files: Annotated[list[Path], Argument(metavar="FILE...", help=_FILES)],
-    stated: opt.StatedMachine,
+    stated: opt.StatedMachine,  # built from the options that the decorator adds
     form: Annotated[Literal["text", "json", "csv"], Option("--format", help="Text, a JSON object, a table.")] = "text",
     output: Annotated[Path | None, Option("--output", "-o", help=_OUTPUT)] = None,
     healthy: Annotated[int | None, Option(help=_HEALTHY)] = None,
@@ -75,7 +75,8 @@ def trend(
     if not readings:
         raise UnreadableFile("no recording could be read, so there is no trend")
     if healthy is None:
-        healthy = max(1, 0 if stated.commissioned is None else _count_known(readings, stated.commissioned))
+        n_known = 0 if stated.commissioned is None else _count_known(readings, stated.commissioned)
+        healthy = max(1, n_known)  # the first recording is always taken as healthy
     result = trend_of(readings, healthy=healthy, limit=stated.limit, years=years, every=spacing)
     formatters = {
         "text": lambda: trend_text(result, whole=opt.is_verbose(context)),
@@ -97,8 +98,8 @@ def trend(
 def _count_known(readings: Sequence[LeakReading], machine: CommissionedMachine) -> int:
     """Count the first recordings, in the order of their dates, that the machine's file lists as healthy.
 
-    The count ends at the first recording that is not listed. Recordings without a date come before all others, and
-    copies of a recording in the folder count once.
+    `readings`: leakage in each recording; `machine`: the machine of this file. The count ends at the first recording
+    that is not listed. Recordings without a date come before all others, and copies of a recording count once.
     """
     known = {recording.digest for recording in machine.healthy}
     by_date = sorted(readings, key=lambda reading: -math.inf if reading.start is None else reading.start)
@@ -108,7 +109,7 @@ def _count_known(readings: Sequence[LeakReading], machine: CommissionedMachine) 
 def _check_output(output: Path, files: Sequence[Path]) -> None:
     """Raise InputError if a trend cannot be written to `output`, or would replace one of the recordings `files`.
 
-    Temporary files are removed that earlier calls left when they were stopped while writing this file.
+    Also remove temporary files that earlier calls left in the folder, if they were stopped while they wrote this file.
     """
     from sealscope.reporting.template import parse_page_path
 

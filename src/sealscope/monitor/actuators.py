@@ -98,12 +98,13 @@ class _Actuator:
         The detector divides the samples into blocks of some seconds, and estimates the leakage of each. `follows`:
         False if there is a gap between these samples and those before; `settings`: thresholds of the alarm; `verdict`:
         verdict on the samples as a whole recording, None for none. If this verdict decides
-        (`RecordingVerdict.decides`), it updates the alarm, and the estimates state its leak. Otherwise each estimate
-        updates the alarm. The result depends only on the arguments and the state of the actuator.
+        (`RecordingVerdict.decides`), it alone updates the alarm, and the returned estimates state the leak of this
+        verdict. Otherwise each estimate updates the alarm. The result depends only on the arguments and the state of
+        the actuator.
         """
         estimates, events = [], []
         deciding_verdict = verdict if verdict is not None and verdict.decides else None
-        self.pending += 1
+        self.pending += 1  # blocks of samples since the last checkpoint
         self.bytes += count_bytes(samples)
         self._update_oil_temperature(samples)
         for estimate, leak in self.watch.each(samples, follows=follows):
@@ -118,7 +119,7 @@ class _Actuator:
             if change is not None:
                 events.append(AlarmEvent(*change, estimate.t))
         if deciding_verdict is not None:
-            if deciding_verdict.clears and self.watch.leak is not None:
+            if deciding_verdict.clears and self.watch.leak is not None:  # the detector withdraws its leak
                 self.watch.dismiss()
             version = self._baseline_version()
             change = self.judge.update_from_verdict(deciding_verdict, self.verdict, version, settings)
@@ -153,22 +154,22 @@ class _Actuator:
         if self.judge.alarm is not None and len(samples):
             max_samples = round(_ALARM_SAMPLES_S * samples.rate)
             self.alarm_samples.append(samples.samples(slice(-max_samples, None)))
-            while sum(map(len, self.alarm_samples[1:])) > max_samples:  # the first block is not needed
+            while sum(map(len, self.alarm_samples[1:])) > max_samples:  # enough without the first block
                 del self.alarm_samples[0]
 
     def state(self) -> dict[str, Any]:
-        """Convert the state of the actuator, as far as a checkpoint in the database stores it, to plain values.
+        """Convert the state of the actuator that a checkpoint in the database stores to plain values.
 
-        These are the states of its detector and alarm, the last estimate, the oil temperature, the time of the last
-        judged block, and the verdict on the last recording.
+        Stored are the leak detector and the alarm, the last estimate, the oil temperature, the time of the last judged
+        block, and the verdict on the last recording.
         """
         return save_attributes(self, ("watch", "judge", "last", "oil_celsius", "judged_s", "verdict"))
 
     def load_state(self, state: Mapping[str, Any]) -> None:
         """Restore the state of the actuator, except its alarm, from the plain values of a checkpoint.
 
-        These are the state of its detector, the last estimate, the oil temperature, the time of the last judged
-        block, and the verdict on the last recording.
+        Restored are the leak detector, the last estimate, the oil temperature, the time of the last judged block, and
+        the verdict on the last recording. `_load_checkpoint` restores the alarm.
         """
         self.watch = Watch.from_state(state["watch"])
         self.last = None if state["last"] is None else restore(BlockEstimate, state["last"], "last")
@@ -179,9 +180,9 @@ class _Actuator:
     def _machine_state(self) -> MachineState:
         """Determine the state of the machine by NAMUR NE 107, such as "good" or "maintenance required".
 
-        An active alarm determines it, otherwise the verdict on the last recording. If there is neither, it follows from
-        the detector: "no data", "not comparable" (nothing was judged for some time), "learning" (of the healthy
-        baseline) or "watched".
+        An active alarm determines the state, otherwise the verdict on the last recording. Without alarm and verdict the
+        state tells what the detector does: "no data", "not comparable" (no block was judged for some time), "learning"
+        (of the healthy baseline) or "watched".
         """
         alarm, baseline, alarm_end_s = self.judge.alarm, self.watch.baseline, self.judge.over_s
         if alarm is not None and alarm.active:
@@ -251,12 +252,13 @@ def _parse_settings(stored: str) -> WatchSettings | None:
 def _has_same_learning_settings(stored: Watch, fresh: Watch) -> bool:
     """Return True if two leak detectors learn their healthy baseline with the same settings and rig.
 
-    `stored`: detector from the database; `fresh`: detector by the present settings. The rigs may differ in the pump's
-    displacement by up to 5 %, as two measurements of it do.
+    `stored`: detector from the database; `fresh`: detector by the present settings. The pump displacements of the rigs
+    may differ by up to 5 %, as two measurements of a displacement do.
     """
-    rig, *conditions = fresh.learned_with
-    stored_rig, *stored_conditions = stored.learned_with
-    return conditions == stored_conditions and (rig == stored_rig or is_remeasured(rig, stored_rig))
+    rig, *learning_settings = fresh.learned_with
+    stored_rig, *stored_learning_settings = stored.learned_with
+    is_same_machine = rig == stored_rig or is_remeasured(rig, stored_rig)
+    return learning_settings == stored_learning_settings and is_same_machine
 
 
 class _AlreadyStored(Exception):  # noqa: N818 (says what happened)
@@ -283,8 +285,8 @@ class WatchedActuators:
     def _restore(self, settings: ActuatorSettings) -> _Actuator:
         """Restore an actuator from its last checkpoint in the database and the samples since, or create a new one.
 
-        Its leak detector (`watch`) starts anew if the rig or the learning time changed since the checkpoint, or if
-        another version stored it.
+        The leak detector (`watch`) starts anew if the rig or the learning time changed since the checkpoint, or if
+        another version stored the checkpoint.
         """
         name = settings.name
         machine = load_watched(settings.rig)
@@ -297,14 +299,14 @@ class WatchedActuators:
         n_stored = self.store.last_number(self.store.tables.blocks, name)
         actuator = _Actuator(settings, fresh, AlarmJudge(name), n_stored=n_stored)
         checkpoint = self.store.checkpoint(name)
-        if checkpoint is None or self._load_checkpoint(actuator, checkpoint):
+        if checkpoint is None or self._load_checkpoint(actuator, checkpoint):  # a new checkpoint is needed
             rows = StoredRows()
             self._checkpoint(actuator, rows)
             self.store.commit_rows(rows)
         return actuator
 
     def _load_checkpoint(self, actuator: _Actuator, stored: StoredCheckpoint) -> bool:
-        """Restore an actuator from its checkpoint in the database, and judge the samples since then again.
+        """Restore an actuator from its checkpoint `stored` in the database, and judge the samples since then again.
 
         The detector (`watch`) starts anew if another version saved its state, or if it learned with another rig or
         learning time. Returns True if a new checkpoint must be saved, because the detector starts anew or the
@@ -316,13 +318,14 @@ class WatchedActuators:
         if (version := require_part(state["watch"], "version", int)) != STATE_VERSION:
             _log.warning("%s: its state has version %s, not %d, begins anew", name, version, STATE_VERSION)
             baseline_version = require_part(state["watch"], "baseline_version", int)
-            fresh.continue_from(self.store.last_number(self.store.tables.estimates, name), baseline_version)
+            n_blocks = self.store.last_number(self.store.tables.estimates, name)
+            fresh.continue_from(n_blocks, baseline_version)
             return True
         actuator.load_state(state)
         stored_settings = _parse_settings(stored.settings)
         for samples, follows, verdict in stored.pending:  # with the settings that they were judged by
             actuator.judge_samples(samples, follows=follows, settings=stored_settings or settings, verdict=verdict)
-        actuator.watch.false_alarms_per_1000_h = settings.false_alarms_per_1000_h  # needs no new baseline
+        actuator.watch.false_alarms_per_1000_h = settings.false_alarms_per_1000_h  # may change without a new baseline
         if actuator.watch.healthy is not None:  # None after a person has marked a repair
             actuator.watch.healthy = fresh.healthy
         if _has_same_learning_settings(actuator.watch, fresh):
@@ -333,7 +336,7 @@ class WatchedActuators:
         return True
 
     def count(self, reason: str, number: int = 1) -> None:
-        """Add `number` to the counter of `reason`, usually of dropped messages or blocks."""
+        """Add `number` to the counter called `reason`, usually the reason why messages or blocks are dropped."""
         if number:
             with self._counting:
                 self._counters[reason] += number
@@ -360,11 +363,11 @@ class WatchedActuators:
     def _store_once(self, blocks: Sequence[SourceBlock]) -> None:
         """Judge and store those blocks that are not in the database yet.
 
-        Repeated blocks are rare, so the database is searched for them only after it has refused one.
+        Repeated blocks are rare: the database is searched for repeated blocks only after it has refused a block.
         """
         if not blocks:
             return
-        # of two blocks with one identity the first is kept: reversed, it replaces the other
+        # of two blocks with the same identity the first is kept: in reversed order the first replaces the second
         by_identity = {(block.actuator, block.identity): block for block in reversed(blocks)}
         new_blocks = [block for block in blocks if by_identity[block.actuator, block.identity] is block]
         try:
@@ -375,7 +378,7 @@ class WatchedActuators:
                 new_blocks = [block for block in new_blocks if (block.actuator, block.identity) not in stored_keys]
                 self._store_new(new_blocks)
         except BaseException:
-            # the detectors are ahead of the database: restore them with the next block
+            # the detectors have judged blocks that are not stored: the next block restores them from the database
             for name in {block.actuator for block in blocks}:
                 self._actuators.pop(name, None)
             raise
@@ -390,6 +393,7 @@ class WatchedActuators:
         rows = StoredRows()
         with self.store.writing() as connection:
             pairs = [(block, self._actuator(block.actuator)) for block in blocks]
+            # by actuator: running numbers of the new blocks
             numbers = {actuator.settings.name: itertools.count(actuator.n_stored + 1) for _, actuator in pairs}
             identities = [(block.actuator, block.identity, next(numbers[block.actuator])) for block in blocks]
             if identities:
@@ -416,7 +420,7 @@ class WatchedActuators:
         estimates, events = actuator.judge_samples(samples, follows=follows, settings=settings, verdict=verdict)
         rows.add_estimates(name, estimates, actuator.oil_celsius)
         for event in events:
-            rows.add_alarm(*event)
+            rows.add_alarm(event.alarm, event.kind, event.t)
         # the hash of the name spreads the checkpoints of the actuators over time
         is_due = (actuator.n_stored + zlib.crc32(name.encode())) % PENDING_BLOCKS == 0
         if is_due or actuator.bytes >= PENDING_BYTES:
@@ -428,15 +432,15 @@ class WatchedActuators:
     def _checkpoint(self, actuator: _Actuator, rows: StoredRows) -> None:
         """Add a checkpoint of an actuator's state to the rows that will be stored.
 
-        Also add the running numbers up to which the actuator's blocks and estimates are too old and will be deleted,
-        and count the blocks since the checkpoint from 0 again.
+        Also add the running numbers up to which the actuator's blocks and estimates are too old and will be deleted.
+        The count of blocks since the last checkpoint begins again at 0.
         """
         settings = actuator.settings
         rows.add_checkpoint(settings.name, settings.watched_with.model_dump_json(), actuator.state())
         self._add_summary(actuator, rows)
-        n_estimates = self._keep_s / actuator.watch.block_seconds
+        n_kept_estimates = self._keep_s / actuator.watch.block_seconds
         rows.old_blocks[settings.name] = actuator.n_stored - MAX_IDENTITIES
-        rows.old_estimates[settings.name] = math.floor(actuator.watch.blocks - n_estimates)
+        rows.old_estimates[settings.name] = math.floor(actuator.watch.blocks - n_kept_estimates)
         actuator.pending = actuator.bytes = 0
 
     @staticmethod
@@ -472,7 +476,7 @@ class WatchedActuators:
             actuator, rows = self._actuator(name), StoredRows()
             open_alarm = actuator.judge.alarm
             t = 0.0 if open_alarm is None else open_alarm.updated_s
-            if actuator.last is not None:
+            if actuator.last is not None:  # time of the last estimate
                 t = actuator.last.t
             alarm_samples = list(actuator.alarm_samples)
             alarm = actuator.judge.apply_mark(mark, t, until=t + hours * 3600.0, reason=text)
@@ -486,10 +490,10 @@ class WatchedActuators:
                 rows.add_alarm(alarm, mark, t, by_whom, text)
                 self._checkpoint(actuator, rows)
                 self.store.commit_rows(rows)
-            except BaseException:  # restore it from the database with the next block
+            except BaseException:  # the mark is not stored: the next block restores the actuator from the database
                 self._actuators.pop(name, None)
                 raise
-        # outside the lock, as it may take a second
+        # outside the lock, as writing the machine's file may take a second
         if outcome := record_mark(self.settings[name].rig, alarm, mark, alarm_samples):
             rows = StoredRows()
             rows.add_alarm(alarm, "comment", t, "Sealscope", outcome)
@@ -502,7 +506,7 @@ class WatchedActuators:
     def false_alarms_per_1000_h(self) -> float:
         """Upper limit of the expected number of false alarms in 1000 h of operation, of all actuators together.
 
-        It applies if all of them run and are healthy.
+        The limit applies if all actuators run and are healthy.
         """
         return sum(settings.false_alarms_per_1000_h for settings in self.settings.values())
 

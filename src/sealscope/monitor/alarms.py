@@ -132,10 +132,10 @@ class AlarmJudge:
         baseline; `settings`: thresholds [L/min], and how many successive blocks must lie beyond a threshold before the
         alarm changes (`debounce_blocks`).
 
-        An alarm is raised while a leak is found and its flow reaches the threshold of a warning or an error. It ends,
-        or an error becomes a warning, when the flow is below `return_share` times the threshold of its level. A leak
-        without a flow in L/min is a warning. A leak that comes back before anybody has acknowledged its alarm raises
-        the same alarm again. After a restart of the detector `leak` is None during an alarm; the alarm then stays,
+        An alarm is raised while a leak is found and its flow reaches the threshold of a warning or an error. The alarm
+        ends, or an error becomes a warning, when the flow is below `return_share` times the threshold of its level. A
+        leak without a flow in L/min is a warning. A leak that comes back before anybody has acknowledged its alarm
+        raises the same alarm again. If the detector is restarted during an alarm, `leak` is None; the alarm then stays,
         because the leak may last.
         """
         if not estimate.judged:
@@ -143,6 +143,7 @@ class AlarmJudge:
         lpm = estimate.leak_lpm
         is_warning = leak is not None and (lpm is None or lpm >= settings.warning_lpm)
         is_error = leak is not None and lpm is not None and lpm >= (settings.error_lpm or math.inf)
+        # numbers of successive blocks above the thresholds of a warning and of an error
         self.above = self.above + 1 if is_warning or is_error else 0
         self.error = self.error + 1 if is_error else 0
         if self.alarm is None or not self.alarm.active:
@@ -166,7 +167,7 @@ class AlarmJudge:
             )
             return alarm, "raised"
         limit = settings.warning_lpm if self.alarm.level == "warning" else (settings.error_lpm or math.inf)
-        is_below = leak is not None and lpm is not None and lpm < settings.return_share * limit
+        is_below = leak is not None and lpm is not None and lpm < settings.return_share * limit  # hysteresis
         self.below = self.below + 1 if is_below else 0
         clock_jump = min(0.0, estimate.t - self.alarm.updated_s)  # a clock set back moves the end of the shelving too
         shelved_until_s = self.alarm.shelved_until_s + clock_jump
@@ -207,10 +208,10 @@ class AlarmJudge:
     ) -> tuple[Alarm, str] | None:
         """Update the alarm with the verdict on a whole recording; return the alarm and the name of the event.
 
-        A leak at or above the warning threshold raises an alarm if leak-free recordings give such a verdict seldom
-        enough for the settings' rate of false alarms, or if the verdict on the recording before is a leak as well. The
-        verdict `no leak`, or a leak below the warning threshold, ends the alarm. `earlier`: verdict on the recording
-        before, None if there is none; `baseline`: version of the healthy baseline; `settings`: thresholds and the
+        A leak at or above the warning threshold raises an alarm if the verdict on the previous recording was `leak`,
+        too, or if leak-free recordings get such a verdict seldom enough for the allowed rate of false alarms. The
+        verdict `no leak`, or a leak below the warning threshold, ends the alarm. `earlier`: verdict on the previous
+        recording, None if there is none; `baseline`: version of the healthy baseline; `settings`: thresholds and the
         allowed rate of false alarms.
 
         The event is "raised", "error" or "warning" (a change of the level), "returned" (the leak has ended), or ""
@@ -236,6 +237,7 @@ class AlarmJudge:
             "by_chance_per_1000_h": verdict.by_chance_per_1000_h,
         }
         if alarm is not None and is_active:
+            # a person must acknowledge the higher level again, unless the leak is confirmed
             is_worse = level == "error" and alarm.level == "warning"
             state: AlarmState = "new" if is_worse and alarm.state != "valid" else alarm.state
             return self._set_alarm(replace(alarm, **findings, state=state)), "" if level == alarm.level else level
@@ -265,8 +267,9 @@ class AlarmJudge:
 
         `mark`: "acknowledged", "comment" (which changes nothing), "shelved", "valid", "invalid" or "repaired"; `until`
         [s]: time until which a shelved alarm is not announced; `reason`: why the alarm is invalid. All marks but a
-        comment also reset the counters of successive blocks. Raises InputError for an unknown mark, if there is no open
-        alarm, if the alarm has the state of this mark already, or if the mark ``invalid`` has no reason.
+        comment also reset the counts of successive blocks beyond a threshold (`above`, `error`, `below`). Raises
+        InputError for an unknown mark, if there is no open alarm, if the alarm has the state of this mark already, or
+        if the mark ``invalid`` has no reason.
         """
         if mark not in MARKS:
             raise InputError(f"an alarm must be marked {', '.join(MARKS)}, got {mark[:40]!r}")
@@ -298,10 +301,10 @@ class AlarmJudge:
 def rank_actuators(summaries: Mapping[str, Mapping[str, Any]], alarms: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Sort actuators by urgency, and return their summaries as rows, each with the `name` and the open `alarm` or None.
 
-    More urgent is, in this order: the more severe state; a new alarm; the stronger evidence, that is an alarm that a
-    healthy actuator raises more seldom by chance; the larger lower end of the leak's interval; the larger leak. Ties
-    are decided by the name. `summaries`: summary of each actuator by name; `alarms`: the open alarms, for each
-    actuator with the latest first.
+    More urgent is, in this order: the more severe state; a new alarm; the stronger evidence (fewer such alarms of a
+    healthy actuator by chance); the larger lower end of the leak's interval; the larger leak. Ties are decided by the
+    name. `summaries`: summary of each actuator by name; `alarms`: the open alarms, for each actuator with the latest
+    first.
     """
 
     def rank(row: Mapping[str, Any]) -> tuple[Any, ...]:

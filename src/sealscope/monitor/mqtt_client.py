@@ -60,7 +60,7 @@ class MqttLink:
         client.on_pre_connect = self._set_will
 
     def _set_will(self, client: Any, userdata: Any) -> None:
-        """Set the last will of the connection that the client is about to make."""
+        """Set the last will of the connection that the client is about to make; called by the library paho."""
         if self._will is not None:
             self._last_will = self._will()
             client.will_set(*self._last_will, qos=1, retain=self._retain)
@@ -82,7 +82,7 @@ class MqttLink:
             raise RuntimeError("the thread of the connection to the broker has ended")
 
     def publish(self, topic: str, payload: bytes | str, **options: Any) -> bool:
-        """Publish a message; return True if it was sent within `_PUBLISH_TIMEOUT_S`.
+        """Publish `payload` as a message under `topic`; return True if it was sent within `_PUBLISH_TIMEOUT_S`.
 
         `options`: arguments of paho's `publish`; with `qos` 1 the broker must also acknowledge the message in time.
         """
@@ -97,6 +97,7 @@ class MqttLink:
         """Publish the last will and disconnect; do nothing if the connection is not open."""
         if self.is_open:
             self.is_open = False
+            # after a regular end of the connection the broker does not publish the will
             if self._last_will is not None and self.client.is_connected():
                 self.publish(*self._last_will, qos=1, retain=self._retain)
             self.client.disconnect()

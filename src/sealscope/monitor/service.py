@@ -51,8 +51,9 @@ _Storable = TypeVar("_Storable", SourceBlock, RefusedMessage)
 class Service:
     """A running monitor: it takes blocks of samples from its sources, stores them, and sends the events of alarms.
 
-    `once`: True to end when standard input has ended and all files of the folders are stored; `stdin`, `stdout`:
-    streams of incoming blocks and of outgoing events; `sources`: additional sources, such as a simulated rig.
+    It locks and opens the database, restores the actuators, and prepares the page if the settings state one. `once`:
+    True to end when standard input has ended and all files of the folders are stored; `stdin`, `stdout`: streams of
+    incoming blocks and of outgoing events; `sources`: additional sources, such as a simulated rig.
     """
 
     def __init__(
@@ -64,7 +65,6 @@ class Service:
         stdout: TextIO | None = None,
         sources: Iterable[Source] = (),
     ) -> None:
-        """Lock and open the database, restore the actuators, and prepare the page if the settings state one."""
         self.settings, self.once = settings, once
         self._queue: BoundedQueue[SourceBlock | RefusedMessage | None] = BoundedQueue(_QUEUE_BLOCKS, _QUEUE_BYTES)
         self._unstored: list[SourceBlock | RefusedMessage | None] = []
@@ -107,13 +107,13 @@ class Service:
                 _log.warning("%s", block)
             elif _is_logged(self._refused):
                 _log.warning("%s (message %d without a block)", block, self._refused)
-        else:
+        else:  # an error of the drawing, which `attempt` catches, must not prevent the storage
             self.supervisor.part("picture of samples").attempt(partial(self._live.push, block.actuator, block.samples))
         if self._queue.put(block, block.bytes):
             return
         self._n_waits += 1
         start, is_logged = time.monotonic(), False
-        while not self.stopping.is_set() and not self._queue.put(block, block.bytes, 0.5):
+        while not self.stopping.is_set() and not self._queue.put(block, block.bytes, timeout=0.5):
             if not is_logged and time.monotonic() - start > _LONG_WAIT_S:
                 is_logged = True
                 load = self.queue_load()
@@ -135,7 +135,7 @@ class Service:
         self._resources.enter_context(threadpool_limits(limits=1))
         sources, threads = self._all_sources(), list[threading.Thread]()
         storing = self.supervisor.part("storage")
-        put_end = partial(self._queue.put, None, 0, always=True)  # None in the queue: a source has ended
+        put_end = partial(self._queue.put, None, size=0, always=True)  # None in the queue: a source has ended
         self._n_sources = len(sources)
         try:
             threads += self._start_outputs()
@@ -151,7 +151,7 @@ class Service:
                 self.page.leave()
             deadline = time.monotonic() + _END_S
             for thread in threads:
-                if thread.name != _LINES:  # it may wait for a line for ever
+                if thread.name != _LINES:  # the source of lines may wait for ever
                     thread.join(max(0.0, deadline - time.monotonic()))
             if self.page is not None:
                 self.page.close()
@@ -176,23 +176,23 @@ class Service:
     def _start_outputs(self) -> list[threading.Thread]:
         """Start the threads that send events and states to the outputs in the settings, and return them."""
         repeat = self.supervisor.repeat
-        threads = [repeat("standard output", self._write_events, _POLL_S, last=self._write_events)]
+        threads = [repeat("standard output", self._write_events, every_s=_POLL_S, last=self._write_events)]
         outputs = open_outputs(self.actuators, self.settings)
-        threads.extend(repeat(output.part, output.deliver, _POLL_S, last=output.end) for output in outputs)
+        threads.extend(repeat(output.part, output.deliver, every_s=_POLL_S, last=output.end) for output in outputs)
         return threads
 
     def _store_queued(self) -> None:
         """Store the next blocks of the queue; after an error the next call tries the same blocks again."""
         if not self._unstored:
-            self._unstored = self._queue.pop(_MAX_TRANSACTION_BLOCKS, 0.2)
+            self._unstored = self._queue.pop(_MAX_TRANSACTION_BLOCKS, timeout=0.2)
             if 0 < len(self._unstored) < _MAX_TRANSACTION_BLOCKS and None not in self._unstored:
-                self.stopping.wait(_GATHER_S)
-                self._unstored += self._queue.pop(_MAX_TRANSACTION_BLOCKS - len(self._unstored), 0.0)
+                self.stopping.wait(_GATHER_S)  # other blocks may arrive, to be stored in the same transaction
+                self._unstored += self._queue.pop(_MAX_TRANSACTION_BLOCKS - len(self._unstored), timeout=0.0)
         blocks = [block for block in self._unstored if isinstance(block, SourceBlock)]
         self._store(blocks, self.actuators.process_blocks)
         refusals = [block for block in self._unstored if isinstance(block, RefusedMessage)]
         self._store(refusals, lambda messages: self.store.write_refused([message.row() for message in messages]))
-        self._n_sources -= self._unstored.count(None)  # those that have ended
+        self._n_sources -= self._unstored.count(None)  # a source that ends queues None
         self._unstored = []
 
     def stop(self) -> None:
@@ -207,7 +207,8 @@ class Service:
         """Store blocks, or refused messages, in one transaction by the function `write`, and acknowledge them.
 
         If the database has an outage, its error is raised. After any other error the blocks are stored one by one. A
-        block that then fails is counted, dropped and acknowledged: it would fail again, and later ones must not wait.
+        block that fails alone is counted, dropped and acknowledged: a repetition would fail, too, and later blocks must
+        not wait.
         """
         if not blocks:
             return

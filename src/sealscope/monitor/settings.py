@@ -28,7 +28,8 @@ _LongText = Annotated[str, Field(min_length=1, max_length=1000)]
 def _resolve_in_folder(place: _PathLike, info: ValidationInfo) -> _PathLike:
     """Resolve a path in the settings relative to the folder of their file.
 
-    Names of packaged rigs and URLs are returned unchanged. So are all paths if the settings do not come from a file.
+    `place`: path, URL or name of a packaged rig; `info`: name of the setting (`field_name`), and the folder of the file
+    (`context`). URLs and names are returned unchanged, and so are all paths if the settings do not come from a file.
     """
     is_name = isinstance(place, str) and ("://" in place or (info.field_name == "rig" and not place.endswith(".toml")))
     return place if is_name or not info.context else type(place)(Path(info.context["folder"]) / place)
@@ -67,7 +68,7 @@ class WatchSettings(_Table):
 
     @property
     def watched_with(self) -> WatchSettings:
-        """Only those settings that concern the watch, without the actuator's name and source of samples."""
+        """The settings by which the actuator is watched, without its name and the source of its samples."""
         return WatchSettings(**{name: getattr(self, name) for name in WatchSettings.model_fields})
 
 
@@ -114,11 +115,12 @@ class ActuatorSettings(WatchSettings):
     def _fill_from_machine(cls, values: Any, info: ValidationInfo) -> Any:
         """Complete the table of an actuator with the rate, columns, units and repair limit in its machine's file.
 
-        Entries of the table take precedence. Its key `machine` is another name of `rig`, but must name a file written
-        by `sealscope commission`. The limit becomes `error_lpm` [L/min]. The units are those in the column headings of
-        the machine's logs; they are used only for Sparkplug and OPC UA, whose values need not state units.
+        `values`: the table, whose entries take precedence; `info`: its `context` has the folder of the settings. The
+        key `machine` of the table is another name of `rig`, but must name a file written by `sealscope commission`. The
+        limit becomes `error_lpm` [L/min]. The units are those in the column headings of the machine's logs. They are
+        used only for Sparkplug and OPC UA, whose values need not state units.
         """
-        if not isinstance(values, dict):
+        if not isinstance(values, dict):  # refused later, by the check of the types
             return values
         machine_file = values.get("machine")
         is_machine = isinstance(machine_file, str)
@@ -244,11 +246,12 @@ class MonitorSettings(_Table):
     @model_validator(mode="before")
     @classmethod
     def _apply_defaults(cls, values: Any) -> Any:
-        """Fill the defaults into the table of each actuator; divide the fleet's false-alarm rate equally among them.
+        """Fill the defaults into the table of each actuator, with an equal part of the fleet's false-alarm rate.
 
-        Raises ValueError if a table states a false-alarm rate beside that of the fleet.
+        `values`: the tables of all settings. Raises ValueError if the fleet has a false-alarm rate and an actuator or
+        the defaults state another.
         """
-        if not isinstance(values, dict):
+        if not isinstance(values, dict):  # refused later, by the check of the types
             return values
         defaults, actuators = values.get("defaults", {}), values.get("actuator")
         if not (isinstance(defaults, dict) and isinstance(actuators, list)):
@@ -310,6 +313,7 @@ def _check_channels(actuator: ActuatorSettings, *, has_opcua: bool) -> None:
         to_si(0.0, unit, CHANNEL_UNITS[channel], name=f"units.{channel}", place=actuator.name)
     if actuator.units and actuator.folder is not None:
         raise ValueError(f"units of files stand in their headings, got units of {actuator.name!r}, a folder")
+    # the sets of channels that suffice to watch the actuator
     ways = ways_to_watch(load_watched(actuator.rig).rig) if actuator.nodes else ()
     if actuator.nodes and not any(actuator.nodes.keys() >= {*way} for way in ways):
         raise ValueError(f"nodes of {actuator.name!r} must give {format_ways(ways)}, got {', '.join(actuator.nodes)}")
@@ -329,13 +333,15 @@ def topic_level(name: str) -> str:
 
 
 def read_settings(path: Path) -> MonitorSettings:
-    """Read the settings of a monitor from a TOML file; paths in it are relative to its folder.
+    """Read the settings of a monitor from a TOML file; the paths in this file are relative to its folder.
 
     Raises InputError, with a message of one line, if the file cannot be read or breaks a rule.
     """
     values = read_toml(path, "the monitor's settings", os.fspath(path))
     context = {"folder": path.resolve().parent}
-    return read_model(values, MonitorSettings, os.fspath(path), lambda entry: entry or "settings", context)
+    return read_model(
+        values, MonitorSettings, os.fspath(path), entry_name=lambda entry: entry or "settings", context=context
+    )
 
 
 def template() -> str:

@@ -117,7 +117,7 @@ def payload_class() -> Any:
             if "V" in roles:
                 if not message_type.oneof_decl:
                     message_type.oneof_decl.add(name="value")
-                field.oneof_index = 0
+                field.oneof_index = 0  # the only group of alternatives
     pool = descriptor_pool.DescriptorPool()
     pool.AddSerializedFile(file.SerializeToString())
     return message_factory.GetMessageClass(pool.FindMessageTypeByName("sparkplug.Payload"))
@@ -176,7 +176,7 @@ def _decode_metric(entry: Any) -> SparkplugMetric:
     field = None if entry.is_null else entry.WhichOneof("value")
     value = None if field is None else getattr(entry, field)
     if not isinstance(entry.name, str) or (field == "string_value" and not isinstance(value, str)):
-        raise ValueError("a text must be UTF-8")  # damaged text is returned as bytes
+        raise ValueError("a text must be UTF-8")  # protobuf returns a damaged text as bytes
     properties = zip(entry.properties.keys, entry.properties.values, strict=False)
     unit = next((str(value.string_value)[:40] for key, value in properties if key == _UNIT), None)
     name, alias, timestamp = _get_fields(entry, "name", "alias", "timestamp")
@@ -185,5 +185,8 @@ def _decode_metric(entry: Any) -> SparkplugMetric:
 
 
 def topic_of(group: str, kind: str, node: str, device: str | None = None) -> str:
-    """Build the MQTT topic of a Sparkplug message of a node or of its device; `kind`: its type, such as ``NBIRTH``."""
+    """Build the MQTT topic of a Sparkplug message of a node in a group, or of the node's device.
+
+    `kind`: type of the message, such as ``NBIRTH``; `device`: None for a message of the node itself.
+    """
     return "/".join([NAMESPACE, group, kind, node, *([] if device is None else [device])])

@@ -56,7 +56,7 @@ class SupervisedPart:
         self._lock = threading.Lock()
 
     def begin_outage(self, reason: object) -> None:
-        """Begin an outage of the part and log it; if there is one already, it continues with its first reason."""
+        """Begin an outage of the part and log it; an outage that has begun before continues with its first reason."""
         with self._lock:
             if self.since is not None:
                 return
@@ -219,7 +219,7 @@ class LimitedLines(logging.Filter):
                 record.msg, record.args = f"{record.getMessage()} {left_out}", None
             minute_start, n_records = now, 0
         if len(self._places) >= _MAX_PLACES and place not in self._places:
-            self._places.clear()
+            self._places.clear()  # bounds the memory; all places are counted anew
         self._places[place] = minute_start, n_records + 1
         if not (text := record.getMessage()).isprintable():
             record.msg, record.args = printable(text), None
@@ -232,7 +232,7 @@ def describe_error(error: BaseException) -> str:
     place, frame = "", error.__traceback__
     while isinstance(frame, TracebackType):
         file = Path(frame.tb_frame.f_code.co_filename)
-        if file.is_relative_to(_PACKAGE):
+        if file.is_relative_to(_PACKAGE):  # the last such frame is the innermost
             place = f" ({file.relative_to(_PACKAGE).as_posix()}, line {frame.tb_lineno})"
         frame = frame.tb_next
     return f"{' '.join(message.split())[:120]}{place}"

@@ -110,8 +110,8 @@ class RecordingVerdict:
     def decides(self) -> bool:
         """True if the condition of the machine follows from this verdict on a whole recording.
 
-        Otherwise it follows from the verdicts on the blocks of the stream. The verdicts `leak` and `no leak` decide,
-        and so does `cannot tell` after a person has marked the alarm.
+        Otherwise the condition follows from the estimates of the single blocks of samples. The verdicts `leak` and
+        `no leak` decide, and so does `cannot tell` after a person has marked the alarm.
         """
         return self.leaks or self.clears or self.mark != ""
 
@@ -127,14 +127,14 @@ class RecordingVerdict:
 
     @property
     def by_chance_per_1000_h(self) -> float | None:
-        """Expected number of scores as high as this in 1000 h of healthy recordings, None if it is not known."""
+        """Expected number of equally high scores in 1000 h of healthy recordings, None if it is not known."""
         hours = (self.end_s - self.start_s) / 3600.0
         return None if self.chance is None or hours <= 0.0 else 1000.0 * self.chance / hours
 
     def neutral_after_mark(self, mark: str) -> RecordingVerdict:
         """Build the verdict that is shown after a person has marked the alarm, until the next recording is judged.
 
-        It is `cannot tell`, for the same file and times, and quotes the `mark` ("invalid" or "repaired").
+        This verdict is `cannot tell`, for the same file and times, and quotes the `mark` ("invalid" or "repaired").
         """
         state, start_s, end_s = state_of("watched").as_dict(), self.start_s, self.end_s
         texts: dict[str, Any] = {"summary": f"marked {mark}", "reason": "the next recording is judged anew"}
@@ -144,8 +144,8 @@ class RecordingVerdict:
     def restate_block(self, block: BlockEstimate) -> BlockEstimate:
         """Replace the leak in the estimate of a block by the leak of the whole recording.
 
-        Before the onset, or if the recording has no leak, the block gets no leak. Its interval is then from 0 to
-        `bound_lpm`, the 95 % upper bound of a leak in the recording, or None if there is no such bound.
+        Before the onset, or if the recording has no leak, the block gets no leak. The interval of the leak is then from
+        0 to `bound_lpm`, the 95 % upper bound of a leak in the recording, or None if this bound is None.
         """
         is_before_onset = self.onset_s is not None and block.t < self.onset_s
         if self.leaks and not is_before_onset:

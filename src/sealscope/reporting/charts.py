@@ -189,8 +189,8 @@ def rms_charts(chambers: list[ChamberDetails], pressure_unit: str) -> list[Chart
             channel = chamber.channel
             unit, scale = detail_unit(chamber.unit, names[0], pressure_unit)  # the same for all names of a chart
             lines = tuple(ChartLine(detail_label(name), name, chamber.window_rms[name] / scale) for name in names)
-            title = f"RMS of {quantity} of {channel}"
-            charts.append(Chart(f"rms-{channel}{suffix}", "rms", title, unit, lines, f"windows-{channel}", height))
+            title, base = f"RMS of {quantity} of {channel}", f"windows-{channel}"
+            charts.append(Chart(f"rms-{channel}{suffix}", "rms", title, unit, lines, base=base, height=height))
     return charts
 
 
@@ -215,7 +215,7 @@ def course_charts(diagnosis: Diagnosis, *, height: int = 190) -> list[Chart]:
     bottom, top = _y_limits(course.lpm, low, high)
     level = diagnosis.repair_lpm
     if level is not None and top < level < _MAX_LIMIT_RATIO * top:
-        top = 1.06 * level  # with a margin
+        top = 1.06 * level  # 6 % margin above the limit
     title = "Passed by pump and piston together" if course.whole else "Leak past the piston"
     return [
         Chart(
@@ -246,9 +246,11 @@ def _y_limits(values: Array, low: Array, high: Array) -> tuple[float, float]:
     with_most = [*required_values]
     with_most += [np.quantile(low_ends, 0.1)] if low_ends.size else []
     with_most += [np.quantile(high_ends, 0.9)] if high_ends.size else []
-    levels = with_all if max(with_all) - min(with_all) <= 2.0 * (max(with_most) - min(with_most)) else with_most
-    margin = 0.06 * (max(levels) - min(levels)) or 0.5
-    return float(min(levels) - margin), float(max(levels) + margin)
+    is_little_wider = max(with_all) - min(with_all) <= 2.0 * (max(with_most) - min(with_most))
+    included_values = with_all if is_little_wider else with_most
+    bottom, top = min(included_values), max(included_values)
+    margin = 0.06 * (top - bottom) or 0.5  # 0.5 if all values are equal
+    return float(bottom - margin), float(top + margin)
 
 
 def detail_charts(chambers: list[ChamberDetails], pressure_unit: str) -> list[Chart]:
@@ -296,11 +298,12 @@ def draw(
     """Reduce and encode the lines of all charts for the script of the page, and draw a still picture of each chart.
 
     Long channels are divided into groups of successive samples, of which only minimum and maximum are drawn, so that
-    peaks are preserved. `chambers`: wavelet details, for their time axes; `marks`: moments to mark on every chart,
-    besides the onset of the diagnosis.
+    peaks are preserved. `chambers`: wavelet details, which give the time axes of their RMS windows; `charts`: the
+    charts to draw; `marks`: moments to mark on every chart, besides the onset of the diagnosis.
     """
     middle = float(recording.t[len(recording) // 2])
     near = diagnosis.onset_s if diagnosis.onset_s is not None and isfinite(diagnosis.onset_s) else middle
+    # all samples around the onset, or around the middle of the recording if there is no onset, are drawn
     base = choose_drawn_times(recording.t, recording.rate, POINTS, near=near, near_samples=NEAR_SAMPLES)
     still_base = choose_drawn_times(recording.t, recording.rate, STILL_POINTS)
     span = (float(base.t[0]), float(base.t[-1]))
@@ -369,16 +372,17 @@ def render_still(
     finite = all_values[np.isfinite(all_values)]
     low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
     max_magnitude = max(abs(low), abs(high))
-    if high - low <= max(_MIN_EXTENT, _MIN_RELATIVE_EXTENT * max_magnitude):
+    if high - low <= max(_MIN_EXTENT, _MIN_RELATIVE_EXTENT * max_magnitude):  # constant
         pad = max(0.5, 1e-6 * max_magnitude)
         low, high = low - pad, high + pad
     margin = 0.04 * (high - low)
     low, high = chart.limits or (low - margin, high + margin)
     lines = [np.clip(line, low, high) for line in lines]
     ends = (span[0], span[1] if span[1] > span[0] else span[0] + 1)
+    # the margin below has room for the labels of the time axis
     picture = Picture(860.0, float(chart.height), ends, (low, high), margins=(0.0, 0.0, 0.0, 20.0))
-    picture.frame(4)
-    for value in ticks(*ends, 8):
+    picture.frame(count=4)
+    for value in ticks(*ends, count=8):
         picture.below(value, f"{value:g} s")
     for style, begin, end in moments:
         if end is None:
@@ -386,7 +390,7 @@ def render_still(
         else:
             picture.box(style, begin, end)
     if chart.band:
-        _value, low_end, high_end, *_ = lines
+        _value, low_end, high_end, *_ = lines  # the estimate, and the ends of its interval
         picture.area("interval", t, low_end, high_end)
     if chart.level is not None and chart.level <= high:
         picture.level("level", chart.level)

@@ -84,7 +84,7 @@ def chamber_details(recording: Recording, channel: str) -> tuple[ChamberDetails 
             ends, window_rows = windowed_rms(rows[:, inside], first=inside.start)
         except InputError as error:  # such as pressures of 1e300, whose squares overflow
             return None, f"No details of {channel}: {error}."
-        for name, row, level in zip(QUANTITIES, rows, (1, 2, 3, 4, 4), strict=True):  # d3d4 reaches as far as d4
+        for name, row, level in zip(QUANTITIES, rows, (1, 2, 3, 4, 4), strict=True):  # d3d4 is affected where d4 is
             unaffected_samples = transform.inside(level)
             values[name][part][unaffected_samples] = row[unaffected_samples]
         if ends.size:
@@ -134,7 +134,8 @@ def parts_to_compare(diagnosis: Diagnosis, recording: Recording) -> Parts:
         return Parts(low, high, ("Before", "After"), text)
     if len(recording) < 2 * (WINDOW_SIZE + (HALF_WINDOWS - 1) * WINDOW_STEP):
         text = "No onset was found, and the recording is too short to be parted."
-        return Parts(np.inf, np.inf, ("Whole", "Later"), text)
+        # all times lie before the end inf of the first part
+        return Parts(end=np.inf, start=np.inf, heads=("Whole", "Later"), text=text)
     middle = float(t[0] + t[-1]) / 2
     text = f"No onset was found: the first half is set against the second, parted at {middle:.1f} s."
     return Parts(middle, middle, ("First half", "Second half"), text)

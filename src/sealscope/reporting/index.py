@@ -26,7 +26,7 @@ def severity_key(diagnosis: Diagnosis) -> tuple[int, float, float, str]:
     - name of the file
     """
     severity = diagnosis.severity
-    # of the ratio and its interval, the ratio
+    # `of_limit` is the ratio of leak to limit, and the ends of the ratio's interval
     limit_ratio = 0.0 if severity is None or severity.of_limit is None else severity.of_limit[0]
     total_lpm = None if diagnosis.total_leakage is None else diagnosis.total_leakage.lpm
     lpm = total_lpm if diagnosis.leak_lpm is None else diagnosis.leak_lpm

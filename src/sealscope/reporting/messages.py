@@ -68,14 +68,17 @@ def clock(seconds: float | None) -> str:
 
 
 def headline(diagnosis: Diagnosis) -> str:
-    """Format the verdict as a sentence for the heading of the page, or of the card, a picture of the diagnosis."""
+    """Format the verdict as a sentence for the heading of the page, or of the card, a picture of the diagnosis.
+
+    The summary of the verdict is used if `messages.toml` has no sentence for the verdict or its cause.
+    """
     texts = _texts()["headline"]
     key = diagnosis.summary
     if diagnosis.verdict == "leak" and diagnosis.cause in texts:
         key = diagnosis.cause
     elif key == "no leak" and not diagnosis.known_healthy:  # a leak from the start cannot be excluded
         key = "none began"
-    return texts.get(key, key[0].upper() + key[1:])
+    return texts.get(key, key[0].upper() + key[1:])  # `capitalize` would change other letters
 
 
 def cause(diagnosis: Diagnosis) -> str | None:
@@ -103,7 +106,7 @@ def state_text(machine_state: MachineState) -> str:
 
 
 def since(diagnosis: Diagnosis) -> str | None:
-    """Format the time since which the machine leaks, with its interval.
+    """Format the onset of the leak with its interval.
 
     If the onset is not known, the text says that the leak is older than the recording or that it rises within the
     recording. Returns None if the verdict is not "leak".
@@ -144,13 +147,13 @@ def _pump_fraction(diagnosis: Diagnosis) -> str | None:
     severity = diagnosis.severity
     if severity is None or severity.pump_share is None:
         return None
-    fraction, _low, _high = severity.pump_share
+    fraction, _low, _high = severity.pump_share  # without the interval
     return f"{_format_percent(fraction)} of the pump's flow in this duty"
 
 
 def _why_no_flow(diagnosis: Diagnosis) -> str:
-    """Return the reason why the leak cannot be stated in L/min, and what would remedy it, as text."""
-    if "leak_lpm" not in diagnosis.refuses:
+    """Return the reason why the leak cannot be stated in L/min, and the remedy, as text."""
+    if "leak_lpm" not in diagnosis.refuses:  # not withheld, but cannot be computed
         is_too_small = diagnosis.total_leakage is not None and diagnosis.total_leakage.lpm is not None
         return say(f"how_much.{'too_small' if is_too_small else 'channels'}")
     if raw_counts(diagnosis):
@@ -166,7 +169,7 @@ def flow_basis(diagnosis: Diagnosis) -> str | None:
 
 
 def machine_text(machine: AssumedMachine) -> str:
-    """Format the piston area and pump displacement on which flows [L/min] are based, and where they come from."""
+    """Format the piston area and pump displacement on which flows [L/min] are based, and the origin of both."""
     if machine.flow_meter:
         key = "meter"
     elif machine.stated_by == "recording":
@@ -184,15 +187,15 @@ def machine_text(machine: AssumedMachine) -> str:
 def how_bad(diagnosis: Diagnosis) -> str | None:
     """Format the severity of the leak: its size as a percentage or multiple of the repair limit.
 
-    If this ratio is not known but the user stated a limit, the text says that the comparison needs the piston area.
-    Without a stated limit, the text is the leak as a fraction of the pump's flow; this is left out if the leak has no
-    flow in L/min. Returns None if there is no leak or nothing to state.
+    If this size is not known but the user stated a limit, the text says that the comparison needs the piston area.
+    Without a stated limit, the text is the leak as a fraction of the pump's flow. Returns None if the severity is not
+    known, or if the leak has neither such a size nor a flow in L/min.
     """
     severity, limit = diagnosis.severity, diagnosis.limit
     if severity is None:
         return None
     if severity.level is not None and severity.of_limit is not None:
-        _, low, high = severity.of_limit
+        _, low, high = severity.of_limit  # multiples of the limit
         percent = _format_range(100.0 * low, 100.0 * high)
         share = f"{_format_range(low, high)} times" if high >= 10.0 else f"{percent} % of"
         return say(f"how_bad.{severity.level}", share=share, limit=f"{limit}{'' if limit.stated else ', the default'}")
@@ -215,6 +218,7 @@ def other_sizes(diagnosis: Diagnosis) -> str | None:
     if severity is None:
         return None
     creep = severity.creep_mm_per_min
+    # each quantity has a value, which is stated, and an interval
     parts = [
         None if severity.mL_per_min is None else f"{number(severity.mL_per_min[0], 2)} mL/min",
         None if diagnosis.leak_lpm is None else _pump_fraction(diagnosis),
@@ -226,8 +230,8 @@ def other_sizes(diagnosis: Diagnosis) -> str | None:
 def total_leakage(diagnosis: Diagnosis, *, basis: bool = True) -> str | None:
     """Format the total leakage past pump and piston, and the smallest change of this leakage that could be detected.
 
-    `basis`: True to add the machine data on which flows are based, unless the verdict is "leak". Returns None if the
-    total leakage is not known.
+    `basis`: True to add the piston area and pump displacement on which flows are based, unless the verdict is "leak".
+    Returns None if the total leakage is not known.
     """
     leakage = diagnosis.total_leakage
     if leakage is None:
@@ -242,8 +246,9 @@ def total_leakage(diagnosis: Diagnosis, *, basis: bool = True) -> str | None:
     if basis and diagnosis.verdict != "leak" and (machine := flow_basis(diagnosis)) is not None:
         text += f" ({machine})"
     text += "" if leakage.healthy_lpm is None else say("leakage.healthy", lpm=number(leakage.healthy_lpm, 2))
-    step = f"{number(leakage.findable_lpm, 2)} L/min"
-    return text + ("" if leakage.findable_lpm is None else say("leakage.findable", size=step))
+    if leakage.findable_lpm is None:
+        return text
+    return text + say("leakage.findable", size=f"{number(leakage.findable_lpm, 2)} L/min")
 
 
 def _leakage_fraction(leakage: TotalLeakage, pressure: str) -> str:
@@ -256,9 +261,9 @@ def _leakage_fraction(leakage: TotalLeakage, pressure: str) -> str:
     text = say(f"leakage.{key}", share=_format_percent(leakage.pump_share), pressure=pressure)
     if leakage.findable_share is None:
         return text
-    step = _format_percent(leakage.findable_share) + ("" if is_known else " of the pump's flow")
-    step += "" if leakage.findable_lpm is None else f", {number(leakage.findable_lpm, 2)} L/min"
-    return text + say("leakage.findable", size=step)
+    change = _format_percent(leakage.findable_share) + ("" if is_known else " of the pump's flow")
+    change += "" if leakage.findable_lpm is None else f", {number(leakage.findable_lpm, 2)} L/min"
+    return text + say("leakage.findable", size=change)
 
 
 def leakage_in_short(diagnosis: Diagnosis) -> str | None:
@@ -297,8 +302,9 @@ def how_sure(diagnosis: Diagnosis) -> str:
     odds = "" if odds is None else f"{odds}; "
     relation = "over" if diagnosis.score > diagnosis.threshold else "not over"
     if diagnosis.verdict != "leak" and found_cause is not None and diagnosis.alarmed:
+        # the alarm has another cause than a leak
         odds, relation = f"that something changed: {odds}", f"for {found_cause}, over"
-    detector = diagnosis.methods[0].detector if diagnosis.methods else ""  # the deciding one is first
+    detector = diagnosis.methods[0].detector if diagnosis.methods else ""  # the deciding method is first
     return say(
         "how_sure.score", odds=odds, score=number(diagnosis.score), relation=relation,
         threshold=number(diagnosis.threshold), judge=f" of {detector}" if detector else "",
@@ -312,7 +318,7 @@ def odds_or_false_alarms(diagnosis: Diagnosis) -> str:
 
 
 def false_alarms(diagnosis: Diagnosis) -> str:
-    """Format the false-alarm probability of all tests together as a percentage and as 1 in n."""
+    """Format the false-alarm probability of all tests together as a percentage and as "1 in n"."""
     p = diagnosis.false_alarm_probability
     if not 0 < p < 1:
         return say("how_sure.probability", probability=number(p))
@@ -323,7 +329,7 @@ def false_alarms(diagnosis: Diagnosis) -> str:
 def next_steps(diagnosis: Diagnosis) -> tuple[str, ...]:
     """List the recommended next steps as sentences, most useful first."""
     severity_level = None if diagnosis.severity is None else diagnosis.severity.level
-    deciding_detector = diagnosis.methods[0].detector if diagnosis.methods else ""  # the deciding one is first
+    deciding_detector = diagnosis.methods[0].detector if diagnosis.methods else ""  # the deciding method is first
     step_once_confirmed = say(f"once_confirmed.{severity_level or 'plan'}", limit=diagnosis.limit)
     has_named_cause = diagnosis.named_cause is not None
     if diagnosis.verdict == "leak":
@@ -333,10 +339,11 @@ def next_steps(diagnosis: Diagnosis) -> tuple[str, ...]:
     elif diagnosis.verdict == "no leak":
         steps = [say("next.ringing") if deciding_detector == RMS_CHANGE else diagnosis.next_check, say("next.longer")]
     else:
+        # the detectors in `ORDER` measure the leak flow
         estimates_flow = any(method.usable for method in diagnosis.methods if method.detector in ORDER)
         steps = [say("next.cause"), say("next.record")]
         if not estimates_flow and any(method.usable for method in diagnosis.methods):
-            steps.reverse()  # a channel is missing: record it first
+            steps.reverse()  # a channel is missing: first of all it must be recorded
         if diagnosis.unused and not estimates_flow:
             steps.insert(0, say("next.map"))
     # a baseline that was left out, such as the recording itself, is no defect of the data
@@ -416,6 +423,7 @@ def diagnosis_text(diagnosis: Diagnosis, *, width: int = WIDTH) -> str:
         figures = method.reason if method.score is None and method.reason else figures
         rows.append(("method", f"{method.detector}: {method.summary} ({figures})"))
     rows += [(finding.severity, finding.text) for finding in diagnosis.quality]
+    # only the first of the steps has a label
     rows += [("" if k else "next", step) for k, step in enumerate(next_steps(diagnosis)[:2])]
     return _format_lines(diagnosis, rows, width)
 
@@ -431,7 +439,7 @@ def _figure_rows(diagnosis: Diagnosis) -> list[tuple[str, str | None]]:
 def _format_lines(diagnosis: Diagnosis, rows: list[tuple[str, str | None]], width: int) -> str:
     """Format a line with the file and the verdict, then a paragraph for each row (label, text) that has a text."""
     first = say("terminal.diagnosis", file=printable(diagnosis.file), summary=diagnosis.summary)
-    return "\n".join((first, *paragraphs(rows, 12, width)))
+    return "\n".join((first, *paragraphs(rows, columns=12, width=width)))
 
 
 def format_leak_flow(diagnosis: Diagnosis) -> str:
@@ -440,7 +448,7 @@ def format_leak_flow(diagnosis: Diagnosis) -> str:
     If the flow or the bound is not known, the text says that no flow is stated.
     """
     if diagnosis.verdict == "leak" and diagnosis.leak_lpm is not None:
-        low, high = diagnosis.leak_interval_lpm or (diagnosis.leak_lpm,) * 2
+        low, high = diagnosis.leak_interval_lpm or (diagnosis.leak_lpm, diagnosis.leak_lpm)
         return f"{number(diagnosis.leak_lpm, 2)} L/min ({number(low, 2)} to {number(high, 2)})"
     if diagnosis.verdict != "leak" and diagnosis.bound_lpm is not None:
         return f"none above {number(diagnosis.bound_lpm, 2)} L/min"
@@ -459,13 +467,13 @@ _FILE_COLUMNS = 22
 def table_line(diagnosis: Diagnosis, start_s: float | None = None) -> str:
     """Format a diagnosis as a line of a table: file, date, verdict and leak flow in L/min.
 
-    Further lines state the next step or, for `cannot tell`, the reason; a named cause comes first unless the verdict is
-    `leak`. They are left out for `no leak` without a cause. A file name that is longer than its column stands on a line
-    of its own. `start_s`: start of the recording [s since 1970], None to leave the date blank.
+    Further lines state the next step or, for `cannot tell`, the reason, after the cause if one is named and the verdict
+    is not `leak`. There are no further lines for `no leak` without a cause. A file name that is longer than its column
+    stands on a separate line. `start_s`: start of the recording [s since 1970], None to leave the date blank.
     """
     file = PurePath(diagnosis.file).name
     date = "" if start_s is None else datetime.fromtimestamp(start_s, UTC).date().isoformat()
-    file = file if len(file) <= _FILE_COLUMNS else f"{file}\n{'':{_FILE_COLUMNS}}"
+    file = file if len(file) <= _FILE_COLUMNS else f"{file}\n{' ' * _FILE_COLUMNS}"
     line = f"{file:<{_FILE_COLUMNS}} {date:<10} {diagnosis.verdict:<11} {format_leak_flow(diagnosis)}"
     found_cause = cause(diagnosis)
     if diagnosis.verdict == "no leak" and found_cause is None:

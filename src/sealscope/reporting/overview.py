@@ -38,7 +38,7 @@ def draw_curve(values: Array, width: int = CURVE_WIDTH) -> str:
             continue
         # middle sample instead of mean: the mean over many strokes is constant
         fraction = (float(part[part.size // 2]) - low) / (high - low) if high > low else 0.0
-        bars.append(_BARS[min(int(fraction * len(_BARS)), len(_BARS) - 1)])
+        bars.append(_BARS[min(int(fraction * len(_BARS)), len(_BARS) - 1)])  # fraction 1 is the highest bar, too
     return "".join(bars)
 
 
@@ -63,9 +63,10 @@ def overview_text(name: str, recording: Recording, findings: Sequence[Finding]) 
         finite = display_samples[np.isfinite(display_samples)]
         ends = f"{_format_short(finite.min())} to {_format_short(finite.max())} {unit}" if finite.size else "no values"
         line = f"  {channel:<7}{LONG_NAMES[channel]:<24}{ends:<28}"
-        lines.append(line + draw_curve(values, max(CURVE_WIDTH // 2, WIDTH - len(line))))
+        width = max(CURVE_WIDTH // 2, WIDTH - len(line))  # the rest of the line
+        lines.append(line + draw_curve(values, width))
     texts = [f"{name}: {value}" for name, value in recording.remarks.items()]
     texts += [f"not used: {', '.join(recording.unused)}"] if recording.unused else []
     texts += [f"note: {line}" for line in recording.history]
     texts += [f"{finding.severity}: {finding.text}" for finding in findings] or ["no defect of the data"]
-    return "\n".join((*lines, *(paragraph(text, "  ", 4) for text in texts)))
+    return "\n".join((*lines, *(paragraph(text, head="  ", indent=4) for text in texts)))

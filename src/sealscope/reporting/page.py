@@ -111,9 +111,9 @@ def write_page(path: str | os.PathLike[str], recording: Recording, diagnosis: Di
 def _choose_rig(diagnosis: Diagnosis, rig: Rig | str | os.PathLike[str] | None) -> Rig | None:
     """Choose the rig whose values the page shows: `rig` if given, else the packaged rig stated for the diagnosis.
 
-    `rig`: a Rig, the name of a packaged rig or the path of a TOML file. Returns None if `rig` is the
-    default rig, which nobody stated (`states_rig`). If `rig` is not given, returns None if the rig of the diagnosis was
-    not stated by anybody or is not packaged.
+    `rig`: a Rig, the name of a packaged rig or the path of a TOML file. Returns None if the values of `rig` are
+    only assumed, because it is the default rig (`states_rig`). If `rig` is None, returns None if nobody stated the rig
+    of the diagnosis, or if that rig is not packaged.
     """
     from sealscope.parameters import load_rig, rig_names
 
@@ -147,7 +147,9 @@ def render_card(
 ) -> str:
     """Render the card, a picture of the diagnosis, as HTML of `WIDTH` x `HEIGHT` pixels.
 
-    Arguments and errors are the same as for `report`.
+    `rig`: rig, name or file, whose title names the machine if the recording does not; `marks`, `truth_onset_s` [s]:
+    moments that are marked on the curve of the leak; `title`: by default the name of the machine or of the file. Raises
+    InputError if the recording is empty.
     """
     card_charts = charts.course_charts(diagnosis, height=_CURVE_HEIGHT)
     all_marks = _all_marks(recording, marks, truth_onset_s)
@@ -162,7 +164,7 @@ def render_card(
         date=particulars.get("Date", ""),
         subtitle=" · ".join(text for text in subtitle if text),
         charts=card_charts,
-        drawn=charts.draw(recording, [], card_charts, diagnosis, all_marks),
+        drawn=charts.draw(recording, chambers=[], charts=card_charts, diagnosis=diagnosis, marks=all_marks),
         width=WIDTH,
         height=HEIGHT,
     )
@@ -180,7 +182,13 @@ def render_page(
     title: str | None = None,
     pressure_unit: str | None = None,
 ) -> str:
-    """Render the page of a diagnosis as HTML; arguments and errors are the same as for `report`."""
+    """Render the page of a diagnosis as HTML.
+
+    `rig`: rig, name or file, whose values label the schematic; `marks`: moments that are marked on every chart;
+    `truth_onset_s` [s], `truth_leak_lpm` [L/min]: true onset and leak, None if unknown; `title`: by default the name of
+    the file; `pressure_unit`: unit of pressures, by default that of the log. Raises InputError if the recording is
+    empty, or if the unit or the rig is not known.
+    """
     from markupsafe import Markup
 
     pressure_unit = pressure_unit or recording.pressure_unit
@@ -241,8 +249,9 @@ def _change_rows(
         before, after = (None if value is None else value / scale for value in (change.before, change.after))
         label = charts.detail_label(change.name)
         rows.append((change.channel, label, unit, before, after, change.percent))
-    max_change = max([10.0, *(abs(percent) for *_, percent in rows if percent is not None)])
-    return {"changes": rows, "bar_limit": min(100.0, 10.0 * ceil(max_change / 10.0)), "parts": parts}
+    max_change = max([10.0, *(abs(percent) for *_, percent in rows if percent is not None)])  # at least 10 %
+    bar_limit = min(100.0, 10.0 * ceil(max_change / 10.0))  # rounded up to tens of percent
+    return {"changes": rows, "bar_limit": bar_limit, "parts": parts}
 
 
 def _summarise_channel(recording: Recording, name: str, pressure_unit: str) -> dict[str, Any]:

@@ -22,9 +22,9 @@ def collect_particulars(recording: Recording, rig: Rig | None = None) -> dict[st
     facts: dict[str, str] = {}
     start = recording.provenance.get("start")
     if isinstance(start, str):
-        facts["Date"] = re.sub(r"\.\d+", "", start).replace("T", " ")
+        facts["Date"] = re.sub(r"\.\d+", "", start).replace("T", " ")  # without fractions of a second
     if rig is not None:
-        facts["Machine"] = (rig.title or rig.name).partition(":")[0]
+        facts["Machine"] = (rig.title or rig.name).partition(":")[0]  # a title may continue with details after a colon
     for label, patterns in patterns_by_label.items():
         matches = (name for pattern in patterns for name in remarks if re.fullmatch(pattern, name, re.IGNORECASE))
         name = next(matches, None)

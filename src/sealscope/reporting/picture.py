@@ -116,6 +116,7 @@ class Picture:
         """
         is_known = np.isfinite(low) & np.isfinite(high)
         if is_known.any():
+            # along the upper line, and back along the lower one
             outline = np.append(x[is_known], x[is_known][::-1]), np.append(high[is_known], low[is_known][::-1])
             self.draw(style, self._path(*outline) + "z")
 
@@ -131,11 +132,11 @@ class Picture:
         self.draw(style, f"M{left:.1f} {top:.1f}H{right:.1f}V{bottom:.1f}H{left:.1f}z")
 
     def mark(self, style: str, x: float) -> None:
-        """Draw a vertical line at the value `x` over the height of the frame; `style`: its name in the style sheet."""
+        """Draw a vertical line at the value `x` across the frame; `style`: name of its style in the style sheet."""
         self.draw(style, f"M{self.x(x):.1f} 0V{self.height:g}")
 
     def level(self, style: str, y: float) -> None:
-        """Draw a horizontal line at the value `y` over the width of the frame; `style`: its name in the style sheet."""
+        """Draw a horizontal line at the value `y` across the frame; `style`: name of its style in the style sheet."""
         self.draw(style, f"M0 {self.y(y):.1f}H{self.width:g}")
 
     def symbol(self, style: str, x: float, down: float, title: str = "") -> None:
@@ -147,7 +148,7 @@ class Picture:
         self.draw(style, f"M{self.x(x):.1f} {down:.1f}{SYMBOLS[style.split(maxsplit=1)[0]]}", title)
 
     def point(self, style: str, x: float, y: float, ends: tuple[float, float], title: str = "") -> None:
-        """Draw a point at the values `x` and `y`, and a vertical line over its interval `ends` of y values.
+        """Draw a point at the values `x` and `y`, and a vertical line between the two y values `ends`, its interval.
 
         `style`: name of the point's style in the style sheet; `title`: tooltip, "" for none.
         """
@@ -158,6 +159,7 @@ class Picture:
         """Draw the frame, and about `count` horizontal grid lines with their values on the left."""
         for value in ticks(*self.y_ends, count):
             self.level("grid", value)
+            # 6 pixels left of the frame; 4 pixels down bring the middle of the digits to the line
             self.labels.append(SvgText(-6.0, float(self.y(value)) + 4.0, f"{value:g}", "end"))
         self.draw("frame", f"M0 0H{self.width:g}V{self.height:g}H0z")
 
@@ -173,13 +175,14 @@ def ticks(low: float, high: float, count: int) -> list[float]:
     """Choose about `count` round values between low and high, at steps of 1, 2 or 5 times a power of ten."""
     min_step = (high - low) / count
     power = 10.0 ** np.floor(np.log10(min_step))
+    # 0.999 and 1e-9: rounding errors must not change the step or leave out an end
     step = float(next(m for m in (1, 2, 5, 10) if m * power >= min_step * 0.999) * power)
-    first = int(np.ceil(low / step - 1e-9))  # 1e-9: rounding
+    first = int(np.ceil(low / step - 1e-9))
     last = int(np.floor(high / step + 1e-9))
     return [float(f"{i * step:.12g}") for i in range(first, last + 1)]
 
 
 def log_ticks(low: float, high: float) -> list[float]:
-    """List 1, 2 and 5 times the powers of ten between 10^low and 10^high."""
+    """List the values 1, 2 and 5 times a power of ten that lie between 10^low and 10^high."""
     values = [float(f"{m}e{power}") for power in range(math.floor(low), math.ceil(high) + 1) for m in (1, 2, 5)]
     return [value for value in values if low <= math.log10(value) <= high]

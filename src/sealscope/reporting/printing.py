@@ -36,7 +36,7 @@ def print_page(page: str, path: str | os.PathLike[str]) -> str:
             return Path(browser).name
         try:
             from weasyprint import HTML
-        except (ImportError, OSError) as error:  # OSError: its C libraries are not installed
+        except (ImportError, OSError) as error:  # OSError: the C libraries of WeasyPrint are not installed
             raise MissingExtra(
                 "a PDF needs Chromium or WeasyPrint, got neither: install one of them (pip install weasyprint), or "
                 f"write .html ({path})"
@@ -68,15 +68,15 @@ def draw_page(page: str, path: str | os.PathLike[str], width: int, height: int) 
 
 
 def _inline_styles(page: str) -> str:
-    """Prepare a page (HTML) for WeasyPrint, and return it.
+    """Change the styles of a page (HTML) so that WeasyPrint can print the page; return the changed page.
 
-    WeasyPrint neither applies the style sheet of a page to drawings nor supports CSS variables in them. The style
+    WeasyPrint neither applies the style sheet of a page to drawings nor supports CSS variables in drawings. The style
     sheet is therefore copied into each drawing, and each variable is replaced by its value for print.
     """
     sheet = re.search(r"<style>(.*?)</style>", page, re.DOTALL)
     if sheet is None:
         return page
-    values: dict[str, str] = {}
+    values: dict[str, str] = {}  # by variable; those for print come later and replace the others
     for block in re.findall(r"(?:^|@media print\{)\s*:root\{([^}]*)\}", sheet[1], re.MULTILINE):
         values |= dict(re.findall(r"(--[\w-]+):([^;]+)", block))
     resolved_sheet = re.sub(r"var\((--[\w-]+)\)", lambda match: values.get(match[1], match[0]), sheet[1])
@@ -95,11 +95,16 @@ def _is_complete_pdf(data: bytes) -> bool:
     Source: ISO 32000-1, 7.5.5.
     """
     end = re.search(rb"startxref\s+(\d+)\s+%%EOF\s*$", data[-1024:])
-    return end is not None and re.match(rb"%PDF.*(xref|\d+ \d+ obj)", data[:4] + data[int(end[1]) :][:20]) is not None
+    if end is None:
+        return False
+    offset = int(end[1])
+    table_head = data[offset : offset + 20]  # "xref", or the object of a compressed table such as "12 0 obj"
+    return re.match(rb"%PDF.*(xref|\d+ \d+ obj)", data[:4] + table_head) is not None
 
 
 def _is_complete_png(data: bytes, width: int, height: int) -> bool:
-    """Return True if the bytes of a PNG have this size in pixels and end with the chunk IEND and its checksum."""
+    """Return True if a PNG has `width` x `height` pixels, and its bytes end with the chunk IEND and its checksum."""
+    # signature, then the chunk IHDR: length 13, name, width and height
     head = struct.pack(">8sL4sLL", b"\x89PNG\r\n\x1a\n", 13, b"IHDR", width, height)
     return data.startswith(head) and data.endswith(b"\0\0\0\0IEND\xaeB`\x82")
 

@@ -62,9 +62,9 @@ def build_circuit(rig: Rig | None, recorded: Container[str], machine: AssumedMac
         cylinder: tuple[str, str, float] = ("cylinder", "AB", _ROD)
         if machine is not None and machine.area_stated and machine.areas is not None:
             cylinder = _cylinder_parts(machine.areas)
-            values["A_A"], values["A_B"] = (_value_text(area, "mm²", 1e-6) for area in machine.areas)
+            values["A_A"], values["A_B"] = (_value_text(area, "mm²", scale=1e-6) for area in machine.areas)
         if machine is not None and machine.displacement_stated:
-            values["q_b"] = _value_text(machine.displacement, "cm³/rev", 1e-6)
+            values["q_b"] = _value_text(machine.displacement, "cm³/rev", scale=1e-6)
         return Circuit(*cylinder, throttles=False, make_up=False, bypass=bypass, valve=False, values=values)
     return Circuit(
         *_cylinder_parts((rig.cylinder.A_A, rig.cylinder.A_B)),

@@ -42,8 +42,8 @@ class DrawnTimes:
         """Reduce the values (n,) of a channel to the points (m,) that are drawn at the times `t`.
 
         Each bucket, a group of successive samples, gives two points: its minimum and its maximum. The minimum is first
-        if the bucket's last value is not below its first one. A bucket of one sample gives one point. A bucket without
-        finite samples gives NaN, and a NaN is inserted at each gap in time, which interrupts the line.
+        if the bucket's last value is not below the first. A bucket of one sample gives one point. A bucket without
+        finite samples gives NaN. A NaN, which interrupts the line, is also inserted at each gap in time.
         """
         values = np.where(np.isfinite(values), values, np.nan)
         low = np.fmin.reduceat(values, self.starts)
@@ -60,7 +60,7 @@ def _interleave(first: Array, second: Array, sizes: NDArray[np.int64]) -> Array:
     """
     pairs = np.stack([first, second], axis=1)
     is_point = np.stack([np.ones(sizes.size, dtype=bool), sizes > 1], axis=1)
-    return np.asarray(pairs[is_point])
+    return np.asarray(pairs[is_point])  # row by row
 
 
 def ordered_time(t: Array, rate: float) -> tuple[Array, bool]:
@@ -76,25 +76,26 @@ def ordered_time(t: Array, rate: float) -> tuple[Array, bool]:
 def choose_drawn_times(
     t: Array, rate: float, points: int, *, near: float | None = None, near_samples: int = 0
 ) -> DrawnTimes:
-    """Choose the times at which a chart draws a recording: about `points`, and the samples around the time `near`.
+    """Choose the times at which a chart draws a recording: about `points`, and all samples around the time `near`.
 
     There are two times for each bucket, a group of successive samples of which only minimum and maximum are drawn.
-    Full buckets have equal numbers of samples, so a drawn peak is at most one bucket away from its true time. A gap in
-    time starts a new bucket, and an additional point at the gap interrupts the line; of many gaps, only the longest
-    are treated so. `t` (n,) [s]: time stamps; `rate` [Hz]: nominal sampling rate; `near` [s]: time around which
-    `near_samples` samples are all drawn, None for the start of the recording.
+    Full buckets have equal numbers of samples, so a drawn peak is at most one bucket away from its true time. At a gap
+    in time a new bucket starts, and an additional point interrupts the line. If there are more gaps than a twentieth of
+    `points`, this is done only for the longest gaps. `t` (n,) [s]: time stamps; `rate` [Hz]: nominal sampling rate;
+    `near` [s]: time around which `near_samples` samples are all drawn, None for the start of the recording.
     """
     n = t.size
     t, by_sample = ordered_time(t, rate)
-    width = 1 if n <= points else -(-n // (points // 2))  # two points for each bucket; rounded up
+    width = 1 if n <= points else -(-n // (points // 2))  # samples of a bucket, which has two points; rounded up
     centre = 0 if near is None else int(np.searchsorted(t, near))
     fine = slice(max(0, centre - near_samples // 2), min(n, centre + near_samples // 2)) if width > 1 else slice(0, n)
     steps = np.diff(t)
-    gaps = np.flatnonzero(steps > _GAP_RATIO / rate) + 1
+    gaps = np.flatnonzero(steps > _GAP_RATIO / rate) + 1  # indices of the samples after the gaps
     max_gaps = points // 20
     if gaps.size > max_gaps:
         gaps = np.sort(gaps[np.argsort(steps[gaps - 1])[-max_gaps:]])
-    single_samples = np.arange(fine.start, min(fine.stop + 1, n))  # a bucket each, and the start of the next bucket
+    # each sample of `fine` has a bucket to itself; the sample after them starts the next bucket
+    single_samples = np.arange(fine.start, min(fine.stop + 1, n))
     starts = np.unique(np.concatenate([np.arange(0, n, width), gaps, single_samples])).astype(np.int64)
     stops = np.append(starts[1:], n)
     sizes = stops - starts
@@ -107,8 +108,9 @@ def choose_drawn_times(
 def encode_values(values: Array) -> dict[str, Any]:
     """Encode values as base64 text of 16-bit integers, for the script of the page.
 
-    The integers q divide the range from the minimum `low` to the maximum into 65 534 equal steps. They are decoded as
-    `low + (q + 32767) * step`; q = -32768 stands for a value that is not finite. Returns `low`, `step` and `q` as text.
+    The range from the minimum `low` to the maximum is divided into 65 534 equal steps. An integer q is decoded as
+    `low + (q + 32767) * step`; q = -32768 stands for a value that is not finite. Returns the numbers `low` and `step`,
+    and the integers as the text `q`.
     """
     is_finite = np.isfinite(values)
     low, high = 0.0, 0.0
@@ -118,7 +120,7 @@ def encode_values(values: Array) -> dict[str, Any]:
     codes = np.full(values.shape, _MISSING, dtype="<i2")
     if step > 0:
         codes[is_finite] = np.clip(np.rint((values[is_finite] - low) / step) - 32767, -32767, 32767)
-    else:
+    else:  # all values are `low`
         codes[is_finite] = -32767
     return {"low": low, "step": step, "q": b64encode(codes.tobytes()).decode()}
 

@@ -32,7 +32,7 @@ _SUFFIXES = (".html", ".htm", ".pdf", ".png")
 def _environment(package: str) -> jinja2.Environment:
     """Build the jinja2 environment for the templates of a package.
 
-    They may include templates of `sealscope.reporting`.
+    The templates may include others of `sealscope.reporting`.
     """
     import jinja2
 
@@ -54,8 +54,8 @@ def render(
     """Render the template called `template` as the text of a page, with the values `context`.
 
     `package`: package of the template; `scripts`: names of the package's files with scripts that the page runs;
-    `chart_data`: plain JSON values of charts, for which the scripts that draw them are added, None for a page without
-    charts. Control characters, which may come from names and descriptions in files, are replaced.
+    `chart_data`: plain JSON values of charts, None for a page without charts; scripts that draw the charts are added.
+    Control characters, which may come from names and descriptions in files, are replaced.
     """
     names = scripts if chart_data is None else ("vendor/uPlot.iife.min.js", "templates/charts.js", *scripts)
     page = _environment(package).get_template(template)
@@ -72,7 +72,7 @@ def read_package_file(name: str, package: str = _PACKAGE) -> Markup:
 
 
 def _script_hash(code: str) -> Markup:
-    """Compute the hash of a script, by which a page's content security policy allows it."""
+    """Compute the hash of a script, by which the content security policy of a page allows the script."""
     from markupsafe import Markup
 
     return Markup(f"'sha256-{b64encode(sha256(code.encode()).digest()).decode()}'")
@@ -91,7 +91,7 @@ def parse_page_path(path: str | os.PathLike[str], *, card: bool = True) -> Path:
 
     Pages end in .html, .htm or .pdf. If `card` is True, .png is accepted, too, for a picture that sums up the page.
     """
-    suffixes = _SUFFIXES if card else _SUFFIXES[:-1]
+    suffixes = _SUFFIXES if card else _SUFFIXES[:-1]  # the last one is .png
     if Path(path).suffix.lower() not in suffixes:
         raise InputError(f"a page must be a file {', '.join(suffixes)}, got {os.fspath(path)}")
     return Path(path)

@@ -22,15 +22,17 @@ _LABELS = {"valid": "leak", "repaired": "leak", "invalid": "healthy"}
 
 
 def export_labels(store: MonitorStore, folder: Path) -> tuple[int, int]:
-    """Write all alarms and estimates of a monitor to `alarms.csv` and `estimates.csv`; return their numbers of rows.
+    """Write all alarms and estimates of a monitor to `alarms.csv` and `estimates.csv`; return the rows of each.
 
-    The estimates from the start of an alarm's onset interval until its last mark are labelled: `leak` if the mark is
-    `repaired` or `valid`, `healthy` if it is `invalid`. Other estimates have no label.
+    `store`: database of the monitor; `folder`: folder of the two files. The estimates from the start of an alarm's
+    onset interval until its last mark are labelled: `leak` if the mark is `repaired` or `valid`, `healthy` if it is
+    `invalid`. Other estimates have no label.
     """
     events = _events_by_alarm(store)
     rows = []
     # by actuator: start and stop [s] of an interval, and the columns `label` and `alarm` of the estimates in it
     intervals = defaultdict[str, list[tuple[float, float, dict[str, str]]]](list)
+    # in order of time, so that the label of the latest alarm is the last
     for alarm in sorted(reversed(store.alarms()), key=lambda alarm: float(alarm["raised_s"])):
         history = events[alarm["id"]]
         last_mark = next((event for event in reversed(history) if event["event"] in _LABELS), None)

@@ -36,7 +36,10 @@ def record_mark(rig: str, alarm: Alarm, mark: str, samples: Sequence[Recording])
         # a machine's file has times since 1970; the samples' clock may start anywhere
         shift = 0.0 if counts_from_1970(alarm.onset_s) else time.time() - alarm.updated_s
         leak_lpm = None if mark == "invalid" else alarm.leak_lpm
-        judgement = JudgedAlarm(name, mark, time.time(), alarm.onset_s + shift, leak_lpm, reason)
+        onset_s = alarm.onset_s + shift
+        judgement = JudgedAlarm(
+            alarm=name, mark=mark, date_s=time.time(), onset_s=onset_s, leak_lpm=leak_lpm, reason=reason
+        )
         outcome = "written down"
 
         def add_mark(machine: CommissionedMachine) -> CommissionedMachine:

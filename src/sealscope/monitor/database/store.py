@@ -57,7 +57,10 @@ class StoredRows:
     old_estimates: dict[str, int] = field(default_factory=dict)
 
     def add_estimates(self, actuator: str, estimates: Iterable[BlockEstimate], oil_celsius: float | None) -> None:
-        """Add the estimates of an actuator's blocks, each with the oil temperature [deg C], None if unknown."""
+        """Add the leakage estimates of blocks of samples, each with the oil temperature [deg C], None if unknown.
+
+        `actuator`: name of the actuator from which the samples are.
+        """
         for estimate in estimates:
             total_ends = estimate.total_interval_lpm or (None, None)
             leak_ends = estimate.leak_interval_lpm or (None, None)
@@ -204,7 +207,7 @@ class MonitorStore:
             return connection.execute(query).all()
 
     def _value(self, query: Any) -> int:
-        """Execute a query for a single number, and return it; return 0 if there is none."""
+        """Execute a query for a single number, and return the number; return 0 if the query gives none."""
         with self.engine.connect() as connection:
             return int(connection.execute(query).scalar() or 0)
 
@@ -228,7 +231,8 @@ class MonitorStore:
     def insert_blocks(self, connection: sa.Connection, blocks: Iterable[tuple[str, str, int]]) -> None:
         """Store the identities of blocks, each given as (actuator, identity, running number in the actuator's blocks).
 
-        Raises IntegrityError, which ends the transaction, if one of the blocks is stored already.
+        `connection`: has an open transaction. Raises IntegrityError, which ends the transaction, if one of the blocks
+        is stored already.
         """
         names = ("actuator", "identity", "number")
         connection.execute(tables.blocks.insert(), [dict(zip(names, block, strict=True)) for block in blocks])
@@ -244,7 +248,7 @@ class MonitorStore:
             delete_pending = tables.pending.delete().where(tables.pending.c.actuator == actuator)
             connection.execute(delete_pending, [{"name": name} for name in rows.actuators])
         if rows.events and self.engine.dialect.name == "postgresql":
-            # commit events in the order of their numbers: an output that has passed a number never reads earlier ones
+            # commit events in the order of their numbers: outputs never read an event with a smaller number later
             connection.execute(sa.text("lock table events in exclusive mode"))
         for table in (tables.estimates, tables.pending, tables.events):
             if new_rows := getattr(rows, table.name):
@@ -263,7 +267,10 @@ class MonitorStore:
             self.write_rows(connection, rows)
 
     def upsert(self, connection: sa.Connection, table: sa.Table, rows: list[dict[str, Any]]) -> None:
-        """Write rows to a table: update the stored rows with the same primary keys, and insert the missing ones."""
+        """Write rows to a table: update the stored rows with the same primary keys, and insert the missing ones.
+
+        `connection`: has an open transaction, in which the rows are written.
+        """
         if not rows:
             return
         key = table.primary_key.columns.keys()
@@ -273,7 +280,7 @@ class MonitorStore:
         if connection.execute(table.update().where(*is_row), values).rowcount < len(rows):
             if len(rows) == 1:
                 connection.execute(table.insert(), rows)
-            else:  # which ones are missing is not known
+            else:  # it is not known which rows are missing: try each
                 for row in rows:
                     self.upsert(connection, table, [row])
 
@@ -346,6 +353,7 @@ class MonitorStore:
         if actuator is not None:
             query = query.where(columns.actuator == actuator)
         values = [json.loads(text) for (text,) in self._rows(query)]
+        # an alarm's id ends in "-" and a running number
         return sorted(values, key=lambda alarm: (alarm["actuator"], -int(alarm["id"].rpartition("-")[2])))
 
     def events_since(self, number: int, max_events: int = 1000) -> list[tuple[int, dict[str, Any]]]:
@@ -374,7 +382,7 @@ class MonitorStore:
             newest = select(columns.t).where(is_chosen).order_by(columns.number.desc()).limit(1).scalar_subquery()
             is_chosen &= columns.t.between(newest - seconds, newest)
         n_averaged = max(1, -(-self._value(select(func.count()).where(is_chosen)) // max_rows))  # rounded up
-        group = columns.number - columns.number % n_averaged
+        group = columns.number - columns.number % n_averaged  # running number with which the group of a row begins
         query = select(*(func.avg(columns[name]).label(name) for name in ("t", *tables.FIGURES)))
         return [dict(row._mapping) for row in self._rows(query.where(is_chosen).group_by(group).order_by(group))]
 
@@ -400,8 +408,8 @@ class MonitorStore:
     def deliver(self, output: str, send: Callable[[dict[str, Any]], bool]) -> None:
         """Send the events of alarms that an output has not sent yet, in order and at most 1000 of them.
 
-        `output`: name of the output; `send`: function that sends an event, and returns False to try it again in the
-        next call. The number of each sent event is stored, so the next call continues after it.
+        `output`: name of the output; `send`: function that sends an event, and returns False if the next call must try
+        this event again. The number of each sent event is stored, so the next call continues with the following event.
         """
         for number, event in self.events_since(self.position(output)):
             if not send(event):
@@ -410,7 +418,7 @@ class MonitorStore:
 
 
 def outage_reason(error: BaseException) -> str | None:
-    """Describe an outage of the database in one line; return None if `error` is of another kind.
+    """Describe the database outage that an error reports in one line; return None for an error of another kind.
 
     A value that the database cannot store (DataError) is not an outage: waiting would not help.
     """
@@ -463,7 +471,10 @@ def _event_from_row(row: Any) -> dict[str, Any]:
 
 
 def _prepare_sqlite(connection: Any, record: object) -> None:
-    """Set the options of a new connection to SQLite: sizes, waiting time for locks, WAL mode, full synchronisation."""
+    """Set the options of a new connection to SQLite: sizes, waiting time for locks, WAL mode, full synchronisation.
+
+    SQLAlchemy calls this for each connection of the driver; `record`: its record of the connection, not used.
+    """
     # a page has room for a second of samples, the cache for all pages of a transaction
     settings = "page_size=16384", "cache_size=-32000", "busy_timeout=5000", "foreign_keys=ON"
     for setting in (*settings, "journal_mode=WAL", "synchronous=FULL"):

@@ -42,8 +42,8 @@ class EventLines:
     def _write_line(self, event: dict[str, Any]) -> bool:
         """Write an event as one line of JSON, unless its alarm is shelved, and return True.
 
-        Raises PartAway if the stream does not take the line; the next call then writes the rest. The line is not
-        buffered, because a buffer would keep lines that a full disk refuses.
+        Raises PartAway if the stream refuses the line or a part of it; the next call with the same event writes the
+        rest. The line is not buffered, because a buffer would keep lines that a full disk refuses.
         """
         if event["number"] != self._number:
             self._unwritten, self._number = (json.dumps(event) + "\n").encode(), event["number"]
@@ -83,7 +83,10 @@ class Webhook:
 
     @classmethod
     def from_settings(cls, actuators: WatchedActuators, table: WebhookSettings, settings: MonitorSettings) -> Self:
-        """Build the output from its `table` of the settings; raise InputError if the token cannot be read."""
+        """Build the output from its `table` of the settings; raise InputError if the token cannot be read.
+
+        `actuators`: provide the database with the events.
+        """
         token = read_secret(table.token_file, "webhook.token_file")
         return cls(actuators.store, table.url, token, table.timeout_s)
 

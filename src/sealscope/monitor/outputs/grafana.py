@@ -13,9 +13,9 @@ def dashboard() -> dict[str, Any]:
     panels = []
     x = y = row_height = 0  # in columns and rows of Grafana's grid, which has 24 columns
     for number, (title, kind, query, legend, unit, width, height) in enumerate(tables["panels"], 1):
-        if x + width > 24:
+        if x + width > 24:  # the panel begins a new row
             x, y, row_height = 0, y + row_height, 0
-        expression = query.replace("%s", 'actuator=~"$actuator"')
+        expression = query.replace("%s", 'actuator=~"$actuator"')  # the filter by the chosen actuator
         panels.append(
             {
                 "id": number,

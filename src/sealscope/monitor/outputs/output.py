@@ -39,7 +39,10 @@ class Output(Protocol):
 
     @classmethod
     def from_settings(cls, actuators: WatchedActuators, table: Any, settings: MonitorSettings) -> Self:
-        """Build the output from its `table` of the `settings`; raise InputError if a secret cannot be read."""
+        """Build the output from its `table` of the `settings`; raise InputError if a secret cannot be read.
+
+        `actuators`: provide the database with the events, and the summaries.
+        """
 
     def deliver(self) -> None:
         """Send the new events."""

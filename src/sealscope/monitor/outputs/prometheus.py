@@ -60,6 +60,7 @@ def format_metrics(
             families.setdefault(name, kind(name, text, labels=[*labels])).add_metric([*labels.values()], float(value))
 
     for actuator, summary in summaries.items():
+        # the entries of the inner mapping `state` get dotted names, by which `_ACTUATOR_METRICS` finds them
         values = {**summary, **{f"state.{name}": value for name, value in summary.get("state", {}).items()}}
         values["leak_low"], values["leak_high"] = summary.get("leak_interval_lpm") or (None, None)
         for name, (text, key) in _ACTUATOR_METRICS.items():

@@ -60,12 +60,15 @@ class SparkplugNode:
         self._last_birth_number = self._birth_number = 0  # bdSeq of the last birth, and of this connection
         self._seq = 255  # sequence number of the last message; the next is 0
         self._birth_due = threading.Event()
-        self._sent_values: dict[str, dict[str, Any]] = {}
+        self._sent_values: dict[str, dict[str, Any]] = {}  # by actuator and metric
         self._next_update = 0.0
 
     @classmethod
     def from_settings(cls, actuators: WatchedActuators, table: SparkplugSettings, settings: MonitorSettings) -> Self:
-        """Build the node from its `table` of the settings; raise InputError if the password cannot be read."""
+        """Build the node from its `table` of the settings; raise InputError if the password cannot be read.
+
+        `actuators`: provide the database with the events, the summaries, and the counters of dropped messages.
+        """
         broker = settings.mqtt
         assert broker is not None  # `MonitorSettings` refuses Sparkplug without a broker
         password = read_secret(broker.password_file, "mqtt.password_file")
@@ -96,8 +99,8 @@ class SparkplugNode:
         if time.monotonic() >= self._next_update:
             self._next_update = time.monotonic() + self._settings.every_s
             for actuator, summary in self._summaries().items():
-                if actuator not in self._sent_values:
-                    self._send_device_birth(actuator, summary, {})
+                if actuator not in self._sent_values:  # its birth was not sent yet
+                    self._send_device_birth(actuator, summary, alarm={})
                     continue
                 sent_values, present_values = self._sent_values[actuator], _metric_values("summary", summary)
                 changed_values = {name: value for name, value in present_values.items() if value != sent_values[name]}
@@ -142,9 +145,10 @@ class SparkplugNode:
         self._birth_due.set()
 
     def _on_message(self, client: Any, userdata: Any, message: Any) -> None:
-        """Acknowledge a received command; if it requests the birth messages, which state all metrics, mark them as due.
+        """Handle a message with a command to the node; called by the library paho.
 
-        A message that is not a valid Sparkplug payload is counted and logged.
+        The message is acknowledged. If the command requests the birth messages, which state all metrics, these become
+        due. A message that is not a valid Sparkplug payload is counted and logged.
         """
         if message.qos:
             client.ack(message.mid, message.qos)
@@ -160,10 +164,10 @@ class SparkplugNode:
     def _send_event(self, event: dict[str, Any]) -> bool:
         """Send an event and its alarm as a data message of the actuator's device; return True if it was sent.
 
-        An event of an actuator that is no longer in the settings is skipped, with True.
+        An event of an actuator that is no longer in the settings is skipped, and True is returned.
         """
         alarm, timestamp = event["alarm"], _milliseconds(event["t"])
-        if alarm["actuator"] not in self._sent_values:  # the actuator is no longer in the settings
+        if alarm["actuator"] not in self._sent_values:  # no birth was sent: it is not in the settings
             return True
         metrics = _build_metrics("alarm", _metric_values("alarm", alarm), timestamp)
         metrics += _build_metrics("event", _metric_values("event", event), timestamp)
@@ -174,8 +178,9 @@ class SparkplugNode:
         self._store.write_position(_BIRTHS, self._birth_number)
         self._last_birth_number = self._birth_number
         summaries = self._summaries()
+        # alarms are read latest first: reversed, the latest of each actuator replaces the others
         latest = {alarm["actuator"]: alarm for alarm in reversed(self._store.alarms())}
-        self._seq, self._sent_values = 255, {}
+        self._seq, self._sent_values = 255, {}  # the birth of the node gets the sequence number 0
         self._send("NBIRTH", [self._birth_number_metric(), spb.SparkplugMetric(spb.REBIRTH, False, spb.BOOLEAN)])
         for actuator, summary in summaries.items():
             self._send_device_birth(actuator, summary, latest.get(actuator, {}))
@@ -183,7 +188,7 @@ class SparkplugNode:
     def _send_device_birth(self, actuator: str, summary: dict[str, Any], alarm: dict[str, Any]) -> None:
         """Send the birth message of an actuator's device, which states all its metrics.
 
-        `alarm`: its latest alarm as plain values, {} if there is none.
+        `summary`: summary of the actuator; `alarm`: its latest alarm as plain values, {} if there is none.
         """
         values = _metric_values("summary", summary)
         metrics = _build_metrics("summary", values, _milliseconds(summary["t"]))
@@ -193,9 +198,10 @@ class SparkplugNode:
         self._sent_values[actuator] = values
 
     def _send(self, kind: str, metrics: list[spb.SparkplugMetric], actuator: str | None = None) -> bool:
-        """Send a message of the node, or of an actuator's device, with the next sequence number.
+        """Send a message with `metrics` of the node, or of an actuator's device, with the next sequence number.
 
-        `kind`: its type, such as "DDATA". Returns True if it was sent.
+        `kind`: type of the message, such as "DDATA"; `actuator`: None for a message of the node. Returns True if the
+        message was sent.
         """
         self._seq = (self._seq + 1) % 256
         topic = self._topic(kind, None if actuator is None else topic_level(actuator))
@@ -215,7 +221,7 @@ def _load_table(name: str) -> Mapping[str, Mapping[str, str]]:
 
 
 def _milliseconds(t: float | None) -> int:
-    """Convert a time [s] to milliseconds since 1970; use the present time for None, or if `t` is not since 1970."""
+    """Convert a time [s] to milliseconds since 1970; use the present time if `t` is None or not counted from 1970."""
     return round(1000.0 * (t if t is not None and counts_from_1970(t) else time.time()))
 
 

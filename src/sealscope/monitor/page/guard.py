@@ -45,8 +45,8 @@ class Admission:
     def pause_s(self, address: str) -> float:
         """Compute the time [s] that a client's IP address must wait until its next token is checked, 0 for no wait.
 
-        After `_FREE_ATTEMPTS` wrong tokens from its network the pause is `_FIRST_PAUSE_S`. Each further wrong token
-        doubles it, up to `_MAX_PAUSE_S`.
+        After `_FREE_ATTEMPTS` wrong tokens from the network of the address the pause is `_FIRST_PAUSE_S`. Each further
+        wrong token doubles the pause, up to `_MAX_PAUSE_S`.
         """
         n_failures, last = self._failures.get(_network(address), (0, 0.0))
         if n_failures < _FREE_ATTEMPTS:
@@ -55,10 +55,10 @@ class Admission:
         return max(0.0, last + min(_FIRST_PAUSE_S * 2.0**doublings, _MAX_PAUSE_S) - self._now())
 
     def admits(self, address: str, token: str, *, session: bool = False) -> bool:
-        """Return True if a token is right; if it is wrong, count that for the client's IP `address` and return False.
+        """Return True if a token is right; count a wrong token for the client's IP `address`, and return False.
 
         A right token clears the count of the address. `session`: True if `token` is the cookie of a browser that has
-        stated the token before.
+        stated the right token before.
         """
         expected, network = self.session if session else self._token, _network(address)
         if hmac.compare_digest(token.encode("utf-8", "replace"), expected.encode()):
@@ -82,7 +82,10 @@ def _network(address: str) -> str:
 
 
 def connection_limit() -> int:
-    """Compute the largest number of connections: `_MAX_CONNECTIONS`, or 8 to that many if file descriptors are few."""
+    """Compute the largest number of connections: `_MAX_CONNECTIONS`, or fewer (at least 8) if file descriptors are few.
+
+    At most the fraction `_DESCRIPTOR_FRACTION` of the file descriptors of this process is used for connections.
+    """
     with suppress(ImportError, OSError, ValueError):
         import resource
 

@@ -89,7 +89,7 @@ class LiveSamples:
 
     @contextmanager
     def viewing(self, name: str) -> Iterator[bool]:
-        """Keep the samples of an actuator while the context lasts, and yield True.
+        """Keep the samples of the actuator `name` while the context lasts, and yield True.
 
         The last stored samples are shown until new ones arrive. If `MAX_ACTUATORS` others are viewed already, nothing
         is kept, and False is yielded.
@@ -119,7 +119,7 @@ class LiveSamples:
                     del self._n_viewers[name], self._windows[name]
 
     def push(self, name: str, samples: Recording | None) -> None:
-        """Add new samples of an actuator to its window, if anybody views it."""
+        """Add new samples of an actuator to its window, if anybody views the actuator; do nothing for None."""
         if samples is None or name not in self._windows:
             return
         with self._lock:
@@ -133,7 +133,7 @@ class LiveSamples:
         return frozenset(self._windows)
 
     def version(self, name: str) -> int:
-        """Return a number that increases when an actuator gets new samples, 0 if it is not viewed or has none."""
+        """Return a number that increases when a viewed actuator gets samples, 0 for other actuators."""
         window = self._windows.get(name)
         return 0 if window is None else window.version
 
@@ -176,17 +176,18 @@ def _round_to_json(values: Array, digits: int = 3) -> list[float | None]:
 def _envelope(t: Array, series: dict[str, Array]) -> dict[str, list[float | None]]:
     """Reduce long series to the minimum and maximum in each bin, in the order in which they occur.
 
-    A bin is a group of successive samples; there are at most `_BINS` bins of equal size. The last one ends with the
-    last sample, and earlier samples that fill no bin are left out. Series with at most two samples per bin are not
-    reduced. `series`: values (n,) by name, at the times `t` (n,) [s]. Returns the times of the bins' first and middle
-    samples as "t", and the reduced series by name, rounded.
+    A bin is a group of successive samples; there are at most `_BINS` bins of equal size. The last bin ends with the
+    last sample, and the first samples are left out if they do not fill a bin. Series with at most two samples per bin
+    are not reduced. `series`: values (n,) by name, at the times `t` (n,) [s]. Returns the times of the bins' first and
+    middle samples as "t", and the reduced series by name, rounded.
     """
     bin_size = -(-t.size // _BINS)  # rounded up
     if bin_size <= 2:
         return {"t": _round_to_json(t, 4), **{name: _round_to_json(values) for name, values in series.items()}}
     n_bins = t.size // bin_size
     first = t.size - n_bins * bin_size
-    curves = {"t": _round_to_json(t[first:].reshape(n_bins, bin_size)[:, [0, bin_size // 2]].ravel(), 4)}
+    bin_times = t[first:].reshape(n_bins, bin_size)[:, [0, bin_size // 2]]  # of the first and middle samples
+    curves = {"t": _round_to_json(bin_times.ravel(), 4)}
     for name, values in series.items():
         bins = values[first:].reshape(n_bins, bin_size)
         ends = np.stack([bins.min(axis=1), bins.max(axis=1)], axis=1)
@@ -199,12 +200,14 @@ def _detail_curves(t: Array, signal: Array | None, pressure: str, detail_form: s
     """Compute the curves of the wavelet details [kPa] of a pressure, or of their RMS, as plain values.
 
     `signal` [Pa]: the pressure over the times `t` [s], None if it is not recorded; `pressure`: its name;
-    `detail_form`: "details" or "rms". Only the samples after the last missing one are used. If they are fewer than
-    needed, the curves are empty, and `needs` and `has` state these numbers.
+    `detail_form`: "details" or "rms". Only the samples after the last missing sample are used. If there are fewer of
+    these than the wavelet transform needs, the curves are empty. The entry `needs` is the needed number of samples,
+    and `has` the present one.
     """
     samples = np.empty(0) if signal is None else signal / _KILOPASCAL
     missing_indices = np.flatnonzero(~np.isfinite(samples))
-    samples = samples[missing_indices[-1] + 1 if missing_indices.size else 0 :]
+    first = missing_indices[-1] + 1 if missing_indices.size else 0
+    samples = samples[first:]
     header: dict[str, Any] = {"of": pressure, "drawn": detail_form, "needs": min_samples() + WINDOW_SIZE - 1}
     if samples.size < header["needs"]:
         return {**header, "t": [], "has": int(samples.size)}
@@ -274,5 +277,5 @@ def describe_rig(rig: str) -> dict[str, Any]:
         "valve": circuit.valve,
         "stroke": loaded_rig.cylinder.L / _MILLIMETRE,
         "area": 0.5 * (loaded_rig.cylinder.A_A + loaded_rig.cylinder.A_B) * _MILLIMETRE / LITRE_PER_MINUTE,
-        "displacement": loaded_rig.pump.q_b * 1e3,
+        "displacement": loaded_rig.pump.q_b * 1e3,  # from m^3 to L
     }

@@ -201,7 +201,7 @@ class _Pages:
         self._n_listeners -= 1
 
     async def _events(self, request: Request, name: str, pressure: str, detail_form: str) -> AsyncIterator[str]:
-        """Yield the server-sent events of `changes` as text, until the client disconnects or the monitor ends.
+        """Yield the server-sent events that `changes` describes, as text, until the client or the monitor ends.
 
         `name`: actuator whose curves are sent, "" for no curves; `pressure`: pressure whose wavelet details are drawn;
         `detail_form`: "rms" or "details". If too many actuators are viewed already, an event "live" states this error
@@ -213,7 +213,7 @@ class _Pages:
             if name and not is_viewing:
                 yield _format_event("live", {"name": name, "t": None, "error": "too many actuators are viewed"})
             sent_change_number = sent_version = -1  # nothing is sent yet
-            silence_s = 0.0
+            silence_s = 0.0  # since the last event without a name
             while not await request.is_disconnected() and not actuators.closed:
                 if actuators.change_number != sent_change_number or silence_s >= _KEEP_ALIVE_S:
                     sent_change_number, silence_s = actuators.change_number, 0.0
@@ -253,7 +253,7 @@ class _Pages:
     async def login(self, request: Request) -> Response:
         """Answer with the login form; if the right token is posted, set a cookie and redirect to the page.
 
-        After a wrong token the form has status 401. A client that must wait gets status 429.
+        The form has status 401 after a wrong token. A client that must wait after several wrong tokens gets status 429.
         """
         status = 200
         admission, address = self._admission, _client_address(request)
@@ -322,7 +322,7 @@ def _make_refusal(error: str, status: int, headers: dict[str, str] | None = None
 
 
 def _refuse_for_now(wait: float) -> Response:
-    """Build the answer, with status 429, to a client who after wrong tokens must wait `wait` seconds."""
+    """Build the answer (status 429) to a client that must wait `wait` seconds after wrong tokens."""
     return _make_refusal(f"too many wrong tokens: wait {wait:.0f} s", 429, {"Retry-After": str(math.ceil(wait))})
 
 

@@ -65,8 +65,8 @@ _ASKED_AGAIN = "messages of QoS 1 that found no room and were asked for again"
 def broker_source(settings: BrokerSettings) -> Callable[[BlockReceiver], None]:
     """Build a source that submits the messages of a broker as blocks, and publishes alarms to it.
 
-    Returns a function that takes the receiver of the blocks, and runs until it stops. Raises InputError if a secret
-    cannot be read, and MissingExtra if the MQTT library is not installed.
+    Returns a function that takes the receiver of the blocks, and runs until the receiver stops. Raises InputError if a
+    secret cannot be read, and MissingExtra if the MQTT library is not installed.
     """
     password = read_secret(settings.password_file, "mqtt.password_file")
     check_mqtt()
@@ -117,7 +117,7 @@ class _Connection:
             while not self._service.stopping.wait(_POLL_S):
                 self._link.check_thread()
                 alarms.attempt(self._deliver)
-            self._states_due = 0.0
+            self._states_due = 0.0  # publish the last states at once
             alarms.attempt(self._deliver)
         finally:
             self._ended.set()
@@ -141,7 +141,7 @@ class _Connection:
             client.publish(*self._state_message(online=True), qos=1, retain=True)
         for topic in (*self._names, *(self._host.topics if self._host is not None else ())):
             client.subscribe(topic, qos=1)
-        self._received.put((self._connection, None), 0, always=True)  # no message: a new connection
+        self._received.put((self._connection, None), size=0, always=True)  # no message: a new connection
 
     def _offline_message(self) -> tuple[str, str]:
         """Build topic and payload of the last will, by which a Sparkplug primary host states that it is offline.
@@ -153,18 +153,18 @@ class _Connection:
         return self._state_message(online=False)
 
     def _state_message(self, *, online: bool) -> tuple[str, str]:
-        """Build topic and payload of the STATE message of a Sparkplug primary host."""
+        """Build topic and payload of the message STATE, which tells whether a Sparkplug primary host is `online`."""
         state = json.dumps({"online": online, "timestamp": self._connected_ms})
         return f"{NAMESPACE}/STATE/{self._settings.host_id}", state
 
     def _on_disconnect(self, client: Any, userdata: Any, flags: Any, reason: Any, properties: Any) -> None:
-        """Begin an outage after the connection is lost, unless this side has closed the connection."""
+        """Begin an outage after the connection is lost, unless this side has closed it; called by the library paho."""
         if not self._service.stopping.is_set() and self._overfull_connection != self._connection:
             self._broker.begin_outage(f"the connection to {self._settings.host} is lost: {reason}")
 
     def _on_connect_fail(self, client: Any, userdata: Any) -> None:
-        """Begin an outage after a failed attempt to connect, with the reason of the failure."""
-        error = sys.exc_info()[1]  # paho calls while it handles the error
+        """Begin an outage, with its reason, after a failed attempt to connect; called by the library paho."""
+        error = sys.exc_info()[1]  # the error that paho is handling during this call
         reason = " ".join(str(getattr(error, "strerror", None) or error or "").split())[:120]
         if isinstance(error, ssl.SSLCertVerificationError):
             reason = f"its certificate is not trusted ({error.verify_message})"
@@ -172,7 +172,7 @@ class _Connection:
         self._broker.begin_outage(f"no connection to {place}: {reason}".removesuffix(": "))
 
     def _on_message(self, client: Any, userdata: Any, message: Any) -> None:
-        """Queue a received message, without waiting for room: that would let the connection time out.
+        """Queue a received message; called by the library paho, whose connection would time out if this call waited.
 
         If the queue is full, a message of QoS 0 is dropped. A message of QoS 1 is left unacknowledged, and so are all
         later ones of this connection; the broker sends them again over the next connection. Both are counted.
@@ -194,11 +194,11 @@ class _Connection:
     def _submit_received(self) -> None:
         """Decode and submit the queued messages in their order until the service stops.
 
-        If a connection left messages unacknowledged because the queue was full, it is closed once the queue is empty;
-        the broker then sends them again.
+        If a connection left messages unacknowledged because the queue was full, the connection is closed once the queue
+        is empty; the broker then sends these messages again.
         """
         while not (self._service.stopping.is_set() or self._ended.is_set()):
-            queue_entries = self._received.pop(1, 0.5)
+            queue_entries = self._received.pop(max_items=1, timeout=0.5)
             for connection, message in queue_entries:
                 if message is not None:
                     self._submit(connection, message)
@@ -240,7 +240,7 @@ class _Connection:
     def _decode(self, topic: str, payload: bytes) -> SourceBlock | None:
         """Decode a message to its block; return None for a Sparkplug message without samples.
 
-        Raises RefusedMessage if the message is invalid.
+        `topic`: MQTT topic of the message; `payload`: its contents. Raises RefusedMessage if the message is invalid.
         """
         if self._host is not None and topic.startswith(f"{NAMESPACE}/"):
             return self._host.receive(topic, payload)
@@ -250,15 +250,15 @@ class _Connection:
     def _note_decoding(self, message: Any) -> Iterator[None]:
         """Store in the database, until the context ends, that a large or repeated message is being decoded.
 
-        Raises RefusedMessage if its decoding has begun twice and never ended, because the process died both times.
-        A message of QoS 0, or a small one that is sent for the first time, is not stored.
+        Raises RefusedMessage if the decoding of this message has begun twice and never ended, because the process died
+        both times. Nothing is stored for a message of QoS 0, or for a small message that is sent for the first time.
         """
         if not message.qos or not (message.dup or len(message.payload) > _NOTED_BYTES):
             yield
             return
         store, digest = self._service.store, compute_digest(message.payload)
         n_starts = 0
-        with suppress(SQLAlchemyError):  # the storage of the block reports the outage
+        with suppress(SQLAlchemyError):  # an outage of the database, which the storage of the block reports
             n_starts = store.begin_decoding(self._name, digest)
         try:
             if n_starts >= _MAX_ATTEMPTS:

@@ -99,7 +99,7 @@ class WatchedFolder:
         stored, and the file is not read again. A recording that is older than the samples watched so far is refused
         too. Raises PartAway if the folder cannot be read.
         """
-        files = sorted(self._files())
+        files = sorted(self._files())  # by the time of their last change
         self._first_found = {file.identity: self._first_found.get(file.identity, time.monotonic()) for file in files}
         self._submitted &= self._first_found.keys()
         self._unreadable &= self._first_found.keys()
@@ -113,7 +113,7 @@ class WatchedFolder:
             is_read = identity in self._read_ahead
             samples, reason = self._read_ahead.pop(identity) if is_read else self._read(file.path)
             if reason and self._may_be_incomplete(file):
-                self._unreadable.add(identity)
+                self._unreadable.add(identity)  # tried again later
                 continue
             if not reason:
                 reason = self._find_refusal_reason(samples, file)
@@ -152,14 +152,14 @@ class WatchedFolder:
     def _start_time(self, file: _FoundFile) -> float:
         """Find the time of a file's first sample [s since 1970], or the time of its last change if it is unreadable.
 
-        The file is read for this. Its recording is kept for `blocks`, if there is room in `_READ_AHEAD_BYTES`; else
-        `blocks` reads the file again.
+        The file is read to find the time. The recording is kept for `blocks` if there is room in `_READ_AHEAD_BYTES`;
+        otherwise `blocks` reads the file again.
         """
         modified_s, path, identity = file
         if identity not in self._starts:
             samples, reason = self._read(path)
             n_bytes = sum(count_bytes(recording) for recording, _ in self._read_ahead.values() if recording is not None)
-            if samples is None or n_bytes + count_bytes(samples) < _READ_AHEAD_BYTES:  # else it is read again later
+            if samples is None or n_bytes + count_bytes(samples) < _READ_AHEAD_BYTES:
                 self._read_ahead[identity] = samples, reason
             if reason:
                 return modified_s
@@ -176,11 +176,11 @@ class WatchedFolder:
             return None, f"{_printable(path.name)}: {describe_error(error)}"
 
     def _find_refusal_reason(self, samples: Recording | None, file: _FoundFile) -> str:
-        """Return the reason to refuse a recording that starts before the newest one watched so far, or "" to accept it.
+        """Return the reason to refuse a recording that starts before the newest recording so far, or "" to accept it.
 
         After a restart the last stored sample stands for the start of the newest recording. A recording of the same day
         that states no time of day is accepted. If the newest recording is dated in the future, all are accepted. A file
-        that is dated in the future is logged.
+        that is dated in the future is logged. `samples`: the recording, None if it has no samples; `file`: its file.
         """
         if samples is None:
             return ""
@@ -190,6 +190,7 @@ class WatchedFolder:
             _log.warning("%s: %s is dated in the future", self.actuator, _printable(path.name))
         if start >= self._newest_s or self._newest_s > now + _AHEAD_S or _is_midnight_before(start, self._newest_s):
             return ""
+        # [:19]: without the time zone
         dates = (datetime.fromtimestamp(t, UTC).isoformat(" ", "seconds")[:19] for t in (start, self._newest_s))
         return "{} must not be older than what was watched, got {} after {}".format(_printable(path.name), *dates)
 
@@ -199,7 +200,8 @@ class WatchedFolder:
         The samples are corrected for the defects of loggers, and their times converted to seconds since 1970. A
         recording with a date only, without a time of day, begins `_GAP_S` after the previous recording of this day.
         An oil temperature in the file's header becomes the channel `T_oil`. If no samples remain, there is no verdict.
-        Raises PartAway if the file of the machine cannot be read; the recording is then tried again later.
+        `path`: file of the recording. Raises PartAway if the file of the machine cannot be read; the recording is then
+        tried again later.
         """
         start = file_seconds(recording, path)
         # long gaps, which the correction fills in, become NaN again
@@ -224,7 +226,7 @@ class WatchedFolder:
     ) -> RecordingVerdict | None:
         """Judge a whole recording by its machine's healthy recordings; log any error, and then return None.
 
-        `shift` [s]: added to the recording's times to give seconds since 1970.
+        `path`: file of the recording; `shift` [s]: added to the recording's times to give seconds since 1970.
         """
         try:
             return judge_recording(machine, recording, _printable(path.name), shift, limit_lpm=self._limit_lpm)
@@ -300,7 +302,8 @@ def watch_folders(service: BlockReceiver, *, once: bool) -> None:
 
     while not service.stopping.is_set():
         succeeded = [folder_part.attempt(partial(submit_blocks, folder)) for folder_part, folder in folders.items()]
-        if once and (all(succeeded) or part(DATABASE).since is None):  # tried again in an outage of the database
+        # in an outage of the database the folders are tried again
+        if once and (all(succeeded) or part(DATABASE).since is None):
             return
         service.stopping.wait(_LOOK_S)
 
@@ -311,8 +314,8 @@ def _printable(name: str) -> str:
 
 
 def _is_midnight_before(start: float, newest: float) -> bool:
-    """Return True if `start` is the midnight (UTC) at which the day of `newest` begins; both are in seconds since 1970.
+    """Return True if `start` is the midnight (UTC) at which the day of `newest` begins.
 
-    A recording that is dated without a time of day starts at midnight.
+    Both are starts of recordings [s since 1970]. A recording that is dated without a time of day starts at midnight.
     """
     return start % DAY == 0.0 and start <= newest < start + DAY

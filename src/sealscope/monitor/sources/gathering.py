@@ -48,10 +48,10 @@ class _Channel:
         A missing sample repeats the value before it, NaN if there is none.
         """
         known_indices = sorted(k for k in self.values if k < stop)
-        n_known = np.searchsorted(known_indices, np.arange(first, stop), side="right")  # up to each sample
+        n_known = np.searchsorted(known_indices, np.arange(first, stop), side="right")  # known values up to each sample
         previous = math.nan if self.previous is None else self.previous
         known_values = np.array([previous, *(self.values.pop(k) for k in known_indices)])
-        samples = known_values[n_known]
+        samples = known_values[n_known]  # the last known value, or `previous` if none is known yet
         self.previous = float(samples[-1])
         return samples
 
@@ -78,14 +78,15 @@ class ValueGatherer:
         self._newest: int | None = None
 
     def push(self, channel: str, t: float, values: Sequence[float]) -> list[Recording]:
-        """Add successive samples of a channel, in SI units; return the blocks of all channels that they complete.
+        """Add successive samples of a channel, in SI units; return the blocks of all channels that are then complete.
 
         `t` [s]: time of the first sample, rounded to the sampling interval; the others follow at the sampling rate. NaN
         is an unknown value. Values without a finite time, and too many values at once, are dropped. If the time jumps
         forward by more than `_AHEAD_S`, the blocks continue after the pause with each channel's last value. If it jumps
         back by more than `_AHEAD_S`, all earlier values are discarded. Only the first value of a channel may be so old:
-        the channel then counts as constant since.
+        the channel then counts as constant since the time of this value.
         """
+        # a double resolves the number of a sample up to 2^52
         if not math.isfinite(t) or abs(t * self.rate) > 2**52 or not 0 < len(values) <= MAX_SAMPLES:
             self._count("values without a clock, or too many")
             return []
@@ -111,7 +112,7 @@ class ValueGatherer:
             self._channels[name] = _Channel(previous=old_channel.last_value(), arrival=old_channel.arrival)
 
     def _add_values(self, target: _Channel, first: int, values: Sequence[float]) -> None:
-        """Add values to a channel from index `first` of the time axis on; drop those before the next block.
+        """Add values to the channel `target` from index `first` of the time axis on; drop those before the next block.
 
         `_start` is the index at which the next block begins. It is None until every channel has values, and the first
         block begins. Until then a channel keeps only its newest `_max_lead` values, so that memory stays bounded if
@@ -123,7 +124,7 @@ class ValueGatherer:
             else:
                 target.values[k] = value
         while self._start is None and len(target.values) > self._max_lead:
-            target.previous = target.values.pop(next(iter(target.values)))
+            target.previous = target.values.pop(next(iter(target.values)))  # the one added first
         last = first + len(values) - 1
         self._newest = last if self._newest is None else max(self._newest, last)
         target.newest = last if target.newest is None else max(last, target.newest)
@@ -132,8 +133,7 @@ class ValueGatherer:
     def discard_values(self) -> None:
         """Discard the values of all channels that are in no block yet, and the last value of each.
 
-        The time axis begins anew with the next value. This is needed after values were lost with the connection, or if
-        the clock was set back.
+        The time axis begins anew with the next value, as after a lost connection or if the clock was set back.
         """
         self._channels = {name: _Channel() for name in self._channels}
         self._start = self._newest = None
@@ -146,9 +146,8 @@ class ValueGatherer:
         """
         channels = self._channels.values()
         if self._start is None:
-            if any(channel.last_value() is None for channel in channels) or not any(
-                channel.values for channel in channels
-            ):
+            has_new_values = any(channel.values for channel in channels)
+            if not has_new_values or any(channel.last_value() is None for channel in channels):
                 return []
             # start at the first index at which every channel has a value
             first_indices = [min(channel.values) for channel in channels if channel.previous is None]
@@ -156,7 +155,7 @@ class ValueGatherer:
                 first_indices = [min(min(channel.values) for channel in channels if channel.values)]
             self._start = max(first_indices)
         newest = [channel.newest for channel in channels if channel.arrival >= self._now() - SILENT_S]
-        if not newest or None in newest:
+        if not newest or None in newest:  # all channels are silent, or one has no value on the time axis
             return []
         blocks: list[Recording] = []
         known_stop = min(index for index in newest if index is not None) + 1

@@ -55,7 +55,7 @@ class MessageLimit(ValueError):  # noqa: N818 (names what is exceeded)
 
 
 def check_cbor(payload: bytes) -> int:
-    """Check how many and how deeply nested the items of a CBOR message are; return its number of key-value pairs.
+    """Check how many and how deeply nested the items of a CBOR message are; return the number of key-value pairs.
 
     Raises MessageLimit if lists, containers, pairs or texts are too many, too long or too deep, if an item is of a
     type that is not allowed, or if the message is incomplete.
@@ -67,7 +67,7 @@ def check_cbor(payload: bytes) -> int:
 
 
 def check_json(payload: bytes) -> int:
-    """Check that a JSON message does not have too many quotation marks or brackets; return its number of colons.
+    """Check that a JSON message does not have too many quotation marks or brackets; return the number of colons.
 
     `check_json_keys` needs this number, which includes colons within texts, to find repeated keys. Raises MessageLimit
     if there are more than `_MAX_QUOTES` quotation marks or `_MAX_BRACKETS` opening brackets and braces.
@@ -86,7 +86,7 @@ def check_json_keys(values: Any, payload: bytes, n_colons: int) -> None:
     `values`: the decoded message; `payload`: its bytes; `n_colons`: number of colons that `check_json` counted. Each
     pair has a colon outside texts; if a key is repeated, `values` has fewer pairs than there are such colons.
     """
-    if _count_shallow_pairs(values) != n_colons:  # quick test: unequal also if a text contains a colon
+    if _count_shallow_pairs(values) != n_colons:  # a quick test: unequal, too, if a text contains a colon
         unquoted = payload.replace(b"\\\\", b"").replace(b'\\"', b"").split(b'"')[::2]  # the parts outside texts
         check_keys(values, sum(part.count(b":") for part in unquoted))
 
@@ -161,6 +161,7 @@ def _skip_pieces(data: Any, start: int, position: int, major: int, n_texts: int)
             return (_TEXTS if n_texts > MAX_TEXTS else _INCOMPLETE), start, n_texts
         if data[position] == 255:  # the end
             return _NO_FAULT, position + 1, n_texts
+        # a piece must have the same type, and a length, given by additional information up to 27
         if int(data[position]) >> 5 != major or int(data[position]) & 31 > 27:
             return _INCOMPLETE, position, n_texts
         number, position = _read_argument(data, position + 1, int(data[position]) & 31)
@@ -190,6 +191,7 @@ def _scan_items(data: Any) -> tuple[int, int, int]:
             return (_NO_FAULT if position == size else _TRAILING), position, n_pairs
         if position >= size:
             return _INCOMPLETE, position, n_pairs
+        # the initial byte of an item: major type in the upper 3 bits, additional information in the lower 5
         start, major, info = position, int(data[position]) >> 5, int(data[position]) & 31
         position += 1
         if major == _SIMPLE and info == _UNKNOWN_LENGTH:  # the end of a container of unknown length
@@ -197,9 +199,10 @@ def _scan_items(data: Any) -> tuple[int, int, int]:
                 return _INCOMPLETE, start, n_pairs
             depth -= 1
             continue
-        is_sized, number = _BYTES <= major <= _MAPPING, -1  # its argument is a length
+        is_sized = _BYTES <= major <= _MAPPING  # the argument of the item is a length
+        number = -1  # the argument; stays negative if the length is unknown
         has_unknown_length = is_sized and info == _UNKNOWN_LENGTH
-        if info > 27 and not has_unknown_length:
+        if info > 27 and not has_unknown_length:  # reserved
             return _INCOMPLETE, start, n_pairs
         if not has_unknown_length:
             number, position = _read_argument(data, position, info)

@@ -39,8 +39,8 @@ _NO_NUMBER = "OPC UA values that are no number"
 def opcua_source(settings: OpcUaSettings) -> Callable[[BlockReceiver], None]:
     """Build a source that submits the values of an OPC UA server as blocks.
 
-    Returns a function that takes the receiver of the blocks, and runs until it stops. Raises MissingExtra if the
-    library asyncua is not installed, and InputError if a secret cannot be read.
+    Returns a function that takes the receiver of the blocks, and runs until the receiver stops. Raises MissingExtra if
+    the library asyncua is not installed, and InputError if a secret cannot be read.
     """
     if find_spec("asyncua") is None:  # before the service starts
         raise MissingExtra("OPC UA needs asyncua: pip install 'sealscope[opcua]'")
@@ -77,7 +77,7 @@ class _OpcUaSession:
         submitting = self._service.supervisor.start("OPC UA blocks", self._submit)
         while not stopping.wait(self._server.pause_s):
             self._server.attempt(lambda: asyncio.run(self._connect()))
-            for gatherer in self._gatherers.values():
+            for gatherer in self._gatherers.values():  # values were lost with the connection
                 gatherer.discard_values()
         submitting.join()
 
@@ -109,8 +109,11 @@ class _OpcUaSession:
                 nodes = {client.get_node(node): channel for channel, node in actuator.nodes.items()}
                 self._channels.update({node.nodeid: (actuator.name, channel) for node, channel in nodes.items()})
                 rate = float(actuator.rate or 1.0)
+                queue_size = math.ceil(2.0 * rate * self._settings.block_s)  # the samples of two blocks
                 results = await subscription.subscribe_data_change(
-                    [*nodes], queuesize=math.ceil(2.0 * rate * self._settings.block_s), sampling_interval=1e3 / rate
+                    [*nodes],
+                    queuesize=queue_size,
+                    sampling_interval=1000.0 / rate,  # [ms]
                 )
                 for (node, channel), result in zip(nodes.items(), results, strict=True):
                     if not isinstance(result, int):
@@ -121,10 +124,11 @@ class _OpcUaSession:
                 await asyncio.sleep(_POLL_S)
 
     def datachange_notification(self, node: Any, value: Any, data: Any) -> None:
-        """Add a value of a subscription, and queue the blocks that it completes; asyncua calls this.
+        """Add a value of a subscription, and queue the blocks that are then complete; called by the library asyncua.
 
-        The value is a number or an array of samples. Samples that are not finite or not of good quality count as
-        unknown (NaN). Any other value is dropped and counted.
+        `node`: the node of a channel; `value`: number or array of samples; `data`: time and quality of the value.
+        Samples that are not finite or not of good quality count as unknown (NaN). Any other value is dropped and
+        counted.
         """
         name, channel = self._channels[node.nodeid]
         data_value = data.monitored_item.Value
@@ -147,7 +151,10 @@ class _OpcUaSession:
                 self._service.count(_NO_ROOM)
 
     def _submit(self) -> None:
-        """Submit the queued blocks until the service stops, in a thread of its own, because `submit` may wait."""
+        """Submit the queued blocks until the service stops.
+
+        This runs in a separate thread, because the service's `submit` waits while its queue is full.
+        """
         while not self._service.stopping.is_set():
-            for block in self._waiting.pop(1, _POLL_S):
+            for block in self._waiting.pop(max_items=1, timeout=_POLL_S):
                 self._service.submit(block)

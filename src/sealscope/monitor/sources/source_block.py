@@ -63,7 +63,7 @@ class BlockReceiver(Protocol):
         """Queue a block or a refused message for storage; wait while the queue is full."""
 
     def count(self, reason: str, number: int = 1) -> None:
-        """Add `number` to the counter of `reason`, usually of dropped messages or blocks."""
+        """Add `number` to the counter called `reason`, usually the reason why messages or blocks are dropped."""
 
     def summaries(self) -> dict[str, dict[str, Any]]:
         """Return the last summary of each actuator, by name."""
@@ -115,7 +115,7 @@ REASONS = (
 
 @contextmanager
 def raising_refused_message() -> Iterator[None]:
-    """Convert any unexpected error of decoding a message to RefusedMessage, which does not end the decoder's thread."""
+    """Convert an unexpected error in the decoding of a message to RefusedMessage, which does not end the decoder."""
     try:
         yield
     except (RefusedMessage, MissingExtra):
@@ -278,7 +278,8 @@ def _parse_number(values: Mapping[str, Any], name: str) -> float:
 def _parse_channel(values: Any, name: str, units: Mapping[str, Any]) -> np.ndarray[Any, Any]:
     """Convert the list or typed array of a channel to an array (n,) in SI units.
 
-    `name`: the channel; `units`: units by channel. Raises RefusedMessage for anything else, and for infinite values.
+    `values`: the list or array, or a single number for a slow channel; `name`: the channel; `units`: units by channel.
+    Raises RefusedMessage for anything else, and for infinite values.
     """
     if name in SLOW and isinstance(values, (int, float)) and not isinstance(values, bool):
         values = [values]  # a slow channel may be a single number

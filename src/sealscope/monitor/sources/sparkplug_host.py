@@ -68,6 +68,7 @@ class _Birth:
         The name of a metric may be followed by a unit in brackets, such as "pressure [bar]".
         """
         birth = cls()
+        # channel by name of its metric
         channel_of = {actuator.map.get(channel, channel): channel for channel in (*CHANNELS, _RATE)}
         for metric in metrics:
             name, unit = metric.name or "", metric.unit
@@ -134,7 +135,8 @@ class SparkplugHost:
     """Receives the messages of Sparkplug B nodes and devices that are actuators, and converts them to blocks.
 
     `actuators`: settings of all actuators; those without `sparkplug` are ignored; `publish`: function that sends a
-    payload to a topic; `count_event`: function that increments the counter with a given name, such as `GAPS`.
+    payload to a topic; `count_event`: function that increments the counter with a given name, such as `GAPS`. Raises
+    MissingExtra if protobuf is not installed.
     """
 
     def __init__(
@@ -143,7 +145,6 @@ class SparkplugHost:
         publish: Callable[[str, bytes], object],
         count_event: Callable[[str], None],
     ) -> None:
-        """Prepare the state of each node; raise MissingExtra if protobuf is not installed."""
         spb.payload_class()  # fails here rather than at the first message
         self._publish, self._count_event = publish, count_event
         self._actuators = {actuator.sparkplug: actuator for actuator in actuators if actuator.sparkplug is not None}
@@ -155,19 +156,20 @@ class SparkplugHost:
     @property
     def topics(self) -> list[str]:
         """MQTT topic filters that include all messages of the nodes."""
-        return [f"{spb.topic_of(group, '+', node)}/#" for group, node in self._nodes]  # the parent level is included
+        # "/#" matches the topic before it, too
+        return [f"{spb.topic_of(group, '+', node)}/#" for group, node in self._nodes]
 
     def request_all_births(self) -> None:
         """Request from every node a birth message, which states all its metrics.
 
-        It is needed after a connection, because earlier messages may have been missed.
+        The request is needed after a new connection, because messages before the connection may have been missed.
         """
         for (group, node), state in self._nodes.items():
             state.is_complete = False
             self._request_birth(group, node)
 
     def _request_birth(self, group: str, node: str) -> None:
-        """Request a birth message of a node, unless that was done within the last `_REQUEST_PAUSE_S`."""
+        """Request the birth message of a node, which states all metrics, at most once in `_REQUEST_PAUSE_S` seconds."""
         now = time.monotonic()
         if now - self._last_requests.get((group, node), -math.inf) >= _REQUEST_PAUSE_S:
             self._last_requests[group, node] = now
@@ -180,7 +182,8 @@ class SparkplugHost:
     def receive(self, topic: str, data: bytes) -> SourceBlock | None:
         """Process a message of a node; return the block of its samples, or None if it has no samples.
 
-        Raises RefusedMessage if the message breaks the protocol or its samples cannot be used.
+        `topic`: MQTT topic of the message; `data`: its payload. Raises RefusedMessage if the message breaks the
+        protocol or its samples cannot be used.
         """
         match topic.split("/"):
             case [_, _, "NCMD" | "DCMD", *_]:
@@ -222,8 +225,9 @@ class SparkplugHost:
         """Update the state of a node with the birth, death or sequence number of a message of `kind`.
 
         The birth of a node (NBIRTH) begins its session, and the death (NDEATH) ends it; both discard the births of its
-        devices. A gap in the sequence is counted and the birth requested. Raises RefusedMessage if the message has no
-        sequence number, comes before the birth, or is the death of an earlier connection.
+        devices. A gap in the sequence is counted and the birth requested. `group`, `node`: names of the group and the
+        node; `payload`: contents of the message. Raises RefusedMessage if the message has no sequence number, comes
+        before the birth, or is the death of an earlier connection.
         """
         state = self._nodes[group, node]
         if kind in ("NBIRTH", "NDEATH"):
@@ -292,9 +296,9 @@ class SparkplugHost:
     def _sample_times(self, actuator: str, t: float, size: int, rate: float) -> Array:
         """Compute the times [s] of `size` samples at `rate` [Hz], the first at or near its stated time `t` [s].
 
-        `t` is in whole milliseconds. If it is within 3 ms of the expected start, one sampling interval after the last
-        sample of the actuator before, the times begin at the expected start instead. If the rounding of `t` cannot
-        explain the difference, they are shifted towards `t`, by at most `_MAX_SHIFT` samples.
+        `t` is in whole milliseconds. The expected start is one sampling interval after the previous sample of the
+        actuator. If `t` is within 3 ms of the expected start, the times begin at the expected start. If the rounding of
+        `t` cannot explain their difference, the times are shifted towards `t`, by at most `_MAX_SHIFT` samples.
         """
         start, expected_start = t, self._next_starts.get(actuator, math.nan)
         if abs(expected_start - t) < 3.0 * _LATE_S:  # else samples are missing, or the clock was set

@@ -44,9 +44,9 @@ def _format_area(area: Area) -> str:
 
 
 def column_sizes(judgement: Judgement) -> list[float]:
-    """List the leak sizes for the columns of the main table, in the unit of the plan.
+    """List the leak sizes that have a column in the main table, in the unit of the plan.
 
-    If there are no sizes, or more than `_MAX_SIZES`, the list is [nan], for one column of all sizes together.
+    If there are no sizes, or more than `_MAX_SIZES`, the list is [nan], which stands for all sizes together.
     """
     sizes = sorted({row.leak_lpm for row in judgement.table if row.leak_lpm > 0})
     return sizes if 0 < len(sizes) <= _MAX_SIZES else [math.nan]
@@ -67,7 +67,7 @@ def main_table(result: CampaignResult) -> tuple[list[str], list[list[str]]]:
     """
     judgement = result.judgement
     sizes = column_sizes(judgement)
-    rows = judgement.overall if math.isnan(sizes[0]) else judgement.table
+    rows = judgement.overall if math.isnan(sizes[0]) else judgement.table  # nan: all sizes together
     by_detector: dict[str, dict[str, AlarmFractions]] = defaultdict(dict)
     for row in rows:
         by_detector[row.detector][str(row.leak_lpm)] = row  # sizes as text, since nan (all sizes) does not equal itself
@@ -76,8 +76,8 @@ def main_table(result: CampaignResult) -> tuple[list[str], list[list[str]]]:
     table = []
     for name, by_size in by_detector.items():
         knowledge = [_format_knowledge(result.known.get(name))] if result.known else []
-        first_row, *_ = by_size.values()
-        false_alarms = percent(first_row.false_alarm)  # the same for all sizes
+        any_row, *_ = by_size.values()
+        false_alarms = percent(any_row.false_alarm)  # the same for all sizes
         detections = [percent(by_size[str(size)].alarms) if str(size) in by_size else "–" for size in sizes]
         area = areas.get(name, "–")
         a90, a90_95 = _format_a90(pods.get(name))
@@ -98,8 +98,9 @@ def _format_knowledge(known: PriorKnowledge | None) -> str:
 def _format_a90(pod: DetectorPod | None) -> tuple[str, str]:
     """Format the leak sizes a90 and a90/95 of a detector.
 
-    The size a90 is detected with a probability of 90 %, and a90/95 is its upper 95 % confidence bound. A size above the
-    largest tested size is written "> LARGEST"; a dash stands for an unknown size.
+    The size a90 is detected with a probability of 90 %, and a90/95 is its upper 95 % confidence bound. `pod`: the
+    probability of detection (POD) over the leak size, None if unknown. A size above the largest tested size is written
+    "> LARGEST"; a dash stands for an unknown size.
     """
     if pod is None or pod.curve is None:
         return "–", "–"
@@ -112,7 +113,7 @@ def _format_a90(pod: DetectorPod | None) -> tuple[str, str]:
 
 
 def result_text(result: CampaignResult) -> str:
-    """Summarise a campaign in a few sentences: the leaks that the best detectors find, and their false alarms.
+    """Summarise in a few sentences the leaks that the best detectors of a campaign find, and their false alarms.
 
     At most `_MAX_NAMED` detectors are described, in the order of a90, the leak size that is detected with a probability
     of 90 %. Detectors whose a90 is unknown or above the largest tested size come last, in the order of the fraction of
@@ -132,8 +133,8 @@ def result_text(result: CampaignResult) -> str:
             finding = f"finds 9 in 10 leaks of {a90:.2g} {unit}"
         text = f"{pod.detector} {finding} at {percent(largest.false_alarm)} false alarms."
         ranked_findings.append((a90, -largest.alarms.value, text))
-    ranked_findings.sort(key=lambda item: item[:2])
-    sentences = [text for _, _, text in ranked_findings[:_MAX_NAMED]]
+    ranked_findings.sort(key=lambda item: item[:2])  # by a90, then by the negative fraction of the largest leaks
+    sentences = [text for *_, text in ranked_findings[:_MAX_NAMED]]
     n_more = len(ranked_findings) - len(sentences)
     rest = f" {n_more} more detectors are in the table." if n_more > 1 else " Another detector is in the table."
     records = f"{judgement.judged} records were judged."
@@ -145,20 +146,21 @@ def campaign_text(result: CampaignResult) -> str:
     heads, rows = main_table(result)
     widths = [max(map(len, column)) for column in zip(heads, *rows, strict=True)]
     lines = []
-    for first, *cells in (heads, *rows):
+    for name, *cells in (heads, *rows):  # the name of the detector stands left, the other cells right
         right = (text.rjust(width) for text, width in zip(cells, widths[1:], strict=True))
-        lines.append("  ".join([first.ljust(widths[0]), *right]).rstrip())
+        lines.append("  ".join([name.ljust(widths[0]), *right]).rstrip())
     return "\n".join([result.plan.title, *lines, *(paragraph(note) for note in _notes(result))])
 
 
 def _notes(result: CampaignResult) -> list[str]:
-    """List the notes under the main table as sentences, such as the notes on thresholds and on missing records."""
+    """List the notes under a campaign's main table as sentences, such as those on thresholds or missing records."""
     judgement, plan = result.judgement, result.plan
     notes = [_say("intervals", share=100 * plan.confidence, unit=plan.unit)]
     percentage = 100 * plan.false_alarm
     if judgement.thresholds:
         key = "thresholds_of_records" if isinstance(plan, SimulatedPlan) else "thresholds_of_recordings"
         notes.append(_say(key, share=percentage, leak_free=judgement.leak_free, judged=judgement.judged))
+    # without a scorer, a detector states verdicts itself
     judges = [name for name in plan.detectors if parse_detector_name(name).scorer is None]
     notes += [_say("own_verdict", share=percentage, detectors=", ".join(judges))] if judges else []
     with_onset = [name for name, known in result.known.items() if known.onset]
@@ -270,9 +272,9 @@ def _facts(result: CampaignResult) -> list[tuple[str, str]]:
 
 
 def _describe_assumed_machine(plan: SimulatedPlan) -> str:
-    """Describe the rig that the detectors assume, and its first parameters that differ from the simulated rig.
+    """Describe the rig that the detectors assume, with the first parameters in which it differs from the simulated rig.
 
-    If the two rigs are equal, the text says so.
+    If both rigs are equal, the text says that.
     """
     if plan.assumed == plan.rig:
         return f"the rig {plan.rig.name} as it stands, not the machine that was drawn"
@@ -289,18 +291,19 @@ def _detector_section(pod: DetectorPod, judgement: Judgement, unit: str) -> dict
 
     The section has the detector's plots, the areas under its ROC curves, and a table of its fractions of alarms, with a
     row for each combination of the factors' levels and a column for each leak size. The table is empty without factors,
-    or if there are too many sizes. `unit`: unit of the leak sizes.
+    or if there are too many sizes. `pod`: the detector's probability of detection (POD) over the leak size;
+    `judgement`: the results of all detectors; `unit`: unit of the leak sizes.
     """
     name = pod.detector
     rocs = [roc for roc in judgement.rocs if roc.detector == name]
     drawn_rocs = [roc for roc in rocs if not math.isnan(roc.leak_lpm)]
-    if not 0 < len(drawn_rocs) <= _MAX_SIZES:  # the curve without a size pools all sizes
+    if not 0 < len(drawn_rocs) <= _MAX_SIZES:  # draw the curve of all sizes together, which has the size nan
         drawn_rocs = [roc for roc in rocs if math.isnan(roc.leak_lpm)]
     cells = [cell for cell in judgement.cells if cell.detector == name]
     factors = list(cells[0].levels) if cells else []
     sizes = sorted({cell.leak_lpm for cell in cells})
     by_levels: dict[tuple[str, ...], dict[float, str]] = defaultdict(dict)
-    if factors and len(sizes) <= _MAX_SIZES + 1:  # 1 for leak-free records
+    if factors and len(sizes) <= _MAX_SIZES + 1:  # one more for the size 0 of leak-free records
         for cell in cells:
             by_levels[tuple(map(str, cell.levels.values()))][cell.leak_lpm] = percent(cell.alarms)
     return {
@@ -316,7 +319,7 @@ def _detector_section(pod: DetectorPod, judgement: Judgement, unit: str) -> dict
 
 
 def _size_text(roc: SizeRoc, unit: str) -> str:
-    """Format the size of the leaks to which an ROC curve belongs; "any size" for a curve of all leaks."""
+    """Format the leak size of an ROC curve in the given unit; "any size" for a curve of leaks of all sizes."""
     return "any size" if math.isnan(roc.leak_lpm) else f"{roc.leak_lpm:g} {unit}"
 
 
@@ -346,8 +349,9 @@ class _PlotCurve(NamedTuple):
 def _pod_plot(pod: DetectorPod, unit: str) -> dict[str, Any] | None:
     """Draw a detector's fraction of detections over the size of the leak, on a logarithmic axis.
 
-    The picture has the fractions with their intervals, the fitted curve with its band, and the sizes a90 and a90/95.
-    Returns its `title` and the `picture`, or None if there are fewer than two sizes. `unit`: unit of the sizes.
+    The picture has the fractions with their intervals, the fitted curve with its band, and the sizes a90 (detected with
+    a probability of 90 %) and a90/95 (upper bound of a90). `pod`: the probability of detection (POD) over the leak
+    size; `unit`: unit of the sizes. Returns `title` and `picture`, or None if there are fewer than two sizes.
     """
     if len(pod.sizes) < 2:
         return None
@@ -360,7 +364,7 @@ def _pod_plot(pod: DetectorPod, unit: str) -> dict[str, Any] | None:
         curves = [_PlotCurve("hits and misses", grid, pod.curve.detection(grid), band)]
         sizes = ((pod.curve.a90, "a90"), (pod.curve.a90_95, "a90/95"))
         marks = [(size, label) for size, label in sizes if math.isfinite(size) and size <= grid[-1]]
-    x_ends = (math.log10(ends[0]) - 0.02, math.log10(ends[1]) + 0.02)
+    x_ends = (math.log10(ends[0]) - 0.02, math.log10(ends[1]) + 0.02)  # decimal logarithms, with a small margin
     picture = Picture(WIDTH, HEIGHT, x_ends, (0.0, 1.0), log=True)
     _draw_detection_curves(picture, f"leak [{unit}]", curves)
     for point in pod.sizes if len(pod.sizes) <= _MAX_FRACTIONS else ():
@@ -368,7 +372,8 @@ def _pod_plot(pod: DetectorPod, unit: str) -> dict[str, Any] | None:
         picture.point("point", point.size, detection.value, (detection.high, detection.low))
     for k, (size, label) in enumerate(marks, 1):
         picture.mark("mark", size)
-        picture.labels.append(SvgText(float(picture.x(size)) - 4.0, 14.0 * k, label, "end"))
+        # left of the mark, each label below the previous one
+        picture.labels.append(SvgText(float(picture.x(size)) - 4.0, 14.0 * k, label, anchor="end"))
     return {"title": f"Detection over leak size, {pod.detector}", "picture": picture}
 
 
@@ -390,7 +395,7 @@ def _roc_plot(rocs: Sequence[SizeRoc], unit: str) -> dict[str, Any] | None:
 
 
 def _draw_detection_curves(picture: Picture, x_label: str, curves: Sequence[_PlotCurve]) -> None:
-    """Draw curves of the detected fraction into a picture, with frame and axes.
+    """Draw curves of the detected fraction into a picture, with frame and axes; `x_label`: label of the x axis.
 
     Each curve is reduced to at most `_MAX_CURVE_POINTS` points.
     """
@@ -401,11 +406,12 @@ def _draw_detection_curves(picture: Picture, x_label: str, curves: Sequence[_Plo
         if band is not None:
             low, high = band
             picture.area("band", x[indices], low[indices], high[indices])
-    for value in log_ticks(*picture.x_ends) if picture.log else ticks(*picture.x_ends, 5):
+    for value in log_ticks(*picture.x_ends) if picture.log else ticks(*picture.x_ends, count=5):
         picture.mark("grid", value)
         picture.below(value, f"{value:g}")
-    picture.frame(5)
+    picture.frame(count=5)
     for k, (label, x, y) in enumerate(thinned_curves):
         picture.line(f"path s{k % _N_STYLES}", x, y, label, digits=2)
+    # below the values of the x axis, and left of those of the y axis
     picture.labels.append(SvgText(WIDTH / 2, HEIGHT + 32.0, x_label))
     picture.labels.append(SvgText(-34.0, HEIGHT / 2, "detected", turned=True))

@@ -50,7 +50,7 @@ class PageTable(NamedTuple):
 def page_tables(judgement: Judgement, unit: str, part: str = "") -> dict[str, PageTable]:
     """Build the tables that `page_tables.toml` lists, by name; empty ones are left out.
 
-    `unit`: unit of the leak sizes; `part`: purpose of the campaign, such as development, which is added to titles.
+    `unit`: unit of the leak sizes; `part`: purpose of the campaign, such as "development", for the titles, "" for none.
     """
     tables = {}
     for name, layout in tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8")).items():
@@ -66,8 +66,9 @@ def page_tables(judgement: Judgement, unit: str, part: str = "") -> dict[str, Pa
 def _format_cell(row: Any, content: str) -> str:
     """Format one cell of a table as text.
 
-    `content`: name of a format, a space, and the dotted path of the value in `row`. The format is an entry of
-    `_FORMATS`, such as "percent", or a format specification of Python; without a format, `str` is used.
+    `row`: object whose attributes are the values of a row; `content`: name of a format, a space, and the dotted path of
+    the value in `row`. The format is an entry of `_FORMATS`, such as "percent", or a format specification of Python;
+    without a format, `str` is used.
     """
     format_name, _, path = content.rpartition(" ")
     value = resolve_attribute(row, path)
@@ -98,7 +99,7 @@ def cause_tables(judgement: Judgement) -> list[CauseTable]:
         rows = [
             (name, int(counts.sum()), [*map(_format_fraction, shares)])
             for name, counts, shares in confusion_rows
-            if counts.any()
+            if counts.any()  # else no record has this cause
         ]
         right, covered = percent(confusion.accuracy), percent(causes.covered)
         tables.append(CauseTable(causes.detector, confusion.columns, rows, right, covered))
@@ -106,7 +107,7 @@ def cause_tables(judgement: Judgement) -> list[CauseTable]:
 
 
 def _format_fraction(proportion: Proportion) -> str:
-    """Format a proportion in percent, without its interval; a dot for zero."""
+    """Format a proportion as a whole percentage, without its interval; a dot for a proportion of zero."""
     return f"{100 * proportion.value:.0f} %" if proportion.count else "·"
 
 

@@ -94,12 +94,12 @@ def history_pictures(ordered: Sequence[Judged]) -> dict[str, Picture] | None:
     has_dates = all(entry.start_s is not None for entry in ordered)
     days = [(entry.start_s or 0.0) / DAY if has_dates else float(k + 1) for k, entry in enumerate(ordered)]
     limit = ordered[-1].diagnosis.limit_lpm
-    # values above `max_shown` would flatten the others; they are drawn as a symbol at the top
+    # values above 8 times the median would flatten the others; they are drawn as a symbol at the top
     max_shown = 8.0 * float(np.median([lpm for lpm, *_ in known_levels])) or math.inf
     shown_values = [value for lpm, _, high in known_levels for value in (lpm, high)]
     shown_values = [value for value in shown_values if value <= max_shown and value < math.inf]
     shown_values += [] if limit is None or limit > max_shown else [limit]
-    top = 1.08 * max(shown_values, default=0.0) or 1.0
+    top = 1.08 * max(shown_values, default=0.0) or 1.0  # 8 % margin
 
     def format_day(day: float) -> str:
         """Format a value of the time axis as a date, or if there are no dates, as the number of a recording.
@@ -117,24 +117,25 @@ def history_pictures(ordered: Sequence[Judged]) -> dict[str, Picture] | None:
         """
         for entry, day, level in zip(ordered, days, levels, strict=True):
             if level is None:
-                picture.symbol("absent", day, picture.height - 4.0)
+                picture.symbol("absent", day, down=picture.height - 4.0)
                 continue
             lpm, low, high = level
             title = f"{Path(entry.diagnosis.file).name}: {messages.format_leak_flow(entry.diagnosis)}"
             if lpm > top:
-                picture.symbol("beyond", day, 6.0, title)
+                picture.symbol("beyond", day, down=6.0, title=title)
             elif low is None:
-                picture.symbol("bound", day, float(picture.y(lpm)), title)
+                picture.symbol("bound", day, down=float(picture.y(lpm)), title=title)
             else:
                 picture.point("point", day, lpm, (low, min(high, top)), title)
 
-    return level_pictures((days[0], days[-1]), (0.0, top), limit, format_day, draw_levels)
+    ends = (days[0], days[-1])
+    return level_pictures(ends, levels=(0.0, top), limit=limit, format_day=format_day, draw=draw_levels)
 
 
 def _leak_level(diagnosis: Diagnosis) -> _Level | None:
-    """Return the leak of a diagnosis as (estimate, low, high), or its bound as (bound, None, bound), in L/min.
+    """Return the leak of a diagnosis as (estimate, low, high), or a leak's upper bound as (bound, None, bound) [L/min].
 
-    Returns None if the diagnosis states neither.
+    Returns None if the diagnosis states neither a leak flow nor a bound.
     """
     leak, bound = diagnosis.leak_lpm, diagnosis.bound_lpm
     if diagnosis.verdict != "leak":
@@ -146,7 +147,7 @@ def _leak_level(diagnosis: Diagnosis) -> _Level | None:
 
 
 def _dates(ordered: Sequence[Judged]) -> list[str]:
-    """Format the start of each recording as a date; a dash if it is unknown.
+    """Format the start of each recording as a date, with a dash for an unknown start.
 
     The time of day is added if all recordings start within less than three days.
     """
@@ -156,11 +157,11 @@ def _dates(ordered: Sequence[Judged]) -> list[str]:
 
 
 def _draw_comparison(ordered: Sequence[Judged]) -> tuple[list[charts.Chart], charts.DrawnCharts | None, list[str]]:
-    """Draw the channels of the newest recording and of an earlier one in the same charts, from a common start.
+    """Draw the channels of the newest and of an earlier recording in the same charts, from a common start.
 
-    The earlier recording is the last one with the verdict `no leak` or, without such a recording, the last one before
-    the newest. Returns the charts, the charts as drawn, and the names of the two files. Returns ([], None, []) if there
-    is no earlier recording, no common channel, or a clock that does not increase.
+    `ordered`: recordings in order of their starts. The earlier recording is the last one with the verdict `no leak` or,
+    if there is none, the last but one. Returns the charts, the charts as drawn, and the names of the two files. Returns
+    ([], None, []) if there is no earlier recording, no common channel, or a clock that does not increase.
     """
     *earlier, newest = ordered
     healthy = [entry for entry in earlier if entry.diagnosis.verdict == "no leak"]
@@ -178,6 +179,7 @@ def _draw_comparison(ordered: Sequence[Judged]) -> tuple[list[charts.Chart], cha
             continue
         pressure_unit = latest.pressure_unit
         unit, values = charts.display_values(latest, name, pressure_unit)
+        # the other recording at the times of the newest one
         samples = np.interp(latest.t, other_t, other[name], left=np.nan, right=np.nan)
         resampled = replace(latest, channels={name: samples})  # to be displayed in the units of the newest recording
         other_values = charts.display_values(resampled, name, pressure_unit)[1]
@@ -185,4 +187,5 @@ def _draw_comparison(ordered: Sequence[Judged]) -> tuple[list[charts.Chart], cha
         comparison.append(charts.Chart(f"over-{name}", "channels", name, unit, lines))
     if not comparison:
         return [], None, []
-    return comparison, charts.draw(latest, [], comparison, newest.diagnosis, []), files
+    drawn = charts.draw(latest, chambers=[], charts=comparison, diagnosis=newest.diagnosis, marks=[])
+    return comparison, drawn, files

@@ -62,17 +62,18 @@ def level_pictures(
     - `format_day`: function that formats a time [d] for the labels of the time axis
     - `draw`: function that draws the recordings into a picture
     """
-    margin = 0.02 * (days[1] - days[0]) or 0.5
+    margin = 0.02 * (days[1] - days[0]) or 0.5  # half a day if there is one time only
     first, last = days[0] - margin, days[1] + margin
     left, top, right, bottom = _MARGINS
     pictures = {}
     for size, (width, height) in SIZES.items():
         picture = Picture(width - left - right, height - top - bottom, (first, last), levels, margins=_MARGINS)
+        # the shortest step between ticks for which their labels have room
         step = next((step for step in _STEPS if (last - first) / step <= width / _TICK_WIDTH), _STEPS[-1])
-        picture.frame(4)
+        picture.frame(count=4)
         for day in np.arange(days[0], last, step).tolist():
             has_room = picture.x(day) + _HALF_LABEL <= picture.width
-            picture.below(day, format_day(day), "middle" if has_room else "end")
+            picture.below(day, format_day(day), anchor="middle" if has_room else "end")
         if limit is not None and limit <= levels[1]:
             picture.level("limit", limit)
         draw(picture)
@@ -111,8 +112,9 @@ def _draw_trend(trend: Trend, picture: Picture) -> None:
         picture.mark("mark other", point.day)
     for point in trend.points:
         if point.value is None:
-            picture.symbol("absent", point.day, picture.height - 4.0)
+            picture.symbol("absent", point.day, down=picture.height - 4.0)
             continue
+        # another style for a recording with a note, and for one that is not comparable with the first group
         style = "point apart" if point.note else "point" if point.group == 0 else "point other"
         title = f"{point.file}: {point.value:.3g} {trend.unit}"
         picture.point(style, point.day, point.value, (point.low or 0.0, point.high or 0.0), title)
@@ -140,8 +142,8 @@ def _y_limits(trend: Trend) -> tuple[float, float]:
 def _fitted_line(days: list[float], episode: Episode) -> list[tuple[float, float]]:
     """Compute the vertices (day, leakage) of the line fitted to an episode, the recordings from one repair to the next.
 
-    The leakage is in the unit of the trend. If there is no alarm or no onset, the line is straight, has the fitted
-    growth, and ends at the present leakage. Otherwise it stays at the healthy level until the onset, and then rises to
+    The leakage is in the unit of the trend. Without an alarm or an onset, the line is straight, has the fitted growth,
+    and ends at the present leakage. Otherwise the line stays at the healthy level until the onset, and then rises to
     the present leakage: linearly up to the last recording, or at once if the change is a step. `days` [d]: times of the
     compared recordings (`Trend.rows`).
     """

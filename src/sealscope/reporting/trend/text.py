@@ -36,8 +36,11 @@ def moment(trend: Trend, day: float) -> str:
 
 
 def stamp(seconds: float, span_days: float) -> str:
-    """Format a time [s since 1970] as a date, with the time of day if `span_days` is below three."""
-    text = str(np.datetime64(round(seconds * 1e3), "ms"))
+    """Format a time [s since 1970] as a date, with the time of day if all times span less than three days.
+
+    `span_days` [d]: time between the first and the last of all times that are shown together.
+    """
+    text = str(np.datetime64(round(seconds * 1e3), "ms"))  # such as 2026-11-25T09:30:00.000
     return text[:16].replace("T", " ") if span_days < 3.0 else text[:10]
 
 
@@ -55,8 +58,7 @@ def headline(trend: Trend) -> str:
 
     If a repair ended an earlier leak and the verdict is `no leak`, the date of the last repair replaces the onset.
     """
-    key = "trend"
-    since = ""
+    key, since = "trend", ""  # neither an onset nor a repair
     if trend.verdict == "no leak" and trend.repairs:  # a repair ended the earlier leak
         key = "trend_fell"
         since = moment(trend, trend.repairs[-1].day)
@@ -68,7 +70,7 @@ def headline(trend: Trend) -> str:
 
 def verdict_sentence(trend: Trend) -> str:
     """Format the verdict of a trend as a sentence for the heading of its page."""
-    if trend.decision.summary != trend.verdict:  # it names another cause than a leak
+    if trend.decision.summary != trend.verdict:  # the summary names another cause than a leak
         return trend.decision.summary.capitalize()
     key = "ringing"  # an alarm by pressure oscillations, whose leak has no size
     if trend.verdict == "no leak":
@@ -95,6 +97,7 @@ def figures(trend: Trend) -> dict[str, str]:
     if wear is None:
         return dict.fromkeys(("total", "leak", "healthy", "since", "growth", "limit"), "")
     at_pressure = "" if trend.pressure is None else f" at {number(trend.pressure / BAR, 2)} bar"
+    # without a rig, levels are in percent of the first one
     reference = " of the first; no rig was stated" if trend.unit == "%" and trend.basis != "ringing" else ""
     high = healthy_end(wear)
     is_whole = high == wear.healthy.high
@@ -121,7 +124,7 @@ def figures(trend: Trend) -> dict[str, str]:
 def healthy_end(wear: Wear) -> float:
     """Compute the upper end of the healthy range for display, cut off at the repair limit.
 
-    If even the mean level of healthy recordings exceeds the limit, the range ends at this level.
+    `wear.healthy`: mean and range of healthy recordings. If their mean exceeds the limit, the range ends at the mean.
     """
     high = wear.healthy.high
     return high if wear.limit is None else min(high, max(wear.limit, wear.healthy.value))
@@ -141,9 +144,9 @@ def _format_estimate(interval: Interval, unit: str) -> str:
 def _format_reach(trend: Trend, limit: float, reach: Interval) -> str:
     """Format the repair limit, and the predicted date at which the leakage reaches it.
 
-    `limit`: repair limit in the unit of the trend; `reach` [d]: time from the last recording until this date, with its
-    interval. After an alarm the date is stated with its interval, without an alarm only the earliest date (95 %). No
-    date is stated if the recordings are too few or the date is too far away.
+    `limit`: repair limit in the unit of the trend; `reach` [d]: time from the last recording until this date, with the
+    interval of this time. After an alarm the date is stated with an interval, without an alarm only the earliest date
+    (95 %). No date is stated if the recordings are too few or the date is too far away.
     """
     limit_text = f"{number(limit, 2)} {trend.unit} in all"
     first, last = trend.points[0].day, trend.points[-1].day
@@ -155,7 +158,7 @@ def _format_reach(trend: Trend, limit: float, reach: Interval) -> str:
         return f"{limit_text}, reached {expected} ({earliest} to {latest}) if it goes on so"
     if reach.low > max_days:
         return f"{limit_text}, not within {max_days / DAYS_PER_YEAR:.0f} years"
-    # a prediction is not stated if it is nearer than one interval between recordings
+    # no date is stated that is nearer than the mean interval between recordings
     if reach.low * max(len(trend.rows) - 1, 1) < last - first or math.isnan(reach.value):
         return f"{limit_text}; the recordings are too few to say when"
     return f"{limit_text}, not before {earliest} (95 %)"
@@ -170,6 +173,7 @@ def assumptions_text(trend: Trend) -> str:
             machine = f"L/min rest on {machine_text(trend.machine)}. "
     basis = "" if trend.basis is None else say(f"trend_basis.{trend.basis}")
     is_known = [point.temperature is not None for point in trend.points if point.value is not None]
+    # the effect of the oil temperature is removed only if it is known in all recordings
     oil = "taken out" if all(is_known) and trend.basis != "ringing" else "not taken out"
     oil = oil if any(is_known) else "not known"
     first = "The first recording is" if trend.healthy == 1 else f"The first {trend.healthy} recordings are"
@@ -216,7 +220,7 @@ def trend_text(trend: Trend, *, whole: bool = False) -> str:
         rows += [("data", findings[0] + more)] if findings else []
         rows += [("reason", trend.reason)] if trend.verdict == "cannot tell" else []
     rows.append(("next", trend.next_check))
-    return "\n".join([paragraph(headline(trend), indent=2), *paragraphs(rows, 10)])
+    return "\n".join([paragraph(headline(trend), indent=2), *paragraphs(rows, columns=10)])
 
 
 def trend_csv(trend: Trend) -> str:
