@@ -28,6 +28,7 @@ def standstill_force(x: float, p: RigNumbers) -> float:
 
     It is the load against +x, including that of an opposing cylinder, minus the force of an end stop.
     """
+    # at rest, v = 0, the flow coefficient of the opposing cylinder's orifice does not matter: it is set to 1
     load = load_force(x, p.F_l, p.k_load) + opposing_force(0.0, p.A_opp, p.p_opp, 1.0)
     return load - hard_stop_force(x, 0.0, p.L, p.k_stop, p.d_stop)  # type: ignore[no-any-return]
 
@@ -81,17 +82,17 @@ def pressures_behind_valve(force: float, A_A: float, A_B: float, p_1: float, p_2
 
     `force` [N]: load against +x; `p_1`, `p_2` [Pa]: pressures of supply and return. p_A + p_B = p_1 + p_2, because
     the edges to supply and return are equal and have equal pressure drops (Merritt, Hydraulic Control Systems, 1967,
-    section 5.2). An overlapped valve may trap another mean pressure; this one is assumed.
+    section 5.2). This mean pressure is also assumed for an overlapped valve, which may trap another one.
     """
     p_A = (force + A_B * (p_1 + p_2)) / (A_A + A_B)
     return p_A, p_1 + p_2 - p_A
 
 
 def supply_at_standstill(force: float, x: float, p: RigNumbers) -> tuple[float, float, float]:
-    """Compute p_1, p_A, p_B [Pa] of a rig with its servo valve centred and its piston at rest at `x` [m].
+    """Compute the supply pressure p_1 and chamber pressures p_A, p_B [Pa] of a rig at rest with a centred servo valve.
 
-    `force` [N]: load against +x. The supply pressure p_1 is constant at standstill, dp_1/dt = 0. As dp_1/dt falls with
-    rising p_1, this pressure is found by bisection.
+    `force` [N]: load against +x; `x` [m]: position of the piston. At standstill dp_1/dt = 0. As dp_1/dt falls with
+    rising p_1, p_1 is found by bisection.
     """
     y = np.zeros(len(STATES))
     y[POSITION], y[P_2] = x, p.p_return
@@ -121,8 +122,8 @@ def initial_state(rig: Rig, x_0: float, push: float = 0.0) -> np.ndarray:
     the motor runs at the supply's speed (`supply_at_standstill`). A machine that leaks, or whose valve has an
     underlap, creeps from this state.
 
-    Raises InputError if a pressure is below vacuum (with a servo valve: outside of the range from return to supply),
-    or if the drive cannot hold the load.
+    Raises InputError if a pressure is below vacuum (in a rig with a servo valve: not between those of return and
+    supply), or if the drive cannot hold the load.
     """
     p, y = rig_numbers(rig), np.zeros(len(STATES))
     force = standstill_force(x_0, p) + push

@@ -73,13 +73,19 @@ def _build_inputs_law(count: int) -> Any:
     """Compile the function (t, nodes, shape, k, drive, leak, p) that computes the inputs of a group of runs in step k.
 
     It returns the command u [V], the leakage coefficients G and C, and the load F [N], each at the `count` times
-    within a step (nodes) that the integration method needs. Its arguments are: `t` [s], start of the step; `drive`,
-    gain and offset [V] of each run's command; `leak`, numbers of each run's leak (`LEAK_ROWS`); and `nodes`, `shape`
-    and `p` of `advance`.
+    within a step (nodes) that the integration method needs. Its arguments are:
+
+    - `t` [s]: start of the step; `nodes` (count,) [s]: the nodes, from the start of the step on.
+    - `shape` (steps, count): the commands' common waveform at the nodes, followed by the load in further columns.
+    - `drive`: gain and offset [V] of each run's command; `leak`: numbers of each run's leak (`LEAK_ROWS`).
+    - `p`: the runs' choices, which tell whether there is an additional load.
     """
 
     def for_nodes(text: str) -> str:
-        """Repeat a piece of source text for each node, with the node's number in place of `{n}`."""
+        """Repeat a piece of source text for each node, with the node's number in place of `{n}`.
+
+        `{load_column}` becomes the number of the column of `shape` that has the load at this node.
+        """
         return ", ".join(text.format(n=n, load_column=count + n) for n in range(count))
 
     return _compile(
@@ -184,7 +190,7 @@ def advance(
 def advance_lanes_rk4(*run: Any) -> None:
     """Integrate groups of runs by the explicit Runge-Kutta method in compiled code.
 
-    The arguments are those of `advance` in this module without the first, `implicit`.
+    `run`: all arguments of `advance` in this module but the first, `implicit`, which states the method.
     """
     advance(EXPLICIT, *run)
 
@@ -193,6 +199,6 @@ def advance_lanes_rk4(*run: Any) -> None:
 def advance_lanes_imex(*run: Any) -> None:
     """Integrate groups of runs of rigs with throttles by the implicit-explicit method in compiled code.
 
-    The arguments are those of `advance` in this module without the first, `implicit`.
+    `run`: all arguments of `advance` in this module but the first, `implicit`, which states the method.
     """
     advance(IMPLICIT, *run)
