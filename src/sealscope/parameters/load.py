@@ -125,7 +125,7 @@ def save_channel_map(path: str | os.PathLike[str], columns: Mapping[str, str]) -
     if os.fspath(path) in rig_names():
         raise InputError(f"a map is saved beside a rig of your own, a .toml file, got the packaged rig {path}")
     file = Path(path)
-    load_rig(file)
+    load_rig(file)  # raises if this is not a rig's file
     lines = file.read_text(encoding="utf-8-sig").splitlines()
     map_lines = [number for number, line in enumerate(lines) if line.strip() == _MAP]
     if map_lines:  # delete the table up to the heading of the next one

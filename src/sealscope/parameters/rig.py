@@ -264,7 +264,7 @@ class Rig(Part):
     def entry(self, name: str) -> ParameterEntry:
         """Return a parameter as it was stated: value, unit, source, and the file or option that states it.
 
-        `name`: its dotted name, or the bare symbol if that is unique.
+        `name`: dotted name of the parameter, or the bare symbol if that is unique.
         """
         return self._stated_entries()[resolve_name(name, declared_names())]
 
@@ -276,7 +276,7 @@ class Rig(Part):
         return not any(self.entry(name).source.startswith(ASSUMED) for name in names)
 
     def as_assumed(self, reason: str) -> Rig:
-        """Return the same rig with all values marked as assumed; `reason` becomes part of their sources."""
+        """Return the same rig with all values marked as assumed; `reason` becomes part of the values' sources."""
         entries = {name: entry._replace(source=f"{ASSUMED} {reason}") for name, entry in self._stated_entries().items()}
         rig = Rig.from_entries(entries, name=self._name, title=self._title, place=self._name)
         return rig.with_channel_map(self.channel_map)

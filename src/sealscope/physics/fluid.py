@@ -72,6 +72,7 @@ def mixture_density_ratio(p: float, p_0: float, K_oil: float, air: float, n_air:
     """
     r, r_0 = air_volume_ratio(p, air, n_air), air_volume_ratio(p_0, air, n_air)
     r_m = air_volume_ratio(0.5 * (p + p_0), air, n_air)
+    # mean of 1/(1 + r) between both pressures, by Simpson's rule
     mean_liquid_fraction = (1.0 / (1.0 + r) + 4.0 / (1.0 + r_m) + 1.0 / (1.0 + r_0)) / 6.0
     return (1.0 + r_0) / (1.0 + r) * exponential((p - p_0) * mean_liquid_fraction / K_oil)  # type: ignore[no-any-return]
 

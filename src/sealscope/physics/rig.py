@@ -263,7 +263,7 @@ def limit_state(y: State, p: RigNumbers) -> State:
       the return's pressure.
     - Other states that no law of the rig changes are set to 0, so that the compiler removes them.
 
-    Returns the new state.
+    Returns the new state. In `p`, an optional law such as `valved` is an empty tuple if the rig does not have it.
     """
     V_up = y[MADE_UP] if len(p.open_circuit) > 0 else 0.0
     bristle = y[BRISTLE] if len(p.bristled) > 0 else 0.0
@@ -288,7 +288,7 @@ def vapour_floor(q: float, p: RigNumbers) -> float:
 
     Source: E. B. Wylie, V. L. Streeter, Fluid Transients, 1978, chapter 8: vapour cavities at constant pressure.
     """
-    if len(p.boiling) == 0:
+    if len(p.boiling) == 0:  # an empty tuple: the rig's oil does not boil
         return q
     return max(q, p.p_vap - P_ATM)  # type: ignore[no-any-return]
 
@@ -306,7 +306,7 @@ def speed_error(y: State, u: float, p: RigNumbers) -> float:
     The command `u` [V] sets the speed omega_per_volt u. In a valve-controlled rig, where the motor drives the pump of
     the supply, the set speed is `omega_P`.
     """
-    if len(p.valved) > 0:
+    if len(p.valved) > 0:  # an empty tuple in a rig without a servo valve
         return p.omega_P - y[OMEGA]  # type: ignore[no-any-return]
     return p.omega_per_volt * u - y[OMEGA]  # type: ignore[no-any-return]
 
@@ -315,10 +315,10 @@ def speed_error(y: State, u: float, p: RigNumbers) -> float:
 def pump_difference(y: State, p: RigNumbers) -> float:
     """Compute the pressure difference across the pump [Pa], port 1 minus port 2.
 
-    In a rig with neither lines nor servo valve, the ports open into the chambers A and B.
+    In a rig with neither lines nor servo valve, the ports are connected to the chambers A and B directly.
     """
     p_A, p_B, p_1, p_2 = pressures_of(y, p)
-    if len(p.throttled) > 0 or len(p.valved) > 0:
+    if len(p.throttled) > 0 or len(p.valved) > 0:  # empty tuples in a rig without lines and servo valve
         return p_1 - p_2
     return p_A - p_B
 
@@ -329,7 +329,8 @@ def friction_force(y: State, applied: float, p: RigNumbers) -> tuple[float, floa
 
     The force is that of eqs. (4.20)-(4.22), unless the rig has Karnopp's or LuGre's law instead. The rate is 0 in a rig
     without LuGre's law. The friction of a motion along -x is multiplied by the rig's parameter `backward`. `applied`
-    [N]: sum of all other forces on the piston.
+    [N]: sum of all other forces on the piston. In `p`, an optional law such as `sticking` (Karnopp's) is an empty tuple
+    if the rig does not have it.
     """
     v = y[VELOCITY]
     F_C = friction.coulomb_friction(
@@ -354,7 +355,7 @@ def filter_resistances(y: State, p: RigNumbers) -> tuple[float, float]:
 
     The resistance of a clogging filter grows with the oil volume that has passed it (`clogged_resistance`).
     """
-    if len(p.clogging) == 0:
+    if len(p.clogging) == 0:  # an empty tuple: the rig's filters do not clog
         return p.R_A, p.R_B
     R_A = restrictors.clogged_resistance(p.R_A, y[PASSED_A], p.k_clog_A, p.n_clog)
     return R_A, restrictors.clogged_resistance(p.R_B, y[PASSED_B], p.k_clog_B, p.n_clog)
@@ -372,14 +373,15 @@ def implicit_flows(
     with the throttle has the additional drop R Q, so that its resistance R is added to g. With a bypass valve of the
     filter, `filtered_flow` solves the equation.
     """
-    if len(p.filtered) > 0:
+    if len(p.filtered) > 0:  # an empty tuple in a rig without filters
         R_A, R_B = filter_resistances(y, p)
-        if len(p.bypassed) > 0:
+        if len(p.bypassed) > 0:  # an empty tuple in a rig whose filters have no bypass valve
             Q_A = restrictors.filtered_flow(total_A, g_A, R_A, p.p_bypass, p.G_bypass, p.c_A_in, p.c_A_out, p.dp_0)
             return Q_A, restrictors.filtered_flow(
                 total_B, g_B, R_B, p.p_bypass, p.G_bypass, p.c_B_out, p.c_B_in, p.dp_0
             )
         g_A, g_B = g_A + R_A, g_B + R_B
+    # Q_A > 0 flows into the cylinder, Q_B > 0 out of it
     Q_A = restrictors.implicit_orifice_flow(total_A, g_A, p.c_A_in, p.c_A_out, p.dp_0)
     return Q_A, restrictors.implicit_orifice_flow(total_B, g_B, p.c_B_out, p.c_B_in, p.dp_0)
 
@@ -388,7 +390,7 @@ def implicit_flows(
 def filter_flows(y: State, p: RigNumbers) -> tuple[float, float]:
     """Compute the flows [m^3/s, >= 0] through the filters of lines A and B, without the flow in their bypasses."""
     Q_A, Q_B = throttle_flows(y, p)
-    if len(p.bypassed) == 0:
+    if len(p.bypassed) == 0:  # an empty tuple: the filters have no bypass valve
         return abs(Q_A), abs(Q_B)
     R_A, R_B = filter_resistances(y, p)
     filter_flow_A = restrictors.flow_through_filter(Q_A, R_A, p.p_bypass, p.G_bypass)
@@ -404,8 +406,9 @@ def throttle_flows(y: State, p: RigNumbers) -> tuple[float, float]:
     """
     p_A, p_B, p_1, p_2 = pressures_of(y, p)
     dp_A, dp_B = p_1 - p_A, p_B - p_2
-    if len(p.filtered) > 0:
+    if len(p.filtered) > 0:  # an empty tuple in a rig without filters
         return implicit_flows(dp_A, dp_B, 0.0, 0.0, y, p)  # g = 0: the pressures are those of `y`
+    # Q_A > 0 flows into the cylinder, Q_B > 0 out of it
     Q_A = restrictors.orifice_flow(dp_A, restrictors.one_way_coefficient(dp_A, p.c_A_in, p.c_A_out), p.dp_0)
     return Q_A, restrictors.orifice_flow(dp_B, restrictors.one_way_coefficient(dp_B, p.c_B_out, p.c_B_in), p.dp_0)
 
@@ -419,7 +422,7 @@ def volumes_at(x: float, p: RigNumbers) -> tuple[float, float]:
 @contracted
 def bulk_modulus(pressure: float, p: RigNumbers) -> float:
     """Compute the bulk modulus [Pa] of the oil, with the air in it if the rig has any, at `pressure` [Pa gauge]."""
-    if len(p.aerated) == 0:
+    if len(p.aerated) == 0:  # an empty tuple: no air in the oil
         return p.K_oil  # type: ignore[no-any-return]
     return effective_bulk_modulus(vapour_floor(pressure, p), p.K_oil, p.air, p.n_air)
 
@@ -431,7 +434,7 @@ def density_ratio(pressure: float, reference: float, p: RigNumbers) -> float:
     A pressure state may fall below the vapour pressure, where the oil boils, so that mass is conserved
     (`vapour_floor`). Below the vapour pressure the density falls by the constant bulk modulus at the vapour pressure.
     """
-    if len(p.aerated) == 0:  # no air in the oil: one bulk modulus, whether the oil boils or not
+    if len(p.aerated) == 0:  # an empty tuple, no air in the oil: one bulk modulus, whether the oil boils or not
         return oil_density_ratio(pressure - reference, p.K_oil)
     liquid_pressure, liquid_reference = vapour_floor(pressure, p), vapour_floor(reference, p)
     ratio = mixture_density_ratio(liquid_pressure, liquid_reference, p.K_oil, p.air, p.n_air)
@@ -450,7 +453,7 @@ def flows_at_both_ends(Q: float, source: float, sink: float, p: RigNumbers) -> t
     carries the same mass, rho_up Q_up = rho_down Q_down, with the oil's densities rho at the pressures `source` and
     `sink` [Pa]. In a rig that balances volumes instead of masses both flows are Q.
     """
-    if len(p.conserving) == 0:
+    if len(p.conserving) == 0:  # an empty tuple: the rig balances volumes
         return Q, Q
     forward = Q > 0.0
     ratio = density_ratio(select(forward, source, sink), select(forward, sink, source), p)
@@ -481,7 +484,7 @@ def makeup_pressure(y: State, p: RigNumbers) -> float:
 
     The state `y` contains the oil volume V_up that the accumulator has delivered.
     """
-    if len(p.polytropic) > 0:
+    if len(p.polytropic) > 0:  # an empty tuple if the gas is isothermal
         return external.polytropic_pressure(y[MADE_UP], p.p_charge, p.V_gas, p.n_gas)
     return external.accumulator_pressure(y[MADE_UP], p.p_charge, p.V_gas)
 
@@ -496,7 +499,7 @@ def make_up_flows(y: State, p: RigNumbers) -> tuple[float, float]:
     """
     p_up = makeup_pressure(y, p)
     p_A, p_B, p_1, p_2 = pressures_of(y, p)
-    if len(p.throttled) == 0:
+    if len(p.throttled) == 0:  # an optional law is an empty tuple in a rig without it, here without lines
         p_1, p_2 = p_A, p_B
     if len(p.piloted) > 0:
         makeup_1 = external.pilot_valve_flow(p_up - p_1, p_2 - p_up, p.p_crack, p.G_check, p.k_pilot, p.p_open)
@@ -522,11 +525,11 @@ def external_pressure_rates(y: State, p: RigNumbers) -> tuple[Pressures, float]:
     makeup_1, makeup_2 = make_up_flows(y, p)
     out_A, out_B = external.external_leakage(y[P_A], p.G_ext_A), external.external_leakage(y[P_B], p.G_ext_B)
     p_up = makeup_pressure(y, p)
-    # drawn from the accumulator at its pressure, and entering the circuit at the pressure there
+    # drawn from the accumulator at its pressure, and entering the circuit at the pressure of side 1 or 2
     drawn_1, makeup_1 = flows_at_both_ends(makeup_1, p_up, y[P_1] if len(p.throttled) > 0 else y[P_A], p)
     drawn_2, makeup_2 = flows_at_both_ends(makeup_2, p_up, y[P_2] if len(p.throttled) > 0 else y[P_B], p)
     fed = drawn_1 + drawn_2
-    if len(p.throttled) > 0:
+    if len(p.throttled) > 0:  # an optional law is an empty tuple in a rig without it, here without lines
         rate_1 = cylinder.pressure_rate(makeup_1, p.V_1, bulk_modulus(y[P_1], p))
         rate_2 = cylinder.pressure_rate(makeup_2, p.V_2, bulk_modulus(y[P_2], p))
         return (-cylinder.pressure_rate(out_A, V_A, K_A), -cylinder.pressure_rate(out_B, V_B, K_B), rate_1, rate_2), fed
@@ -595,7 +598,8 @@ def rates_without_throttles(y: State, u: float, G: float, C: float, F: float, p:
 
     `y`: state in the order of `STATES`; `u`: command [V]; `G` [m^3/(s Pa)] and `C` [m^3/(s Pa^0.5)]: conductance and
     flow coefficient of the leakage past the piston, through a laminar gap and an orifice (`piston_leakage`); `F`: load
-    [N] in addition to the rig's own; `p`: the rig's numbers.
+    [N] in addition to the rig's own; `p`: the rig's numbers, in which an optional law, such as `damped`, is an empty
+    tuple if the rig does not have it.
     """
     p_A, p_B, x, v = vapour_floor(y[P_A], p), vapour_floor(y[P_B], p), y[POSITION], y[VELOCITY]
     if len(p.sticking) > 0:
@@ -633,10 +637,9 @@ def rates_without_throttles(y: State, u: float, G: float, C: float, F: float, p:
         rate_1 = cylinder.pressure_rate(to_1, p.V_1, bulk_modulus(y[P_1], p))
         rate_2 = cylinder.pressure_rate(-from_2, p.V_2, bulk_modulus(y[P_2], p))
     elif len(p.valved) > 0:
-        valve_part = valve_rates(y, Q_1, p)  # rates of p_A, p_B, p_1 and p_2
-        rate_A = valve_part[0] + cylinder.pressure_rate(-p.A_A * v - from_A, V_A, K_A)
-        rate_B = valve_part[1] + cylinder.pressure_rate(p.A_B * v + to_B, V_B, K_B)
-        rate_1, rate_2 = valve_part[2], valve_part[3]
+        valve_rate_A, valve_rate_B, rate_1, rate_2 = valve_rates(y, Q_1, p)
+        rate_A = valve_rate_A + cylinder.pressure_rate(-p.A_A * v - from_A, V_A, K_A)
+        rate_B = valve_rate_B + cylinder.pressure_rate(p.A_B * v + to_B, V_B, K_B)
     else:
         from_2, to_1 = flows_at_both_ends(Q_1, y[P_B], y[P_A], p)
         rate_A = cylinder.pressure_rate(to_1 - p.A_A * v - from_A, V_A, K_A)
@@ -665,7 +668,7 @@ def rates(y: State, u: float, G: float, C: float, F: float, p: RigNumbers) -> St
     of the piston (`piston_leakage`); `F` [N]: load in addition to the rig's own; `p`: the rig's numbers.
     """
     dy = rates_without_throttles(y, u, G, C, F, p)
-    if len(p.throttled) > 0:
+    if len(p.throttled) > 0:  # an empty tuple in a rig without throttles
         Q_A, Q_B = throttle_flows(y, p)
         dy = add_to_pressures(dy, 1.0, throttle_rates(y, Q_A, Q_B, p))
     return dy
@@ -677,7 +680,8 @@ def observe(y: State, u: float, G: float, C: float, p: RigNumbers, row: np.ndarr
 
     The outputs are the states with pressures not below the vapour pressure, the flows, and the motor's voltage. `y`:
     the state; `u` [V]: command; `G` [m^3/(s Pa)], `C` [m^3/(s Pa^0.5)]: leakage coefficients of the piston
-    (`piston_leakage`); `p`: the rig's numbers.
+    (`piston_leakage`); `p`: the rig's numbers, in which an optional law, such as `lossy`, is an empty tuple if the rig
+    does not have it.
     """
     n = len(y)
     for m in range(n):

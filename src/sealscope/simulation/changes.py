@@ -257,7 +257,10 @@ class Wander:
             raise InputError(f"a wander must have finite weights and last > 0 s, got {self}")
 
     def value_at(self, t: Array) -> Array:
-        """Compute the random walk, which is the change of a drifting parameter, at times t [s]; 0 before t = 0."""
+        """Compute the random walk at times t [s]: slope t/T + sum of w_k sin((k - 1/2) pi t/T); 0 before t = 0.
+
+        T is the `duration`, and w_1, w_2, ... are the `weights`.
+        """
         phase = np.pi / self.duration * np.maximum(t, 0.0)
         change = np.asarray(self.slope / np.pi * phase)  # slope t / T
         if self.weights:
@@ -326,6 +329,7 @@ class ParameterDrift:
     absolute: bool = False
 
     def __post_init__(self) -> None:
+        """Replace a bare name of the parameter by the dotted name; raise InputError for a drift that cannot be."""
         if self.parameter not in PARAMETER_GROUPS:
             from sealscope.parameters import declared_names
             from sealscope.parameters.names import resolve_name

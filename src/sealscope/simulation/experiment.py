@@ -258,7 +258,7 @@ class Experiment:
         return replace(self.command, signal=self._with_duty_changes(self.command.signal))
 
     def _with_duty_changes(self, command: Command) -> Command:
-        """Return a command with the changes of amplitude and frequency that faults cause (`Fault.change_command`)."""
+        """Apply all faults that change a command's amplitude and frequency (`Fault.change_command`) to `command`."""
         for fault in self.faults:
             command = fault.change_command(command)
         return command
@@ -355,7 +355,7 @@ class Experiment:
         inputs = [identity_values(self.command), *(identity_values(leak) for leak in self.leaks)]
         inputs += [identity_values(change) for change in (*self.faults, *self.drifts)]
         solver = [self.method, self.step, self.allow_unresolved]
-        solver += [] if self.error is None else [self.error]  # keys of experiments without an error stay as they were
+        solver += [] if self.error is None else [self.error]  # keys without it must not change between versions
         inputs += [identity_values(added) for added in (self.load, self.active_controller) if added is not None]
         text = json.dumps([self.describe(), values, inputs, solver], sort_keys=True, default=str)
         return hashlib.sha256(text.encode()).hexdigest()[:16]

@@ -423,7 +423,7 @@ class _Integration:
         from sealscope.physics.solvers.advance import EXPLICIT, IMPLICIT, advance, advance_closed, step_nodes
         from sealscope.physics.solvers.limits import longest_step
 
-        unloaded = np.zeros((0, 0))
+        unloaded = np.zeros((0, 0))  # stands for no load
         h = 1.0 / (self.rate * n_steps)
         implicit = IMPLICIT if self.method == "imex" else EXPLICIT
         nodes = step_nodes(implicit, h)
@@ -442,6 +442,7 @@ class _Integration:
                     refuse_long(h, longest_step(p, max_G, max_C), "the leak")
                 steps = slice((k - first) * n_steps, (end - first) * n_steps)
                 out = rows[k - origin : end - origin]
+                # in the order of `advance` and `advance_closed`
                 arguments = G[steps], C[steps], F[steps], pack_numbers(p), self.euler, n_steps
                 if self.feedback is None:
                     advance(implicit, y, h, u[steps], *arguments, out)
@@ -562,21 +563,21 @@ class StepErrorCheck:
         self._tolerance = tolerance
         self._outputs_per_sample = max(1, round(rate / rig.daq.sample_rate))  # a sample of the recording
         sensors = [getattr(rig.sensors, name) for name in CHAMBERS]
-        # four columns: p_A at the step and at half of it, then p_B
+        # four columns: p_A at the step and at half the step, then p_B
         self._noise_variances = np.repeat([sensor.noise**2 + rig.sensors.common_noise**2 for sensor in sensors], 2)
-        self._squares = np.zeros((LEVELS, 4))
+        self._squares = np.zeros((LEVELS, 4))  # sums of the squared details over all windows so far
         self._samples = 0
         self.pressure_error = self.detail_error = 0.0
 
     def add_window(self, coarse: Array, fine: Array) -> float:
-        """Compare a run with the one at half the step in one more window of time.
+        """Compare a run with the same run at half the step, in one more window of time.
 
-        Returns the largest ratio of an error to its tolerance; the step is short enough if it is at most 1.
+        Returns the largest ratio of an error to its tolerance; the step is short enough if this ratio is at most 1.
 
-        `coarse`, `fine` (n, 4): p_A, p_B, p_1, p_2 [Pa] at the step and at half of it. The error of a pressure is the
-        rms difference within the window, times `SAFETY`. If it is within its tolerance, the RMS of the db8 wavelet
-        details d_1 .. d_4 of p_A and p_B are compared, too: over all windows so far that are long enough for the
-        wavelet, at the recording's rate and with its noise added.
+        `coarse`, `fine` (n, 4): p_A, p_B, p_1, p_2 [Pa] at the step and at half the step. The error of a pressure is
+        the rms difference within the window, times `SAFETY`. If all pressures are within their tolerance, the RMS of
+        the db8 wavelet details d_1 .. d_4 of p_A and p_B are compared, too: over all windows so far that are long
+        enough for the wavelet, at the recording's sampling rate and with the sensors' noise added.
         """
         pressure_error = SAFETY * float(np.sqrt(np.mean(np.square(coarse - fine), axis=0)).max(initial=0.0))
         self.pressure_error = max(self.pressure_error, pressure_error)
@@ -592,7 +593,10 @@ class StepErrorCheck:
         return max(pressure_error / self._tolerance, detail_error / DETAIL_TOLERANCE)
 
     def describe_worst(self) -> str:
-        """Describe the larger of two differences relative to its tolerance: of a pressure, or of a detail's RMS."""
+        """Describe the worst difference that halving the step made: of a pressure, or of the RMS of a wavelet detail.
+
+        The worst is the larger one relative to its tolerance.
+        """
         if self.pressure_error / self._tolerance >= self.detail_error / DETAIL_TOLERANCE:
             return f"a pressure by {self.pressure_error:.4g} Pa rms, which must be <= {self._tolerance:.4g} Pa"
         error, tolerance = 100 * self.detail_error, 100 * DETAIL_TOLERANCE

@@ -95,7 +95,7 @@ def size_leaks(
     best_error = SCATTER_TOLERANCE
     for attempt in range(MAX_RUNS):
         if progress is not None:
-            progress("sizing the leak", 1.0 - 0.5**attempt)
+            progress("sizing the leak", 1.0 - 0.5**attempt)  # the number of attempts is not known beforehand
         unit_flows, run = measure(coefficients)
         flows = unit_flows * coefficients
         error = float(np.abs(flows[indices] / means[indices] - 1.0).max(initial=0.0))

@@ -74,7 +74,8 @@ def _solve_stage(z: State, h: float, p: RigNumbers) -> tuple[State, Pressures]:
     `h` [s]: length of the step; `z`: the state without the implicit rates of this stage. If bulk moduli and densities
     depend on the pressures, the stage is solved repeatedly (`MAX_STAGE_ITERATIONS`). In the body, r [Pa/m^3] is the
     pressure rate of an oil volume per unit flow, and g [Pa s/m^3] the fall of a throttle's pressure difference over the
-    stage per unit flow. Boiling oil keeps its pressure, so its r is 0.
+    stage per unit flow. Boiling oil keeps its pressure, so its r is 0. In `p`, an optional law such as `boiling` is an
+    empty tuple if the rig does not have it.
     """
     V_A, V_B = rig.volumes_at(z[POSITION], p)
     step = GAMMA * h

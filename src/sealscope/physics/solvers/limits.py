@@ -76,7 +76,7 @@ def longest_step(p: RigNumbers, G: float = 0.0, C: float = 0.0) -> float:
 
     The stability limit of a decay is that of RK4; the explicit part of ARK4(3)6L[2]SA is stable beyond it.
     Position-dependent volumes are taken at the end of the stroke where the oil is stiffer. Air is left out because it
-    only makes the oil softer.
+    only makes the oil softer. In `p`, an optional law, such as `lossy`, is an empty tuple if the rig does not have it.
     """
     ends = _end_volumes(p)
     # stiffness of the oil in both chambers, and in the volumes at the pump's ports [Pa/m^3]

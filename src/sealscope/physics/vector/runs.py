@@ -118,7 +118,7 @@ def _add_output(z: State, leak: Leak, t: float, totals: Totals, q: RigNumbers) -
     flow_sum = flow_sum + abs(piston_leakage(p_A - p_B, leak[4] * opening, leak[5] * opening, q.dp_0))
     min_pressure = min(min_pressure, p_A)
     min_pressure = min(min_pressure, p_B)
-    if len(q.throttled) > 0:
+    if len(q.throttled) > 0:  # an empty tuple in rigs without lines
         min_pressure = min(min_pressure, p_1)
         min_pressure = min(min_pressure, p_2)
     state_sum = z[0] + z[1] + z[2] + z[3] + z[4] + z[5] + z[6] + z[7] + z[8] + z[9] + z[10] + z[11] + z[12] + z[13]
@@ -161,7 +161,7 @@ def advance(
     cells, fields, states = table.shape[1], table.shape[2], y.shape[1]
     for g in range(groups[0], groups[1]):
         z = load_state(y, g * states)
-        gain = (load(drive, 2 * g), load(drive, 2 * g + 1))
+        gain_and_offset = (load(drive, 2 * g), load(drive, 2 * g + 1))
         leak, run_totals = load_leak(leaks, g * LEAK_ROWS), load_totals(totals, g * N_TOTALS)
         out = (g * pressures.shape[1] + begin) * CHANNELS
         for cell in range(cells):
@@ -177,9 +177,11 @@ def advance(
                     run_totals = _add_output(z, leak, t + nodes[0], run_totals, q)
                 steps_to_output -= 1
                 if len(implicit) > 0:
-                    z = imex_step(z, h, *_imex_inputs(t, nodes, shape, step, gain, leak, q), q)  # type: ignore[call-arg]
+                    imex_inputs = _imex_inputs(t, nodes, shape, step, gain_and_offset, leak, q)
+                    z = imex_step(z, h, *imex_inputs, q)  # type: ignore[call-arg]
                 else:
-                    z = rk4_step(z, h, *_rk4_inputs(t, nodes, shape, step, gain, leak, q), q, False)  # type: ignore[call-arg]
+                    rk4_inputs = _rk4_inputs(t, nodes, shape, step, gain_and_offset, leak, q)
+                    z = rk4_step(z, h, *rk4_inputs, q, False)  # type: ignore[call-arg]  # False: no `euler_integral`
         for m in range(states):
             store(y, g * states + m, z[m])
         for m in range(N_TOTALS):

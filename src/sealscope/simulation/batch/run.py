@@ -320,6 +320,7 @@ def _pressure_instruments(rig: Rig, readings: Readings, ends: Array, samples: in
             (signals.COMMON, signals.COMMON_RISE, "sensors.common_noise", rig.sensors.common_noise, 0.0),
         ):
             start_value, end_value = np.broadcast_to(readings.value(parameter, value, ends), (2,))
+            # `addend`: the gain is 1 plus the gain error
             row[start_row], row[rise_row] = start_value + addend, (end_value - start_value) / samples
         row[signals.DRIFT_STEP] = sensor.drift / np.sqrt(daq.sample_rate)
         row[signals.HUM], row[signals.HUM_CYCLES] = sensor.hum, sensor.hum_frequency / daq.sample_rate
@@ -508,7 +509,7 @@ class SetRun:
         from sealscope.simulation.batch.signals import sense_lanes
 
         advance = advance_lanes_imex if self.method == "imex" else advance_lanes_rk4
-        a, b = groups  # first group, and the end
+        a, b = groups  # first group, and the group after the last
         local_groups = (0, b - a)  # indices within the slices [a:b] of the arrays
         state, leaks, totals = self.state[a:b], self.leaks[a:b], self.totals[a:b]
         table, cells = np.empty((0, 0, 0, 0)), (-1, -1)
