@@ -81,7 +81,8 @@ def lugre_friction(v: float, z: float, dz: float, sigma_0: float, sigma_1: float
     `F_v` [N s/m]: viscous coefficient. The damping decays at speeds above `v_th` [m/s]; otherwise the force could drive
     the motion.
 
-    Source: eq. (3) of the paper cited in `bristle_rate`; the decay: H. Olsson, Control Systems with Friction, Lund 1996, section 5.
+    Source: eq. (3) of the paper cited in `bristle_rate`; the decay: H. Olsson, Control Systems with Friction, Lund
+    1996, section 5.
     """
     relative_v = v / v_th
     return sigma_0 * z + sigma_1 * exponential(-relative_v * relative_v) * dz + F_v * v  # type: ignore[no-any-return]

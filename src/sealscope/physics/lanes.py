@@ -65,7 +65,7 @@ def _vector_type(lanes: Lanes) -> Any:
 
 @register_model(Lanes)
 class _LanesModel(models.PrimitiveModel):  # type: ignore[misc]
-    """How numba represents lanes in machine code: by one LLVM vector."""
+    """The representation of lanes in machine code: one LLVM vector of numbers."""
 
     def __init__(self, manager: Any, lanes: Any) -> None:
         super().__init__(manager, lanes, _vector_type(lanes))
@@ -73,7 +73,7 @@ class _LanesModel(models.PrimitiveModel):  # type: ignore[misc]
 
 @register_model(Mask)
 class _MaskModel(models.PrimitiveModel):  # type: ignore[misc]
-    """How numba represents a mask in machine code: by an LLVM vector of single bits."""
+    """The representation of a mask in machine code: one LLVM vector of single bits."""
 
     def __init__(self, manager: Any, mask: Any) -> None:
         super().__init__(manager, mask, ir.VectorType(ir.IntType(1), mask.lanes.width))

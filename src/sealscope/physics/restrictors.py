@@ -152,8 +152,8 @@ def filtered_flow(
 def flow_through_filter(Q: float, R: float, p_bypass: float, G_bypass: float) -> float:
     """Compute the part of a flow [m^3/s, >= 0] that passes a filter rather than its bypass valve.
 
-    Of the two values in the body, the whole flow holds while the bypass valve is shut; it is then the smaller one.
     `Q` [m^3/s]: flow through filter and bypass together, of either sign; `R` [Pa s/m^3]: resistance of the filter.
     The bypass valve opens at the pressure drop `p_bypass` [Pa] and has the conductance `G_bypass` [m^3/(s Pa)].
     """
-    return min(abs(Q), (abs(Q) + G_bypass * p_bypass) / (1.0 + G_bypass * R))
+    part_with_open_valve = (abs(Q) + G_bypass * p_bypass) / (1.0 + G_bypass * R)
+    return min(abs(Q), part_with_open_valve)  # the valve is shut while the whole flow is the smaller one

@@ -622,7 +622,7 @@ def rates_without_throttles(y: State, u: float, G: float, C: float, F: float, p:
         load = load + cylinder.opposing_force(v, p.A_opp, p.p_opp, p.C_opp)
     if len(p.pushed) > 0:
         load = load + F
-    if len(p.pushed) > 1:
+    if len(p.pushed) > 1:  # the tables of a load over position and velocity
         load = load + cylinder.piecewise_linear_force(x, p.pushed[0]) + cylinder.piecewise_linear_force(v, p.pushed[1])
     F_f, dz = friction_force(y, p_A * p.A_A - p_B * p.A_B - load + stop, p)
     acceleration = cylinder.piston_acceleration(p_A, p_B, F_f, load, stop, p.A_A, p.A_B, p.M_eq)

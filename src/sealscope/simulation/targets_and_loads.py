@@ -274,6 +274,7 @@ def _extract_terms(text: str, letter: str) -> tuple[Breakpoints, str]:
             breakpoints.append((float(start) * start_units[start_unit], slope))
         else:
             common_slope += slope
+    # (force at 0, slope at first), then (position or velocity, change of the slope) for each term with a start
     return ((0.0, common_slope), *breakpoints), pattern.sub("", text)
 
 

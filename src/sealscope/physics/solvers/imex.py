@@ -82,7 +82,7 @@ def _solve_stage(z: State, h: float, p: RigNumbers) -> tuple[State, Pressures]:
     p_A, p_B, p_1, p_2 = rig.pressures_of(z, p)
     total_A, total_B = p_1 - p_A, p_B - p_2
     solved = z
-    s = (z[P_A], z[P_B], z[P_1], z[P_2])  # overwritten; numba needs its type before the loop
+    s = (z[P_A], z[P_B], z[P_1], z[P_2])  # overwritten; numba needs the type of s before the loop
     max_iterations = MAX_STAGE_ITERATIONS if len(p.aerated) + len(p.conserving) + len(p.boiling) > 0 else 1
     for _ in range(max_iterations):
         K_A, K_B = rig.bulk_modulus(solved[P_A], p), rig.bulk_modulus(solved[P_B], p)

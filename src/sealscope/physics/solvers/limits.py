@@ -95,7 +95,7 @@ def longest_step(p: RigNumbers, G: float = 0.0, C: float = 0.0) -> float:
     if p.literal_bracket:
         friction_slope = F_C * (p.K_brk + p.F_v * p.v_th) / p.v_th
     damper = p.d_load
-    if len(p.pushed) > 1:
+    if len(p.pushed) > 1:  # the tables of a load over position and velocity
         column_stiffness += _steepest_rise(p.pushed[0]) / p.M_eq
         damper += _steepest_rise(p.pushed[1])
     sliding_step = _longest_mode_step((p.F_v + damper) / p.M_eq, column_stiffness)

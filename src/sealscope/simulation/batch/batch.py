@@ -110,7 +110,7 @@ class Batch:
 
 
 def _index_of(name: str, names: tuple[str, ...], what: str) -> int:
-    """Return the index of `name` in `names`; raise InputError, which calls the name `what`, if it is absent."""
+    """Return the index of `name` in `names`; raise InputError for another name. `what`: word for names in the error."""
     if name not in names:
         raise InputError(f"{what} must be one of {', '.join(names)}, got {name!r}")
     return names.index(name)
