@@ -329,7 +329,7 @@ class ParameterDrift:
     absolute: bool = False
 
     def __post_init__(self) -> None:
-        """Replace a bare name of the parameter by the dotted name; raise InputError for a drift that cannot be."""
+        """Replace a bare name of the parameter by the dotted name; raise InputError for an impossible drift."""
         if self.parameter not in PARAMETER_GROUPS:
             from sealscope.parameters import declared_names
             from sealscope.parameters.names import resolve_name
