@@ -57,18 +57,20 @@ def choices_of(field: FieldInfo) -> tuple[str, ...]:
 
 
 def with_unit(number: float, unit: str) -> str:
-    """Format `number` with its unit; without one if `unit` is "" or "1"."""
+    """Format `number` with its unit; without a unit if `unit` is "" or "1"."""
     return f"{number:g}" if unit in ("", "1") else f"{number:g} {unit}"
 
 
 def format_broken_rule(error: ValidationError, model: type[BaseModel]) -> str:
-    """Format one of pydantic's errors on `model` as a line such as "SYMBOL must be ..., got ...".
+    """Format one of the errors found by pydantic as a line such as "SYMBOL must be ..., got ...".
 
-    It is the first error, or the error of an unknown name if there is one (`format_error`). If the broken rule is a
-    bound, the parameter's unit follows it.
+    `model`: class of the group of parameters that could not be made. The line states the first error, or that of an
+    unknown name if there is one (`format_error`). If the broken rule is a bound, such as "must be > 0", the parameter's
+    unit follows the bound.
     """
     first = error.errors(include_url=False)[0]
     symbol = ".".join(map(str, first["loc"]))
+    # pydantic states a broken bound under its name, as in {"gt": 0}
     has_bound = symbol in model.model_fields and first.get("ctx", {}).keys() & {"gt", "ge", "lt", "le"}
     unit = unit_of(model.model_fields[symbol]) if has_bound else ""
     return format_error(error, unit="" if unit in ("", "1") else f" {unit}")
@@ -94,6 +96,7 @@ class Part(BaseModel):
         try:
             super().__init__(**values)
         except ValidationError as error:
+            # "value_error": a ValueError of a validator in this package, which checks several parameters
             is_joint_rule = error.errors(include_url=False)[0]["type"] == "value_error"
             raise (PartsDisagreeError if is_joint_rule else InputError)(format_broken_rule(error, type(self))) from None
 
@@ -110,11 +113,12 @@ class Part(BaseModel):
 def iter_fields(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, FieldInfo]]:
     """Yield the dotted name and the declaration of each parameter of a rig or of a group of parameters, in order.
 
-    `model`: class of the rig or group; groups within it are searched, too. `prefix`: beginning of the dotted names.
+    `model`: class of the rig or group; the groups that it contains are searched, too. `prefix`: beginning of the dotted
+    names, "" for a rig.
     """
     for symbol, field in model.model_fields.items():
         annotation = field.annotation
         if isinstance(annotation, type) and issubclass(annotation, BaseModel):
             yield from iter_fields(annotation, f"{prefix}{symbol}.")
-        elif field.json_schema_extra is not None:
+        elif field.json_schema_extra is not None:  # declared by `quantity` or `choice`
             yield prefix + symbol, field

@@ -111,7 +111,7 @@ def _load_file(path: Path, place: str) -> Rig:
 
     `place`: name of the file in messages.
     """
-    head, entries, columns = _read_layers(path, place, ())
+    head, entries, columns = _read_layers(path, place, visited=())
     rig = Rig.from_entries(entries, name=head.get("name", path.stem), title=head.get("title", ""), place=place)
     return rig.with_channel_map(columns) if columns else rig
 
@@ -125,7 +125,7 @@ def save_channel_map(path: str | os.PathLike[str], columns: Mapping[str, str]) -
     if os.fspath(path) in rig_names():
         raise InputError(f"a map is saved beside a rig of your own, a .toml file, got the packaged rig {path}")
     file = Path(path)
-    load_rig(file)
+    load_rig(file)  # raises if this is not a rig's file
     lines = file.read_text(encoding="utf-8-sig").splitlines()
     map_lines = [number for number, line in enumerate(lines) if line.strip() == _MAP]
     if map_lines:  # delete the table up to the heading of the next one
@@ -137,7 +137,7 @@ def save_channel_map(path: str | os.PathLike[str], columns: Mapping[str, str]) -
     table = [f"{json.dumps(channel)} = {json.dumps(column)}" for channel, column in columns.items()]
     with atomic_write(file) as temporary:
         temporary.write_text("\n".join([*lines, "", _MAP, *table]) + "\n", encoding="utf-8")
-        _read_layers(temporary, os.fspath(path), ())  # raises if the result is not a rig's file
+        _read_layers(temporary, os.fspath(path), visited=())  # raises if the result is not a rig's file
 
 
 class _RigFile(NamedTuple):
@@ -155,10 +155,10 @@ class _RigFile(NamedTuple):
 def _read_layers(path: Path, place: str, visited: tuple[Path, ...]) -> _RigFile:
     """Read a rig's file together with the files that it extends.
 
-    Parameters of the file replace those of the files that it extends. So does its table `[map]` as a whole, if it has
-    one. Tables of a commissioned machine's file that do not describe a rig (`MACHINE_TABLES`) are left out. `place`:
-    name of the file in messages; `visited`: the files that extend this one, to detect circles. Raises InputError for a
-    wrong table or key, a circle, or more than `_MAX_LAYERS` files.
+    A parameter in the file replaces the same parameter of an extended file. A table `[map]` in the file replaces the
+    extended file's table as a whole. Tables of a commissioned machine's file that do not describe a rig
+    (`MACHINE_TABLES`) are left out. `place`: name of the file in messages; `visited`: the files that extend this one,
+    to detect circles. Raises InputError for a wrong table or key, a circle, or more than `_MAX_LAYERS` files.
     """
     file = path.resolve()
     if file in visited or len(visited) >= _MAX_LAYERS:

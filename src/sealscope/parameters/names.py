@@ -19,10 +19,11 @@ _OTHER_NAMES = {
 
 
 def resolve_name(name: str, dotted: Sequence[str]) -> str:
-    """Find the dotted name of a parameter by this name or by its end, such as `V_1` or `p_A.noise`, if that is unique.
+    """Find the dotted name of a parameter from a shorter name, such as `V_1` or `p_A.noise`, or from the dotted name.
 
-    `dotted`: the dotted names of all parameters. Raises InputError if no parameter has the name, or if several have.
-    The error for a name that is usual in other programs (`_OTHER_NAMES`) suggests the parameter.
+    A shorter name is the end of exactly one dotted name. `dotted`: the dotted names of all parameters. Raises
+    InputError if no parameter has the name, or if several have it. The error for a name that is usual in other
+    programs (`_OTHER_NAMES`) suggests the parameter.
     """
     if name in dotted:
         return name

@@ -151,8 +151,8 @@ def _read_template(file: str) -> Template:
 def _volume_ratio(base: Rig, area_A: float, area_B: float, stroke: float) -> float:
     """Compute a new cylinder's chamber volume, divided by the chamber volume V of the rig `base`.
 
-    The volumes are those of the larger side at mid-stroke; the new one contains an assumed dead volume. `area_A`,
-    `area_B` [m^2]: piston areas of the new cylinder; `stroke` [m]: its stroke.
+    The volumes are those of the larger side at mid-stroke: for the new cylinder, area times half the stroke plus an
+    assumed dead volume. `area_A`, `area_B` [m^2], `stroke` [m]: piston areas and stroke of the new cylinder.
     """
     return (0.5 + _DEAD_VOLUME_RATIO) * max(area_A, area_B) * stroke / base.cylinder.V
 
@@ -160,8 +160,8 @@ def _volume_ratio(base: Rig, area_A: float, area_B: float, stroke: float) -> flo
 def _cylinder_parameters(base: Rig, area_A: float, area_B: float, stroke: float) -> dict[str, str]:
     """Format the cylinder and friction parameters of a new rig, scaled from the rig `base`, for a template.
 
-    `area_A`, `area_B` [m^2]: piston areas of the new cylinder; `stroke` [m]: its stroke. Returns a mapping from the
-    names in the template to texts.
+    `area_A`, `area_B` [m^2], `stroke` [m]: piston areas and stroke of the new cylinder. Returns a mapping from the
+    names in the template to texts: areas in mm^2, lengths in mm, volumes in cm^3, and other values in SI units.
     """
     volume_ratio = _volume_ratio(base, area_A, area_B, stroke)
     bore_ratio = math.sqrt(max(area_A, area_B) / max(base.cylinder.A_A, base.cylinder.A_B))

@@ -137,8 +137,9 @@ class Rig(Part):
             swept = getattr(cylinder, symbol) * cylinder.L / 2.0
             if swept >= volume:
                 rule = f'must be > {symbol} L/2 = {with_unit(swept, "m^3")} when volumes = "position"'
-                minus_rod = " - V_rod" if volume < V else ""
-                raise ValueError(f"cylinder.V{minus_rod} {rule}, got {with_unit(volume, '') if minus_rod else volume}")
+                # V as it was stated; the difference rounded
+                text, value = ("V - V_rod", with_unit(volume, "")) if volume < V else ("V", str(volume))
+                raise ValueError(f"cylinder.{text} {rule}, got {value}")
         if makeup.G_relief > 0 and makeup.check_valves == "absent":
             raise ValueError(
                 f"makeup.G_relief = {makeup.G_relief:g} m^3/(s Pa): relief valves must have an accumulator to open "
@@ -189,6 +190,7 @@ class Rig(Part):
         thinner at 100 than at 40 deg C. Raises ValueError otherwise.
         """
         line, oil = self.line, self.fluid
+        # `absent`: value of a parameter that describes no valve or filter
         for name, absent in (("open_A", 1.0), ("open_B", 1.0), ("R_A", 0.0), ("R_B", 0.0)):
             if getattr(line, name) != absent and line.orifices == "absent":
                 raise ValueError(
@@ -262,7 +264,7 @@ class Rig(Part):
     def entry(self, name: str) -> ParameterEntry:
         """Return a parameter as it was stated: value, unit, source, and the file or option that states it.
 
-        `name`: its dotted name, or the bare symbol if that is unique.
+        `name`: dotted name of the parameter, or the bare symbol if that is unique.
         """
         return self._stated_entries()[resolve_name(name, declared_names())]
 
@@ -274,7 +276,7 @@ class Rig(Part):
         return not any(self.entry(name).source.startswith(ASSUMED) for name in names)
 
     def as_assumed(self, reason: str) -> Rig:
-        """Return the same rig with all values marked as assumed; `reason` becomes part of their sources."""
+        """Return the same rig with all values marked as assumed; `reason` becomes part of the values' sources."""
         entries = {name: entry._replace(source=f"{ASSUMED} {reason}") for name, entry in self._stated_entries().items()}
         rig = Rig.from_entries(entries, name=self._name, title=self._title, place=self._name)
         return rig.with_channel_map(self.channel_map)
@@ -305,12 +307,13 @@ class Rig(Part):
             if full_name in names_by_parameter:
                 raise InputError(f"{full_name} must be set once, got {names_by_parameter[full_name]} and {name}")
             names_by_parameter[full_name] = name
-            entries[full_name] = ParameterEntry(*_parse_value(full_name, value, source), source, source)
+            new_value, unit = _parse_value(full_name, value, source)
+            entries[full_name] = ParameterEntry(new_value, unit, source=source, place=source)
         rig = Rig.from_entries(entries, name=self._name, title=self._title, place=source)
         return rig.with_channel_map(self.channel_map)
 
     def with_areas(self, A_A: float, A_B: float, *, source: str) -> Rig:
-        """Return the same rig with other piston areas [m^2], and with volumes that suit them.
+        """Return the same rig with other piston areas [m^2], and with volumes that suit these areas.
 
         The areas have the source `source`. If the chamber volumes depend on the position, the dead volume, which the
         piston does not sweep, is scaled with the larger area. The gas of a make-up accumulator is scaled likewise, and
@@ -331,7 +334,8 @@ class Rig(Part):
         stated_values = {"cylinder.A_A": A_A, "cylinder.A_B": A_B}
         sources = dict.fromkeys(scaled_values, assumed) | dict.fromkeys(stated_values, source)
         for full_name, value in {**scaled_values, **stated_values}.items():
-            entries[full_name] = ParameterEntry(*_parse_value(full_name, value, source), sources[full_name], source)
+            new_value, unit = _parse_value(full_name, value, source)
+            entries[full_name] = ParameterEntry(new_value, unit, source=sources[full_name], place=source)
         rig = Rig.from_entries(entries, name=self._name, title=self._title, place=source)
         return rig.with_channel_map(self.channel_map)
 
@@ -473,8 +477,9 @@ def _short_name(full_name: str) -> str:
 def _si_value(full_name: str, field: FieldInfo, entry: ParameterEntry) -> Value:
     """Convert the entry of a parameter to a number in SI, or to the value of a choice.
 
-    Raises InputError for a wrong type or unit, a number that is not finite, an unknown option, or an entry that
-    does not state the `source` of its value.
+    `full_name`: dotted name of the parameter; `field`: declaration of the parameter, with unit and options. Raises
+    InputError for a wrong type or unit, a number that is not finite, an unknown option, or an entry that does not state
+    the `source` of its value.
     """
     short_name, place = _short_name(full_name), entry.place
     if not isinstance(entry.source, str) or not entry.source.strip():
@@ -537,7 +542,8 @@ def flatten_entries(tree: Iterable[tuple[str, Any]], place: str, prefix: str = "
 def _parse_entry(full_name: str, item: Any, place: str) -> ParameterEntry:
     """Check the table of a parameter in a rig's file, and convert it to an entry.
 
-    Raises InputError for an unknown name, a wrong key or a wrong type.
+    `full_name`: dotted name of the parameter; `item`: the table with value, unit and source; `place`: the file, for
+    messages. Raises InputError for an unknown name, a wrong key or a wrong type.
     """
     if full_name not in declared_fields():
         raise InputError(f"{full_name} is not a parameter{suggestion(full_name, declared_names())} ({place})")

@@ -12,7 +12,7 @@ _OVERLAP = "overlap of the edge from {} (< 0: underlap)"
 
 
 def _overlap(edge: str) -> Any:
-    """Declare the parameter for the overlap [m] of a metering edge of the valve; `edge`: its ends, such as "P to A"."""
+    """Declare the parameter for the overlap [m] of a metering edge of the valve; `edge`: name, such as "P to A"."""
     return quantity(_OVERLAP.format(edge), "m", absent=0, ge=-0.1, le=0.1)
 
 

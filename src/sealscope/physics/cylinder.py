@@ -108,5 +108,8 @@ def opposing_force(v: float, A_opp: float, p_opp: float, C_opp: float) -> float:
 
 
 def mechanical_power(p_A: Any, p_B: Any, v: Any, A_A: float, A_B: float) -> Any:
-    """Compute the mechanical power (p_A A_A - p_B A_B) v [W] that the chamber pressures deliver to the piston."""
+    """Compute the mechanical power (p_A A_A - p_B A_B) v [W] that the chamber pressures deliver to the piston.
+
+    `p_A`, `p_B` [Pa]: chamber pressures; `v` [m/s]: velocity; `A_A`, `A_B` [m^2]: piston areas.
+    """
     return (p_A * A_A - p_B * A_B) * v

@@ -56,7 +56,7 @@ def gas_volume(p: float, p_pre: float, V_acc: float, n_acc: float) -> float:
 def accumulator_compliance(p: float, p_pre: float, V_gas: float, n_acc: float) -> float:
     """Compute the compliance [m^3/Pa] of an accumulator: the oil it takes in per unit rise of the line's pressure.
 
-    It is V_gas/(n p_abs), minus the slope of `gas_volume`, and 0 up to the precharge pressure `p_pre` [Pa gauge].
+    It is V_gas/(n p_abs), the negative slope of `gas_volume`, and 0 up to the precharge pressure `p_pre` [Pa gauge].
     `V_gas` [m^3]: volume of the gas at the pressure `p` [Pa gauge]; `n_acc`: polytropic exponent n.
     """
     return select(p > p_pre, V_gas / (n_acc * (max(p, p_pre) + P_ATM)), 0.0)  # type: ignore[no-any-return]
@@ -94,8 +94,12 @@ def pilot_valve_flow(
 ) -> float:
     """Compute the flow [m^3/s] through a pilot-operated check valve, positive in the free direction.
 
-    It is G_check dp times the opening of the valve. `dp` [Pa]: pressure drop in the free direction, inlet minus outlet,
-    which is negative while the pilot holds the valve open against it; `G_check` [m^3/(s Pa)]: conductance of the fully
-    open valve. The other arguments are those of `pilot_opening`.
+    It is G_check dp times the valve's opening 0..1, which `pilot_opening` computes from the other arguments.
+
+    - `dp` [Pa]: inlet minus outlet pressure, negative if oil flows backwards while the pilot holds the valve open.
+    - `dp_pilot` [Pa]: pilot pressure minus inlet pressure.
+    - `G_check` [m^3/(s Pa)]: conductance of the fully open valve.
+    - `p_crack`, `p_open` [Pa]: pressure at which the valve begins to open, and further pressure until it is fully open.
+    - `k_pilot`: pilot ratio, the factor on `dp_pilot`.
     """
     return G_check * dp * pilot_opening(dp, dp_pilot, p_crack, k_pilot, p_open)

@@ -29,7 +29,7 @@ def effective_bulk_modulus(p: float, K_oil: float, air: float, n_air: float) -> 
     exactly K_oil.
 
     Source: H. E. Merritt, Hydraulic Control Systems, 1967, effective bulk modulus (1/K is the sum of the compliances of
-    liquid and gas); in this form the hydraulic fluid of the Simscape library, from which the thesis took its friction.
+    liquid and gas). The Simscape library, from which the thesis took its friction law, has the same formula.
     """
     if not any_lane(air > 0.0):
         return K_oil + 0.0 * p  # of p's type: a number, or a vector of numbers (lanes)
@@ -66,18 +66,21 @@ def mixture_density_ratio(p: float, p_0: float, K_oil: float, air: float, n_air:
     - the air contributes ln((1 + r_0)/(1 + r)) exactly, where r and r_0 are the ratios of the volumes of air and oil at
       p and p_0 (`air_volume_ratio`);
     - the liquid, of bulk modulus `K_oil` [Pa], contributes the integral of dp/(K_oil (1 + r)), which is computed by
-      Simpson's rule with an error far below r dp/K_oil.
+      Simpson's rule with an error far below r (p - p_0)/K_oil.
 
     `air`: the ratio at atmospheric pressure; `n_air`: polytropic exponent of the air.
     """
     r, r_0 = air_volume_ratio(p, air, n_air), air_volume_ratio(p_0, air, n_air)
     r_m = air_volume_ratio(0.5 * (p + p_0), air, n_air)
+    # mean of 1/(1 + r) between both pressures, by Simpson's rule
     mean_liquid_fraction = (1.0 / (1.0 + r) + 4.0 / (1.0 + r_m) + 1.0 / (1.0 + r_0)) / 6.0
     return (1.0 + r_0) / (1.0 + r) * exponential((p - p_0) * mean_liquid_fraction / K_oil)  # type: ignore[no-any-return]
 
 
 def kinematic_viscosity(T: NDArray[np.float64], nu_40: float, nu_100: float) -> NDArray[np.float64]:
-    """Compute an oil's kinematic viscosity [m^2/s] at the temperatures T [K] from its values at 40 and 100 deg C.
+    """Compute an oil's kinematic viscosity [m^2/s] at the temperatures T [K].
+
+    `nu_40`, `nu_100` [m^2/s]: the oil's kinematic viscosity at 40 and 100 deg C.
 
     Source: Walther's law, ASTM D341: log log(nu + 0.7) = A - B log T, nu in mm^2/s (for nu above 2 mm^2/s).
     """
@@ -87,9 +90,10 @@ def kinematic_viscosity(T: NDArray[np.float64], nu_40: float, nu_100: float) -> 
 
 
 def thermal_density_ratio(T: NDArray[np.float64], T_0: float, alpha: float) -> NDArray[np.float64]:
-    """Compute the density ratio rho(T)/rho(T_0) = 1 - alpha (T - T_0) of an oil; T, T_0 [K], expansion alpha [1/K].
+    """Compute the density ratio rho(T)/rho(T_0) = 1 - alpha (T - T_0) of an oil at the temperatures T and T_0 [K].
 
-    Source: Merritt, Hydraulic Control Systems, 1967, section 2.2, density of petroleum fluids.
+    `alpha` [1/K]: thermal expansion. Source: Merritt, Hydraulic Control Systems, 1967, section 2.2, density of
+    petroleum fluids.
     """
     return np.asarray(1.0 - alpha * (T - T_0))
 

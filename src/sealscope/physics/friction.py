@@ -38,9 +38,10 @@ def karnopp_friction(
 ) -> float:
     """Compute Karnopp's friction force [N]: the piston sticks at velocities |v| < v_th, and slides otherwise.
 
-    While the piston sticks, friction balances the sum of all other forces on it, `applied` [N], up to `breakaway` [N]
-    (see `stuck_velocity`). While it slides at the velocity `v` [m/s], friction is the force of eq. (4.21), F_C (1 +
-    (K_brk - 1) exp(-C_c |v|)) sign(v) + F_v v, with the parameters of `stribeck_friction`.
+    While the piston sticks, friction balances `applied` [N], the sum of all other forces, up to `breakaway` [N]. While
+    the piston slides at the velocity `v` [m/s], friction is F_C (1 + (K_brk - 1) exp(-C_c |v|)) sign(v) + F_v v, eq.
+    (4.21). `F_C` [N]: Coulomb force; `K_brk`: breakaway force over Coulomb force; `C_c` [s/m]: transition coefficient;
+    `F_v` [N s/m]: viscous coefficient.
 
     Source: D. Karnopp, Computer simulation of stick-slip friction in mechanical dynamic systems, ASME Journal of
     Dynamic Systems, Measurement and Control 107 (1985) 100-103.
@@ -53,8 +54,8 @@ def karnopp_friction(
 
 @contracted
 def stuck_velocity(v: float, v_th: float) -> float:
-    """Compute the velocity [m/s] of a piston with Karnopp's friction: v, or 0 while it sticks (|v| < v_th)."""
-    return select(abs(v) < v_th, 0.0 * v, v)  # type: ignore[no-any-return]
+    """Compute the velocity [m/s] of a piston with Karnopp's friction: v, or 0 while the piston sticks, |v| < v_th."""
+    return select(abs(v) < v_th, 0.0 * v, v)  # type: ignore[no-any-return]  # 0.0 * v: a zero of v's type
 
 
 @contracted
@@ -80,7 +81,8 @@ def lugre_friction(v: float, z: float, dz: float, sigma_0: float, sigma_1: float
     `F_v` [N s/m]: viscous coefficient. The damping decays at speeds above `v_th` [m/s]; otherwise the force could drive
     the motion.
 
-    Source: as `bristle_rate`, eq. (3); the decay: H. Olsson, Control Systems with Friction, Lund 1996, section 5.
+    Source: eq. (3) of the paper cited in `bristle_rate`; the decay: H. Olsson, Control Systems with Friction, Lund
+    1996, section 5.
     """
     relative_v = v / v_th
     return sigma_0 * z + sigma_1 * exponential(-relative_v * relative_v) * dz + F_v * v  # type: ignore[no-any-return]
@@ -107,4 +109,5 @@ def stribeck_friction(
         stribeck = 1.0 + (K_brk - 1.0) * exponential(-C_c * speed)
         slow = v * F_C * (stribeck + F_v * v_th) / v_th
         return select(speed > v_th, math.copysign(F_C * stribeck, v) + F_v * v, slow)  # type: ignore[no-any-return]
-    return stribeck_force(max(speed, v_th), F_C, K_brk, C_c) * min(max(v / v_th, -1.0), 1.0) + F_v * v
+    smooth_sign = min(max(v / v_th, -1.0), 1.0)  # sign(v) for |v| > v_th, so that one formula serves both cases
+    return stribeck_force(max(speed, v_th), F_C, K_brk, C_c) * smooth_sign + F_v * v

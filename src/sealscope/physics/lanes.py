@@ -38,7 +38,8 @@ class Lanes(types.Type):  # type: ignore[misc]
     def can_convert_from(self, typingctx: Any, source: Any) -> Any:
         """Tell numba that any single number can be converted to lanes, a vector of equal numbers.
 
-        Returns None, which forbids the conversion, if `source` is not the type of a number.
+        `source`: type of the value to convert. Returns None, which forbids the conversion, if it is not the type of a
+        number. numba requires the argument `typingctx`, which is not used.
         """
         from numba.core.typeconv import Conversion
 
@@ -64,12 +65,16 @@ def _vector_type(lanes: Lanes) -> Any:
 
 @register_model(Lanes)
 class _LanesModel(models.PrimitiveModel):  # type: ignore[misc]
+    """The representation of lanes in machine code: one LLVM vector of numbers."""
+
     def __init__(self, manager: Any, lanes: Any) -> None:
         super().__init__(manager, lanes, _vector_type(lanes))
 
 
 @register_model(Mask)
 class _MaskModel(models.PrimitiveModel):  # type: ignore[misc]
+    """The representation of a mask in machine code: one LLVM vector of single bits."""
+
     def __init__(self, manager: Any, mask: Any) -> None:
         super().__init__(manager, mask, ir.VectorType(ir.IntType(1), mask.lanes.width))
 
@@ -234,7 +239,7 @@ def register_lowering(function: Any, arity: int, infer_type: Any, build: Any) ->
 def select(condition: Any, yes: Any, no: Any) -> Any:
     """Choose `yes` if the condition is true, else `no`, separately in each lane of a vector.
 
-    Both values are computed in any case.
+    Both values are computed, whatever the condition.
     """
     return yes if condition else no
 
@@ -343,7 +348,10 @@ def _is_array_of_lanes(array: Any) -> bool:
 
 
 def _row_address(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
-    """Build the LLVM instructions that compute the address of a row of an array, as a pointer to a vector (lanes)."""
+    """Build the LLVM instructions that compute the address of a row of an array, as a pointer to a vector (lanes).
+
+    `arg_types`, `values`: types and values of a call's arguments, of which the first two are the array and the row.
+    """
     data = context.make_array(arg_types[0])(context, builder, values[0]).data
     row = context.cast(builder, values[1], arg_types[1], types.intp)
     lanes = _LANES_OF_DTYPE[arg_types[0].dtype]

@@ -19,8 +19,8 @@ from sealscope.physics.restrictors import orifice_flow
 def pump_flow(omega: float, dp: float, q_b: float, G_pump: float) -> float:
     """Compute the pump's delivery at port 1, Q_1 = q_b omega/(2 pi) - G_pump (p_1 - p_2) [m^3/s], eq. (4.1).
 
-    `omega` [rad/s], `dp` = p_1 - p_2 [Pa], displacement `q_b` [m^3/rev]; internal leakage `G_pump` [m^3/(s Pa)] is 0 in
-    the thesis.
+    `omega` [rad/s]: speed; `dp` = p_1 - p_2 [Pa]: pressure difference of the ports; `q_b` [m^3/rev]: displacement;
+    `G_pump` [m^3/(s Pa)]: conductance of the internal leakage, 0 in the thesis.
     """
     return q_b / (2.0 * math.pi) * omega - G_pump * dp
 
@@ -39,7 +39,8 @@ def loss_coefficients(q_b: float, C_st: float, C_h: float, rho: float) -> tuple[
     """Compute the coefficients (c_slip, k_h) of the pump's turbulent slip and of its hydrodynamic torque.
 
     c_slip = C_st D^(2/3) sqrt(2/rho) [m^3/(s Pa^0.5)] and k_h = C_h rho D^(5/3)/2 [N m s^2], with the displacement
-    per radian D = q_b/(2 pi) [m^3/rad] and the oil's density `rho` [kg/m^3] (Schlosser 1961).
+    per radian D = q_b/(2 pi) [m^3/rad] and the oil's density `rho` [kg/m^3] (Schlosser 1961). `q_b` [m^3/rev]:
+    displacement; `C_st`, `C_h`: dimensionless coefficients.
     """
     D = q_b / (2.0 * math.pi)
     return C_st * D ** (2.0 / 3.0) * math.sqrt(2.0 / rho), 0.5 * C_h * rho * D ** (5.0 / 3.0)
@@ -62,7 +63,7 @@ def friction_torque(omega: float, dp: float, q_b: float, T_f: float, C_f: float,
     T = sat(omega/omega_f) (T_f + C_f D |dp|) + k_h omega |omega|, with the displacement D = q_b/(2 pi) [m^3/rad]:
 
     - `T_f` [N m]: constant friction.
-    - `C_f`: coefficient of friction that grows with the pressure difference `dp` [Pa] of the ports.
+    - `C_f`: coefficient (without unit) of friction that grows with the pressure difference `dp` [Pa] of the ports.
     - `k_h` [N m s^2]: coefficient of the hydrodynamic torque.
 
     sat limits its argument to +-1, so that T is continuous at standstill: below the speed `omega_f` [rad/s] the

@@ -48,8 +48,8 @@ def orifice_flow(dp: float, c: float, dp_0: float) -> float:
     """Compute the flow [m^3/s] through an orifice under the pressure difference `dp` [Pa].
 
     Q = c dp / (dp^2 + dp_0^2)^(1/4), with the flow coefficient `c` [m^3/(s Pa^0.5)]. This is the square-root law of
-    eqs. (4.9)-(4.12), made smooth at dp = 0 where its slope is infinite: turbulent flow c sign(dp) sqrt|dp| for |dp|
-    >> dp_0, laminar flow c dp / sqrt(dp_0) for |dp| << dp_0.
+    eqs. (4.9)-(4.12), made smooth at dp = 0 where its slope is infinite. Around `dp_0` [Pa] the flow changes from
+    laminar, c dp / sqrt(dp_0) for |dp| << dp_0, to turbulent, c sign(dp) sqrt|dp| for |dp| >> dp_0.
     """
     return c * dp / math.sqrt(math.sqrt(dp * dp + dp_0 * dp_0))
 
@@ -68,11 +68,12 @@ def _solve_scaled_flow(b: float, a: float) -> float:
     """Solve w r(w) + a w = b for the scaled flow w = Q/(c sqrt(dp_0)) >= 0 of an orifice, with a >= 0 and b >= 0.
 
     w r(w) with r = sqrt((w^2 + sqrt(w^4 + 4))/2) >= 1 is the orifice's pressure difference over dp_0: `orifice_flow`
-    inverted. The left side of the equation rises and is convex, so the root is unique. Halley's method finds it to a
-    relative error of 1e-12, in a single iteration if a >> 1, where r hardly matters.
+    inverted. a w is a pressure difference that grows linearly with the flow, over dp_0; b is the sum of both. The left
+    side of the equation rises and is convex, so the root is unique. Halley's method finds the root to a relative error
+    of 1e-12, in a single iteration if a >> 1, where r hardly matters.
     """
-    w = b / (a + 1.0)
-    w = b / (a + select(w < 2.0, 1.0 + 0.25 * w * w, w))  # r(w) approximated for small and large w
+    w = b / (a + 1.0)  # first guess, with r = 1
+    w = b / (a + select(w < 2.0, 1.0 + 0.25 * w * w, w))  # better, with r(w) approximated for small and for large w
     for _ in range(50):
         square = w * w
         r = math.sqrt(0.5 * (square + math.sqrt(square * square + 4.0)))
@@ -95,9 +96,9 @@ def implicit_orifice_flow(total: float, g: float, c_forward: float, c_reverse: f
     """Compute the flow Q [m^3/s] of a one-way throttle at the end of an implicit stage of the solver.
 
     Q solves d + g Q(d) = total, where Q(d) is the flow of the throttle (`orifice_flow`) under the pressure difference d
-    [Pa] at the end of the stage. `total` [Pa]: what d would be if nothing flowed in the stage; `g` >= 0 [Pa s/m^3]:
-    fall of d over the stage per unit flow. The root is unique and has the sign of `total`. `c_forward`, `c_reverse`,
-    `dp_0`: as in `one_way_coefficient` and `orifice_flow`.
+    [Pa] at the end of the stage. `total` [Pa]: d if nothing flowed in the stage; `g` >= 0 [Pa s/m^3]: fall of d over
+    the stage per unit flow. The root is unique and has the sign of `total`. `c_forward`, `c_reverse`
+    [m^3/(s Pa^0.5)]: flow coefficients for d > 0 and d < 0; `dp_0` [Pa]: difference below which the flow is laminar.
     """
     c = one_way_coefficient(total, c_forward, c_reverse)
     sqrt_dp_0 = math.sqrt(dp_0)
@@ -110,8 +111,8 @@ def clogged_resistance(R: float, V: float, k: float, n: float) -> float:
     """Compute the resistance [Pa s/m^3] of a filter through which the oil volume `V` [m^3] has passed.
 
     The blocking laws of filtration at a constant dirt concentration, dR_V/dV = k R (R_V/R)^n, give
-    R_V = R (1 + (1 - n) k V)^(1/(1 - n)): `R` is the resistance of the new filter, `k` [1/m^3] its relative rise per
-    volume at first, `n` the law. R_V/R is
+    R_V = R (1 + (1 - n) k V)^(1/(1 - n)): `R` is the resistance of the new filter, `k` [1/m^3] the relative rise of the
+    resistance per volume at first, and `n` selects the law. R_V/R is
 
     - 1 + k V for cake filtration (n = 0) and exp(k V) for intermediate blocking (n = 1),
     - (1 - k V/2)^-2 for standard (n = 1.5) and 1/(1 - k V) for complete blocking (n = 2).
@@ -132,10 +133,13 @@ def filtered_flow(
     """Compute the flow Q [m^3/s] of a throttle and a filter in series at the end of an implicit stage of the solver.
 
     The filter has the resistance `R` [Pa s/m^3], and a bypass valve of conductance `G_bypass` [m^3/(s Pa)] that opens
-    at the filter's pressure drop `p_bypass` [Pa]. Q solves d + g Q + dp_f = total, with d, `g`, `total` and the
-    throttle's coefficients as in `implicit_orifice_flow`. The filter's drop dp_f is R Q while the bypass valve is shut;
-    while it is open, Q = dp_f/R + G_bypass (dp_f - p_bypass). As dp_f is linear in Q in both cases,
-    `implicit_orifice_flow` solves the equation for either case.
+    at the filter's pressure drop `p_bypass` [Pa]. Q solves d + dp_f + g Q = total, with the pressure drops d of the
+    throttle and dp_f of the filter. `total` [Pa]: sum of both drops if nothing flowed in the stage; `g` [Pa s/m^3]:
+    fall of this sum over the stage per unit flow; `c_forward`, `c_reverse`, `dp_0`: coefficients of the throttle as in
+    `implicit_orifice_flow`.
+
+    dp_f is R Q while the bypass valve is shut; while it is open, Q = dp_f/R + G_bypass (dp_f - p_bypass). As dp_f is
+    linear in Q in both cases, `implicit_orifice_flow` solves the equation for either case.
     """
     shut_flow = implicit_orifice_flow(total, g + R, c_forward, c_reverse, dp_0)
     filter_fraction = 1.0 / (1.0 + G_bypass * R)  # of additional flow while the valve is open
@@ -148,8 +152,8 @@ def filtered_flow(
 def flow_through_filter(Q: float, R: float, p_bypass: float, G_bypass: float) -> float:
     """Compute the part of a flow [m^3/s, >= 0] that passes a filter rather than its bypass valve.
 
-    It is the whole flow while the valve is shut, which is the smaller of the two values below.
     `Q` [m^3/s]: flow through filter and bypass together, of either sign; `R` [Pa s/m^3]: resistance of the filter.
     The bypass valve opens at the pressure drop `p_bypass` [Pa] and has the conductance `G_bypass` [m^3/(s Pa)].
     """
-    return min(abs(Q), (abs(Q) + G_bypass * p_bypass) / (1.0 + G_bypass * R))
+    part_with_open_valve = (abs(Q) + G_bypass * p_bypass) / (1.0 + G_bypass * R)
+    return min(abs(Q), part_with_open_valve)  # the valve is shut while the whole flow is the smaller one

@@ -157,7 +157,8 @@ def derived_numbers(v: RigValues, exponent: float, literal: bool) -> tuple[float
     """Compute the numbers that follow from a rig's parameters, in the order of `DERIVED`.
 
     They are the flow coefficients of the throttles, the oil volumes of both sides at mid-stroke, and the coefficients
-    of the pump's losses. `exponent`, `literal`: see `throttle_flow_coefficients`.
+    of the pump's losses. `v`: the rig's parameters; `exponent`, `literal`: how the rig reads the thesis's equations of
+    its throttles (`throttle_readings`).
     """
     c_A_in, c_A_out, c_B_in, c_B_out = throttle_flow_coefficients(v, exponent, literal)
     V_A, V_B = cylinder.mid_stroke_volumes(v)
@@ -262,7 +263,7 @@ def limit_state(y: State, p: RigNumbers) -> State:
       the return's pressure.
     - Other states that no law of the rig changes are set to 0, so that the compiler removes them.
 
-    Returns the new state.
+    Returns the new state. In `p`, an optional law such as `valved` is an empty tuple if the rig does not have it.
     """
     V_up = y[MADE_UP] if len(p.open_circuit) > 0 else 0.0
     bristle = y[BRISTLE] if len(p.bristled) > 0 else 0.0
@@ -272,7 +273,7 @@ def limit_state(y: State, p: RigNumbers) -> State:
     if len(p.valved) > 0:
         p_1, p_2 = y[P_1], p.p_return
         x_s, v_s = valve.spool_within_stroke(y[SPOOL], y[SPOOL_SPEED], p.x_max, p.v_max)
-    if len(p.clogging) > 0:
+    if len(p.clogging) > 0:  # in a rig without a spool, these two states are the oil that has passed each filter
         x_s, v_s = y[PASSED_A], y[PASSED_B]
     return y[0], current, y[2], y[3], y[4], y[5], y[6], y[7], p_1, p_2, V_up, bristle, x_s, v_s
 
@@ -282,12 +283,12 @@ def vapour_floor(q: float, p: RigNumbers) -> float:
     """Compute the pressure [Pa] of an oil volume from its pressure state q [Pa]: q, but at least the vapour pressure.
 
     Below the vapour pressure `p_vap` [Pa absolute] the oil boils. The state q may fall further, so that mass balances
-    hold: with the density rho(q) that follows from the oil's bulk modulus, rho(q) V is the mass of oil in the volume V,
-    of which V (1 - rho(q)/rho(p_vap)) is vapour.
+    hold: rho(q) V is the mass of oil in the volume V, with the density rho(q) that follows from the oil's bulk modulus.
+    Of the volume V, V (1 - rho(q)/rho(p_vap)) is vapour.
 
     Source: E. B. Wylie, V. L. Streeter, Fluid Transients, 1978, chapter 8: vapour cavities at constant pressure.
     """
-    if len(p.boiling) == 0:
+    if len(p.boiling) == 0:  # an empty tuple: the rig's oil does not boil
         return q
     return max(q, p.p_vap - P_ATM)  # type: ignore[no-any-return]
 
@@ -305,16 +306,19 @@ def speed_error(y: State, u: float, p: RigNumbers) -> float:
     The command `u` [V] sets the speed omega_per_volt u. In a valve-controlled rig, where the motor drives the pump of
     the supply, the set speed is `omega_P`.
     """
-    if len(p.valved) > 0:
+    if len(p.valved) > 0:  # an empty tuple in a rig without a servo valve
         return p.omega_P - y[OMEGA]  # type: ignore[no-any-return]
     return p.omega_per_volt * u - y[OMEGA]  # type: ignore[no-any-return]
 
 
 @contracted
 def pump_difference(y: State, p: RigNumbers) -> float:
-    """Compute the pressure difference across the pump [Pa], port 1 minus port 2."""
+    """Compute the pressure difference across the pump [Pa], port 1 minus port 2.
+
+    In a rig with neither lines nor servo valve, the ports are connected to the chambers A and B directly.
+    """
     p_A, p_B, p_1, p_2 = pressures_of(y, p)
-    if len(p.throttled) > 0 or len(p.valved) > 0:
+    if len(p.throttled) > 0 or len(p.valved) > 0:  # empty tuples in a rig without lines and servo valve
         return p_1 - p_2
     return p_A - p_B
 
@@ -325,7 +329,8 @@ def friction_force(y: State, applied: float, p: RigNumbers) -> tuple[float, floa
 
     The force is that of eqs. (4.20)-(4.22), unless the rig has Karnopp's or LuGre's law instead. The rate is 0 in a rig
     without LuGre's law. The friction of a motion along -x is multiplied by the rig's parameter `backward`. `applied`
-    [N]: sum of all other forces on the piston.
+    [N]: sum of all other forces on the piston. In `p`, an optional law such as `sticking` (Karnopp's) is an empty tuple
+    if the rig does not have it.
     """
     v = y[VELOCITY]
     F_C = friction.coulomb_friction(
@@ -350,7 +355,7 @@ def filter_resistances(y: State, p: RigNumbers) -> tuple[float, float]:
 
     The resistance of a clogging filter grows with the oil volume that has passed it (`clogged_resistance`).
     """
-    if len(p.clogging) == 0:
+    if len(p.clogging) == 0:  # an empty tuple: the rig's filters do not clog
         return p.R_A, p.R_B
     R_A = restrictors.clogged_resistance(p.R_A, y[PASSED_A], p.k_clog_A, p.n_clog)
     return R_A, restrictors.clogged_resistance(p.R_B, y[PASSED_B], p.k_clog_B, p.n_clog)
@@ -368,14 +373,15 @@ def implicit_flows(
     with the throttle has the additional drop R Q, so that its resistance R is added to g. With a bypass valve of the
     filter, `filtered_flow` solves the equation.
     """
-    if len(p.filtered) > 0:
+    if len(p.filtered) > 0:  # an empty tuple in a rig without filters
         R_A, R_B = filter_resistances(y, p)
-        if len(p.bypassed) > 0:
+        if len(p.bypassed) > 0:  # an empty tuple in a rig whose filters have no bypass valve
             Q_A = restrictors.filtered_flow(total_A, g_A, R_A, p.p_bypass, p.G_bypass, p.c_A_in, p.c_A_out, p.dp_0)
             return Q_A, restrictors.filtered_flow(
                 total_B, g_B, R_B, p.p_bypass, p.G_bypass, p.c_B_out, p.c_B_in, p.dp_0
             )
         g_A, g_B = g_A + R_A, g_B + R_B
+    # Q_A > 0 flows into the cylinder, Q_B > 0 out of it
     Q_A = restrictors.implicit_orifice_flow(total_A, g_A, p.c_A_in, p.c_A_out, p.dp_0)
     return Q_A, restrictors.implicit_orifice_flow(total_B, g_B, p.c_B_out, p.c_B_in, p.dp_0)
 
@@ -384,7 +390,7 @@ def implicit_flows(
 def filter_flows(y: State, p: RigNumbers) -> tuple[float, float]:
     """Compute the flows [m^3/s, >= 0] through the filters of lines A and B, without the flow in their bypasses."""
     Q_A, Q_B = throttle_flows(y, p)
-    if len(p.bypassed) == 0:
+    if len(p.bypassed) == 0:  # an empty tuple: the filters have no bypass valve
         return abs(Q_A), abs(Q_B)
     R_A, R_B = filter_resistances(y, p)
     filter_flow_A = restrictors.flow_through_filter(Q_A, R_A, p.p_bypass, p.G_bypass)
@@ -400,8 +406,9 @@ def throttle_flows(y: State, p: RigNumbers) -> tuple[float, float]:
     """
     p_A, p_B, p_1, p_2 = pressures_of(y, p)
     dp_A, dp_B = p_1 - p_A, p_B - p_2
-    if len(p.filtered) > 0:
+    if len(p.filtered) > 0:  # an empty tuple in a rig without filters
         return implicit_flows(dp_A, dp_B, 0.0, 0.0, y, p)  # g = 0: the pressures are those of `y`
+    # Q_A > 0 flows into the cylinder, Q_B > 0 out of it
     Q_A = restrictors.orifice_flow(dp_A, restrictors.one_way_coefficient(dp_A, p.c_A_in, p.c_A_out), p.dp_0)
     return Q_A, restrictors.orifice_flow(dp_B, restrictors.one_way_coefficient(dp_B, p.c_B_out, p.c_B_in), p.dp_0)
 
@@ -415,7 +422,7 @@ def volumes_at(x: float, p: RigNumbers) -> tuple[float, float]:
 @contracted
 def bulk_modulus(pressure: float, p: RigNumbers) -> float:
     """Compute the bulk modulus [Pa] of the oil, with the air in it if the rig has any, at `pressure` [Pa gauge]."""
-    if len(p.aerated) == 0:
+    if len(p.aerated) == 0:  # an empty tuple: no air in the oil
         return p.K_oil  # type: ignore[no-any-return]
     return effective_bulk_modulus(vapour_floor(pressure, p), p.K_oil, p.air, p.n_air)
 
@@ -424,18 +431,18 @@ def bulk_modulus(pressure: float, p: RigNumbers) -> float:
 def density_ratio(pressure: float, reference: float, p: RigNumbers) -> float:
     """Compute the ratio of the oil's densities at two pressure states, `pressure` and `reference` [Pa gauge].
 
-    Air in the oil and boiling are taken into account if the rig has them. The ratio also holds for states below the
-    vapour pressure, so that mass is conserved (`vapour_floor`).
+    A pressure state may fall below the vapour pressure, where the oil boils, so that mass is conserved
+    (`vapour_floor`). Below the vapour pressure the density falls by the constant bulk modulus at the vapour pressure.
     """
-    if len(p.aerated) == 0:  # no air in the oil
+    if len(p.aerated) == 0:  # an empty tuple, no air in the oil: one bulk modulus, whether the oil boils or not
         return oil_density_ratio(pressure - reference, p.K_oil)
-    p_a, p_b = vapour_floor(pressure, p), vapour_floor(reference, p)
-    ratio = mixture_density_ratio(p_a, p_b, p.K_oil, p.air, p.n_air)
+    liquid_pressure, liquid_reference = vapour_floor(pressure, p), vapour_floor(reference, p)
+    ratio = mixture_density_ratio(liquid_pressure, liquid_reference, p.K_oil, p.air, p.n_air)
     if len(p.boiling) == 0:
         return ratio
     boiling_modulus = effective_bulk_modulus(p.p_vap - P_ATM, p.K_oil, p.air, p.n_air)
-    # below the vapour pressure, a pressure of the simulation stands for a density by this modulus (`vapour_floor`)
-    return ratio * oil_density_ratio((pressure - p_a) - (reference - p_b), boiling_modulus)
+    # the parts of both states below the vapour pressure
+    return ratio * oil_density_ratio((pressure - liquid_pressure) - (reference - liquid_reference), boiling_modulus)
 
 
 @contracted
@@ -446,7 +453,7 @@ def flows_at_both_ends(Q: float, source: float, sink: float, p: RigNumbers) -> t
     carries the same mass, rho_up Q_up = rho_down Q_down, with the oil's densities rho at the pressures `source` and
     `sink` [Pa]. In a rig that balances volumes instead of masses both flows are Q.
     """
-    if len(p.conserving) == 0:
+    if len(p.conserving) == 0:  # an empty tuple: the rig balances volumes
         return Q, Q
     forward = Q > 0.0
     ratio = density_ratio(select(forward, source, sink), select(forward, sink, source), p)
@@ -472,12 +479,12 @@ def throttle_rates(y: State, Q_A: float, Q_B: float, p: RigNumbers) -> Pressures
 
 
 @contracted
-def supply_pressure(y: State, p: RigNumbers) -> float:
+def makeup_pressure(y: State, p: RigNumbers) -> float:
     """Compute the pressure [Pa gauge] of the make-up's accumulator, which replaces oil that the circuit has lost.
 
     The state `y` contains the oil volume V_up that the accumulator has delivered.
     """
-    if len(p.polytropic) > 0:
+    if len(p.polytropic) > 0:  # an empty tuple if the gas is isothermal
         return external.polytropic_pressure(y[MADE_UP], p.p_charge, p.V_gas, p.n_gas)
     return external.accumulator_pressure(y[MADE_UP], p.p_charge, p.V_gas)
 
@@ -487,23 +494,23 @@ def make_up_flows(y: State, p: RigNumbers) -> tuple[float, float]:
     """Compute the flows [m^3/s] from the make-up's accumulator to sides 1 (A) and 2 (B), through its valves.
 
     The valves are check valves and, for the opposite direction, relief valves. Sides 1 and 2 are the pump's ports,
-    or the chambers A and B in a rig without lines. The pressure on one side is the pilot pressure of the other side's
-    check valve, if these are pilot-operated. Without a make-up the flows are 0.
+    or the chambers A and B in a rig without lines. If the check valves are pilot-operated, the pilot pressure of each
+    is the pressure on the opposite side. Without a make-up the flows are 0.
     """
-    supply = supply_pressure(y, p)
+    p_up = makeup_pressure(y, p)
     p_A, p_B, p_1, p_2 = pressures_of(y, p)
-    if len(p.throttled) == 0:
+    if len(p.throttled) == 0:  # an optional law is an empty tuple in a rig without it, here without lines
         p_1, p_2 = p_A, p_B
     if len(p.piloted) > 0:
-        makeup_1 = external.pilot_valve_flow(supply - p_1, p_2 - supply, p.p_crack, p.G_check, p.k_pilot, p.p_open)
-        makeup_2 = external.pilot_valve_flow(supply - p_2, p_1 - supply, p.p_crack, p.G_check, p.k_pilot, p.p_open)
+        makeup_1 = external.pilot_valve_flow(p_up - p_1, p_2 - p_up, p.p_crack, p.G_check, p.k_pilot, p.p_open)
+        makeup_2 = external.pilot_valve_flow(p_up - p_2, p_1 - p_up, p.p_crack, p.G_check, p.k_pilot, p.p_open)
     else:
         G_check = p.G_check if p.made_up else 0.0 * p.G_check  # a zero of G_check's type: a number or lanes
-        makeup_1 = external.check_valve_flow(supply - p_1, p.p_crack, G_check)
-        makeup_2 = external.check_valve_flow(supply - p_2, p.p_crack, G_check)
+        makeup_1 = external.check_valve_flow(p_up - p_1, p.p_crack, G_check)
+        makeup_2 = external.check_valve_flow(p_up - p_2, p.p_crack, G_check)
     if len(p.relieved) > 0:
-        makeup_1 = makeup_1 - external.check_valve_flow(p_1 - supply, p.p_relief, p.G_relief)
-        makeup_2 = makeup_2 - external.check_valve_flow(p_2 - supply, p.p_relief, p.G_relief)
+        makeup_1 = makeup_1 - external.check_valve_flow(p_1 - p_up, p.p_relief, p.G_relief)
+        makeup_2 = makeup_2 - external.check_valve_flow(p_2 - p_up, p.p_relief, p.G_relief)
     return makeup_1, makeup_2
 
 
@@ -517,11 +524,12 @@ def external_pressure_rates(y: State, p: RigNumbers) -> tuple[Pressures, float]:
     K_A, K_B = bulk_modulus(y[P_A], p), bulk_modulus(y[P_B], p)
     makeup_1, makeup_2 = make_up_flows(y, p)
     out_A, out_B = external.external_leakage(y[P_A], p.G_ext_A), external.external_leakage(y[P_B], p.G_ext_B)
-    supply = supply_pressure(y, p)
-    drawn_1, makeup_1 = flows_at_both_ends(makeup_1, supply, y[P_1] if len(p.throttled) > 0 else y[P_A], p)
-    drawn_2, makeup_2 = flows_at_both_ends(makeup_2, supply, y[P_2] if len(p.throttled) > 0 else y[P_B], p)
+    p_up = makeup_pressure(y, p)
+    # drawn from the accumulator at its pressure, and entering the circuit at the pressure of side 1 or 2
+    drawn_1, makeup_1 = flows_at_both_ends(makeup_1, p_up, y[P_1] if len(p.throttled) > 0 else y[P_A], p)
+    drawn_2, makeup_2 = flows_at_both_ends(makeup_2, p_up, y[P_2] if len(p.throttled) > 0 else y[P_B], p)
     fed = drawn_1 + drawn_2
-    if len(p.throttled) > 0:
+    if len(p.throttled) > 0:  # an optional law is an empty tuple in a rig without it, here without lines
         rate_1 = cylinder.pressure_rate(makeup_1, p.V_1, bulk_modulus(y[P_1], p))
         rate_2 = cylinder.pressure_rate(makeup_2, p.V_2, bulk_modulus(y[P_2], p))
         return (-cylinder.pressure_rate(out_A, V_A, K_A), -cylinder.pressure_rate(out_B, V_B, K_B), rate_1, rate_2), fed
@@ -534,9 +542,10 @@ def external_pressure_rates(y: State, p: RigNumbers) -> tuple[Pressures, float]:
 
 @contracted
 def valve_flows(y: State, p: RigNumbers) -> tuple[float, float, float, float]:
-    """Compute a servo valve's flows [m^3/s] from supply P to A, from A to return T, from P to B, and from B to T.
+    """Compute a servo valve's flows [m^3/s] through its edges: from P to A, from A to T, from P to B, and from B to T.
 
-    A spool position x_s > 0 opens the edges P-A and B-T, x_s < 0 the other two; A and B are the chambers.
+    P is the supply and T the return; A and B are the chambers. A spool position x_s > 0 opens the edges P-A and B-T,
+    x_s < 0 opens A-T and P-B.
     """
     x_s, Q_N, dp_N, x_max, dp_lam = y[SPOOL], p.Q_N, p.dp_N, p.x_max, p.dp_lam
     p_A, p_B, p_P, p_T = pressures_of(y, p)
@@ -579,7 +588,7 @@ def valve_rates(y: State, Q_1: float, p: RigNumbers) -> Pressures:
         cylinder.pressure_rate(to_A - from_A, V_A, bulk_modulus(p_A, p)),  # eq. (4.18)
         cylinder.pressure_rate(to_B - from_B, V_B, bulk_modulus(p_B, p)),  # eq. (4.19)
         (fed - relief - drawn_A - drawn_B) / supply_compliance(p_P, p),
-        0.0 * p_T,
+        0.0 * p_T,  # a zero of p_T's type: a number or lanes
     )
 
 
@@ -589,7 +598,8 @@ def rates_without_throttles(y: State, u: float, G: float, C: float, F: float, p:
 
     `y`: state in the order of `STATES`; `u`: command [V]; `G` [m^3/(s Pa)] and `C` [m^3/(s Pa^0.5)]: conductance and
     flow coefficient of the leakage past the piston, through a laminar gap and an orifice (`piston_leakage`); `F`: load
-    [N] in addition to the rig's own; `p`: the rig's numbers.
+    [N] in addition to the rig's own; `p`: the rig's numbers, in which an optional law, such as `damped`, is an empty
+    tuple if the rig does not have it.
     """
     p_A, p_B, x, v = vapour_floor(y[P_A], p), vapour_floor(y[P_B], p), y[POSITION], y[VELOCITY]
     if len(p.sticking) > 0:
@@ -612,7 +622,7 @@ def rates_without_throttles(y: State, u: float, G: float, C: float, F: float, p:
         load = load + cylinder.opposing_force(v, p.A_opp, p.p_opp, p.C_opp)
     if len(p.pushed) > 0:
         load = load + F
-    if len(p.pushed) > 1:
+    if len(p.pushed) > 1:  # the tables of a load over position and velocity
         load = load + cylinder.piecewise_linear_force(x, p.pushed[0]) + cylinder.piecewise_linear_force(v, p.pushed[1])
     F_f, dz = friction_force(y, p_A * p.A_A - p_B * p.A_B - load + stop, p)
     acceleration = cylinder.piston_acceleration(p_A, p_B, F_f, load, stop, p.A_A, p.A_B, p.M_eq)
@@ -627,10 +637,9 @@ def rates_without_throttles(y: State, u: float, G: float, C: float, F: float, p:
         rate_1 = cylinder.pressure_rate(to_1, p.V_1, bulk_modulus(y[P_1], p))
         rate_2 = cylinder.pressure_rate(-from_2, p.V_2, bulk_modulus(y[P_2], p))
     elif len(p.valved) > 0:
-        valve_part = valve_rates(y, Q_1, p)  # rates of p_A, p_B, p_1 and p_2
-        rate_A = valve_part[0] + cylinder.pressure_rate(-p.A_A * v - from_A, V_A, K_A)
-        rate_B = valve_part[1] + cylinder.pressure_rate(p.A_B * v + to_B, V_B, K_B)
-        rate_1, rate_2 = valve_part[2], valve_part[3]
+        valve_rate_A, valve_rate_B, rate_1, rate_2 = valve_rates(y, Q_1, p)
+        rate_A = valve_rate_A + cylinder.pressure_rate(-p.A_A * v - from_A, V_A, K_A)
+        rate_B = valve_rate_B + cylinder.pressure_rate(p.A_B * v + to_B, V_B, K_B)
     else:
         from_2, to_1 = flows_at_both_ends(Q_1, y[P_B], y[P_A], p)
         rate_A = cylinder.pressure_rate(to_1 - p.A_A * v - from_A, V_A, K_A)
@@ -645,7 +654,7 @@ def rates_without_throttles(y: State, u: float, G: float, C: float, F: float, p:
         d_x_s = valve.spool_speed(y[SPOOL_SPEED], p.v_max)
         x_d = valve.spool_target(u, p.u_N, p.x_max)
         d_v_s = valve.spool_acceleration(y[SPOOL], y[SPOOL_SPEED], x_d, p.omega_s, p.zeta_s, p.v_max)
-    if len(p.clogging) > 0:
+    if len(p.clogging) > 0:  # in a rig without a spool, these two states are the oil that has passed each filter
         d_x_s, d_v_s = filter_flows(y, p)
     # in the order of `STATES`; dx/dt = v is eq. (4.13)
     return error, d_i, d_omega, y[OMEGA], v, acceleration, rate_A, rate_B, rate_1, rate_2, fed, dz, d_x_s, d_v_s
@@ -655,10 +664,11 @@ def rates_without_throttles(y: State, u: float, G: float, C: float, F: float, p:
 def rates(y: State, u: float, G: float, C: float, F: float, p: RigNumbers) -> State:
     """Compute the rates dy/dt of all states of the rig from its physical laws.
 
-    The arguments are those of `rates_without_throttles`.
+    `y`: state in the order of `STATES`; `u` [V]: command; `G` [m^3/(s Pa)], `C` [m^3/(s Pa^0.5)]: leakage coefficients
+    of the piston (`piston_leakage`); `F` [N]: load in addition to the rig's own; `p`: the rig's numbers.
     """
     dy = rates_without_throttles(y, u, G, C, F, p)
-    if len(p.throttled) > 0:
+    if len(p.throttled) > 0:  # an empty tuple in a rig without throttles
         Q_A, Q_B = throttle_flows(y, p)
         dy = add_to_pressures(dy, 1.0, throttle_rates(y, Q_A, Q_B, p))
     return dy
@@ -669,12 +679,14 @@ def observe(y: State, u: float, G: float, C: float, p: RigNumbers, row: np.ndarr
     """Write all outputs of the rig in one state to `row` (21,), in the order of `OUTPUTS`.
 
     The outputs are the states with pressures not below the vapour pressure, the flows, and the motor's voltage. `y`:
-    the state; `u` [V]: command; `G`, `C`: leakage coefficients of the piston, as for `rates_without_throttles`.
+    the state; `u` [V]: command; `G` [m^3/(s Pa)], `C` [m^3/(s Pa^0.5)]: leakage coefficients of the piston
+    (`piston_leakage`); `p`: the rig's numbers, in which an optional law, such as `lossy`, is an empty tuple if the rig
+    does not have it.
     """
-    for m in range(len(y)):
+    n = len(y)
+    for m in range(n):
         row[m] = y[m]
     row[P_A], row[P_B], row[P_1], row[P_2] = pressures_of(y, p)
-    n = len(y)
     dp_pump = pump_difference(y, p)
     Q_1 = pump.pump_flow(y[OMEGA], dp_pump, p.q_b, p.G_pump)
     if len(p.lossy) > 0:

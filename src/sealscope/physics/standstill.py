@@ -28,6 +28,7 @@ def standstill_force(x: float, p: RigNumbers) -> float:
 
     It is the load against +x, including that of an opposing cylinder, minus the force of an end stop.
     """
+    # at rest, v = 0, the flow coefficient of the opposing cylinder's orifice does not matter: it is set to 1
     load = load_force(x, p.F_l, p.k_load) + opposing_force(0.0, p.A_opp, p.p_opp, 1.0)
     return load - hard_stop_force(x, 0.0, p.L, p.k_stop, p.d_stop)  # type: ignore[no-any-return]
 
@@ -36,16 +37,16 @@ def standstill_force(x: float, p: RigNumbers) -> float:
 def pressures_at_standstill(force: float, p: RigNumbers) -> tuple[float, float]:
     """Compute the chamber pressures p_A, p_B [Pa] that hold the piston at rest: p_A A_A - p_B A_B = force.
 
-    `force` [N]: load against +x. With a make-up the lower pressure is the charge pressure. Without one the circuit
-    contains as much oil as with the charge pressure everywhere: the mean of both pressures, weighted by the oil
+    `force` [N]: load against +x. With a make-up the lower pressure is the charge pressure. Without a make-up the
+    circuit contains as much oil as with the charge pressure everywhere: the mean of both pressures, weighted by the oil
     volumes of the two sides, is the charge pressure.
     """
-    if p.made_up:
+    if p.made_up:  # each pressure for the case that the other one is the charge pressure
         p_B = max((p.p_charge * p.A_A - force) / p.A_B, p.p_charge)
         p_A = max((p.p_charge * p.A_B + force) / p.A_A, p.p_charge)
         return p_A, p_B
     V_A, V_B = p.V_A, p.V_B
-    if len(p.throttled) > 0:
+    if len(p.throttled) > 0:  # an empty tuple in a rig without lines; their oil belongs to sides A and B
         V_A, V_B = V_A + p.V_1, V_B + p.V_2
     missing_force = force - p.p_charge * (p.A_A - p.A_B)  # [N], not carried by the charge pressure
     # [Pa m^3]: bulk modulus times the oil volume displaced from side B to A; over a side's volume: its pressure change
@@ -81,17 +82,17 @@ def pressures_behind_valve(force: float, A_A: float, A_B: float, p_1: float, p_2
 
     `force` [N]: load against +x; `p_1`, `p_2` [Pa]: pressures of supply and return. p_A + p_B = p_1 + p_2, because
     the edges to supply and return are equal and have equal pressure drops (Merritt, Hydraulic Control Systems, 1967,
-    section 5.2). An overlapped valve may trap another mean pressure; this one is assumed.
+    section 5.2). This mean pressure is also assumed for an overlapped valve, which may trap another one.
     """
     p_A = (force + A_B * (p_1 + p_2)) / (A_A + A_B)
     return p_A, p_1 + p_2 - p_A
 
 
 def supply_at_standstill(force: float, x: float, p: RigNumbers) -> tuple[float, float, float]:
-    """Compute p_1, p_A, p_B [Pa] of a rig with its servo valve centred and its piston at rest at `x` [m].
+    """Compute the supply pressure p_1 and chamber pressures p_A, p_B [Pa] of a rig at rest with a centred servo valve.
 
-    `force` [N]: load against +x. The supply pressure p_1 is constant at standstill, dp_1/dt = 0. As dp_1/dt falls with
-    rising p_1, this pressure is found by bisection.
+    `force` [N]: load against +x; `x` [m]: position of the piston. At standstill dp_1/dt = 0. As dp_1/dt falls with
+    rising p_1, p_1 is found by bisection.
     """
     y = np.zeros(len(STATES))
     y[POSITION], y[P_2] = x, p.p_return
@@ -115,14 +116,14 @@ def supply_at_standstill(force: float, x: float, p: RigNumbers) -> tuple[float, 
 def initial_state(rig: Rig, x_0: float, push: float = 0.0) -> np.ndarray:
     """Compute the state (14,) of a rig at rest with the piston at x_0 [m].
 
-    The rig's load and `push` [N] act against +x. The pressures carry them (`pressures_at_standstill`), and the motor
+    The rig's load and `push` [N] act against +x. The pressures carry both (`pressures_at_standstill`), and the motor
     holds the pump against the pressures (`stand_still`). Without load and with equal areas all pressures are the
     charge pressure and all other states but the position are 0. In a rig with a servo valve the valve is centred and
     the motor runs at the supply's speed (`supply_at_standstill`). A machine that leaks, or whose valve has an
     underlap, creeps from this state.
 
-    Raises InputError if a pressure is below vacuum (with a servo valve: outside of the range from return to supply),
-    or if the drive cannot hold the load.
+    Raises InputError if a pressure is below vacuum (in a rig with a servo valve: not between those of return and
+    supply), or if the drive cannot hold the load.
     """
     p, y = rig_numbers(rig), np.zeros(len(STATES))
     force = standstill_force(x_0, p) + push
@@ -163,7 +164,7 @@ def _fill_standstill_state(rig: Rig, y: np.ndarray, x: float, force: float, p: R
     y[POSITION], y[P_1], y[P_2], y[P_A], y[P_B] = x, p_1, rig.supply.p_return, p_A, p_B
     y[OMEGA] = rig.supply.omega_P
     y[CURRENT] = pump_torque(p_1 - y[P_2], p.q_b) / m.C_m + m.B_M * y[OMEGA] / m.C_m
-    if len(p.lossy) > 0:
+    if len(p.lossy) > 0:  # an empty tuple in a rig without friction of motor and pump
         y[CURRENT] += friction_torque(y[OMEGA], p_1 - y[P_2], p.q_b, p.T_f, p.C_f, p.k_h, p.omega_f) / m.C_m
     volts = m.R_c * y[CURRENT] + m.C_e * y[OMEGA]
     y[INTEGRAL] = volts / m.K_i

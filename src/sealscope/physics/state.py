@@ -52,6 +52,9 @@ def add_step(y: State, h: float, dy: State) -> State:
 
 @contracted
 def add_to_pressures(y: State, h: float, s: Pressures) -> State:
-    """Compute a state, or its rates, `y` with h s added to the elements of p_A, p_B, p_1 and p_2; `s`: four rates."""
+    """Add h s to the elements p_A, p_B, p_1 and p_2 of a state, or of its rates, `y`; `s`: rates of the four pressures.
+
+    Returns all elements.
+    """
     p_A, p_B, p_1, p_2 = y[P_A] + h * s[0], y[P_B] + h * s[1], y[P_1] + h * s[2], y[P_2] + h * s[3]
     return y[0], y[1], y[2], y[3], y[4], y[5], p_A, p_B, p_1, p_2, y[10], y[11], y[12], y[13]

@@ -20,7 +20,7 @@ def spool_target(u: float, u_N: float, x_max: float) -> float:
 
 @contracted
 def spool_speed(v_s: float, v_max: float) -> float:
-    """Compute the velocity dx_s/dt [m/s] of the spool: the speed state v_s, which the drive limits to +-v_max."""
+    """Compute the velocity dx_s/dt [m/s] of the spool: the state `v_s` [m/s], limited to +-`v_max` [m/s]."""
     return min(max(v_s, -v_max), v_max)
 
 
@@ -41,7 +41,7 @@ def spool_acceleration(x_s: float, v_s: float, x_d: float, omega_s: float, zeta_
 
 @contracted
 def spool_within_stroke(x_s: float, v_s: float, x_max: float, v_max: float) -> tuple[float, float]:
-    """Limit the spool's position [m] to its stroke +-x_max and its speed [m/s] to +-v_max; return both.
+    """Limit the spool's position `x_s` to its stroke +-`x_max` [m], its speed `v_s` to +-`v_max` [m/s]; return both.
 
     At an end of the stroke, a speed that points outwards becomes 0.
     """

@@ -103,16 +103,17 @@ def block_bounds(effects: Sequence[Effect], n_out: int, rate: float) -> np.ndarr
     which the solver writes its results, `n_out` of them at `rate` [Hz]; `effects`: changes of parameters within the
     run.
 
-    A block is at most `LONGEST_BLOCK` long, and breakpoints of effects fall on bounds, to within one output interval.
-    Longer blocks are divided into equal parts, as many as the effect that needs most: enough that it changes by at most
-    its `max_change` from part to part, but no more than keep the parts as long as its `min_block`. A part may therefore
-    be shorter than the `min_block` of another effect. Between close breakpoints it may be shorter than any.
+    The first bounds are the breakpoints of effects, to within one output interval, and times `LONGEST_BLOCK` apart.
+    Then each block between these bounds is divided into equal parts. The number of parts is the largest that any effect
+    needs: the effect changes by at most its `max_change` from part to part, unless the parts would become shorter than
+    its `min_block`. A part may therefore be shorter than the `min_block` of a slower effect, and between close
+    breakpoints shorter than that of any effect.
     """
     if not effects:
         return np.array([0, n_out], dtype=np.int64)
     breakpoints = np.array([t for effect in effects for t in effect.breakpoints if math.isfinite(t)], dtype=np.float64)
     grid = np.arange(0, n_out, max(1, round(LONGEST_BLOCK * rate)))
-    break_outputs = np.ceil(breakpoints * rate * (1.0 - 1e-12))  # 1e-12: a break on an output stays there
+    break_outputs = np.ceil(breakpoints * rate * (1.0 - 1e-12))  # 1e-12: a breakpoint on an output stays there
     bounds = np.unique(np.clip(np.r_[grid, n_out, break_outputs], 0, n_out))
     starts, stops = bounds[:-1], bounds[1:]
     inset = 1e-6 / rate  # excludes a jump at a block's bound from the change within the block
@@ -120,7 +121,8 @@ def block_bounds(effects: Sequence[Effect], n_out: int, rate: float) -> np.ndarr
     for effect in effects:
         change = np.abs(effect.change(stops / rate - inset) - effect.change(starts / rate + inset))
         max_parts = np.maximum(1, (stops - starts) // max(1, round(effect.min_block * rate)))
-        n_parts = np.maximum(n_parts, np.minimum(np.ceil(change / effect.max_change - 1e-9), max_parts))
+        needed_parts = np.ceil(change / effect.max_change - 1e-9)  # 1e-9: rounding adds no part
+        n_parts = np.maximum(n_parts, np.minimum(needed_parts, max_parts))
     blocks = zip(starts, stops, n_parts, strict=True)
     parts = [np.linspace(start, stop, int(n), endpoint=False) for start, stop, n in blocks]
     return np.unique(np.rint(np.concatenate([*parts, [n_out]])).astype(np.int64))
@@ -155,8 +157,8 @@ class Schedule:
     def __init__(self, effects: Sequence[Effect], base: RigNumbers, n_out: int, rate: float) -> None:
         """Divide a run into blocks of time, and compute the model's parameters in each of them.
 
-        The run has `n_out` outputs at `rate` [Hz]. `effects`: changes of parameters within the run; `base`: the
-        parameters without these changes.
+        The run has `n_out` outputs at `rate` [Hz], the times at which the solver writes its results. `effects`: changes
+        of parameters within the run; `base`: the parameters without these changes.
         """
         self.bounds = block_bounds(effects, n_out, rate)
         self.numbers = [base]
@@ -165,7 +167,7 @@ class Schedule:
         middles: Array = np.asarray(0.5 * (self.bounds[:-1] + self.bounds[1:]) / rate, dtype=np.float64)
         values = changing_values(effects, base, middles)
         table = np.array(list(values.values()))  # (parameters, blocks)
-        differs = np.r_[True, np.any(table[:, 1:] != table[:, :-1], axis=0)]  # from the block before
+        differs = np.r_[True, np.any(table[:, 1:] != table[:, :-1], axis=0)]  # True: from the block before it
         self.bounds = np.r_[self.bounds[:-1][differs], n_out]
         # optional parts of the model are compiled in, so that all blocks have those that any of them needs
         options: dict[str, Any] = {}
@@ -255,7 +257,10 @@ class Wander:
             raise InputError(f"a wander must have finite weights and last > 0 s, got {self}")
 
     def value_at(self, t: Array) -> Array:
-        """Compute the random walk, which is the change of a drifting parameter, at times t [s]; 0 before t = 0."""
+        """Compute the random walk at times t [s]: slope t/T + sum of w_k sin((k - 1/2) pi t/T); 0 before t = 0.
+
+        T is the `duration`, and w_1, w_2, ... are the `weights`.
+        """
         phase = np.pi / self.duration * np.maximum(t, 0.0)
         change = np.asarray(self.slope / np.pi * phase)  # slope t / T
         if self.weights:
@@ -292,7 +297,7 @@ def linear_path(size: float, duration: float) -> Wander:
     return Wander((), duration, size)
 
 
-#: Largest change from one block to the next of parameters that drift in their own unit; others have no limit.
+#: Largest change from one block to the next of model parameters that drift in their own unit.
 _ABSOLUTE_MAX_CHANGES = {"F_l": 0.2}
 
 
@@ -324,6 +329,7 @@ class ParameterDrift:
     absolute: bool = False
 
     def __post_init__(self) -> None:
+        """Replace a bare name of the parameter by the dotted name; raise InputError for an impossible drift."""
         if self.parameter not in PARAMETER_GROUPS:
             from sealscope.parameters import declared_names
             from sealscope.parameters.names import resolve_name
@@ -358,7 +364,7 @@ class ParameterDrift:
 
         def build_effect(name: str, power: float) -> Effect:
             """Build the change of one parameter: the drift is added if absolute, else (1 + drift)^power is a factor."""
-            if self.absolute:
+            if self.absolute:  # without a limit for instruments, which do not divide a run into blocks
                 max_change = _ABSOLUTE_MAX_CHANGES.get(name, math.inf)
                 return Effect(name, self.shape.value_at, max_change, additive=True, breakpoints=breakpoints)
             return Effect(

@@ -26,7 +26,7 @@ def outputs_per_sample(rate: float, controller_rate: float, min_outputs: int) ->
     both rates.
     """
     for outputs in range(min_outputs, _MAX_OUTPUTS_PER_SAMPLE + 1):
-        spacing = rate * outputs / controller_rate
+        spacing = rate * outputs / controller_rate  # outputs per controller sample, which must be a whole number
         if spacing >= 1.0 - 1e-9 and abs(spacing - round(spacing)) < 1e-9 * spacing:
             return outputs
     raise InputError(
@@ -50,7 +50,7 @@ class Feedback:
         `rate` [Hz]: rate at which the solver writes its outputs; `seed`: seed of the noise in the measured pressures.
         """
         self._controller = controller
-        self._spacing = round(rate / controller.rate)
+        self._spacing = round(rate / controller.rate)  # solver outputs per sample of the controller
         samples = round(duration * rate) // self._spacing + 1
         t = np.arange(samples + 1) / controller.rate
         inputs = np.zeros((samples + 1, 5))  # time, target, its speed, noise of p_A and p_B (`Loop.inputs`)

@@ -185,7 +185,7 @@ _MAX_BREAKPOINTS = 1000
 
 
 def polyline(points: Sequence[tuple[float, float]], words: str) -> Polyline:
-    """Make the signal that is linear between the points (t [s], y); `words`: its text, such as "step 5 at 1 s"."""
+    """Make the signal that is linear between the points (t [s], y); `words`: text of the signal ("step 5 at 1 s")."""
     t, y = np.array(points, dtype=np.float64).T
     return Polyline(t, y, words)
 
@@ -267,7 +267,7 @@ class PseudoRandom:
         """Compute the voltage u [V] of the pseudo-random command at times t [s]; 0 before t = 0."""
         interval = np.clip(np.floor(t / self.hold), 0.0, 2.0**63).astype(np.uint64)
         first_state = np.random.SeedSequence(self.seed).generate_state(1, np.uint64)
-        state = first_state + (interval + np.uint64(1)) * np.uint64(GOLDEN)
+        state = first_state + (interval + np.uint64(1)) * np.uint64(GOLDEN)  # each interval adds the increment once
         for shift, factor in MIX:
             state = (state ^ (state >> np.uint64(shift))) * np.uint64(factor)
         random_bits = state ^ (state >> np.uint64(LAST_SHIFT))
@@ -392,6 +392,7 @@ def _parse_sines(text: str) -> Sine | MultiSine | None:
     """
     parts: list[Sine] = []
     end = 0
+    # each sine but the first must have a sign, match[1]
     while (match := _SINES.match(text, end)) is not None and (match[1] or not parts):
         sign, amplitude, omega, phase = match.groups()
         factor = -1.0 if sign == "-" else 1.0
@@ -416,7 +417,7 @@ def parse_command(text: str) -> Command:
         path = stripped[len("file ") :].strip()
         return recorded_command(read(path), path)
     stripped = normalize_blanks(text, "command")
-    if "period" in stripped.lower():
+    if "period" in stripped.lower():  # sines in turn, such as "6 periods of 5 sin(2t), 10 periods of 3 sin(4t)"
         form = r"\s*(\d{1,6})\s+periods?\s+of\s+(.*)"
         matches = [re.fullmatch(form, part, re.IGNORECASE) for part in stripped.split(",")]
         parts = [(int(match[1]), parse_command(match[2])) for match in matches if match]

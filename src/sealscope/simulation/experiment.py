@@ -133,6 +133,7 @@ class Experiment:
     controller: Controller | None = None
 
     def __post_init__(self) -> None:
+        """Raise InputError if a number is out of its range, or if the inputs do not fit together."""
         if not (math.isfinite(self.duration) and self.duration > 0):
             raise InputError(f"duration must be > 0 s and finite, got {self.duration}")
         samples = self.duration * self.rate
@@ -238,7 +239,7 @@ class Experiment:
 
     @property
     def voltage_command(self) -> Command:
-        """The voltage command of the run, with the changes of amplitude and frequency by faults.
+        """The voltage command of the run, including the changes of its amplitude and frequency by faults.
 
         Raises InputError if the experiment has a position target instead.
         """
@@ -248,7 +249,7 @@ class Experiment:
 
     @property
     def target(self) -> Position | None:
-        """The position target of the run, with the changes of amplitude and frequency by faults.
+        """The position target of the run, including the changes of its amplitude and frequency by faults.
 
         None if the experiment has a voltage command instead.
         """
@@ -257,7 +258,7 @@ class Experiment:
         return replace(self.command, signal=self._with_duty_changes(self.command.signal))
 
     def _with_duty_changes(self, command: Command) -> Command:
-        """Return a command with the changes of amplitude and frequency that faults cause (`Fault.change_command`)."""
+        """Apply all faults that change a command's amplitude and frequency (`Fault.change_command`) to `command`."""
         for fault in self.faults:
             command = fault.change_command(command)
         return command
@@ -286,8 +287,8 @@ class Experiment:
     def scale_with_viscosity(self, leaks: tuple[Leak, ...]) -> tuple[Leak, ...]:
         """Let laminar leaks grow as a fault warms the oil: divide their openings by the oil's viscosity over time.
 
-        The viscosity is relative to that at the rig's oil temperature, for which the leaks' coefficients hold. Returns
-        all leaks; they are unchanged if there is no fault of the oil's temperature.
+        The viscosity is relative to the viscosity at the rig's oil temperature, for which the leaks' coefficients hold.
+        Returns all leaks; without a fault of the oil's temperature they are unchanged.
         """
         for fault in self.faults:
             if (viscosity := fault.viscosity_ratio(self.rig)) is not None:
@@ -349,12 +350,12 @@ class Experiment:
         }
 
     def key(self) -> str:
-        """Compute a hash of the experiment as 16 hexadecimal digits; equal experiments have equal keys."""
+        """Compute the key of the experiment, a hash of 16 hexadecimal digits; equal experiments have equal keys."""
         values = {name: repr(value) for name, value in self.rig.present_values().items()}
         inputs = [identity_values(self.command), *(identity_values(leak) for leak in self.leaks)]
         inputs += [identity_values(change) for change in (*self.faults, *self.drifts)]
         solver = [self.method, self.step, self.allow_unresolved]
-        solver += [] if self.error is None else [self.error]  # keys of experiments without an error stay as they were
+        solver += [] if self.error is None else [self.error]  # keys without it must not change between versions
         inputs += [identity_values(added) for added in (self.load, self.active_controller) if added is not None]
         text = json.dumps([self.describe(), values, inputs, solver], sort_keys=True, default=str)
         return hashlib.sha256(text.encode()).hexdigest()[:16]

@@ -91,23 +91,29 @@ class FaultRow:
         return self.kind.startswith("sensor")
 
     def parse(self, text: str) -> Fault | None:
-        """Parse a text such as "pump leak x3 from 90 s" as a fault of this kind; return None if it is not one."""
+        """Parse a text such as "pump leak x3 from 90 s" as a fault of this kind; return None for any other text."""
         pattern = self.pattern.format(**_PATTERNS).replace(" ", r"\s+") + _WHEN[self.when]
         match = re.fullmatch(pattern, text, re.IGNORECASE)
         if match is None:
             return None
         groups = match.groupdict()
-        channel_or_side = groups.get("at") or ""
+        channel_or_side = groups.get("at") or ""  # of a faulty sensor, or of a part that is at side A or B
         if not self.is_sensor_fault:
-            channel_or_side = channel_or_side.upper()  # side A or B
-        frequency_factor = _parse_number(groups.get("frequency") or "1")  # stated only by a change of the duty
-        return Fault(self.name, self._parse_value(groups), channel_or_side, parse_opening(groups), frequency_factor)
+            channel_or_side = channel_or_side.upper()
+        return Fault(
+            self.name,
+            value=self._parse_value(groups),
+            at=channel_or_side,
+            opening=parse_opening(groups),  # the extent of the fault over time, such as "from 90 s"
+            frequency_factor=_parse_number(groups.get("frequency") or "1"),  # of the command
+        )
 
     def _parse_value(self, groups: Groups) -> float:
         """Read the size of a fault from the named groups of its matched text.
 
         A number with a unit is converted to SI units. "x3" gives the factor 3, "+20 %" the factor 1.2, and "1 %" of a
-        gain or of air the fraction 0.01. Without a number the result is 1 for a fault stated by a factor, else 0.
+        gain or of air the fraction 0.01. Without a number the result is 1 for a kind of fault that is stated by a
+        factor, else 0.
         """
         if groups.get("size") is not None:
             unit = CHANNEL_UNITS.get(groups["at"] or "", "Pa") if self.is_sensor_fault else self.unit
@@ -173,7 +179,7 @@ class Fault:
         """
         row = self.row
         if row.needs is not None:
-            pattern, rule = row.needs
+            pattern, rule = row.needs  # of a parameter's name, and the beginning of the message
             if rig[name := pattern.format(at=self.at)] == 0:
                 raise InputError(f"{rule} {name} > 0, got 0 ({self})")
         if self.name in _EFFECTS:
@@ -199,8 +205,8 @@ class Fault:
     def _addend(self, rig: Rig) -> float:
         """Compute the number that the fault at full size adds to its parameters.
 
-        It is the rig's parameter `row.adds`, or else the fault's value, divided by the rig's parameter `row.over` if
-        the row states one.
+        It is the value of the rig's parameter that `row.adds` names. Without `row.adds`, it is the fault's value,
+        divided by the rig's parameter that `row.over` names, if any.
         """
         if self.row.adds:
             return float(rig[self.row.adds])
@@ -210,7 +216,8 @@ class Fault:
         """Return the time span over which a stuck sensor repeats its reading, in a tuple; () for any other fault."""
         if self.name != "sensor stuck":
             return ()
-        stop = math.inf if self.opening.y[-1] > 0 else float(self.opening.t[-1])  # infinite if the fault never ends
+        never_ends = self.opening.y[-1] > 0  # the opening at its last point, which stays
+        stop = math.inf if never_ends else float(self.opening.t[-1])
         return (Hold(self.at, self.onset(), stop),)
 
     def change_command(self, command: Command) -> Command:
@@ -295,10 +302,10 @@ class ChangedDuty:
 
 
 def _shut_off_effects(fault: Fault, rig: Rig) -> tuple[Effect, ...]:
-    """Build the effects of opening or closing a shut-off valve within a run.
+    """Build the changes of the model's parameters by a shut-off valve that a fault opens or closes within a run.
 
-    The line has one flow coefficient for each flow direction, and each effect changes one of them. Raises InputError
-    for a rig without throttles in its lines.
+    The valve's line has one flow coefficient for each flow direction, and each effect changes one of them. Raises
+    InputError for a rig without throttles in its lines.
     """
     from sealscope.physics.restrictors import orifice_coefficient, series_coefficient
     from sealscope.physics.rig import throttle_coefficients

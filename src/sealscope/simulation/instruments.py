@@ -135,8 +135,9 @@ def read_pressure(
     3. saturation and conversion to digits (`digitize`);
     4. stuck samples, which repeat a reading, and lost samples, which are NaN.
 
-    `parameter(symbol, value)` computes a parameter of the sensor over time from its `value` in the rig; it may change
-    within the run.
+    `sensor`, `daq`: the rig's transducer and data acquisition; `random`: random numbers of this channel.
+    `parameter(symbol, value)` computes a parameter of the sensor over time from its `value` in the rig, because faults
+    and drifts may change the parameter within the run.
     """
     n = pressure.size
     t = np.arange(n) / rate

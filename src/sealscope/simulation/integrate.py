@@ -182,10 +182,10 @@ def integrate_run(
 ) -> Trajectory:
     """Integrate an experiment from standstill, with outputs at the rate that its instruments need.
 
-    `leaks`, all with coefficients, replace those of the experiment. `step` [s] and `error` [Pa] replace those of the
-    experiment unless None; with a `step` stated here the error is not checked. `duration` [s]: length of the run, by
-    default that of the recording plus the reach of the anti-alias filter. `progress` is called with the time reached
-    [s].
+    `leaks`, all with coefficients, replace the leaks of the experiment. `step` [s] and `error` [Pa] replace the
+    experiment's step and error unless they are None; with a `step` stated here the error is not checked. `duration`
+    [s]: length of the run, by default that of the recording plus the reach of the anti-alias filter. `progress` is
+    called with the simulated time reached [s].
     """
     if duration is None:
         duration = (round(experiment.duration * experiment.rate) + FILTER_REACH) / experiment.rate
@@ -216,12 +216,12 @@ def integrate_run(
 
 
 def _start_of_search(leaks: Sequence[Leak]) -> tuple[Leak, ...]:
-    """Replace the stated mean flow of each leak by the coefficient 0, at which the search for it starts."""
+    """Replace each leak's stated mean flow by the coefficient 0, at which the search for the coefficient starts."""
     return tuple(leak if leak.mean is None else replace(leak, mean=None, coefficient=0.0) for leak in leaks)
 
 
 def solve_leak_coefficients(experiment: Experiment) -> tuple[Leak, ...]:
-    """Find the leakage coefficients that give the stated mean flows; return the leaks of the experiment with them."""
+    """Find the leakage coefficients that give the stated mean flows; return the leaks with these coefficients."""
     if not any(leak.mean for leak in experiment.leaks):
         return _start_of_search(experiment.leaks)
     leaks, _ = run_with_sized_leaks(experiment)
@@ -251,8 +251,8 @@ def run_with_sized_leaks(
     def measure(coefficients: Array) -> tuple[Array, tuple[tuple[Leak, ...], Trajectory]]:
         """Simulate the n leaks with `coefficients` (n,), and compute each leak's mean flow per unit of coefficient.
 
-        Returns the mean flows (n,) [m^3/s] that leaks with the coefficient 1 would have under the pressures of this
-        run, 0 for leaks without a stated mean flow; and the simulated leaks with their trajectory.
+        The first result, (n,) [m^3/s], has the mean flows that leaks with the coefficient 1 would have under the
+        pressures of this run, 0 for leaks without a stated mean flow. The second has the simulated leaks and the run.
         """
         nonlocal is_first_run
         pairs = zip(initial_leaks, coefficients, strict=True)
@@ -299,15 +299,15 @@ def integrate(
 ) -> Trajectory:
     """Integrate a rig from standstill over `duration` [s], with outputs at `rate` [Hz].
 
-    `inputs`: command and leakage; `x_0` [m]: position at the start; `load`: in addition to the rig's own; `feedback`:
-    a controller whose voltage replaces the command; `effects`: changes of the model's parameters within the run
-    (`Schedule`); `progress` is called with the time reached [s].
+    `inputs`: command and leakage; `x_0` [m]: position at the start; `load`: load in addition to the rig's own;
+    `feedback`: a controller whose voltage replaces the command; `effects`: changes of the model's parameters within
+    the run (`Schedule`); `progress` is called with the simulated time reached [s].
 
-    A stated `step` [s] is rounded down to a divisor of the output interval. Without one, ever shorter steps are tried
-    until one passes a check, from the longest that resolves the rig, at most `LONGEST_STEP`, to `LONGEST_STEP` /
-    `MAX_STEP_REFINEMENT`. This shortest step is taken even if it fails. The check integrates short windows of the run
-    (`comparison_windows`) at half the step as well: no pressure may change by more than `error` [Pa rms], and the RMS
-    of no wavelet detail by more than 0.1 % (`StepErrorCheck`). A stated step is not checked if `error` is None.
+    A stated `step` [s] is rounded down to a divisor of the output interval. If `step` is None, ever shorter steps are
+    tried until a step passes a check. The first is the longest that resolves the rig, at most `LONGEST_STEP`; the last
+    is `LONGEST_STEP` / `MAX_STEP_REFINEMENT`, which is taken even if it fails. The check integrates short windows of
+    the run (`comparison_windows`) at half the step as well: no pressure may change by more than `error` [Pa rms], and
+    the RMS of no wavelet detail by more than 0.1 % (`StepErrorCheck`). A stated step is not checked if `error` is None.
 
     Raises InputError for a step or an error that is not positive. Raises SimulationFailed if
 
@@ -364,7 +364,7 @@ def integrate(
                 if start <= first and end <= stop:
                     excess = max(excess, run.compare_with_half_step(rows, first, end, n_steps, check))
             if excess > 1.0 and n_steps < max_steps and step is None:
-                break
+                break  # a shorter step is tried at once
         h = 1.0 / (rate * n_steps)
         if excess <= 1.0 or n_steps >= max_steps or (step is not None and allow_unresolved):
             volts = None if feedback is None else feedback.volts(n_out)
@@ -416,15 +416,14 @@ class _Integration:
         """Integrate the state `y` (14,) in place from output `start` to output `stop`; write the outputs to `rows`.
 
         Output k is written to rows[k - origin]. `n_steps`: number of solver steps from one output to the next.
-        Raises SimulationFailed if a state is not finite. Unless the experiment allows steps that are too long
-        (`allow_unresolved`), it is also raised if the step is too long for a leak or an end stop, or if a pressure is
-        below vacuum.
+        Raises SimulationFailed if a state is not finite. Without `allow_unresolved`, also raises SimulationFailed if
+        the step is too long for a leak or an end stop, or if a pressure is below vacuum.
         """
         from sealscope.physics.rig import pack_numbers
         from sealscope.physics.solvers.advance import EXPLICIT, IMPLICIT, advance, advance_closed, step_nodes
         from sealscope.physics.solvers.limits import longest_step
 
-        unloaded = np.zeros((0, 0))
+        unloaded = np.zeros((0, 0))  # stands for no load
         h = 1.0 / (self.rate * n_steps)
         implicit = IMPLICIT if self.method == "imex" else EXPLICIT
         nodes = step_nodes(implicit, h)
@@ -443,6 +442,7 @@ class _Integration:
                     refuse_long(h, longest_step(p, max_G, max_C), "the leak")
                 steps = slice((k - first) * n_steps, (end - first) * n_steps)
                 out = rows[k - origin : end - origin]
+                # in the order of `advance` and `advance_closed`
                 arguments = G[steps], C[steps], F[steps], pack_numbers(p), self.euler, n_steps
                 if self.feedback is None:
                     advance(implicit, y, h, u[steps], *arguments, out)
@@ -459,8 +459,8 @@ class _Integration:
     def compare_with_half_step(self, rows: Array, first: int, end: int, n_steps: int, check: StepErrorCheck) -> float:
         """Integrate a window of the run again at half the step; return the largest ratio of an error to its tolerance.
 
-        `rows`: outputs of the run with `n_steps` steps per output; the window is first <= k < end. The errors are added
-        to `check`.
+        `rows`: outputs of the run with `n_steps` steps per output; the window has the outputs first <= k < end. The
+        errors are added to `check`.
         """
         from sealscope.physics.state import OUTPUTS, P_2, P_A, STATES
 
@@ -516,8 +516,8 @@ def refuse_unresolved(p: RigNumbers, h: float, method: str) -> None:
 
     - `longest_step`, for all parts but leaks, throttles and end stops: an oscillation may advance by one radian per
       step, and a decay must be stable.
-    - 2.785/lambda for "rk4" with throttles, with the decay rate lambda [1/s] of the pressures across a throttle
-      (`stiffest_rate`).
+    - 2.785/lambda for "rk4" with throttles, where lambda [1/s] is the fastest rate at which the pressures on both sides
+      of a throttle equalise (`stiffest_rate`).
     """
     from sealscope.physics.solvers.limits import DECAY_LIMIT, longest_step, stiffest_rate
 
@@ -535,8 +535,8 @@ def refuse_unresolved(p: RigNumbers, h: float, method: str) -> None:
 def comparison_windows(n_out: int, rate: float) -> list[tuple[int, int]]:
     """Choose the time windows in which the solver's step is checked, as pairs (start, stop) of output indices.
 
-    They are the first 2 s of the run, and 1 s from 50 % and from 90 % of it on, unless such a window would overlap
-    another one or exceed the run. `n_out`: number of outputs of the run; `rate` [Hz]: their rate.
+    They are the first 2 s of the run, and 1 s from 50 % and from 90 % of the run on. A window that would overlap the
+    window before it or exceed the run is left out. `n_out`: number of outputs of the run; `rate` [Hz]: rate of outputs.
     """
     windows = [(0, min(n_out, round(FIRST_WINDOW * rate)))]
     length = round(LATER_WINDOW * rate)
@@ -561,23 +561,23 @@ class StepErrorCheck:
         difference of a pressure.
         """
         self._tolerance = tolerance
-        self._outputs_per_sample = max(1, round(rate / rig.daq.sample_rate))
+        self._outputs_per_sample = max(1, round(rate / rig.daq.sample_rate))  # a sample of the recording
         sensors = [getattr(rig.sensors, name) for name in CHAMBERS]
-        # four columns: p_A at the step and at half of it, then p_B
+        # four columns: p_A at the step and at half the step, then p_B
         self._noise_variances = np.repeat([sensor.noise**2 + rig.sensors.common_noise**2 for sensor in sensors], 2)
-        self._squares = np.zeros((LEVELS, 4))
+        self._squares = np.zeros((LEVELS, 4))  # sums of the squared details over all windows so far
         self._samples = 0
         self.pressure_error = self.detail_error = 0.0
 
     def add_window(self, coarse: Array, fine: Array) -> float:
-        """Compare a run with the one at half the step in one more window of time.
+        """Compare a run with the same run at half the step, in one more window of time.
 
-        Returns the largest ratio of an error to its tolerance; the step is short enough if it is at most 1.
+        Returns the largest ratio of an error to its tolerance; the step is short enough if this ratio is at most 1.
 
-        `coarse`, `fine` (n, 4): p_A, p_B, p_1, p_2 [Pa] at the step and at half of it. The error of a pressure is the
-        rms difference within the window, times `SAFETY`. If it is within its tolerance, the RMS of the db8 wavelet
-        details d_1 .. d_4 of p_A and p_B are compared, too: over all windows so far that are long enough for the
-        wavelet, at the recording's rate and with its noise added.
+        `coarse`, `fine` (n, 4): p_A, p_B, p_1, p_2 [Pa] at the step and at half the step. The error of a pressure is
+        the rms difference within the window, times `SAFETY`. If all pressures are within their tolerance, the RMS of
+        the db8 wavelet details d_1 .. d_4 of p_A and p_B are compared, too: over all windows so far that are long
+        enough for the wavelet, at the recording's sampling rate and with the sensors' noise added.
         """
         pressure_error = SAFETY * float(np.sqrt(np.mean(np.square(coarse - fine), axis=0)).max(initial=0.0))
         self.pressure_error = max(self.pressure_error, pressure_error)
@@ -593,7 +593,10 @@ class StepErrorCheck:
         return max(pressure_error / self._tolerance, detail_error / DETAIL_TOLERANCE)
 
     def describe_worst(self) -> str:
-        """Describe the larger of two differences relative to its tolerance: of a pressure, or of a detail's RMS."""
+        """Describe the worst difference that halving the step made: of a pressure, or of the RMS of a wavelet detail.
+
+        The worst is the larger one relative to its tolerance.
+        """
         if self.pressure_error / self._tolerance >= self.detail_error / DETAIL_TOLERANCE:
             return f"a pressure by {self.pressure_error:.4g} Pa rms, which must be <= {self._tolerance:.4g} Pa"
         error, tolerance = 100 * self.detail_error, 100 * DETAIL_TOLERANCE

@@ -178,6 +178,7 @@ def simulate_experiment(experiment: Experiment, progress: Progress | None = None
         """Build the function that reports the progress of `task`, called with the simulated time reached [s]."""
 
         def report(time: float) -> None:
+            """Report the completed fraction of the task at the simulated time `time` [s]."""
             if progress is not None:
                 progress(task, min(1.0, time / experiment.duration))
 

@@ -80,9 +80,9 @@ def size_leaks(
     """Find the leakage coefficients (n,) that give the leaks' stated mean flows, by repeated simulation.
 
     A coefficient has the unit m^3/(s Pa) for a laminar leak, m^3/(s Pa^0.5) for an orifice. `coefficients`: start
-    values, which are kept for leaks without a stated mean. `measure(coefficients)` simulates the rig; it returns the
-    mean flow [m^3/s] of each leak divided by its coefficient (n,), and the run in any form. Returns the coefficients
-    found, and the run with them. `progress` is called with the task and its completed fraction.
+    values, which are kept for leaks without a stated mean flow. `measure(coefficients)` simulates the rig. It returns
+    the mean flow [m^3/s] of each leak divided by its coefficient (n,), and the run in any form. Returns the
+    coefficients found, and the run with them. `progress` is called with the task and its completed fraction.
 
     A small leak's flow is proportional to its coefficient, because friction sets the pressure difference. A large
     leak's flow grows less, and its coefficient is found step by step (`next_coefficient`). Raises SimulationFailed
@@ -95,7 +95,7 @@ def size_leaks(
     best_error = SCATTER_TOLERANCE
     for attempt in range(MAX_RUNS):
         if progress is not None:
-            progress("sizing the leak", 1.0 - 0.5**attempt)
+            progress("sizing the leak", 1.0 - 0.5**attempt)  # the number of attempts is not known beforehand
         unit_flows, run = measure(coefficients)
         flows = unit_flows * coefficients
         error = float(np.abs(flows[indices] / means[indices] - 1.0).max(initial=0.0))
@@ -108,8 +108,8 @@ def size_leaks(
         next_coefficients = coefficients.copy()
         for k in indices:
             previous = previous_coefficients[k], previous_flows[k]
-            latest = coefficients[k], flows[k] if coefficients[k] > 0.0 else unit_flows[k]
-            next_coefficients[k] = next_coefficient(means[k], previous, latest)
+            latest_flow = flows[k] if coefficients[k] > 0.0 else unit_flows[k]  # as `next_coefficient` asks for
+            next_coefficients[k] = next_coefficient(means[k], previous, latest=(coefficients[k], latest_flow))
         previous_coefficients, previous_flows = coefficients, flows
         coefficients = next_coefficients
     raise SimulationFailed(

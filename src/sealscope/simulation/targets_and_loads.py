@@ -43,7 +43,8 @@ Breakpoints = tuple[tuple[float, float], ...]
 class Position:
     """A target for the piston's position over time, which a controller follows.
 
-    `signal`: the position [m] from mid-stroke, as a command whose method `volts` computes metres; `words`: its text.
+    `signal`: the position [m] from mid-stroke, as a command whose method `volts` computes metres; `words`: text of the
+    target.
     """
 
     signal: Command
@@ -147,7 +148,7 @@ def _parse_signal(text: str, units: Mapping[str, float], what: str) -> Command:
         return Sine(amplitude=0.0, omega=0.0, offset=float(in_si))  # a constant
     try:
         return parse_command(in_si)
-    except InputError as error:
+    except InputError as error:  # let the message name this quantity, and quote the text with its units
         raise InputError(
             str(error).replace("command must be", f"{what} must be").replace(repr(in_si), repr(text))
         ) from None
@@ -214,7 +215,7 @@ def _read_force(path: str, words: str) -> Force:
     s = to_si(table[:, 0], columns[argument].unit, unit, name=argument, place=path)
     F = to_si(table[:, 1], columns["F"].unit, "N", name="F", place=path)
     if argument == "t":
-        return Force(sampled_signal(s - s[:1], F, path), words)
+        return Force(sampled_signal(s - s[:1], F, path), words)  # s[:1], not s[0]: the table may be empty
     if s.size > 1 and s[0] > s[-1]:  # a falling table is the same curve
         s, F = s[::-1], F[::-1]
     if not (2 <= s.size <= MAX_LOAD_ROWS and np.all(np.diff(s) > 0) and np.all(np.isfinite(table))):
@@ -273,9 +274,10 @@ def _extract_terms(text: str, letter: str) -> tuple[Breakpoints, str]:
             breakpoints.append((float(start) * start_units[start_unit], slope))
         else:
             common_slope += slope
+    # (force at 0, slope at first), then (position or velocity, change of the slope) for each term with a start
     return ((0.0, common_slope), *breakpoints), pattern.sub("", text)
 
 
 def _match_unit(unit: str, units: Mapping[str, float]) -> str:
-    """Return the key of `units` that equals the text `unit` apart from blanks."""
+    """Return the key of `units` that equals the text `unit` when blanks are ignored."""
     return next(name for name in units if name.replace(" ", "") == unit.replace(" ", ""))

@@ -78,11 +78,16 @@ def advance_closed(
     rows: np.ndarray,
     loop: Loop,
 ) -> int:
-    """Integrate a run, or a part of it, whose voltage a controller sets; return the number of outputs written.
+    """Integrate a run, or a part of it, whose voltage the controller `loop` sets; return the number of outputs written.
 
-    The arguments are those of `advance`, with the controller `loop` in place of a command. `start`: number of the
-    output in rows[0], counted from the beginning of the run. If the controller returns a voltage that is not finite,
-    the integration stops there and writes fewer outputs than `rows` has.
+    - `implicit`: `IMPLICIT` or `EXPLICIT`, the integration method; `euler_integral`: as in `advance`.
+    - `y` (14,): the state, changed in place. `h` [s]: the step; there is an output before each `every`-th step.
+    - `G`, `C`, `F` (n, nodes): leakage coefficients and additional load in each of n steps, as in `advance`.
+    - `numbers`: parameters of the model. `rows` (n // every, 21): receives the outputs. `start`: number of the output
+      in rows[0], counted from the beginning of the run.
+
+    If the controller returns a voltage that is not finite, the integration stops there, with fewer outputs than `rows`
+    has.
     """
     spacing, n_rows = loop.counters[SPACING], rows.shape[0]
     u = np.empty((spacing * every, G.shape[1]))

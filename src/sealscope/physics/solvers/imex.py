@@ -74,14 +74,15 @@ def _solve_stage(z: State, h: float, p: RigNumbers) -> tuple[State, Pressures]:
     `h` [s]: length of the step; `z`: the state without the implicit rates of this stage. If bulk moduli and densities
     depend on the pressures, the stage is solved repeatedly (`MAX_STAGE_ITERATIONS`). In the body, r [Pa/m^3] is the
     pressure rate of an oil volume per unit flow, and g [Pa s/m^3] the fall of a throttle's pressure difference over the
-    stage per unit flow. Boiling oil keeps its pressure, so its r is 0.
+    stage per unit flow. Boiling oil keeps its pressure, so its r is 0. In `p`, an optional law such as `boiling` is an
+    empty tuple if the rig does not have it.
     """
     V_A, V_B = rig.volumes_at(z[POSITION], p)
     step = GAMMA * h
     p_A, p_B, p_1, p_2 = rig.pressures_of(z, p)
     total_A, total_B = p_1 - p_A, p_B - p_2
     solved = z
-    s = (z[P_A], z[P_B], z[P_1], z[P_2])  # overwritten; numba needs its type before the loop
+    s = (z[P_A], z[P_B], z[P_1], z[P_2])  # overwritten; numba needs the type of s before the loop
     max_iterations = MAX_STAGE_ITERATIONS if len(p.aerated) + len(p.conserving) + len(p.boiling) > 0 else 1
     for _ in range(max_iterations):
         K_A, K_B = rig.bulk_modulus(solved[P_A], p), rig.bulk_modulus(solved[P_B], p)

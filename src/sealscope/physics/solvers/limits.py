@@ -43,9 +43,10 @@ def _longest_mode_step(damping: float, stiffness: float) -> float:
 
 
 def _steepest_rise(breakpoints: np.ndarray) -> float:
-    """Compute the steepest positive slope of a piecewise linear load, or 0 if it never rises.
+    """Compute the steepest positive slope of a piecewise linear load, or 0 if the load never rises.
 
-    `breakpoints`: as in `piecewise_linear_force`. The slope is in N/m over position and in N s/m over velocity.
+    `breakpoints` (n, 2): as in `piecewise_linear_force`; column 1 has the first slope, then its change at each further
+    breakpoint. The slope is in N/m for a load over position, in N s/m for a load over velocity.
     """
     return max(0.0, float(np.cumsum(breakpoints[:, 1]).max()))
 
@@ -75,12 +76,12 @@ def longest_step(p: RigNumbers, G: float = 0.0, C: float = 0.0) -> float:
 
     The stability limit of a decay is that of RK4; the explicit part of ARK4(3)6L[2]SA is stable beyond it.
     Position-dependent volumes are taken at the end of the stroke where the oil is stiffer. Air is left out because it
-    only makes the oil softer.
+    only makes the oil softer. In `p`, an optional law, such as `lossy`, is an empty tuple if the rig does not have it.
     """
     ends = _end_volumes(p)
     # stiffness of the oil in both chambers, and in the volumes at the pump's ports [Pa/m^3]
-    chambers = p.K_oil * max(1.0 / V_A + 1.0 / V_B for V_A, V_B in ends)
-    ports = p.K_oil * (1.0 / p.V_1 + 1.0 / p.V_2) if len(p.throttled) > 0 else chambers
+    chamber_stiffness = p.K_oil * max(1.0 / V_A + 1.0 / V_B for V_A, V_B in ends)
+    port_stiffness = p.K_oil * (1.0 / p.V_1 + 1.0 / p.V_2) if len(p.throttled) > 0 else chamber_stiffness
     B_M, G_pump = p.B_M, p.G_pump
     if len(p.lossy) > 0:  # steepest slopes: of friction at rest under the largest torque, of slip at no pressure
         B_M += (p.T_f + p.C_f * p.C_m * p.i_max) / p.omega_f
@@ -88,27 +89,29 @@ def longest_step(p: RigNumbers, G: float = 0.0, C: float = 0.0) -> float:
     loop_stiffness = (p.R_c * B_M + p.C_m * (p.C_e + p.k_p)) / (p.L_c * p.J_M)
     speed_loop_step = _longest_mode_step(p.R_c / p.L_c + B_M / p.J_M, loop_stiffness)
     # stiffness of the oil columns and the load's spring, over the mass [1/s^2]
-    column = (p.K_oil * max(p.A_A**2 / V_A + p.A_B**2 / V_B for V_A, V_B in ends) + p.k_load) / p.M_eq
+    column_stiffness = (p.K_oil * max(p.A_A**2 / V_A + p.A_B**2 / V_B for V_A, V_B in ends) + p.k_load) / p.M_eq
     F_C = p.F_pr + (0.0 if p.coulomb_of_difference else p.F_cfr * 2.0 * p.p_charge)
     friction_slope = F_C * p.K_brk / p.v_th + p.F_v
     if p.literal_bracket:
         friction_slope = F_C * (p.K_brk + p.F_v * p.v_th) / p.v_th
     damper = p.d_load
-    if len(p.pushed) > 1:
-        column += _steepest_rise(p.pushed[0]) / p.M_eq
+    if len(p.pushed) > 1:  # the tables of a load over position and velocity
+        column_stiffness += _steepest_rise(p.pushed[0]) / p.M_eq
         damper += _steepest_rise(p.pushed[1])
-    sliding_step = _longest_mode_step((p.F_v + damper) / p.M_eq, column)
-    sticking_step = _longest_mode_step((max(1.0, p.backward) * friction_slope + damper) / p.M_eq, column)
+    sliding_step = _longest_mode_step((p.F_v + damper) / p.M_eq, column_stiffness)
+    sticking_step = _longest_mode_step((max(1.0, p.backward) * friction_slope + damper) / p.M_eq, column_stiffness)
     if len(p.bristled) > 0:
-        sticking_step = _longest_mode_step((p.sigma_1 + p.F_v + damper) / p.M_eq, column + p.sigma_0 / p.M_eq)
+        bristle_stiffness = column_stiffness + p.sigma_0 / p.M_eq
+        sticking_step = _longest_mode_step((p.sigma_1 + p.F_v + damper) / p.M_eq, bristle_stiffness)
     if len(p.valved) > 0:
-        ports = 0.0  # the pump feeds the supply (`_longest_valve_step`)
-    pump_step = _longest_mode_step(ports * G_pump, ports * (p.q_b / (2.0 * math.pi)) ** 2 / p.J_M)
-    leak_step = _longest_mode_step(chambers * (G + C / math.sqrt(p.dp_0)), 0.0)
+        port_stiffness = 0.0  # the pump feeds the supply (`_longest_valve_step`)
+    pump_step = _longest_mode_step(port_stiffness * G_pump, port_stiffness * (p.q_b / (2.0 * math.pi)) ** 2 / p.J_M)
+    leak_step = _longest_mode_step(chamber_stiffness * (G + C / math.sqrt(p.dp_0)), stiffness=0.0)
     # dQ/dp over G: Q = G dp (dp - p_crack)/p_open of a pilot-operated valve is steepest where it just opens fully
     steepest = 2.0 + p.p_crack / p.p_open if len(p.piloted) > 0 else 1.0
-    valves = max(p.G_check * steepest * p.made_up, p.G_relief * (len(p.relieved) > 0))
-    external_step = _longest_mode_step(chambers * max(p.G_ext_A, p.G_ext_B) + ports * valves, 0.0)
+    max_valve_slope = max(p.G_check * steepest * p.made_up, p.G_relief * (len(p.relieved) > 0))
+    external_decay = chamber_stiffness * max(p.G_ext_A, p.G_ext_B) + port_stiffness * max_valve_slope
+    external_step = _longest_mode_step(external_decay, stiffness=0.0)
     step = min(speed_loop_step, sliding_step, sticking_step, pump_step, leak_step, external_step)
     if len(p.valved) > 0:
         step = min(step, _longest_valve_step(p, ends))
@@ -125,18 +128,19 @@ def _longest_valve_step(p: RigNumbers, end_volumes: tuple[tuple[float, float], .
     - The supply line: its oil oscillates with the inertia of motor and pump, and is damped by the pump's leakage, the
       relief valve and the edges of both chambers.
 
-    Each is resolved as in `_longest_mode_step`. `end_volumes`: (V_A, V_B) [m^3] at each end of the stroke.
+    Each part gives a limit by `_longest_mode_step`. `end_volumes`: (V_A, V_B) [m^3] at each end of the stroke.
     """
     overlaps = (p.o_PA, p.o_AT, p.o_PB, p.o_BT)
     edge_slope = p.Q_N / math.sqrt(p.dp_N * p.dp_lam)  # of one edge at full stroke, laminar
     chamber_slope = edge_slope * (1.0 + 2.0 * max(0.0, *(-o for o in overlaps)) / p.x_max)  # both edges of a chamber
-    chamber = p.K_oil * max(1.0 / volume for volumes in end_volumes for volume in volumes)
-    supply = p.K_oil / p.V_1  # the accumulator may be empty
+    # stiffness of the oil in the smaller chamber and in the supply line, whose accumulator may be empty [Pa/m^3]
+    chamber_stiffness = p.K_oil * max(1.0 / volume for volumes in end_volumes for volume in volumes)
+    supply_stiffness = p.K_oil / p.V_1
     spool_step = _longest_mode_step(2.0 * p.zeta_s * p.omega_s, p.omega_s**2)
-    chamber_step = _longest_mode_step(chamber_slope * chamber, 0.0)
-    slip = p.c_slip / math.sqrt(p.dp_0)
-    supply_damping = supply * (p.G_pump + slip + p.G_set + 2.0 * chamber_slope)
-    supply_step = _longest_mode_step(supply_damping, supply * (p.q_b / (2.0 * math.pi)) ** 2 / p.J_M)
+    chamber_step = _longest_mode_step(chamber_slope * chamber_stiffness, stiffness=0.0)
+    slip_slope = p.c_slip / math.sqrt(p.dp_0)
+    supply_damping = supply_stiffness * (p.G_pump + slip_slope + p.G_set + 2.0 * chamber_slope)
+    supply_step = _longest_mode_step(supply_damping, supply_stiffness * (p.q_b / (2.0 * math.pi)) ** 2 / p.J_M)
     return min(spool_step, chamber_step, supply_step)
 
 

@@ -23,7 +23,7 @@ def freeze_integral(dy: State, euler_integral: bool) -> State:
     The caller then updates the integral once per step instead, which is eq. (4.2) of the thesis taken literally
     (`rk4_step`).
     """
-    dI = 0.0 * dy[0] if euler_integral else dy[0]
+    dI = 0.0 * dy[0] if euler_integral else dy[0]  # 0.0 * dy[0]: a zero of the rate's type, a number or lanes
     return dI, dy[1], dy[2], dy[3], dy[4], dy[5], dy[6], dy[7], dy[8], dy[9], dy[10], dy[11], dy[12], dy[13]
 
 

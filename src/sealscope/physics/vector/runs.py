@@ -73,13 +73,19 @@ def _build_inputs_law(count: int) -> Any:
     """Compile the function (t, nodes, shape, k, drive, leak, p) that computes the inputs of a group of runs in step k.
 
     It returns the command u [V], the leakage coefficients G and C, and the load F [N], each at the `count` times
-    within a step (nodes) that the integration method needs. Its arguments are: `t` [s], start of the step; `drive`,
-    gain and offset [V] of each run's command; `leak`, numbers of each run's leak (`LEAK_ROWS`); and `nodes`, `shape`
-    and `p` of `advance`.
+    within a step (nodes) that the integration method needs. Its arguments are:
+
+    - `t` [s]: start of the step; `nodes` (count,) [s]: the nodes, from the start of the step on.
+    - `shape` (steps, count): the commands' common waveform at the nodes, followed by the load in further columns.
+    - `drive`: gain and offset [V] of each run's command; `leak`: numbers of each run's leak (`LEAK_ROWS`).
+    - `p`: the runs' choices, which tell whether there is an additional load.
     """
 
     def for_nodes(text: str) -> str:
-        """Repeat a piece of source text for each node, with the node's number in place of `{n}`."""
+        """Repeat a piece of source text for each node, with the node's number in place of `{n}`.
+
+        `{load_column}` becomes the number of the column of `shape` that has the load at this node.
+        """
         return ", ".join(text.format(n=n, load_column=count + n) for n in range(count))
 
     return _compile(
@@ -112,7 +118,7 @@ def _add_output(z: State, leak: Leak, t: float, totals: Totals, q: RigNumbers) -
     flow_sum = flow_sum + abs(piston_leakage(p_A - p_B, leak[4] * opening, leak[5] * opening, q.dp_0))
     min_pressure = min(min_pressure, p_A)
     min_pressure = min(min_pressure, p_B)
-    if len(q.throttled) > 0:
+    if len(q.throttled) > 0:  # an empty tuple in rigs without lines
         min_pressure = min(min_pressure, p_1)
         min_pressure = min(min_pressure, p_2)
     state_sum = z[0] + z[1] + z[2] + z[3] + z[4] + z[5] + z[6] + z[7] + z[8] + z[9] + z[10] + z[11] + z[12] + z[13]
@@ -155,7 +161,7 @@ def advance(
     cells, fields, states = table.shape[1], table.shape[2], y.shape[1]
     for g in range(groups[0], groups[1]):
         z = load_state(y, g * states)
-        gain = (load(drive, 2 * g), load(drive, 2 * g + 1))
+        gain_and_offset = (load(drive, 2 * g), load(drive, 2 * g + 1))
         leak, run_totals = load_leak(leaks, g * LEAK_ROWS), load_totals(totals, g * N_TOTALS)
         out = (g * pressures.shape[1] + begin) * CHANNELS
         for cell in range(cells):
@@ -171,9 +177,11 @@ def advance(
                     run_totals = _add_output(z, leak, t + nodes[0], run_totals, q)
                 steps_to_output -= 1
                 if len(implicit) > 0:
-                    z = imex_step(z, h, *_imex_inputs(t, nodes, shape, step, gain, leak, q), q)  # type: ignore[call-arg]
+                    imex_inputs = _imex_inputs(t, nodes, shape, step, gain_and_offset, leak, q)
+                    z = imex_step(z, h, *imex_inputs, q)  # type: ignore[call-arg]
                 else:
-                    z = rk4_step(z, h, *_rk4_inputs(t, nodes, shape, step, gain, leak, q), q, False)  # type: ignore[call-arg]
+                    rk4_inputs = _rk4_inputs(t, nodes, shape, step, gain_and_offset, leak, q)
+                    z = rk4_step(z, h, *rk4_inputs, q, False)  # type: ignore[call-arg]  # False: no `euler_integral`
         for m in range(states):
             store(y, g * states + m, z[m])
         for m in range(N_TOTALS):
@@ -184,7 +192,7 @@ def advance(
 def advance_lanes_rk4(*run: Any) -> None:
     """Integrate groups of runs by the explicit Runge-Kutta method in compiled code.
 
-    The arguments are those of `advance` in this module without the first, `implicit`.
+    `run`: all arguments of `advance` in this module but the first, `implicit`, which states the method.
     """
     advance(EXPLICIT, *run)
 
@@ -193,6 +201,6 @@ def advance_lanes_rk4(*run: Any) -> None:
 def advance_lanes_imex(*run: Any) -> None:
     """Integrate groups of runs of rigs with throttles by the implicit-explicit method in compiled code.
 
-    The arguments are those of `advance` in this module without the first, `implicit`.
+    `run`: all arguments of `advance` in this module but the first, `implicit`, which states the method.
     """
     advance(IMPLICIT, *run)

@@ -110,7 +110,7 @@ class Batch:
 
 
 def _index_of(name: str, names: tuple[str, ...], what: str) -> int:
-    """Return the index of `name` in `names`; raise InputError, which calls the name `what`, if it is absent."""
+    """Return the index of `name` in `names`; raise InputError for another name. `what`: word for names in the error."""
     if name not in names:
         raise InputError(f"{what} must be one of {', '.join(names)}, got {name!r}")
     return names.index(name)
@@ -221,7 +221,8 @@ def _run_set(
     step = stated_step or choose_step(experiment_set, coefficients, error)
     if any(member.leak.mean for member in members):
         coefficients = _size_leaks(experiment_set, step, coefficients, threads)
-        step = stated_step or min(step, choose_step(experiment_set, coefficients, error))  # large leaks need short ones
+        # again with the coefficients found, because large leaks need short steps
+        step = stated_step or min(step, choose_step(experiment_set, coefficients, error))
     run = SetRun(experiment_set, step, coefficients, flow_coefficients=coefficients, bounds=batch.bounds)
     run.run_all(threads, progress)
     batch.rms[rows] = run.rms()
@@ -233,9 +234,9 @@ def _run_set(
 def choose_step(experiment_set: ExperimentSet, coefficients: Array, error: float) -> float:
     """Choose the solver's step [s] for a set of experiments that are integrated together.
 
-    For the first 4 s of up to four runs of the set, error control (`integrate`) finds a step short enough that halving
-    it changes no pressure by more than `error` [Pa rms]. The result is the shortest of these steps, and no longer than
-    any run of the set allows (`longest_allowed_step`). `coefficients` (runs,): leakage coefficients.
+    For the first 4 s of up to four runs of the set, `integrate` finds a step so short that half the step changes no
+    pressure by more than `error` [Pa rms]. The result is the shortest of these steps, but no longer than the rigs and
+    leaks of all runs allow (`longest_allowed_step`). `coefficients` (runs,): leakage coefficients.
     """
     members, steps = experiment_set.members, [longest_allowed_step(experiment_set, coefficients)]
     for k in np.unique(np.linspace(0, len(members) - 1, _N_SAMPLE_RUNS).round().astype(int)):
@@ -249,7 +250,7 @@ def longest_allowed_step(experiment_set: ExperimentSet, coefficients: Array) -> 
     """Compute the longest step [s] that resolves the rig and the leak of every run in a set of experiments.
 
     `coefficients` (runs,): leakage coefficients, G [m^3/(s Pa)] of a laminar leak or C [m^3/(s Pa^0.5)] of an orifice.
-    The result is no shorter than the shortest step that error control tries.
+    The result is no shorter than the shortest step that `integrate` tries, `LONGEST_STEP` / `MAX_STEP_REFINEMENT`.
     """
     from sealscope.physics.solvers.limits import longest_step
 

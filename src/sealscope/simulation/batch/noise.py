@@ -43,7 +43,8 @@ def noise_keys(seeds: list[int]) -> Array:
 def uniform(key: Any, position: int) -> Any:
     """Draw uniform random numbers in (0, 1] for a vector of runs, in compiled code.
 
-    `key`: keys of the runs' noise (`noise_keys`); `position` >= 0: position in the sequences of random numbers.
+    `key`: keys of the runs' noise (`noise_keys`); `position` >= 0: position in the sequences of random numbers. The
+    compiled body is built by `_lower_uniform`.
     """
 
 
@@ -69,7 +70,7 @@ def _lower_uniform(context: Any, builder: Any, arg_types: Any, values: Any) -> A
 
 
 def _exponent(x: Any) -> Any:
-    """Extract the binary exponent of positive normal doubles, returned as doubles, in compiled code."""
+    """Extract the binary exponent of positive normal doubles, as doubles, in code that `_lower_exponent` builds."""
 
 
 def _lower_exponent(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
@@ -79,7 +80,7 @@ def _lower_exponent(context: Any, builder: Any, arg_types: Any, values: Any) -> 
 
 
 def _fraction(x: Any) -> Any:
-    """Extract the significand 1 <= m < 2 of positive normal doubles in compiled code."""
+    """Extract the significand 1 <= m < 2 of positive normal doubles, in code that `_lower_fraction` builds."""
 
 
 def _lower_fraction(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:

@@ -52,7 +52,7 @@ class Member:
     def leak(self) -> Leak:
         """The leak of the experiment, or a leak with the coefficient 0 if the experiment has none."""
         leaks = self.experiment.leaks
-        return leaks[0] if leaks else Leak("laminar", 0.0)
+        return leaks[0] if leaks else Leak("laminar", coefficient=0.0)
 
     @cached_property
     def step_limiting_parameters(self) -> tuple[RigNumbers, ...]:
@@ -132,9 +132,9 @@ def _split_command(command: Command) -> _ScaledCommand:
     The waveform of a sine is the sine of amplitude 1. Any other command is its own waveform, with gain 1 and offset 0.
     """
     if isinstance(command, Sine):
-        shape = Sine(1.0, command.omega, command.phase)
+        shape = Sine(amplitude=1.0, omega=command.omega, phase=command.phase)
         return _ScaledCommand(str(identity_values(shape)), shape, command.amplitude, command.offset)
-    return _ScaledCommand(str(identity_values(command)), command, 1.0, 0.0)
+    return _ScaledCommand(str(identity_values(command)), command, gain=1.0, offset=0.0)
 
 
 def group_experiments(experiments: Sequence[Experiment]) -> list[ExperimentSet]:
@@ -169,7 +169,8 @@ def group_experiments(experiments: Sequence[Experiment]) -> list[ExperimentSet]:
         if any(effect.field == "air" for effect in effects):
             numbers = numbers._replace(aerated=(True,))
         scaled_command = _split_command(experiment.voltage_command)
-        choices = tuple(getattr(numbers, name) for name in CHOICES if name != "pushed")  # the load, which `load` states
+        # without "pushed", the tables of the load, which `load` identifies
+        choices = tuple(getattr(numbers, name) for name in CHOICES if name != "pushed")
         method = choose_method(experiment.rig, experiment.method)
         kind = (scaled_command.key, load, choices, method, experiment.step, experiment.error)
         shapes[kind] = scaled_command.shape
@@ -203,8 +204,8 @@ def build_leak_rows(members: Sequence[Member], coefficients: Array, flow_coeffic
     - start [s] and slope [1/s] of the leak's opening;
     - G and C of the leak whose mean flow is computed, from `flow_coefficients` (runs,).
 
-    Both arguments differ only in the search for a coefficient that gives a stated mean flow. It starts with a run
-    without a leak, which computes the flow that a leak of coefficient 1 would have under the pressures of this run.
+    Both arguments differ only in the search for a coefficient that gives a stated mean flow. The search starts with a
+    run without a leak, in which the mean flow of a leak with the coefficient 1 is computed.
     """
     rows = []
     for member, coefficient, flow_coefficient in zip(members, coefficients, flow_coefficients, strict=True):
@@ -293,8 +294,9 @@ def build_instrument_rows(members: Sequence[Member], first: int, last: int) -> A
     samples = last - first
     rows = np.array([_pressure_instruments(run.rig, run.readings(), ends, samples) for run in experiments])
     for row, experiment in zip(rows, experiments, strict=True):
-        if row[:, HUM].any():  # 1: not the random numbers of the noise
-            row[:, HUM_PHASE] = np.random.default_rng([experiment.seed, 1]).random(len(CHAMBERS))
+        if row[:, HUM].any():
+            random = np.random.default_rng([experiment.seed, 1])  # 1: not the random numbers of the noise
+            row[:, HUM_PHASE] = random.random(len(CHAMBERS))
     return rows
 
 
@@ -318,6 +320,7 @@ def _pressure_instruments(rig: Rig, readings: Readings, ends: Array, samples: in
             (signals.COMMON, signals.COMMON_RISE, "sensors.common_noise", rig.sensors.common_noise, 0.0),
         ):
             start_value, end_value = np.broadcast_to(readings.value(parameter, value, ends), (2,))
+            # `addend`: the gain is 1 plus the gain error
             row[start_row], row[rise_row] = start_value + addend, (end_value - start_value) / samples
         row[signals.DRIFT_STEP] = sensor.drift / np.sqrt(daq.sample_rate)
         row[signals.HUM], row[signals.HUM_CYCLES] = sensor.hum, sensor.hum_frequency / daq.sample_rate
@@ -409,11 +412,10 @@ class SetRun:
             self._prepare_statistics(bounds)
 
     def _prepare_filters(self, rate: float) -> None:
-        """Set `taps` to the coefficients of each run's anti-alias filter, which includes the delays of its transducers.
+        """Set `taps` to the coefficients of each run's anti-alias filter, which includes the transducers' delays.
 
-        The filter computes a sample of the recording from the solver's outputs, which are `oversampling` times as many:
-        for a sample at output n, from `taps_before` outputs before n to `taps_after` outputs after n, which are set,
-        too. `rate` [Hz]: rate of the outputs.
+        The solver writes `oversampling` outputs per sample of the recording, at `rate` [Hz]. The filter computes a
+        sample at output n from the outputs n - `taps_before` to n + `taps_after`; both numbers are set, too.
         """
         sensors = [member.experiment.rig.sensors for member in self.experiment_set.members]
         delays = np.array([[getattr(group, name).delay * rate for name in CHAMBERS] for group in sensors])
@@ -450,7 +452,7 @@ class SetRun:
         `progress` is called with the completed fraction of the set. The threads run in parallel because compiled
         code releases Python's lock.
         """
-        # groups at which the share of a thread begins, and the end
+        # a thread simulates the groups between two successive bounds
         bounds = np.unique(np.linspace(0, self.n_groups, min(threads, self.n_groups) + 1).round().astype(int)).tolist()
         lock, completed = threading.Lock(), 0.0
 
@@ -507,7 +509,7 @@ class SetRun:
         from sealscope.simulation.batch.signals import sense_lanes
 
         advance = advance_lanes_imex if self.method == "imex" else advance_lanes_rk4
-        a, b = groups  # first group, and the end
+        a, b = groups  # first group, and the group after the last
         local_groups = (0, b - a)  # indices within the slices [a:b] of the arrays
         state, leaks, totals = self.state[a:b], self.leaks[a:b], self.totals[a:b]
         table, cells = np.empty((0, 0, 0, 0)), (-1, -1)

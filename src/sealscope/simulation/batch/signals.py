@@ -157,6 +157,7 @@ def add_reading_squares(
             filter_rows(pressures, source + 1, stride, -CHANNELS, taps, B * n_taps, n_taps, buffers, b, n)
             for i in range(n):
                 s, samples_since = start + i, float(start - first + i)
+                # three pairs of normal numbers for each sample s, of which the last number is not used
                 noise_A, noise_B = normals(key, 3 * s)
                 common_noise, drift_step_A = normals(key, 3 * s + 1)
                 drift_step_B, _ = normals(key, 3 * s + 2)

@@ -13,7 +13,7 @@ import numpy as np
 from sealscope.control import controller_named, drive_of
 from sealscope.errors import InputError
 from sealscope.simulation.bench.profile import DriftRange, Nuisance, NuisanceChoice, Profile, load_profile
-from sealscope.simulation.changes import ParameterDrift, Wander
+from sealscope.simulation.changes import ParameterDrift, Wander, linear_path
 from sealscope.simulation.commands import Command, parse_command
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.targets_and_loads import Force, Position, command_or_target, parse_force
@@ -103,8 +103,8 @@ def centred_start(rig: Rig, command: Command | Position | str, duration: float) 
 def _random_stream(seed: int, name: str) -> np.random.Generator:
     """Make the random generator from which the nuisance `name` (a difference between machines) is drawn.
 
-    The generator depends on `seed` and `name` only, so that the other nuisances of a profile do not change what is
-    drawn.
+    The generator depends on `seed` and `name` only, so that what is drawn for one nuisance does not depend on the
+    others in the profile.
     """
     return np.random.default_rng([seed, zlib.crc32(name.encode())])
 
@@ -115,11 +115,12 @@ def _draw_path(random: np.random.Generator, shapes: tuple[str, ...], duration: f
     The range is maximum minus minimum. `shapes`: names of the courses to choose from, "linear" and "wander" (a smooth
     random walk); `warms`: True for a linear course that always rises, False for one that rises or falls at random.
     """
+    # all are drawn for either shape, so that later draws do not depend on the shape
     shape = shapes[int(random.integers(len(shapes)))]
     rises = random.random() < 0.5 or warms
     weights = random.standard_normal(WANDER_TERMS) / (np.arange(WANDER_TERMS) + 0.5)  # standard deviations of `Wander`
     if shape == "linear":
-        return Wander((), duration, 1.0 if rises else -1.0)
+        return linear_path(1.0 if rises else -1.0, duration)
     return Wander(tuple(map(float, weights)), duration).scale_to_range(1.0)
 
 
