@@ -420,7 +420,8 @@ class _Draws(NamedTuple):
         a, b = (np.stack([getattr(node, name)[-1][changes.profile_index] for node in nodes]) for name in ("a", "b"))
         scale = changes.scale * np.array([[node.tau] for node in nodes])
         v = 1.0 / (a + scale**-2)  # variance of the size, before any truncation to > 0; its mean is b v
-        log_ratio = 0.5 * (np.log(v) + b * b * v) if signed else _log_mean_ratio(a, b, scale)
+        normal_log_ratio = 0.5 * (np.log(v) + b * b * v) - np.log(scale)
+        log_ratio = normal_log_ratio if signed else _log_mean_ratio(a, b, scale)
         log_weight = np.array([[node.log_null[-1]] for node in nodes]) + log_ratio + changes.log_weight
         weight = np.exp(log_weight - log_weight.max())
         # draw a point of the grid and a change together
