@@ -447,12 +447,14 @@ def live_equations(rig: Rig, names: Sequence[str], with_tested_terms: bool = Fal
     """Build the volume balances of a running machine that the channels `names` allow.
 
     Balances whose flow is computed from the command are left out. The term of the pump's leakage is left out, too, as
-    it cannot be distinguished from the piston's leakage. `with_tested_terms` includes terms that are zero in a healthy
-    machine and are only tested for a change.
+    it cannot be distinguished from the piston's leakage. `with_tested_terms` includes terms that are not fitted, but
+    only tested for a change, such as those that are zero in a healthy machine.
     """
     balances = []
     for balance in equations(rig, frozenset(names)):
-        terms = (term for term in balance.terms if (term.nuisance or with_tested_terms) and term.name != PUMP)
-        if not balance.by_command:
-            balances.append(balance._replace(terms=tuple(terms)))
+        if balance.by_command:
+            continue
+        # fitted terms (`Term.nuisance`) are unknown in any machine; the leak past the piston is one of them
+        terms = [term for term in balance.terms if (term.nuisance or with_tested_terms) and term.name != PUMP]
+        balances.append(balance._replace(terms=tuple(terms)))
     return balances

@@ -177,16 +177,16 @@ class PressureEstimator:
             return self._reject(follower, end, is_settling, restarts)
         self._misfits = 0
         if is_settling:
-            return NotJudged.with_count(end, "settling", restarts)
+            return NotJudged.with_count(end, "settling", restarts=restarts)
         # G: index of the conductance; the covariance is in units of the priors
         g, sd = float(follower.theta[G]), math.sqrt(follower.covariance[G, G]) * float(follower.priors.unit[G])
         if sd > _MAX_SD:
             status = "conductance not resolved" if is_moving(block["u"]) else "at standstill"
-            return NotJudged.with_count(end, status, restarts)
+            return NotJudged.with_count(end, status, restarts=restarts)
         pressure = float(np.mean(np.abs(block["p_A"] - block["p_B"])))
         speed = self._rig.motor.omega_per_volt * float(np.mean(np.abs(block["u"])))
         pump_flow = speed * self._rig.pump.q_b / (2.0 * math.pi)
-        # `offset`: the level is not known, as all blocks share the error of the prior
+        # `offset`: deviation of the error that all blocks share, that of the prior: only changes of g are known
         return [BlockConductance(begin, end, g, sd, total=g, offset=_MAX_SD, pressure=pressure, pump_flow=pump_flow)]
 
     def _reject(self, follower: Follower, end: float, is_settling: bool, restarts: bool) -> NotJudged:
@@ -209,7 +209,8 @@ class PressureEstimator:
             self._misfits, self._settling = 0, _SETTLING
             return NotJudged.with_count(end, "not described by the model", restarts=True)
         self._settling = self._settling if is_settling else _RESUMING
-        return NotJudged.with_count(end, "settling" if is_settling else "not described by the model", restarts)
+        status = "settling" if is_settling else "not described by the model"
+        return NotJudged.with_count(end, status, restarts=restarts)
 
     def _resume(self, follower: Follower, gap: float, rate: float) -> tuple[Follower, bool]:
         """Prepare the fit of the pressures for a block that follows the last one after a `gap` [s].

@@ -121,7 +121,8 @@ def _rates(y: State, friction: float, omega_ref: float, theta: Parameters, m: Re
     """
     # p_A = p/2 and p_B = -p/2, so p changes twice as fast as p_A; 0.0: no leakage of the pump, no force of an end stop
     p, v, omega, i, integral, x = y
-    outflow, viscous = m.A_A * v + laminar_leakage(p, theta[G]), theta[F_V] * v * _direction_factor(v, theta)
+    outflow = m.A_A * v + laminar_leakage(p, theta[G])  # from chamber A, by motion and leakage
+    viscous = theta[F_V] * v * _direction_factor(v, theta)
     error = omega_ref - omega
     voltage = controller_voltage(error, integral, m.k_p, m.K_i, m.V_max)
     return (
@@ -130,7 +131,7 @@ def _rates(y: State, friction: float, omega_ref: float, theta: Parameters, m: Re
         shaft_acceleration(i, omega, pump_torque(p, m.q_b), m.C_m, m.B_M, m.J_M),
         winding_current_rate(voltage, i, omega, m.R_c, m.L_c, m.C_e, m.i_max),
         error,
-        v - x * _CENTRING_RATE,
+        v - x * _CENTRING_RATE,  # x decays slowly to 0: it counts from the slowly varying mean position
     )
 
 

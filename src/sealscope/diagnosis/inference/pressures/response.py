@@ -352,7 +352,11 @@ class Follower:
         self.covariance, self.states, self.last = covariance, states, math.nan
 
     def at_rate(self, rig: Rig, rate: float) -> Follower:
-        """Return a filter with the same parameters for samples at another rate [Hz], which starts as after a gap."""
+        """Make a filter for samples at another `rate` [Hz] that starts from the state of this filter.
+
+        Parameters, covariance and simulated states are kept, but there is no previous sample: as after a gap, the next
+        block starts the simulation anew (`next_segment`).
+        """
         follower = Follower(Machine.from_rig(rig, rate, self.machine.law), self.priors, self.sense)
         follower.theta, follower.covariance = self.theta, self.covariance
         follower.variance, follower.states = self.variance, self.states
