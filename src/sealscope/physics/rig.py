@@ -578,6 +578,7 @@ def valve_rates(y: State, Q_1: float, p: RigNumbers) -> Pressures:
     p_A, p_B, p_P, p_T = y[P_A], y[P_B], y[P_1], y[P_2]
     Q_PA, Q_AT, Q_PB, Q_BT = valve_flows(y, p)
     V_A, V_B = volumes_at(y[POSITION], p)
+    # each flow at the pressures of its source and of its sink: drawn from the supply, and into the chamber
     drawn_A, to_A = flows_at_both_ends(Q_PA, p_P, p_A, p)
     drawn_B, to_B = flows_at_both_ends(Q_PB, p_P, p_B, p)
     from_A, _ = flows_at_both_ends(Q_AT, p_A, p_T, p)

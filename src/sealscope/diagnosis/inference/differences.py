@@ -171,7 +171,7 @@ def compare_estimates(
     inflations = np.geomspace(1.0, prior.inflation, INFLATIONS) if prior.inflation > 1.0 else np.ones(1)
     ratios, inflations = (grid.ravel() for grid in np.meshgrid(ratios, inflations))
     scatter = prior.deviation * ratios  # at each point of the joint grid
-    weights = 1.0 / (scatter[:, None] ** 2 + (inflations[:, None] * errors) ** 2)
+    weights = 1.0 / (scatter[:, None] ** 2 + (inflations[:, None] * errors) ** 2)  # (grid points, n)
     precision = weights.sum(axis=1)
     means = weights @ values / precision
     squares = (weights * (values - means[:, None]) ** 2).sum(axis=1)

@@ -86,7 +86,8 @@ class Mixture(NamedTuple):
         """Compute the quantile of the mixture: the value below which it lies with the given probability."""
         from scipy.special import ndtr, ndtri
 
-        # scale all values by a typical deviation, so that the quantile is of the order of one
+        # scale all values by a typical deviation, so that the quantile is of the order of one; very large deviations
+        # count only in part
         scale = max(float(self.weights @ np.minimum(self.deviations, 1e3 * self.deviations.min())), TINY)
         scaled = self._replace(centres=self.centres / scale, deviations=self.deviations / scale)
 
@@ -196,8 +197,8 @@ class Rise(NamedTuple):
         """
         tail_values = [self.threshold(chance) * self.deviation for chance in (tail, 1.0 - tail)]
         min_log_density = min(self._log_density(value) for value in tail_values)
-        log_densities = [max(self._log_density(error), min_log_density) for error in (self.value - rise, self.value)]
-        return log_densities[0] - log_densities[1]
+        with_rise = max(self._log_density(self.value - rise), min_log_density)
+        return with_rise - max(self._log_density(self.value), min_log_density)
 
     def _log_ratio_lognormal(self, rise: float, log_deviation: float) -> float:
         """Compute the log likelihood ratio of a true rise with a log-normal prior about `rise` to no rise.
@@ -286,7 +287,7 @@ class RecordingSums(NamedTuple):
         left side); `start_s`: date [s since 1970] and `oil_degC`: oil temperature, None if unknown, are stored as they
         are.
         """
-        weights = np.maximum(blocks.rows, 1e-9)
+        weights = np.maximum(blocks.rows, 1e-9)  # positive, so that the means exist
         flow = float(np.average(blocks.flow, weights=weights))
         pressure = float(np.average(blocks.mean_pressure(), weights=weights))
         return cls(eliminate_unshared(sum_blocks(blocks, columns), columns), flow, pressure, start_s, oil_degC)
@@ -555,7 +556,7 @@ def _rise_of_mixture(predicted: Mixture, values: Array) -> Rise:
     value follows the mixture over all estimates. The rise is its median, and the standard deviation half of its central
     68 % interval.
     """
-    judged = np.reshape(values, (-1, *[1] * (predicted.centres.ndim - 1)))
+    judged = np.reshape(values, (-1, *[1] * (predicted.centres.ndim - 1)))  # (s, 1, ..., 1)
     log_weights, deviations = predicted.weights.ravel(), predicted.deviations.ravel()
     centres = (predicted.centres - judged).ravel()
     is_counted = log_weights > log_weights.max() - NEGLIGIBLE
@@ -671,6 +672,7 @@ class Population:
         )
         if not 1e4 * sums_of_squares.max() < MAX_READING:  # would overflow: return a rise without a bound
             return Rise(float(values.mean()), deviation=np.inf, degrees_of_freedom=freedom)
+        # limits of a log-spaced grid of sigma, far below and far above the probable values
         min_sigma = np.sqrt(np.maximum(0.1 * freedom * prior_sigma**2, 1e-9 * sums_of_squares) / (freedom + count))
         max_sigma = np.maximum(100.0 * np.sqrt(sums_of_squares), 10.0 / MAX_READING)
         sigma = np.geomspace(np.maximum(min_sigma, 1.0 / MAX_READING), max_sigma, NODES, axis=1)

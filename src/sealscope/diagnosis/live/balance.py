@@ -282,7 +282,7 @@ class LiveBalance:
             self._moving = self._moving + 1 if self._relative_motion(block) > 1.0 / STANDSTILL else 0
             if self._moving >= N_WAKING:
                 self.relearn()
-                return NotJudged(end, "learning", "blocks: moves as never before", restarts=True)
+                return NotJudged(end, "learning", counter="blocks: moves as never before", restarts=True)
             estimate = self._estimate_block(block)
             return estimate if isinstance(estimate, NotJudged) else [estimate]
         has_moved = _volume_square(block) > 0.0
@@ -390,6 +390,7 @@ class LiveBalance:
             return ()
         centred = remove_pressure_offset(blocks, self._roles)
         volumes = volume_observables(centred, blocks, self._balances, self._roles, oil_loss={})
+        # the samples of a block begin less than a block before the time range of its equations
         return (*volumes, *self._signals.observables(since - BLOCK_SECONDS))
 
     def state(self) -> dict[str, Any]:

@@ -121,13 +121,15 @@ class PressureEstimator:
             self._held[:] = math.nan
             self._samples = self._samples[:, :0]
         samples = np.hstack([self._samples, [run.t, *(run.channels[name] for name in _READ)]])
+        # numbers of samples: for the first fit, and in a block
         n_first, n_block = (round(seconds * run.rate) for seconds in (_PRIORS.begins, self.block_seconds))
         is_slow = run.rate < _MIN_RATE  # blocks are refused without a fit
         while self._follower is None and not is_slow and samples.shape[1] >= n_first:
             beginning = _make_recording(samples[:, :n_first], run.rate)
             if reason := find_unmet_requirement(beginning, self._rig) or describe_hold(beginning):
                 samples = samples[:, n_first // 2 :]
-                yield NotJudged(float(run.t[-1]), "", f"half minutes before the first block: {reason}")
+                counter = f"half minutes before the first block: {reason}"
+                yield NotJudged(float(run.t[-1]), status="", counter=counter)
             else:
                 self._follower = Follower.fit_start(beginning, self._rig)
         while (self._follower is not None or is_slow) and samples.shape[1] >= n_block:
@@ -260,6 +262,7 @@ class PressureEstimator:
         stored blocks do not reach from `onset` to `end`, and an empty tuple if there are too few blocks.
         """
         rows, seconds = self._rows, self.block_seconds
+        # no blocks, a last block that is not the one at `end`, or a first block that begins after the onset
         if not rows.size or rows[-1, _END] != end or rows[0, _END] - seconds > onset:
             return None
         rows = rows[rows[:, _END] > since + 0.5 * seconds]  # begin at `since` or later, to half a block

@@ -176,7 +176,7 @@ def simulate_response(
     y, friction, reading = _load_six(states, 0), load(states, 6), load(states, 7)
     theta = (*_load_six(sets, 0), *_load_six(sets, 6), load(sets, LAG))
     h = 1.0 / (rate * n_substeps)
-    steady = _steady_friction(y[1], theta, m)[0]
+    steady = _steady_friction(y[1], theta, m)[0]  # friction of steady sliding at the piston's speed y[1]
     for sample in range(command.size - 1):
         rise = command[sample + 1] - command[sample]
         # added to gain times command: the bias, and the effect of the lead, by which the linear command comes earlier
@@ -186,6 +186,7 @@ def simulate_response(
             speed_0 = theta[GAIN] * (command[sample] + rise * (step / n_substeps)) + lead_speed
             speed_1 = theta[GAIN] * (command[sample] + rise * ((step + 0.5) / n_substeps)) + lead_speed
             speed_2 = theta[GAIN] * (command[sample] + rise * ((step + 1.0) / n_substeps)) + lead_speed
+            # the four stages of RK4; the first result of `_advance_friction` is the friction at the stage
             k_1 = _rates(y, friction, speed_0, theta, m)
             y_1 = _advance(y, 0.5 * h, k_1)
             k_2 = _rates(y_1, _advance_friction(friction, steady, y_1[1], 0.5 * h, theta, m)[0], speed_1, theta, m)
