@@ -216,7 +216,7 @@ class _Law(CPUDispatcher):  # type: ignore[misc]
         return self.py_func if inlined else compile_kernel(self.py_func, self.targetoptions["fastmath"], self.folder)
 
     def __call__(self, *arguments: Any, **named: Any) -> Any:
-        """Run the law for a call from Python (`_for_python`)."""
+        """Run the law for a call from Python: the source of a small law, or the kernel of a large one."""
         return self._for_python(*arguments, **named)
 
 

@@ -147,7 +147,7 @@ def test_pressures_that_decay_tell_the_law_of_the_leak() -> None:
     for exponent, other in ((1.0, 0.5), (0.5, 1.0)):
         chambers = held_press(piston=SEAL, exponent=exponent)
         found = PistonFit(0.0, 0.0, NEITHER)
-        likelihoods = {e: chambers.fit_piston_leak(found, LeakLaw(e)).likelihood for e in (1.0, 0.5)}
+        likelihoods = {e: chambers.fit_piston_leak(found, LeakLaw(e)).log_likelihood for e in (1.0, 0.5)}
         assert likelihoods[exponent] > likelihoods[other] + 5.0
 
 

@@ -126,15 +126,16 @@ class Drive(_Invertible):
     @classmethod
     def from_rig(cls, rig: Rig) -> Self:
         """Build the model of a rig's pump and drive; raise InputError for a valve-controlled rig."""
-        check_circuit_property(
-            "a pump's drive (of a servo valve: ValveDrive)", rig.name, rig.circuit, "pump_feeds_chambers"
-        )
-        motor, displacement = rig.motor, rig.pump.q_b / (2.0 * math.pi)
+        subject = "a pump's drive (of a servo valve: ValveDrive)"  # for the error message
+        check_circuit_property(subject, rig.name, rig.circuit, flag="pump_feeds_chambers")
+        motor = rig.motor
+        displacement = rig.pump.q_b / (2.0 * math.pi)  # per radian, from q_b per revolution
         shortfall = corner = 0.0  # without a proportional gain the speed is taken as the commanded one
         if motor.k_p > 0:
-            shortfall, corner = motor.C_e / motor.k_p, motor.K_i / motor.k_p
+            shortfall = motor.C_e / motor.k_p  # back electromotive force over the gain of the speed controller
+            corner = motor.K_i / motor.k_p  # corner of the PI controller [1/s]
         droop = motor.R_c * displacement / (motor.C_m * motor.C_e)
-        return cls(displacement, motor.omega_per_volt, shortfall, corner, droop)
+        return cls(displacement, motor.omega_per_volt, shortfall=shortfall, corner=corner, droop=droop)
 
     @property
     def lag(self) -> float:

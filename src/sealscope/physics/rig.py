@@ -578,6 +578,7 @@ def valve_rates(y: State, Q_1: float, p: RigNumbers) -> Pressures:
     p_A, p_B, p_P, p_T = y[P_A], y[P_B], y[P_1], y[P_2]
     Q_PA, Q_AT, Q_PB, Q_BT = valve_flows(y, p)
     V_A, V_B = volumes_at(y[POSITION], p)
+    # each flow at the pressures of its source and of its sink: drawn from the supply, and into the chamber
     drawn_A, to_A = flows_at_both_ends(Q_PA, p_P, p_A, p)
     drawn_B, to_B = flows_at_both_ends(Q_PB, p_P, p_B, p)
     from_A, _ = flows_at_both_ends(Q_AT, p_A, p_T, p)
@@ -605,7 +606,7 @@ def rates_without_throttles(y: State, u: float, G: float, C: float, F: float, p:
     if len(p.sticking) > 0:
         v = friction.stuck_velocity(v, p.v_th)
     dp_pump = pump_difference(y, p)
-    error = speed_error(y, u, p)  # eq. (4.2) as a state
+    error = speed_error(y, u, p)  # the rate of the state I, its integral; eq. (4.2) of the thesis
     voltage = motor.controller_voltage(error, y[INTEGRAL], p.k_p, p.K_i, p.V_max)
     d_i = motor.winding_current_rate(voltage, y[CURRENT], y[OMEGA], p.R_c, p.L_c, p.C_e, p.i_max)
     torque = pump.pump_torque(dp_pump, p.q_b)
@@ -630,7 +631,7 @@ def rates_without_throttles(y: State, u: float, G: float, C: float, F: float, p:
     V_A, V_B = volumes_at(x, p)
     K_A, K_B = bulk_modulus(p_A, p), bulk_modulus(p_B, p)
     from_A, to_B = flows_at_both_ends(Q_L, y[P_A], y[P_B], p)
-    if len(p.throttled) > 0:
+    if len(p.throttled) > 0:  # the pump's ports have volumes of their own; `throttle_rates` adds the throttles' flows
         from_2, to_1 = flows_at_both_ends(Q_1, y[P_2], y[P_1], p)
         rate_A = cylinder.pressure_rate(-p.A_A * v - from_A, V_A, K_A)
         rate_B = cylinder.pressure_rate(p.A_B * v + to_B, V_B, K_B)
@@ -656,7 +657,7 @@ def rates_without_throttles(y: State, u: float, G: float, C: float, F: float, p:
         d_v_s = valve.spool_acceleration(y[SPOOL], y[SPOOL_SPEED], x_d, p.omega_s, p.zeta_s, p.v_max)
     if len(p.clogging) > 0:  # in a rig without a spool, these two states are the oil that has passed each filter
         d_x_s, d_v_s = filter_flows(y, p)
-    # in the order of `STATES`; dx/dt = v is eq. (4.13)
+    # in the order of `STATES`; dx/dt = v is eq. (4.13) of the thesis
     return error, d_i, d_omega, y[OMEGA], v, acceleration, rate_A, rate_B, rate_1, rate_2, fed, dz, d_x_s, d_v_s
 
 

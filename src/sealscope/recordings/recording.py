@@ -337,8 +337,8 @@ class Recording:
         ----------
         frame : pandas.DataFrame
             Columns such as ``p_A [bar]``; a unit may also be in ``frame.attrs["units"][column]`` or in the column's
-            own ``attrs["units"]``. The time is a column such as ``t [s]``, or the index: with a name, of numbers with
-            a fraction, of dates or of time differences.
+            own ``attrs["units"]``. The time is a column such as ``t [s]``, or else the index, if this has a name or
+            contains floating-point numbers, dates or time differences.
         map : mapping of str to str or "auto", optional
             Channel (or ``t``) -> column, as for `read`.
         rate : float, optional

@@ -90,14 +90,15 @@ def compare_with_healthy(
     above : bool
         Count only a value above the healthy ones.
     prior_change : float
-        Standard deviation of a true change, infinite if unknown. If it is known, the chance is at least the inverse of
+        Standard deviation of a true change, infinite if unknown. If it is known, the p-value is at least the inverse of
         the Bayes factor of such a change, and 1 if a true change explains the value no better than scatter does.
 
     Returns
     -------
     Observable or None
-        Its size is the difference from the healthy mean, its score the square of t; with `above`, the score of a value
-        below the mean is 0. None for fewer than `MIN_HEALTHY` healthy recordings, or if a number is not finite.
+        Its size is the difference from the healthy mean, and its score the square of t; with `above`, the score of a
+        value below the mean is 0. Its chance is the p-value, the probability of so large a t without a change. None for
+        fewer than `MIN_HEALTHY` healthy recordings, or if a number is not finite.
     """
     from scipy.special import stdtr
 
@@ -107,7 +108,7 @@ def compare_with_healthy(
     count = len(healthy_values)
     freedom = count - 1
     change = value - float(healthy_values.mean())
-    scatter_variance = float(healthy_values.var() * count) / freedom
+    scatter_variance = float(healthy_values.var() * count) / freedom  # unbiased estimate, s^2
     variance = (scatter_variance + error**2) * (1.0 + 1.0 / count)
     t = change / max(float(np.sqrt(variance)), TINY)
     chance = float(stdtr(freedom, -t if above else -abs(t))) * (1.0 if above else 2.0)
@@ -115,7 +116,8 @@ def compare_with_healthy(
     if not np.isfinite(score):
         return None
     if np.isfinite(prior_change):
-        # Bayes factor of a true change: density of Student's t with the variance of such a change added, over without
+        # Bayes factor of a true change: ratio of two densities of Student's t at the value, with the variance of such a
+        # change added, and without it
         variance_ratio = 1.0 + prior_change**2 / max(variance, TINY)
         log_factor = 0.5 * (freedom + 1.0) * np.log1p(t * t / freedom)
         log_factor -= 0.5 * (freedom + 1.0) * np.log1p(t * t / variance_ratio / freedom) + 0.5 * np.log(variance_ratio)
@@ -153,9 +155,10 @@ def compare_estimates(
     Returns
     -------
     Observable or None
-        Its size is the difference from the weighted mean of the healthy estimates, its score the square of this
-        difference over its variance; with `above`, the score of a negative difference is 0. None for fewer than
-        `MIN_HEALTHY` healthy recordings, or if a number is not finite.
+        Its size is the difference from the weighted mean of the healthy estimates, and its score the square of this
+        difference over its variance; with `above`, the score of a negative difference is 0. Its chance is the p-value,
+        the probability of so large a difference without a change. None for fewer than `MIN_HEALTHY` healthy recordings,
+        or if a number is not finite.
     """
     from scipy.special import ndtr
 
@@ -168,7 +171,7 @@ def compare_estimates(
     inflations = np.geomspace(1.0, prior.inflation, INFLATIONS) if prior.inflation > 1.0 else np.ones(1)
     ratios, inflations = (grid.ravel() for grid in np.meshgrid(ratios, inflations))
     scatter = prior.deviation * ratios  # at each point of the joint grid
-    weights = 1.0 / (scatter[:, None] ** 2 + (inflations[:, None] * errors) ** 2)
+    weights = 1.0 / (scatter[:, None] ** 2 + (inflations[:, None] * errors) ** 2)  # (grid points, n)
     precision = weights.sum(axis=1)
     means = weights @ values / precision
     squares = (weights * (values - means[:, None]) ** 2).sum(axis=1)

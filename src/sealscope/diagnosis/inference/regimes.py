@@ -99,18 +99,20 @@ def _rest_share(blocks: Blocks, roles: ColumnRoles, *states: str) -> float:
 
 
 def shut_odds(blocks: Blocks, roles: ColumnRoles) -> float:
-    """Compute the log odds that valves cut the pump off from the cylinder while it rests.
+    """Compute the log odds that valves cut the pump off from the cylinder while the pump rests.
 
     The leakage at rest is compared with zero and with the leakage in motion (`rest_log_odds`). Positive log odds mean
     that valves cut the pump off. The log odds are limited to +-`rest.most` of `priors.toml`, and are 0 if the recording
-    says nothing about the valves. `roles`: indices of the columns of `blocks` by role; they include the leakage of a
-    pump that moves or holds the piston, and the flow offset in motion (`terms.with_rests`).
+    says nothing about the valves. `roles`: indices of the columns of `blocks` by role. The columns must include
+    `TURNING`, the additional leakage while the pump moves the piston, and `MOVING_BIAS`, the additional flow offset in
+    motion (`terms.with_rests`).
     """
     if not has_rests(blocks, roles) or len(blocks) < 2:
         return 0.0
     turning, moving_bias = roles.names.index(TURNING), roles.names.index(MOVING_BIAS)
     columns = [*roles.nuisance, turning, moving_bias]
-    coefficients, covariance = fit_with_robust_covariance(blocks.gram[:, 0], columns, roles.left)
+    grams = blocks.gram[:, 0]  # of the pump's volume balance in each block
+    coefficients, covariance = fit_with_robust_covariance(grams, columns, roles.left)
     # at rest the leakage is the leak's coefficient; in motion the coefficient of the turning pump is added
     rest, extra = columns.index(roles.leak), columns.index(turning)
     rest_leak, motion_leak = coefficients[rest], coefficients[rest] + coefficients[extra]

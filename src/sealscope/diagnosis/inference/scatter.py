@@ -86,7 +86,8 @@ class Mixture(NamedTuple):
         """Compute the quantile of the mixture: the value below which it lies with the given probability."""
         from scipy.special import ndtr, ndtri
 
-        # scale all values by a typical deviation, so that the quantile is of the order of one
+        # scale all values by a typical deviation, so that the quantile is of the order of one; very large deviations
+        # count only in part
         scale = max(float(self.weights @ np.minimum(self.deviations, 1e3 * self.deviations.min())), TINY)
         scaled = self._replace(centres=self.centres / scale, deviations=self.deviations / scale)
 
@@ -196,8 +197,8 @@ class Rise(NamedTuple):
         """
         tail_values = [self.threshold(chance) * self.deviation for chance in (tail, 1.0 - tail)]
         min_log_density = min(self._log_density(value) for value in tail_values)
-        log_densities = [max(self._log_density(error), min_log_density) for error in (self.value - rise, self.value)]
-        return log_densities[0] - log_densities[1]
+        with_rise = max(self._log_density(self.value - rise), min_log_density)
+        return with_rise - max(self._log_density(self.value), min_log_density)
 
     def _log_ratio_lognormal(self, rise: float, log_deviation: float) -> float:
         """Compute the log likelihood ratio of a true rise with a log-normal prior about `rise` to no rise.
@@ -286,7 +287,7 @@ class RecordingSums(NamedTuple):
         left side); `start_s`: date [s since 1970] and `oil_degC`: oil temperature, None if unknown, are stored as they
         are.
         """
-        weights = np.maximum(blocks.rows, 1e-9)
+        weights = np.maximum(blocks.rows, 1e-9)  # positive, so that the means exist
         flow = float(np.average(blocks.flow, weights=weights))
         pressure = float(np.average(blocks.mean_pressure(), weights=weights))
         return cls(eliminate_unshared(sum_blocks(blocks, columns), columns), flow, pressure, start_s, oil_degC)
@@ -304,9 +305,13 @@ def rise(judged: RecordingSums, baseline: Sequence[RecordingSums], columns: Sequ
     `baseline`: summaries of the healthy recordings; `columns`: for each equation the indices of its columns by role
     (leak, motion, left side), the same for all recordings. The rise and its standard deviation are in the unit of the
     leak's coefficient, for the laminar leak m^3/(s Pa).
+
+    The other coefficients may differ between recordings within a prior. As its width is uncertain, the rises are
+    estimated for several widths, and the result is an average over them (`_compare_levels`).
     """
     healthy_sums = np.sum([recording.sums for recording in baseline], axis=0)
     count, prior = len(baseline), INFERENCE.scatter
+    # factors on the prior standard deviations; `prior.between` is one standard deviation of these factors
     widths = prior.between ** np.linspace(-MAX_SCALE, MAX_SCALE, SCALES)
     rises, rise_errors = np.zeros((SCALES, count)), np.zeros((SCALES, count))
     if count > 1:  # rises of each healthy recording over the others, scaled to its rise over the mean of all
@@ -319,6 +324,8 @@ def rise(judged: RecordingSums, baseline: Sequence[RecordingSums], columns: Sequ
         )
     values, error = _estimate_leak_excess(judged.sums, healthy_sums, columns, widths)
     level, level_error = coefficient_level(healthy_sums, columns)
+    # error of a rise for each width: a fraction of the typical standard error, and at least the fraction `prior.finest`
+    # of the pump's mean flow, as a conductance
     errors = prior.estimate * np.median(np.column_stack([error, rise_errors]), axis=1)
     errors = np.maximum(errors, max(prior.finest * _conductance_of_flow(judged), 1.0 / MAX_READING))
     return _compare_levels(judged, baseline, _Estimates(values, rises, errors, level, level_error))
@@ -478,7 +485,7 @@ def _candidate_covariances(
     log_priors : array of float, shape (g,)
     """
     # grid of the standard deviation between sessions over its prior, denser near zero; the log priors are those of a
-    # half-normal density times the spacing of the grid
+    # half-normal density times the distance of the grid points, which grows with the root of the ratio
     ratios = MAX_SESSION_RATIO * ((np.arange(NODES) + 0.5) / NODES) ** 2
     log_priors = 0.5 * np.log(ratios) - 0.5 * ratios**2
     if len(set(sessions)) == 1:
@@ -526,9 +533,10 @@ class _LevelScale(NamedTuple):
     def to_levels(self, predicted: Mixture, transformed: Array) -> Mixture:
         """Convert a distribution of z to a distribution of the leak coefficient, relative to the healthy mean `level`.
 
-        `predicted`: mixture of normal distributions of z, shape (s, g, nodes), whose weights are logarithms and whose
-        centres are relative to `transformed` (s,), the z of the judged recording. Each normal distribution is split
-        into `PARTS` narrower ones, along a new last axis, within which the coefficient is nearly linear in z.
+        `predicted`: mixture of normal distributions of z, shape (s, g, nodes) as from `Population.predict`, whose
+        weights are logarithms and whose centres are relative to `transformed` (s,), the z of the judged recording. Each
+        normal distribution is split into `PARTS` narrower ones, along a new last axis, within which the coefficient is
+        nearly linear in z.
         """
         x, part_weights = np.polynomial.hermite_e.hermegauss(PARTS)  # centres of the parts [standard deviations]
         centres, deviations = predicted.centres + transformed[:, None, None], predicted.deviations[..., None]
@@ -548,7 +556,7 @@ def _rise_of_mixture(predicted: Mixture, values: Array) -> Rise:
     value follows the mixture over all estimates. The rise is its median, and the standard deviation half of its central
     68 % interval.
     """
-    judged = np.reshape(values, (-1, *[1] * (predicted.centres.ndim - 1)))
+    judged = np.reshape(values, (-1, *[1] * (predicted.centres.ndim - 1)))  # (s, 1, ..., 1)
     log_weights, deviations = predicted.weights.ravel(), predicted.deviations.ravel()
     centres = (predicted.centres - judged).ravel()
     is_counted = log_weights > log_weights.max() - NEGLIGIBLE
@@ -605,10 +613,10 @@ def leak_deviations_from_mean(recordings: Sequence[RecordingSums], columns: Sequ
     """Compute the deviation of each recording's leak coefficient from the mean of all n recordings, shape (n,).
 
     It is (n - 1)/n times the difference of the recording's coefficient from the common coefficient of the other n - 1
-    recordings. The coefficients of all other terms may differ between recordings within the usual prior, and the flow
-    offset freely. `columns`: for each equation the indices of its columns by role (leak, motion, left side).
+    recordings. The coefficients of all other terms may differ between recordings within the usual prior; only the flow
+    offset may differ freely. `columns`: for each equation the indices of its columns by role (leak, motion, left side).
     """
-    usual_width, columns = np.ones(1), [roles.with_free_zero() for roles in columns]
+    usual_width, columns = np.ones(1), [roles.with_free_zero() for roles in columns]  # a factor of 1 on the priors
     all_sums = [eliminate_unshared(recording.sums, columns) for recording in recordings]
     total = np.sum(all_sums, axis=0)
     rises = [_estimate_leak_excess(sums, total - sums, columns, usual_width)[0] for sums in all_sums]
@@ -633,7 +641,7 @@ class Population:
         self._sample = np.unique(np.linspace(0, n - 1, min(n, MAX_RECORDINGS)).astype(int))
         healthy = candidates[:, self._sample[:, None], self._sample]
         eigen, basis = np.linalg.eigh(healthy)
-        # the other quantities are stored along these eigenvectors; axes (g, 1, n): 1 for the nodes of sigma
+        # the other quantities are stored along these eigenvectors; axes (g, 1, n): 1 for the grid of sigma
         self._eigen, self._basis = np.maximum(eigen, 0.0)[:, None], basis
         self._cross = np.einsum("gij,gi->gj", basis, candidates[:, self._sample, n])[:, None]
         self._ones = basis.sum(axis=1)[:, None]
@@ -663,7 +671,8 @@ class Population:
             (healthy - healthy.mean(axis=1, keepdims=True)) ** 2, axis=1
         )
         if not 1e4 * sums_of_squares.max() < MAX_READING:  # would overflow: return a rise without a bound
-            return Rise(float(values.mean()), np.inf, freedom)
+            return Rise(float(values.mean()), deviation=np.inf, degrees_of_freedom=freedom)
+        # limits of a log-spaced grid of sigma, far below and far above the probable values
         min_sigma = np.sqrt(np.maximum(0.1 * freedom * prior_sigma**2, 1e-9 * sums_of_squares) / (freedom + count))
         max_sigma = np.maximum(100.0 * np.sqrt(sums_of_squares), 10.0 / MAX_READING)
         sigma = np.geomspace(np.maximum(min_sigma, 1.0 / MAX_READING), max_sigma, NODES, axis=1)
@@ -691,7 +700,7 @@ class Population:
         healthy_values : array of float, shape (s, n)
             The healthy values x by the same estimates.
         sigma : array of float, shape (s, nodes)
-            Log-spaced grid of the scatter of the values.
+            Standard deviations of the values: a log-spaced grid of `NODES` for each alternative estimate.
         log_priors : array of float, shape (s,)
             Log prior of each alternative estimate.
         sigma_log_prior : array of float, shape (s, nodes), or float
@@ -700,8 +709,8 @@ class Population:
         Returns
         -------
         Mixture
-            Log weights, standard deviations and centres of shape (s, g, nodes), for g candidate covariances. The
-            centres are relative to `values`.
+            Log weights, standard deviations and centres of shape (s, g, nodes), for g candidate covariances and the
+            grid of `sigma`. The centres are relative to `values`.
         """
         healthy = healthy_values[:, self._sample]
         variance = sigma[:, None] ** 2  # (s, 1, nodes)
@@ -798,9 +807,9 @@ def _oil_hypotheses(recordings: Sequence[RecordingSums]) -> list[_Oil]:
 def coefficient_level(gram: Array, columns: Sequence[ColumnRoles]) -> tuple[float, float]:
     """Estimate the leak coefficient, at least 0, and its standard error from the Gram matrices `gram` (E, m, m).
 
-    `columns`: for each equation the indices of its columns by role (leak, motion, left side). The other coefficients
-    are eliminated from each equation (Schur complement), and the equations are added up. Both results are 0 if the
-    matrices have no information on the leak.
+    `columns`: for each equation the indices of its columns by role (leak, motion, left side). The coefficients of the
+    other terms (nuisances) are eliminated from each equation by the Schur complement, and the equations are added up.
+    Both results are 0 if the matrices have no information on the leak.
     """
     precision, moment = 0.0, 0.0
     for e, roles in enumerate(columns):
@@ -830,14 +839,17 @@ def motion_change(judged: Array, healthy: Array, roles: ColumnRoles) -> tuple[fl
     fitted = [k for k in roles.compared if k == roles.leak or np.isfinite(roles.between_deviation[k])]
     reference = solve(healthy[np.ix_(fitted, fitted)], healthy[fitted, roles.left])
     is_free = np.isin(fitted, [*roles.motion, roles.leak])
-    precision = roles.difference_precisions(fitted, reference, reference[fitted.index(roles.leak)])
+    leak_coefficient = reference[fitted.index(roles.leak)]
+    precision = roles.difference_precisions(fitted, reference, leak_coefficient)
     gram = judged[np.ix_(fitted, fitted)]
+    # limited to a precision that is enough to fix a coefficient
     prior = np.where(is_free, 0.0, np.minimum(precision, 1e9 * np.diag(gram)))
     weights = np.where(np.isin(fitted, motion), np.diag(gram), 0.0)
     right_sides = np.column_stack([judged[fitted, roles.left] + prior * reference, weights])
     coefficients, error_weights = solve(gram + np.diag(prior), right_sides).T
-    flow, healthy_flow = (max(abs(float(weights @ c)), TINY) for c in (coefficients, reference))
-    return math.log(flow / healthy_flow), math.sqrt(max(float(weights @ error_weights), 0.0)) / flow
+    # means of the motion coefficients, times the sum of the weights, which cancels in both results
+    motion_sum, healthy_sum = (max(abs(float(weights @ c)), TINY) for c in (coefficients, reference))
+    return math.log(motion_sum / healthy_sum), math.sqrt(max(float(weights @ error_weights), 0.0)) / motion_sum
 
 
 def student_rise(value: float, deviations: Sequence[float] | Array, prior_scatter: float) -> Rise:
@@ -854,8 +866,8 @@ def student_rise(value: float, deviations: Sequence[float] | Array, prior_scatte
     freedom = prior.freedom + count - 1
     if count > 1:
         sum_of_squares += float(np.sum(np.square(deviations))) * ((count - 1) / count) ** 2
-    deviation = np.sqrt(sum_of_squares / freedom * (1.0 + 1.0 / count))
-    return Rise(value, max(float(deviation), np.finfo(float).tiny), freedom)
+    deviation = max(float(np.sqrt(sum_of_squares / freedom * (1.0 + 1.0 / count))), np.finfo(float).tiny)
+    return Rise(value, deviation, degrees_of_freedom=freedom)
 
 
 def eliminate_unshared(gram: Array, columns: Sequence[ColumnRoles]) -> Array:
@@ -904,7 +916,7 @@ def compare_laws(
     if any(ORIFICE not in roles.names for roles in columns):
         return None
     reference = np.sum([recording.sums for recording in baseline], axis=0)
-    grams, moments, left_square = np.zeros((2, 2)), np.zeros(2), 0.0
+    grams, moments, square_without_leak = np.zeros((2, 2)), np.zeros(2), 0.0
     for e, roles in enumerate(columns):
         gram, leaks = judged.sums[e], [roles.leak, roles.names.index(ORIFICE)]  # laminar, orifice
         residual, nuisance, prior = _residual_products(gram, reference[e], roles)
@@ -913,11 +925,12 @@ def compare_laws(
         solved_leaks, solved_residual = solved[:, :2], solved[:, 2]
         grams += gram[np.ix_(leaks, leaks)] - gram[np.ix_(leaks, nuisance)] @ solved_leaks
         moments += residual[leaks] - gram[np.ix_(leaks, nuisance)] @ solved_residual
-        left_square += float(residual[-1] - residual[nuisance] @ solved_residual)
+        square_without_leak += float(residual[-1] - residual[nuisance] @ solved_residual)
     energies, cross = np.diag(grams), grams[0, 1]
     if not energies.min() > 0.0 or not cross > 0.0:
         return None
-    laminar, orifice = np.maximum(left_square - moments**2 / energies, 1e-9 * abs(left_square) + TINY)
+    min_square = 1e-9 * abs(square_without_leak) + TINY  # above rounding errors
+    laminar, orifice = np.maximum(square_without_leak - moments**2 / energies, min_square)
     return LawFit(regression=float(cross / energies[0]), log_ratio=float(-0.5 * np.log(orifice / laminar)))
 
 
@@ -943,7 +956,7 @@ def compare_with_leak(
     reference = np.sum([recording.sums for recording in baseline], axis=0)
     residual_squares = []
     for is_rival in (False, True):
-        energy = moment = left_square = 0.0
+        energy = moment = square_without = 0.0  # square of the tested column, its product with the residual, ...
         for e, roles in enumerate(columns):
             gram = judged.sums[e]
             tested = roles.names.index(rival) if is_rival else roles.leak
@@ -952,11 +965,12 @@ def compare_with_leak(
             solved = solve(regularised, np.column_stack([gram[nuisance, tested], residual[nuisance]]))
             energy += float(gram[tested, tested] - gram[tested, nuisance] @ solved[:, 0])
             moment += float(residual[tested] - gram[tested, nuisance] @ solved[:, 1])
-            left_square += float(residual[-1] - residual[nuisance] @ solved[:, 1])
+            square_without += float(residual[-1] - residual[nuisance] @ solved[:, 1])
         if not energy > 0.0:
             return None
-        gain = (moment if is_rival and rival == AIR else max(moment, 0.0)) ** 2 / energy  # oil only leaves
-        residual_squares.append(max(left_square - gain, 1e-9 * abs(left_square) + TINY))
+        can_be_negative = is_rival and rival == AIR  # there may be less air, but oil only leaves
+        gain = (moment if can_be_negative else max(moment, 0.0)) ** 2 / energy  # decrease of the residual square
+        residual_squares.append(max(square_without - gain, 1e-9 * abs(square_without) + TINY))
     with_leak, with_rival = residual_squares
     return float(-0.5 * np.log(with_rival / with_leak))
 
@@ -990,8 +1004,9 @@ def _residual_products(gram: Array, reference: Array, roles: ColumnRoles, *, has
     coefficients[roles.left] = 1.0
     products = gram @ coefficients
     products[roles.left] = coefficients @ products  # the residual's sum of squares
-    # a coefficient of zero has an infinite precision
-    return _Residual(products, nuisance, np.minimum(prior, 1e9 * np.diag(gram)[nuisance]))
+    # limited, as the prior on a coefficient of zero has an infinite precision
+    prior = np.minimum(prior, 1e9 * np.diag(gram)[nuisance])
+    return _Residual(products, nuisance, prior_precision=prior)
 
 
 def _estimate_leak_excess(
@@ -1002,23 +1017,25 @@ def _estimate_leak_excess(
     Both results have the shape (s,), for s widths of a prior, and are 0 where there is no information.
 
     - `gram`, `reference` (E, m, m): Gram matrices of the recording, and of the sum of the others, for E equations.
-    - `columns`: for each equation the indices of its columns by role (leak, motion, left side).
-    - `widths` (s,): factors on the prior standard deviations of the differences of the nuisance coefficients.
+    - `columns`: for each equation the indices of its columns by role (leak, nuisances, left side).
+    - `widths` (s,): factors on the prior standard deviations by which the nuisance coefficients, i.e. those of the
+      other terms, differ between recordings.
 
-    The nuisance coefficients are eliminated (Schur complement). Each equation then states precision x excess = moment.
-    Precisions and moments are summed over the equations, and the excess is moment / precision.
+    The excess is fitted to the residual under the coefficients of the others (`_residual_products`). The nuisance
+    coefficients are eliminated (Schur complement). Each equation then states precision x excess = moment. Precisions
+    and moments are summed over the equations, and the excess is moment / precision.
     """
     precision, moment = np.zeros((2, len(widths)))
     for e, roles in enumerate(columns):
         residual, nuisance, prior = _residual_products(gram[e], reference[e], roles)
         matrix, cross = gram[e][np.ix_(nuisance, nuisance)], gram[e][nuisance, roles.leak]
-        right = np.column_stack([cross, residual[nuisance]])
-        for s, width in enumerate(widths):
-            # at most 1e9 times as precise as the recording, which already fixes a coefficient
+        right_sides = np.column_stack([cross, residual[nuisance]])
+        for index, width in enumerate(widths):
+            # the prior's precision is limited to 1e9 times the recording's, which is enough to fix a coefficient
             regularised = matrix + np.diag(np.minimum(prior / width**2, 1e9 * np.diag(matrix)))
-            solved = solve(regularised, right)
-            precision[s] += float(gram[e][roles.leak, roles.leak] - cross @ solved[:, 0])
-            moment[s] += float(residual[roles.leak] - cross @ solved[:, 1])
+            solved = solve(regularised, right_sides)
+            precision[index] += float(gram[e][roles.leak, roles.leak] - cross @ solved[:, 0])
+            moment[index] += float(residual[roles.leak] - cross @ solved[:, 1])
     is_known = precision > 0.0
     divisor = np.where(is_known, precision, 1.0)
     return np.where(is_known, moment / divisor, 0.0), np.where(is_known, divisor**-0.5, 0.0)

@@ -282,7 +282,7 @@ class LiveBalance:
             self._moving = self._moving + 1 if self._relative_motion(block) > 1.0 / STANDSTILL else 0
             if self._moving >= N_WAKING:
                 self.relearn()
-                return NotJudged(end, "learning", "blocks: moves as never before", restarts=True)
+                return NotJudged(end, "learning", counter="blocks: moves as never before", restarts=True)
             estimate = self._estimate_block(block)
             return estimate if isinstance(estimate, NotJudged) else [estimate]
         has_moved = _volume_square(block) > 0.0
@@ -390,6 +390,7 @@ class LiveBalance:
             return ()
         centred = remove_pressure_offset(blocks, self._roles)
         volumes = volume_observables(centred, blocks, self._balances, self._roles, oil_loss={})
+        # the samples of a block begin less than a block before the time range of its equations
         return (*volumes, *self._signals.observables(since - BLOCK_SECONDS))
 
     def state(self) -> dict[str, Any]:
@@ -447,12 +448,14 @@ def live_equations(rig: Rig, names: Sequence[str], with_tested_terms: bool = Fal
     """Build the volume balances of a running machine that the channels `names` allow.
 
     Balances whose flow is computed from the command are left out. The term of the pump's leakage is left out, too, as
-    it cannot be distinguished from the piston's leakage. `with_tested_terms` includes terms that are zero in a healthy
-    machine and are only tested for a change.
+    it cannot be distinguished from the piston's leakage. `with_tested_terms` includes terms that are not fitted, but
+    only tested for a change, such as those that are zero in a healthy machine.
     """
     balances = []
     for balance in equations(rig, frozenset(names)):
-        terms = (term for term in balance.terms if (term.nuisance or with_tested_terms) and term.name != PUMP)
-        if not balance.by_command:
-            balances.append(balance._replace(terms=tuple(terms)))
+        if balance.by_command:
+            continue
+        # fitted terms (`Term.nuisance`) are unknown in any machine; the leak past the piston is one of them
+        terms = [term for term in balance.terms if (term.nuisance or with_tested_terms) and term.name != PUMP]
+        balances.append(balance._replace(terms=tuple(terms)))
     return balances

@@ -203,7 +203,8 @@ def _learn_block(model: Any, rows: float, g: float) -> float:
     energy = max(model.block[n, n], TINY)
     # variances of the block's estimate, of the leak's random step, which is assumed as large, and of the earlier one
     step_variance = OVERLAP * numbers[NOISE] * (2.0 / (energy * weight) + 1.0 / information)
-    add_block(model, rows, weight, step**2 > JUMP**2 * step_variance)
+    has_stepped = step**2 > JUMP**2 * step_variance
+    add_block(model, rows, weight, has_stepped)
     numbers[NOISE] += (1.0 - _MEMORY) * (variance * weight - numbers[NOISE])
     return float(weight)
 

@@ -194,7 +194,8 @@ def find_level_rise(
     scatter = healthy.deviation**2 * (1.0 + 1.0 / healthy.count)  # of one more healthy mean about their average
     variance = deviation**2 + scatter
     degrees_of_freedom = (healthy.count - 1) * (variance / max(scatter, np.finfo(float).tiny)) ** 2
-    rise = Rise(g - healthy.level, math.sqrt(variance), min(degrees_of_freedom, 1e9))  # beyond it Student's t is normal
+    degrees_of_freedom = min(degrees_of_freedom, 1e9)  # beyond it Student's t is normal
+    rise = Rise(g - healthy.level, deviation=math.sqrt(variance), degrees_of_freedom=degrees_of_freedom)
     chance = max(float(ndtr((max_healthy - g) / deviation)), rise.chance)
     if chance >= probability:
         return None
@@ -202,7 +203,7 @@ def find_level_rise(
     healthy_sd = max(healthy.level - healthy.low, max_healthy - healthy.level, 0.0) / WITHIN_95
     size = g - max(healthy.level, 0.0)
     score = -float(ndtri(max(chance, 1e-300)))  # finite for a chance of 0
-    return LiveRise(LEVEL, score, onset, size, math.hypot(deviation, healthy_sd))
+    return LiveRise(LEVEL, score, onset, size, deviation=math.hypot(deviation, healthy_sd))
 
 
 def level_before_leak(leak: WatchedLeak, t: float) -> HealthyLevel:

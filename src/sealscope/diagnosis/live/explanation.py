@@ -54,23 +54,23 @@ def explain_rise(observables: Sequence[Observable], data: str, onset: Interval, 
     a leak.
 
     The result is a leak if leaks are more probable than all other events together, else the most probable other events.
-    It is `UNKNOWN` if no change of this kind is sufficiently rare, or if none of the rare changes can be an effect of
-    the leak.
+    It is `UNKNOWN` if no change of the kind `data` is significant (p-value below `_MAX_CHANCE`), or if none of the
+    significant changes can be an effect of the leak.
     """
     leak_names = ALARMING if is_settled else LEAK_EVENTS
     leak_events = [event for event in load_events() if event.name in leak_names]
     at_onset = [observable for observable in observables if observable.data != data or _coincides(observable, onset)]
-    rare_changes = [
+    significant_changes = [
         observable for observable in at_onset if observable.data == data and observable.chance < _MAX_CHANCE
     ]
     explanations = [explanation for explanation in explain(at_onset) if data in explanation.data]
     if probability_of(explanations, *leak_names) > _MIN_PROBABILITY.leak:
-        if not any(event.affects(change) for event in leak_events for change in rare_changes):
+        if not any(event.affects(change) for event in leak_events for change in significant_changes):
             return UNKNOWN
         is_outside = probability_of(explanations, causes=[OUTSIDE]) > _MIN_PROBABILITY.named
         return RiseExplanation(is_leak=True, is_outside=is_outside)
     without_leak = [explanation for explanation in explanations if not explanation.has(*ALARMING)]
-    if not without_leak or not rare_changes:
+    if not without_leak or not significant_changes:
         return UNKNOWN
     most_probable, *_ = without_leak  # sorted by probability
     other_events = " and ".join(event.description for event in most_probable.events)

@@ -121,13 +121,15 @@ class PressureEstimator:
             self._held[:] = math.nan
             self._samples = self._samples[:, :0]
         samples = np.hstack([self._samples, [run.t, *(run.channels[name] for name in _READ)]])
+        # numbers of samples: for the first fit, and in a block
         n_first, n_block = (round(seconds * run.rate) for seconds in (_PRIORS.begins, self.block_seconds))
         is_slow = run.rate < _MIN_RATE  # blocks are refused without a fit
         while self._follower is None and not is_slow and samples.shape[1] >= n_first:
             beginning = _make_recording(samples[:, :n_first], run.rate)
             if reason := find_unmet_requirement(beginning, self._rig) or describe_hold(beginning):
                 samples = samples[:, n_first // 2 :]
-                yield NotJudged(float(run.t[-1]), "", f"half minutes before the first block: {reason}")
+                counter = f"half minutes before the first block: {reason}"
+                yield NotJudged(float(run.t[-1]), status="", counter=counter)
             else:
                 self._follower = Follower.fit_start(beginning, self._rig)
         while (self._follower is not None or is_slow) and samples.shape[1] >= n_block:
@@ -177,16 +179,16 @@ class PressureEstimator:
             return self._reject(follower, end, is_settling, restarts)
         self._misfits = 0
         if is_settling:
-            return NotJudged.with_count(end, "settling", restarts)
+            return NotJudged.with_count(end, "settling", restarts=restarts)
         # G: index of the conductance; the covariance is in units of the priors
         g, sd = float(follower.theta[G]), math.sqrt(follower.covariance[G, G]) * float(follower.priors.unit[G])
         if sd > _MAX_SD:
             status = "conductance not resolved" if is_moving(block["u"]) else "at standstill"
-            return NotJudged.with_count(end, status, restarts)
+            return NotJudged.with_count(end, status, restarts=restarts)
         pressure = float(np.mean(np.abs(block["p_A"] - block["p_B"])))
         speed = self._rig.motor.omega_per_volt * float(np.mean(np.abs(block["u"])))
         pump_flow = speed * self._rig.pump.q_b / (2.0 * math.pi)
-        # `offset`: the level is not known, as all blocks share the error of the prior
+        # `offset`: deviation of the error that all blocks share, that of the prior: only changes of g are known
         return [BlockConductance(begin, end, g, sd, total=g, offset=_MAX_SD, pressure=pressure, pump_flow=pump_flow)]
 
     def _reject(self, follower: Follower, end: float, is_settling: bool, restarts: bool) -> NotJudged:
@@ -209,7 +211,8 @@ class PressureEstimator:
             self._misfits, self._settling = 0, _SETTLING
             return NotJudged.with_count(end, "not described by the model", restarts=True)
         self._settling = self._settling if is_settling else _RESUMING
-        return NotJudged.with_count(end, "settling" if is_settling else "not described by the model", restarts)
+        status = "settling" if is_settling else "not described by the model"
+        return NotJudged.with_count(end, status, restarts=restarts)
 
     def _resume(self, follower: Follower, gap: float, rate: float) -> tuple[Follower, bool]:
         """Prepare the fit of the pressures for a block that follows the last one after a `gap` [s].
@@ -259,6 +262,7 @@ class PressureEstimator:
         stored blocks do not reach from `onset` to `end`, and an empty tuple if there are too few blocks.
         """
         rows, seconds = self._rows, self.block_seconds
+        # no blocks, a last block that is not the one at `end`, or a first block that begins after the onset
         if not rows.size or rows[-1, _END] != end or rows[0, _END] - seconds > onset:
             return None
         rows = rows[rows[:, _END] > since + 0.5 * seconds]  # begin at `since` or later, to half a block

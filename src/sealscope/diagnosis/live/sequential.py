@@ -170,10 +170,12 @@ class StepDetector:
         There is one onset for each of `PARTS`, the fractions of the block in which the leak is open. Every
         `_SELECT_EVERY` blocks, old onsets are thinned out.
         """
-        # with a small probability the walk changes, after which all walks are equally likely
+        # with a small probability the variance of the coefficient's random walk changes; then all `WALKS` are equally
+        # likely
         log_prior = np.logaddexp(np.log1p(-_PRIORS.changes) + self._log_weights, np.log(_PRIORS.changes / len(WALKS)))
-        # the likelihood of n innovations with variances S and the sum T of e^2 / S is T^(-n/2) times the product of
-        # S^(-1/2); its value at the onset is divided out here, so that `_log_likelihoods` counts from the onset
+        # the likelihood of n innovations e with variances S and the sum T of e^2 / S is T^(-n/2) times the product of
+        # S^(-1/2). T begins with its value before the onset; the log likelihood before the onset is subtracted from the
+        # log prior, so that only the innovations after the onset count in `_log_likelihoods`
         sums = np.zeros((_N_ROWS, len(WALKS), len(PARTS)))
         sums[_T] = self._squares
         sums[_LOG_PRIOR] = log_prior + 0.5 * (self._count * np.log(self._squares) + self._log_variances)
@@ -195,7 +197,9 @@ class StepDetector:
         """
         if not len(self._onsets):
             return -np.inf
-        a, b, T = self._sums[_A : _T + 1]  # sums of f e / S, f^2 / S and e^2 / S (`take`)
+        # for each walk and onset the sums of f e / S, f^2 / S and e^2 / S: e is the error of a prediction, S its
+        # variance, and f the response of e to a unit step (`take`)
+        a, b, T = self._sums[_A : _T + 1]
         # fraction of T that a step of the best size explains, less than 1 so that its logarithm is finite
         explained = np.minimum(np.maximum(a, 0.0) ** 2 / (b * T), 1.0 - 1e-15)
         max_log_ratio = -0.5 * float(np.min(self._onsets[:, _N] * np.log1p(-explained)))
@@ -241,14 +245,16 @@ class StepDetector:
     def rise(self) -> LiveRise:
         """Estimate the onset [s] and the size of a rise of the coefficient, in the coefficient's unit.
 
-        Both are averages over the possible prior variances v of the step's size (`SIZES`), variances q of the random
-        walk in a block (`WALKS`), and onsets j, weighted by their posterior probabilities. The onset has a 95 %
-        interval, and the size a standard deviation.
+        Both are averages over the possible prior variances v of the step's size (`SIZES`), variances q by which the
+        coefficient's random walk grows in a block (`WALKS`), and onsets j, weighted by their posterior probabilities.
+        The onset has a 95 % interval, and the size a standard deviation.
         """
         terms = self._log_terms()
-        log_e = float(np.logaddexp.reduce(terms.ravel()))
-        weights = np.exp(terms - log_e)  # posterior probabilities
-        a, b, T = self._sums[_A : _T + 1]  # sums of f e / S, f^2 / S and e^2 / S (`take`)
+        log_evidence = float(np.logaddexp.reduce(terms.ravel()))
+        weights = np.exp(terms - log_evidence)  # posterior probabilities (v, q, j)
+        # for each walk and onset the sums of f e / S, f^2 / S and e^2 / S: e is the error of a prediction, S its
+        # variance, and f the response of e to a unit step (`take`)
+        a, b, T = self._sums[_A : _T + 1]
         # Student's t posterior of the size, for each v, q and j
         precision = b + 1.0 / SIZES[:, None, None]
         sizes = a / precision
@@ -262,10 +268,11 @@ class StepDetector:
         order = np.argsort(times, kind="stable")
         low_index, high_index = np.searchsorted(np.cumsum(onset_probabilities[order]), [0.025, 0.975])
         earliest, latest = times[order[low_index]], times[order[min(high_index, len(order) - 1)]]
-        # a fifth of the last block, about the distance between the onsets in it
-        resolution = float((times - block_begins)[-len(PARTS)]) / len(PARTS)
+        # the last onsets (one for each of `PARTS`) are in one block; the latest of them comes first
+        latest_in_block = float((times - block_begins)[-len(PARTS)])  # from the begin of the block [s]
+        resolution = latest_in_block / len(PARTS)  # about the distance between neighbouring onsets
         interval = Interval(mean_time, float(earliest) - resolution, float(latest) + resolution)
-        return LiveRise(STEP, 2.0 * log_e, interval, self._unit * size, self._unit * deviation)
+        return LiveRise(STEP, 2.0 * log_evidence, interval, self._unit * size, self._unit * deviation)
 
     def bound(self, probability: float = BOUND_PROBABILITY) -> float:
         """Compute an upper bound of an undetected rise of the coefficient, in the coefficient's unit.
@@ -275,7 +282,9 @@ class StepDetector:
         """
         if not len(self._onsets):
             return np.inf
-        a, b, T = self._sums[_A : _T + 1]  # sums of f e / S, f^2 / S and e^2 / S (`take`)
+        # for each walk and onset the sums of f e / S, f^2 / S and e^2 / S: e is the error of a prediction, S its
+        # variance, and f the response of e to a unit step (`take`)
+        a, b, T = self._sums[_A : _T + 1]
         # least-squares size of a step at each onset and for each walk, and its standard error
         sizes = a / b
         residual_squares = np.maximum(T - a * sizes, np.finfo(float).tiny)

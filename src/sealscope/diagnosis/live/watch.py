@@ -122,7 +122,7 @@ class Watch:
         self._learning, self._detector = BaselineLearning(), StepDetector()
         self._compared = np.empty(0, _BLOCK)  # the last blocks with which the next is compared, at most `RECENT`
         self._grouped = 0  # number of these that await the test of their mean
-        self._is_known = True  # whether the last block was under the baseline's duty
+        self._is_known = True  # True if the last block's duty (pressure and flow) was in the baseline's range
         self._since = math.nan  # begin of the first block since the tests restarted [s]
 
     def _false_alarm_probability(self, test: str, seconds: float) -> float:
@@ -407,7 +407,7 @@ class Watch:
         else:
             cause = leak.cause
         reason = f"the leakage conductance rises at {clock_text(rise.interval.value)} beyond its random walk"
-        self._raise_leak(estimator, rise, block, 2.0 * log_threshold, reason, cause=cause)
+        self._raise_leak(estimator, rise, block, threshold=2.0 * log_threshold, reason=reason, cause=cause)
         return False
 
     def _explain(self, estimator: Estimator, rise: LiveRise, block: BlockConductance) -> RiseExplanation:
@@ -474,7 +474,8 @@ class Watch:
                 f"the leakage conductance is {mean:.3g} m^3/(s Pa), over {max_ratio:g} times the least of the {name}: "
                 "more than the warmest oil makes of it"
             )
-            self._raise_leak(estimator, rise, block, rise.threshold(probability), reason, before=healthy.level)
+            threshold = rise.threshold(probability)
+            self._raise_leak(estimator, rise, block, threshold=threshold, reason=reason, before=healthy.level)
 
     def _raise_leak(
         self,

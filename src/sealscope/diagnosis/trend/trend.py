@@ -322,13 +322,15 @@ def trend(
         for recording in recordings
     ]
     points, differences = build_timeline(readings, every)
-    rows = tuple(k for k, point in enumerate(points) if point.group >= 0)
+    rows = tuple(k for k, point in enumerate(points) if point.group >= 0)  # -1: the recording is left out
     compared = [points[k] for k in rows]
     states_flow = bool(compared) and all(point.states_flow for point in compared)
     notes = [point.note for point in points if point.note]
     lack = f"no recording states a level: {notes[0]}" if notes else "no recording states a level"
+    # the decision for lack of comparable recordings; `_add_episodes` replaces it if there are any
+    no_decision = decide(Observed("", lack=lack), (), HealthyNull(), false_alarm_probability=0.0)
     result = Trend(
-        decision=decide(Observed("", lack=lack), (), HealthyNull(), false_alarm_probability=0.0),
+        decision=no_decision,
         basis=compared[0].basis if compared else None,
         unit="L/min" if states_flow else "%",
         pressure=float(np.median([point.pressure for point in compared])) if states_flow else None,

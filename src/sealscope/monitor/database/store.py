@@ -442,9 +442,10 @@ def _pack_samples(samples: Recording, follows: bool, verdict: RecordingVerdict |
 
 @lru_cache(maxsize=64)
 def _format_header(units: tuple[tuple[str, str], ...], rate: float, follows: bool) -> bytes:
-    """Format the line of JSON with which packed samples begin (`_pack_samples`), without a verdict.
+    """Format the first line of packed samples as JSON; `_pack_samples` adds the verdict of a block that has one.
 
-    `units`: (channel, unit) of each channel; `rate` [Hz]; `follows`: False after a gap.
+    `units`: (channel, unit) of each channel; `rate`: sampling rate [Hz]; `follows`: True if the samples follow the
+    stored ones without a gap.
     """
     return json.dumps({"units": dict(units), "rate": rate, "follows": follows}).encode() + b"\n"
 

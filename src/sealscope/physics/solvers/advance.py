@@ -82,16 +82,17 @@ def advance_closed(
 
     - `implicit`: `IMPLICIT` or `EXPLICIT`, the integration method; `euler_integral`: as in `advance`.
     - `y` (14,): the state, changed in place. `h` [s]: the step; there is an output before each `every`-th step.
-    - `G`, `C`, `F` (n, nodes): leakage coefficients and additional load in each of n steps, as in `advance`.
+    - `G`, `C`, `F` (n, nodes): leakage coefficients of the piston, laminar and of an orifice, and additional load [N],
+      at the times (nodes) within each of n steps that the method needs; `F` is (0, 0) without an additional load.
     - `numbers`: parameters of the model. `rows` (n // every, 21): receives the outputs. `start`: number of the output
       in rows[0], counted from the beginning of the run.
 
     If the controller returns a voltage that is not finite, the integration stops there, with fewer outputs than `rows`
     has.
     """
-    spacing, n_rows = loop.counters[SPACING], rows.shape[0]
+    spacing, n_rows = loop.counters[SPACING], rows.shape[0]  # outputs per sample of the controller, and in all
     u = np.empty((spacing * every, G.shape[1]))
-    first = 0  # row of the controller's next sample
+    first = 0  # first row that is not yet written
     while first < n_rows:
         k = (start + first) // spacing  # the controller's sample
         if (start + first) % spacing == 0 and not sample_controller(loop, k, y):

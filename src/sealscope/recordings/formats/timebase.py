@@ -97,16 +97,20 @@ class TimeState:
 def _parse_stamp(text: str) -> dict[str, str | None] | None:
     """Split a date stamp or time of day into its parts, name -> text or None; None for any other text.
 
-    The names are those of the groups in `_DATES` and `_STAMPS`, such as `year`, `clock` and `half` (AM or PM).
+    The names are those of the groups in `_DATES` and `_STAMPS`, such as `year`, `clock` (time of day) and `half` (AM or
+    PM). A date of eight digits has the additional part `plain`.
     """
     text = text.strip()
     if len(text) > _MAX_STAMP or (_BARE_NUMBER.fullmatch(text) and len(text) != len("20240531")):
-        return None
+        return None  # too long, or a bare number that is no date of eight digits
     match = next(filter(None, (stamp.fullmatch(text) for stamp in _STAMPS)), None)
-    if match is None or not (match["clock"] or match.groupdict().keys() - {"clock", "half"}):
-        return None  # neither a time of day nor a date
+    if match is None:
+        return None
     parts, month = match.groupdict(), match.groupdict().get("month")
-    if match["clock"] and ":" not in match["clock"] and "plain" not in parts:
+    has_date = bool(parts.keys() - {"clock", "half"})  # the form has further groups, which are those of a date
+    if not (parts["clock"] or has_date):
+        return None
+    if parts["clock"] and ":" not in parts["clock"] and "plain" not in parts:
         return None  # six digits are a time of day only after a date of eight digits
     if month and not month.isdecimal():
         name = month.casefold()

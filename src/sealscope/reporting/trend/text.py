@@ -145,8 +145,13 @@ def _format_reach(trend: Trend, limit: float, reach: Interval) -> str:
     """Format the repair limit, and the predicted date at which the leakage reaches it.
 
     `limit`: repair limit in the unit of the trend; `reach` [d]: time from the last recording until this date, with the
-    interval of this time. After an alarm the date is stated with an interval, without an alarm only the earliest date
-    (95 %). No date is stated if the recordings are too few or the date is too far away.
+    interval of this time. The text states, in this order of precedence,
+
+    - that the limit is reached,
+    - after an alarm the date with its interval, unless it is too far away,
+    - that the limit is not reached within the next years,
+    - that the recordings are too few to state a date,
+    - the earliest date (95 %).
     """
     limit_text = f"{number(limit, 2)} {trend.unit} in all"
     first, last = trend.points[0].day, trend.points[-1].day

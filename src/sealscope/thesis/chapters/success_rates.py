@@ -155,11 +155,17 @@ def drift_threshold(drift: DataSheet, chamber: str, detail: str) -> float:
 
 
 def count_with_thresholds(measured: DataSheet | None, leak: DataSheet, drift: DataSheet) -> list[_Row]:
-    """Count the leaks that each rule on a single wavelet detail finds if the change must exceed a threshold.
+    """Count the leaks that each rule on a single wavelet detail finds if a change must exceed a threshold.
 
-    The threshold is set for 5 % false alarms: on the measured sheet (None if not given) by the scatter of d1
-    (`d1_threshold`), on the simulated sheet `leak` by the sheet `drift`, simulated without a leak but with drifting
-    parameters (`drift_threshold`). Returns rows with the columns `THRESHOLDS`.
+    A leak counts as found if the log RMS of the detail changes with the leak by more than the threshold, in the
+    direction in which a leak should move it (`DIRECTION`). 5 % of the tests without a leak exceed the threshold.
+
+    - `measured`: measured tests, or None; the scatter of d1 gives their threshold (`d1_threshold`).
+    - `leak`: tests that are simulated with a leak.
+    - `drift`: tests that are simulated without a leak but with drifting parameters; they give the threshold for `leak`
+      (`drift_threshold`).
+
+    Returns rows with the columns `THRESHOLDS`.
     """
     rows: list[_Row] = []
     for rule in (*CLAIMED_CELLS, *UNCLAIMED):
@@ -171,7 +177,8 @@ def count_with_thresholds(measured: DataSheet | None, leak: DataSheet, drift: Da
                 row += [None, *_format_count(None)]
                 continue
             fires = sheet.log_change(chamber, detail) * DIRECTION[chamber] > limit
-            row += [100.0 * float(np.expm1(DIRECTION[chamber] * limit)), *_format_count(fires)]
+            limit_percent = 100.0 * float(np.expm1(DIRECTION[chamber] * limit))  # from log to signed percent
+            row += [limit_percent, *_format_count(fires)]
         rows.append(tuple(row))
     return rows
 

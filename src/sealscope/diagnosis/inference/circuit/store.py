@@ -46,11 +46,12 @@ def cycle_length(speed: Array, rate: float) -> float | None:
 
 
 def recorded_oil_loss_tests(recording: Recording, rig: Rig, offset: float) -> dict[str, StepTest]:
-    """Test a recording with a position for an external leak of chamber A or B that begins within it.
+    """Test a recording that contains the position for an external leak of chamber A or B that begins within it.
 
     The tests use the volume of oil in the accumulator, and are returned by the name of the leak (`oil_loss_tests`).
     `rig`: sizes of the cylinder and the accumulator; `offset`: sensor offset of p_A - p_B [Pa]. The result is empty for
-    a double rod: check valves let either side keep its pressure, which need not be that of the accumulator.
+    a double rod: as its strokes draw no oil from the accumulator, the check valves may stay shut, and the pressure of
+    neither chamber need be that of the accumulator.
     """
     if not rig.cylinder.single_rod:
         return {}

@@ -140,9 +140,11 @@ class Joint:
         theta = np.array([block.theta for block in blocks])
         prior_precision = _prior_precision(len(blocks), priors, block_s)
         prior_gradient = prior_precision @ ((theta - priors.centre) / priors.unit).ravel()
+        # row and column 0 of a block's Gram matrix belong to the residual, the others to its derivatives
         gram = block_diag(*(block.gram[1:, 1:] for block in blocks))
         gradient = np.concatenate([block.gram[0, 1:] for block in blocks])
-        variance, _ = _estimate_noise(blocks, np.zeros(theta.size), parameter)  # about the linearised parameters
+        # of the residual at the parameters about which the blocks are linearised, i.e. with deviations of zero
+        variance, _ = _estimate_noise(blocks, np.zeros(theta.size), parameter)
         inflation = 1.0  # white noise at first
         for _ in range(2):  # the fit changes the variance of the noise, which weights the prior
             factor = cho_factor(gram / (variance * inflation) + prior_precision, check_finite=False)

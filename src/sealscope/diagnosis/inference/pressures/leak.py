@@ -171,17 +171,17 @@ class ResponseLeak:
         return None
 
     def total(self, detectable_flow: float | None) -> TotalLeakage:
-        """Return the smallest detectable leak, without the total leakage, which pressures alone do not show.
+        """Return a `TotalLeakage` that states only the smallest detectable leak.
 
-        `detectable_flow`: flow [m^3/s] of the smallest leak that would be detected if it began within the recording,
-        None if that was not tested. The result states this flow in L/min and as a fraction of the pump's flow
-        (`findable_lpm`, `findable_share`).
+        The total leakage itself is None, as the pressures alone show only changes of it. `detectable_flow`: flow
+        [m^3/s] of the smallest leak that would be detected if it began within the recording, None if that was not
+        tested. The fields `findable_lpm` and `findable_share` state it in L/min and as a fraction of the pump's flow.
         """
         (pump_flow, _), lpm_per_flow = self.pump_flow, self.lpm_per_flow
         return TotalLeakage(
             lpm=None,
             interval_lpm=None,
-            pressure=self.flow_per_conductance,
+            pressure=self.flow_per_conductance,  # a flow over a conductance is a pressure, the mean of abs(p_A - p_B)
             findable_lpm=None if detectable_flow is None or lpm_per_flow is None else detectable_flow * lpm_per_flow,
             findable_share=None if detectable_flow is None or not pump_flow > 0.0 else detectable_flow / pump_flow,
         )

@@ -121,7 +121,8 @@ def _rates(y: State, friction: float, omega_ref: float, theta: Parameters, m: Re
     """
     # p_A = p/2 and p_B = -p/2, so p changes twice as fast as p_A; 0.0: no leakage of the pump, no force of an end stop
     p, v, omega, i, integral, x = y
-    outflow, viscous = m.A_A * v + laminar_leakage(p, theta[G]), theta[F_V] * v * _direction_factor(v, theta)
+    outflow = m.A_A * v + laminar_leakage(p, theta[G])  # from chamber A, by motion and leakage
+    viscous = theta[F_V] * v * _direction_factor(v, theta)
     error = omega_ref - omega
     voltage = controller_voltage(error, integral, m.k_p, m.K_i, m.V_max)
     return (
@@ -130,7 +131,7 @@ def _rates(y: State, friction: float, omega_ref: float, theta: Parameters, m: Re
         shaft_acceleration(i, omega, pump_torque(p, m.q_b), m.C_m, m.B_M, m.J_M),
         winding_current_rate(voltage, i, omega, m.R_c, m.L_c, m.C_e, m.i_max),
         error,
-        v - x * _CENTRING_RATE,
+        v - x * _CENTRING_RATE,  # x decays slowly to 0: it counts from the slowly varying mean position
     )
 
 
@@ -175,7 +176,7 @@ def simulate_response(
     y, friction, reading = _load_six(states, 0), load(states, 6), load(states, 7)
     theta = (*_load_six(sets, 0), *_load_six(sets, 6), load(sets, LAG))
     h = 1.0 / (rate * n_substeps)
-    steady = _steady_friction(y[1], theta, m)[0]
+    steady = _steady_friction(y[1], theta, m)[0]  # friction of steady sliding at the piston's speed y[1]
     for sample in range(command.size - 1):
         rise = command[sample + 1] - command[sample]
         # added to gain times command: the bias, and the effect of the lead, by which the linear command comes earlier
@@ -185,6 +186,7 @@ def simulate_response(
             speed_0 = theta[GAIN] * (command[sample] + rise * (step / n_substeps)) + lead_speed
             speed_1 = theta[GAIN] * (command[sample] + rise * ((step + 0.5) / n_substeps)) + lead_speed
             speed_2 = theta[GAIN] * (command[sample] + rise * ((step + 1.0) / n_substeps)) + lead_speed
+            # the four stages of RK4; the first result of `_advance_friction` is the friction at the stage
             k_1 = _rates(y, friction, speed_0, theta, m)
             y_1 = _advance(y, 0.5 * h, k_1)
             k_2 = _rates(y_1, _advance_friction(friction, steady, y_1[1], 0.5 * h, theta, m)[0], speed_1, theta, m)

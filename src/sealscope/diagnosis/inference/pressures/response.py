@@ -261,14 +261,14 @@ def fit_from_priors(segment: Segment, total: Array, noise: float) -> Linearisati
         return sets.reshape(n_groups, -1, len(PARAMETERS))[range(n_groups), order]
 
     slow_part = replace(segment, smooth=_FOLLOW.slow * segment.machine.ringing_period(priors.centre[K_OIL]))
-    gains = priors.centre[GAIN] * _geometric_grid(*PRESSURE.start["gain"], 8)
+    gains = priors.centre[GAIN] * _geometric_grid(*PRESSURE.start["gain"], count=8)
     springs = priors.centre[SPRING] + priors.width[SPRING] * np.array([0.0, 1.0])
     variants = {GAIN: np.tile(gains, 2), SPRING: np.repeat(springs, 8)}  # all 16 combinations
     best_start, *_ = rank_starts(slow_part, priors.centre, n_groups=1, values=variants)  # (1, p)
     theta = slow_part.descend(slow_part.linearise(best_start), priors.normal, _N_STEPS // 2).theta
     ringing = segment.machine.ringing_stiffnesses(segment.dp, total, priors)
-    stiffnesses = np.append(ringing, priors.centre[K_OIL] * _geometric_grid(*PRESSURE.start["K"], 2))  # (4,)
-    breakaways = theta[K_BRK] * _geometric_grid(*PRESSURE.start["K_brk"], 4)
+    stiffnesses = np.append(ringing, priors.centre[K_OIL] * _geometric_grid(*PRESSURE.start["K"], count=2))  # (4,)
+    breakaways = theta[K_BRK] * _geometric_grid(*PRESSURE.start["K_brk"], count=4)
     variants = {K_OIL: np.repeat(stiffnesses, 4), K_BRK: np.tile(breakaways, 4)}
     # one group for each stiffness of the oil: its best and its second-best breakaway force, (4, p) each
     best_starts, second_best_starts, *_ = rank_starts(segment, theta, n_groups=4, values=variants)
@@ -304,7 +304,7 @@ class Follower:
         self.theta = priors.centre  # parameters (p,)
         self.covariance = np.diag(priors.variance)  # of the parameters, in units of `priors.unit`
         self.variance = math.nan  # of the noise [Pa^2]
-        self.states = np.zeros((8, SPRING + 2))  # simulated states, as in `Segment`
+        self.states = np.zeros((8, SPRING + 2))  # simulated states of all simulated parameter sets, as in `Segment`
         self.last = math.nan  # command at the last sample [V], NaN at the start and after a gap
         self.excess = 0.0  # misfit of the last block of n samples, (chi squared - n) / sqrt(2 n)
 
@@ -352,7 +352,11 @@ class Follower:
         self.covariance, self.states, self.last = covariance, states, math.nan
 
     def at_rate(self, rig: Rig, rate: float) -> Follower:
-        """Return a filter with the same parameters for samples at another rate [Hz], which starts as after a gap."""
+        """Make a filter for samples at another `rate` [Hz] that starts from the state of this filter.
+
+        Parameters, covariance and simulated states are kept, but there is no previous sample: as after a gap, the next
+        block starts the simulation anew (`next_segment`).
+        """
         follower = Follower(Machine.from_rig(rig, rate, self.machine.law), self.priors, self.sense)
         follower.theta, follower.covariance = self.theta, self.covariance
         follower.variance, follower.states = self.variance, self.states
@@ -423,7 +427,7 @@ class Follower:
             # the grid of the conductance after a jump is absolute, that of the stiffness relative to the current one
             for parameter, unit, jump in ((G, 1.0, PRESSURE.jump["G"]), (K_OIL, self.theta[K_OIL], PRESSURE.jump["K"])):
                 sets = np.tile(self.theta, (SINGLE_WIDTH, 1))
-                sets[:, parameter] = unit * _geometric_grid(*jump, SINGLE_WIDTH)
+                sets[:, parameter] = unit * _geometric_grid(*jump, count=SINGLE_WIDTH)
                 best = int(segment.residual_squares(sets).argmin())
                 candidates.append(fit_candidate(sets[best], self._prior(block_s, jumped=parameter)))
         _, fit, prior = min(candidates, key=lambda candidate: candidate[0])

@@ -30,7 +30,7 @@ def iter_series(fields: Mapping[str, Any]) -> Iterator[Series]:
 
     `fields`: name -> value, which is an array (n,) or (n, m), a struct as a mapping, a table or an object.
     """
-    # `depth` counts structs, of which the file itself is none
+    # the file counts as no struct: its depth is -1, so that its values have the depth 0 (no struct around them)
     yield from _iter_struct(group="", name="", fields=fields, clock=None, depth=-1)
 
 

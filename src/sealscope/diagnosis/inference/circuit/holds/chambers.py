@@ -247,7 +247,7 @@ class HeldChambers:
         """
         unit_leak = self._unit_piston_leak(conditions.offset, conditions.refilled, law)
         fit = self._fit_leak(unit_leak, conditions.onset)
-        return fit._replace(likelihood=fit.likelihood - 0.5 * self._offset_cost(conditions.offset))
+        return fit._replace(log_likelihood=fit.log_likelihood - 0.5 * self._offset_cost(conditions.offset))
 
     def _offset_cost(self, offset: float) -> float:
         """Compute -2 log of the prior density of a sensor offset [Pa] and of the holds' deviations from this offset."""
@@ -294,7 +294,7 @@ class HeldChambers:
             deviation, by_oil = float(fit.by_noise[0, 0]) ** 0.5, float(max(fit.by_oil[0, 0], 0.0)) ** 0.5
             if not fit.coefficients[0] < 0.0:  # a leak flows from the higher to the lower pressure only
                 value, variance = float(fit.coefficients[0]), fit.variance
-        return LeakFit(value, deviation, by_oil, likelihood=-0.5 * self.n_readings * float(np.log(variance)))
+        return LeakFit(value, deviation, by_oil, log_likelihood=-0.5 * self.n_readings * float(np.log(variance)))
 
     @cached_property
     def onsets(self) -> Array:
@@ -404,14 +404,16 @@ class HeldChambers:
             for (exponent, conditions), law_prior in zip(self.piston_fits.items(), law_priors(), strict=True):
                 law = LeakLaw(exponent, growth, conditions.onset)
                 fit = self.fit_piston_leak(conditions, law)
-                fits.append(LawFit(law, conditions, fit, fit.likelihood + float(np.log(growth_prior * law_prior))))
+                log_weight = fit.log_likelihood + float(np.log(growth_prior * law_prior))
+                fits.append(LawFit(law, conditions, fit, log_weight))
         return fits
 
     def _fit_growing_leak(self, leak: UnitLeak, onset: float) -> LeakFit:
         """Fit a leak that may grow from its `onset` [s] on; its coefficient is the mean from the onset to the end.
 
-        The coefficient is that of the most probable growth, the likelihood a mean over the growths of `growth_priors`.
-        `leak`: flow of the leak with a coefficient of 1, without growth.
+        The leak is fitted for each growth of `growth_priors`. The result has the coefficient of the most probable
+        growth, and the log of the likelihood that is averaged over the growths by their prior probabilities. `leak`:
+        flow of the leak with a coefficient of 1, without growth.
         """
         fits, log_weights = list[LeakFit](), list[float]()
         for growth, probability in growth_priors():
@@ -420,10 +422,11 @@ class HeldChambers:
                 flow * law.growth_factor(hold.t, self.end) for flow, hold in zip(leak.flows, self.holds, strict=True)
             ]
             fit = self._fit_leak(leak._replace(flows=flows), onset)
-            mean_growth = 1.0 + 0.5 * growth  # of a coefficient that grows linearly
-            fits.append(fit.scale(mean_growth, fit.likelihood))
-            log_weights.append(fit.likelihood + float(np.log(probability)))
-        return fits[int(np.argmax(log_weights))]._replace(likelihood=float(np.logaddexp.reduce(log_weights)))
+            mean_ratio = 1.0 + 0.5 * growth  # mean over initial coefficient, which grows linearly
+            fits.append(fit.scale(mean_ratio, fit.log_likelihood))  # the scaling does not change the likelihood
+            log_weights.append(fit.log_likelihood + float(np.log(probability)))
+        most_probable = fits[int(np.argmax(log_weights))]
+        return most_probable._replace(log_likelihood=float(np.logaddexp.reduce(log_weights)))
 
     def _mean_unit_flow(self, conditions: PistonFit, law: LeakLaw) -> float:
         """Compute the mean magnitude of the flow past the piston in the holds, for a leak with a coefficient of 1.
@@ -472,7 +475,7 @@ class HeldChambers:
         for leak in leaks:
             onset = int(self._onset_posteriors(leak).argmax())
             fits.append((self._fit_growing_leak(leak, float(self.onsets[onset])), onset))
-        log_posteriors = np.array([fit.likelihood + self._onset_log_priors[onset] for fit, onset in fits])
+        log_posteriors = np.array([fit.log_likelihood + self._onset_log_priors[onset] for fit, onset in fits])
         probabilities = np.exp(log_posteriors - log_posteriors.max())
         probabilities /= probabilities.sum()
         fractions_after = (self.end - self.onsets) / max(self.end - self.begin, np.finfo(float).tiny)

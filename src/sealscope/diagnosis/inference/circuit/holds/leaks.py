@@ -81,7 +81,7 @@ class PistonFit(NamedTuple):
 
 
 class LeakFit(NamedTuple):
-    """Fitted coefficient of a leak: `value` [m^3/(s Pa^e)], and log `likelihood` of the fit.
+    """Fitted coefficient of a leak: `value` [m^3/(s Pa^e)], and `log_likelihood` of the fit.
 
     e is the exponent of the leak's law. The coefficient has two standard deviations in the same unit: `deviation` due
     to noise, and `by_oil` due to the uncertain properties of the oil.
@@ -90,15 +90,15 @@ class LeakFit(NamedTuple):
     value: float
     deviation: float
     by_oil: float
-    likelihood: float
+    log_likelihood: float
 
-    def scale(self, factor: float, likelihood: float) -> LeakFit:
-        """Multiply coefficient and standard deviations by a `factor`, and set the log `likelihood`.
+    def scale(self, factor: float, log_likelihood: float) -> LeakFit:
+        """Multiply coefficient and standard deviations by a `factor`, and set the `log_likelihood` of the fit.
 
         The deviation `UNKNOWN` of a leak without information is kept.
         """
         deviation = factor * self.deviation if self.deviation < UNKNOWN else UNKNOWN
-        return LeakFit(factor * self.value, deviation, factor * self.by_oil, likelihood)
+        return LeakFit(factor * self.value, deviation, factor * self.by_oil, log_likelihood)
 
 
 class LawFit(NamedTuple):
@@ -133,5 +133,5 @@ def average_fits(fits: Sequence[LeakFit]) -> Flow:
 
     Returns the mean and the standard deviation, due to noise and to the uncertain properties of the oil.
     """
-    values, deviations, by_oil, likelihoods = np.array(fits).T
-    return mixture_flow(np.exp(likelihoods - likelihoods.max()), values, np.hypot(deviations, by_oil))
+    values, deviations, by_oil, log_likelihoods = np.array(fits).T
+    return mixture_flow(np.exp(log_likelihoods - log_likelihoods.max()), values, np.hypot(deviations, by_oil))
