@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from importlib import import_module
 
 import numpy as np
@@ -120,11 +121,11 @@ def count_threads(patch: pytest.MonkeyPatch, owner: object, *names: str) -> dict
     for name in names:
         whole = getattr(owner, name)
 
-        def counted(*inputs: object, name: str = name, whole: Callable[..., object] = whole) -> object:
+        def counted(name: str, whole: Callable[..., object], *inputs: object, **options: object) -> object:
             threads[name] = {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"}
-            return whole(*inputs)
+            return whole(*inputs, **options)
 
-        patch.setattr(owner, name, counted)
+        patch.setattr(owner, name, partial(counted, name, whole))
     return threads
 
 

@@ -62,6 +62,7 @@ from sealscope.recordings.channels import COUNTS, flow_source
 from sealscope.recordings.joining import start_seconds
 from sealscope.recordings.oil import oil_temperature
 from sealscope.recordings.recording import Array, Recording
+from sealscope.signals.smoothing import average_over
 from sealscope.units import P_ATM
 
 if TYPE_CHECKING:
@@ -71,6 +72,8 @@ if TYPE_CHECKING:
 END_QUANTILE = 0.02
 #: Number of ratios of the two piston areas, and of shares of a side's motion, that are compared; the smallest share.
 N_RATIOS, N_SHARES, MIN_SHARE = 801, 51, 1e-3
+#: Time over which the flow that does not move the piston is averaged [s].
+LOST_FLOW_TIME = 0.05
 
 
 class Size(NamedTuple):
@@ -209,16 +212,16 @@ class RecordedBalance:
         recording, pumped = self.recording, self._pumped
         pressures = {name: recording[name] for name in ("p_A", "p_B")}
         rests = find_rests(pumped, recording.rate, max_rest_rate(pumped, recording.rate))
-        rests = extend_rests(rests, pumped * recording.rate, recording.rate)
         lower_pressure = np.minimum(pressures["p_A"], pressures["p_B"])
         charge = find_charge_pressure(lower_pressure, rests, recording.rate)
         # absolute minus gauge pressure; larger if sensor offsets would make the least pressure too low
         to_absolute = max(P_ATM, MIN_ABSOLUTE_PRESSURE - float(np.nanmin(lower_pressure)))
         # time, absolute pressures of A and B, position
         channels = (recording.t, *(values + to_absolute for values in pressures.values()), recording["x"])
+        held_rests = extend_rests(rests, self._lost_flow(sides), recording.rate)
         holds = [
             hold
-            for hold in find_locked_holds(channels, rests, recording.rate)
+            for hold in find_locked_holds(channels, held_rests, recording.rate)
             if self._is_pump_off(hold) and self._is_loaded(hold)
         ]
         begin, end = float(recording.t[0]), float(recording.t[-1])
@@ -236,14 +239,30 @@ class RecordedBalance:
         """Volume that the pump delivers between the samples of the recording [m^3], shape (n - 1,)."""
         return self.equations[0].left(Signals(dict(self.recording.channels), self.recording.rate, {}))
 
+    def _lost_flow(self, sides: CylinderSides) -> Array:
+        """Compute the flow of the pump [m^3/s] that does not move the piston, by magnitude, shape (n - 1,).
+
+        It is positive while the pump holds a load or compresses oil. The area is that of the side with the higher
+        pressure. The flow is averaged over `LOST_FLOW_TIME`.
+        """
+        recording = self.recording
+        is_A_higher = recording["p_A"][1:] > recording["p_B"][1:]
+        area = np.where(is_A_higher, abs(sides.area_A), abs(sides.area_B))
+        flow, displaced = (
+            np.abs(average_over(LOST_FLOW_TIME, volume * recording.rate, recording.rate))
+            for volume in (self._pumped, area * np.diff(recording["x"]))
+        )
+        return np.asarray(np.maximum(flow - displaced, 0.0))
+
     def _is_pump_off(self, hold: LockedHold) -> bool:
         """Return True if the pump probably rests in a hold, and does not hold the load by replacing the leakage.
 
         The mean flow is compared with zero and with the typical flow of a pump that holds a load.
         """
         recording = self.recording
-        first_shut = hold.edges[1]  # index of the first sample with the valves surely shut
-        begin, end = np.searchsorted(recording.t, hold.t[[first_shut, -1]])
+        # the pump's flow may fall during the first interval, and as long as `extend_rests` extends a rest
+        falling = hold.t[hold.edges[1]] - hold.t[0] + INFERENCE.rest.averaged
+        begin, end = np.searchsorted(recording.t, [hold.t[0] + falling, hold.t[-1]])
         flow = self._pumped[begin:end] * recording.rate
         flow = flow[np.isfinite(flow)]
         mean_flow = abs(float(flow.mean()))
@@ -261,7 +280,7 @@ class RecordedBalance:
         oil, t = INFERENCE.held_oil, self.recording.t
         difference = np.abs(self.recording["p_A"] - self.recording["p_B"])
         # just before the hold the pump stops and the valves shut
-        first, last = np.searchsorted(t, hold.t[0] - np.array([oil.equalises + oil.settles, 0.0]))
+        first, last = np.searchsorted(t, hold.t[0] - np.array([oil.settles, 0.0]))
         difference_before = np.nanmedian(difference[first : last + 1])
         pressure = float(np.nanmax([np.abs(hold.mean(hold.p_A - hold.p_B)).max(), difference_before]))
         return float(self._load_log_odds(np.array([pressure]))[0]) > oil.loaded

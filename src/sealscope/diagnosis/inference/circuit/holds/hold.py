@@ -120,11 +120,12 @@ def find_charge_pressure(lower_pressure: Array, rests: NDArray[np.bool_], rate: 
 
 
 def extend_rests(rests: NDArray[np.bool_], flow: Array, rate: float) -> NDArray[np.bool_]:
-    """Extend each rest of the pump back to the time at which its flow has fallen to half of its level before.
+    """Extend each rest of the pump back to the time at which its lost flow has fallen to half of its level before.
 
     Rests are found by the mean flow over `rest.averaged` (`priors.toml`), and therefore begin too late, by at most this
     time. A large leak equalises the pressures within it, once the valves shut. `rests` (n,): flags of the sampling
-    intervals in which the pump rests; `flow` (n,): flow of the pump [m^3/s]; `rate`: sampling rate [Hz].
+    intervals in which the pump rests; `flow` (n,): flow of the pump that does not move the piston [m^3/s], since a
+    piston that comes to rest is not held yet; `rate`: sampling rate [Hz].
     """
     window = max(1, round(INFERENCE.rest.averaged * rate))
     speed, extended = np.nan_to_num(np.abs(flow)), rests.copy()
