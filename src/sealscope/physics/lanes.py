@@ -82,7 +82,7 @@ class _MaskModel(models.PrimitiveModel):  # type: ignore[misc]
 def _broadcast(builder: Any, scalar: Any, lanes: Lanes) -> Any:
     """Build the LLVM instructions that copy one number into every lane of a vector; return the vector.
 
-    `lanes`: type of the vector.
+    `builder` appends the instructions; `scalar`: the number; `lanes`: type of the vector.
     """
     zero = ir.Constant(ir.IntType(32), 0)
     first_lane = builder.insert_element(ir.Constant(_vector_type(lanes), ir.Undefined), scalar, zero)
@@ -93,7 +93,8 @@ def _broadcast(builder: Any, scalar: Any, lanes: Lanes) -> Any:
 def _convert_to_lanes(context: Any, builder: Any, value: Any, value_type: Any, lanes: Lanes) -> Any:
     """Build the LLVM instructions that convert a number to lanes, a vector of equal numbers.
 
-    A vector is returned unchanged. `value_type`: numba's type of the value; `lanes`: type of the result.
+    A vector is returned unchanged. `context`: numba's target, which converts numbers; `builder` appends the
+    instructions; `value_type`: numba's type of the value; `lanes`: type of the result.
     """
     if isinstance(value_type, Lanes):
         return value
@@ -246,7 +247,7 @@ def select(condition: Any, yes: Any, no: Any) -> Any:
 
 def _select_type(arg_types: Any) -> Any:
     """Find the type of the result of `select`: that of the vectors in its arguments, or a double without any."""
-    if isinstance(arg_types[0], Mask):
+    if isinstance(arg_types[0], Mask):  # the condition
         return arg_types[0].lanes
     return next((arg_type for arg_type in arg_types if isinstance(arg_type, Lanes)), types.float64)
 

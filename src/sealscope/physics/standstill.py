@@ -80,9 +80,10 @@ def stand_still(y: Any, x: float, force: float, p: RigNumbers) -> int:
 def pressures_behind_valve(force: float, A_A: float, A_B: float, p_1: float, p_2: float) -> tuple[float, float]:
     """Compute the chamber pressures p_A, p_B [Pa] that hold the piston at rest behind a centred servo valve.
 
-    `force` [N]: load against +x; `p_1`, `p_2` [Pa]: pressures of supply and return. p_A + p_B = p_1 + p_2, because
-    the edges to supply and return are equal and have equal pressure drops (Merritt, Hydraulic Control Systems, 1967,
-    section 5.2). This mean pressure is also assumed for an overlapped valve, which may trap another one.
+    `force` [N]: load against +x; `A_A`, `A_B` [m^2]: piston areas; `p_1`, `p_2` [Pa]: pressures of supply and return.
+    p_A + p_B = p_1 + p_2, because the edges to supply and return are equal and have equal pressure drops (Merritt,
+    Hydraulic Control Systems, 1967, section 5.2). This mean pressure is also assumed for an overlapped valve, which may
+    trap another one.
     """
     p_A = (force + A_B * (p_1 + p_2)) / (A_A + A_B)
     return p_A, p_1 + p_2 - p_A

@@ -86,8 +86,7 @@ class Mixture(NamedTuple):
         """Compute the quantile of the mixture: the value below which it lies with the given probability."""
         from scipy.special import ndtr, ndtri
 
-        # scale all values by a typical deviation, so that the quantile is of the order of one; very large deviations
-        # count only in part
+        # scale by a typical deviation (very large ones count in part), so that the quantile is of the order of one
         scale = max(float(self.weights @ np.minimum(self.deviations, 1e3 * self.deviations.min())), TINY)
         scaled = self._replace(centres=self.centres / scale, deviations=self.deviations / scale)
 
@@ -407,8 +406,9 @@ class _Estimates(NamedTuple):
 def _compare_levels(judged: RecordingSums, baseline: Sequence[RecordingSums], estimates: _Estimates) -> Rise:
     """Estimate by how much the judged leak coefficient exceeds the coefficient that the healthy recordings predict.
 
-    `estimates`: rises of the judged and of the n healthy recordings over the healthy mean, with their errors. Each of
-    its s rows belongs to one width of the prior on the other coefficients; there is one row if no such prior is used.
+    `judged`, `baseline`: summaries of the judged recording and of n healthy ones; `estimates`: rises of all of them
+    over the healthy mean, with their errors. Each of its s rows belongs to one width of the prior on the other
+    coefficients; there is one row if no such prior is used.
 
     The sum of healthy mean and rise is the leak coefficient a of a recording. Leak coefficients are compared as z =
     asinh(a / 2 c), which is logarithmic for large a (`_LevelScale`). From z the predicted effect of the oil is

@@ -375,7 +375,10 @@ class Watch:
         self._compared = np.append(self._compared[1 - RECENT :], row)
 
     def _learn(self, estimator: Estimator, block: BlockConductance) -> None:
-        """Add a block to the baseline, the healthy state; freeze the baseline after `learn_hours` of operation."""
+        """Add a block to the baseline, the healthy state; freeze the baseline after `learn_hours` of operation.
+
+        `estimator`, the source of the conductances, tells if the baseline can be stated in L/min.
+        """
         self._learning.add(block.g, block.lpm, block.duty)
         hours = self._learning.blocks * self.block_seconds / 3600.0
         if self._learning.blocks >= LEARNED and hours >= self.learn_hours * (1.0 - 1e-12):  # rounding of `hours`

@@ -134,8 +134,9 @@ class Joint:
     def fit(blocks: Sequence[Block], priors: Priors, block_s: float, parameter: int) -> Joint:
         """Fit the parameters of all blocks, each `block_s` [s] long, together.
 
-        `parameter`: index of the tested parameter, whose scores (`Block`) show how much the correlation of the noise
-        inflates the variance of the estimates.
+        `blocks`: sums over the samples of each block; `priors`: priors on the parameters; `parameter`: index of the
+        tested parameter, whose scores (`Block`) show how much the correlation of the noise inflates the variance of the
+        estimates.
         """
         theta = np.array([block.theta for block in blocks])
         prior_precision = _prior_precision(len(blocks), priors, block_s)
@@ -178,8 +179,8 @@ class Joint:
 def _prior_precision(n_blocks: int, priors: Priors, block_s: float) -> Array:
     """Compute the joint prior precision of the parameters in K blocks, each `block_s` [s] long, shape (K p, K p).
 
-    The parameters are in units of `priors.unit`. Each parameter is a random walk from block to block, and its mean over
-    the blocks has the prior standard deviation `priors.width`.
+    K is `n_blocks`. The parameters are in units of `priors.unit`. Each parameter is a random walk from block to block,
+    and its mean over the blocks has the prior standard deviation `priors.width`.
     """
     differences = np.diff(np.eye(n_blocks), axis=0)  # matrix (K - 1, K) of the changes from block to block
     walks = np.kron(differences.T @ differences, np.diag(1.0 / priors.wander_variance(block_s)))
@@ -190,9 +191,9 @@ def _prior_precision(n_blocks: int, priors: Priors, block_s: float) -> Array:
 def _estimate_noise(blocks: Sequence[Block], deviations: Array, parameter: int) -> tuple[float, float]:
     """Compute the variance of the residual [Pa^2], and its inflation in estimates by the correlation of the noise.
 
-    The inflation is the variance of the scores (`Block`) over their variance under white noise, at least 1.
-    `deviations` (K p,): deviations of the parameters from `theta` of each block, in multiples of `Priors.unit`;
-    `parameter`: index of the tested parameter.
+    The inflation is the variance of the scores (`Block`) over their variance under white noise, at least 1. `blocks`:
+    sums over the samples of each block; `deviations` (K p,): deviations of the parameters from `theta` of each block,
+    in multiples of `Priors.unit`; `parameter`: index of the tested parameter.
     """
     # residual at these deviations: (1, -deviations) times the rows of residual and Jacobian
     directions = [np.append(1.0, -deviation) for deviation in deviations.reshape(len(blocks), -1)]

@@ -95,7 +95,7 @@ def _advance_friction(
     """Advance the friction force by LuGre's law over a time step h [s].
 
     Returns the friction force after the step and the friction of steady sliding at the speed v, both [N].
-    `friction_0`, `steady_0`: the same two forces before the step.
+    `friction_0`, `steady_0`: the same two forces before the step; `theta`: fitted parameters; `m`: sizes of the rig.
 
     The law, without the damping of the contact, is c dF/dt = v - |v| F/F_m for the friction force F, with the contact's
     compliance c and the magnitude F_m of the steady friction (`_steady_friction`). The step is L-stable and of order 2:
@@ -256,7 +256,7 @@ class Machine(NamedTuple):
         return out[:, : len(sets)].T.astype(np.float64, order="C"), ends[:, : len(sets)].astype(np.float64)
 
     def centred_start(self, speed: Array) -> float:
-        """Compute the initial position [m] that centres the stroke about 0, for motor speeds (n,) [rad/s]."""
+        """Compute the initial position [m] that centres the stroke about 0; `speed` (n,): motor speeds [rad/s]."""
         position = np.cumsum(speed) * self.numbers.q_b / (2.0 * math.pi * self.rate * self.numbers.A_A)
         return float(-0.5 * (position.max() + position.min()))
 
@@ -269,8 +269,8 @@ class Machine(NamedTuple):
         """Find the two stiffnesses of the oil [Pa] that correspond to the strongest ringing of p_A - p_B, shape (2,).
 
         The ringing shows in the spectrum of `dp` (n,), i.e. p_A - p_B [Pa], minus the spectrum of `total` (n,), i.e.
-        p_A + p_B [Pa], which has the same noise and hum but does not ring. If the spectrum has no line within the
-        prior, both results are the centre of the prior.
+        p_A + p_B [Pa], which has the same noise and hum but does not ring. `priors`: priors on the parameters. If the
+        spectrum has no line within the prior of the stiffness, both results are the centre of this prior.
         """
         relative_width = priors.width[K_OIL] / priors.centre[K_OIL]
         n_padded = 4 * _SEGMENT  # samples of a segment with zeros, for a finer grid of frequencies

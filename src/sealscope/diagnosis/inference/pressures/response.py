@@ -279,7 +279,7 @@ def fit_from_priors(segment: Segment, total: Array, noise: float) -> Linearisati
 
 
 def fit_from_starts(segment: Segment, starts: Sequence[Array] | Array, noise: float, n_best: int) -> Linearisation:
-    """Fit the parameters from several starts (s, p), and return the best fit.
+    """Fit the parameters to the samples `segment` from several starts (s, p), and return the best fit.
 
     The fit makes a few Gauss-Newton steps from all starts, and then more steps from the `n_best` best results. `noise`:
     variance of the noise [Pa^2].
@@ -312,8 +312,8 @@ class Follower:
     def fit_start(recording: Recording, rig: Rig) -> Follower:
         """Start a filter with parameters that are fitted to the beginning of a recording.
 
-        The law of friction is Stribeck's, or LuGre's if Stribeck's does not explain the beginning and LuGre's fits
-        better.
+        `rig`: assumed machine, which gives sizes and priors. The law of friction is Stribeck's, or LuGre's if
+        Stribeck's does not explain the beginning and LuGre's fits better.
         """
         u, dp = recording["u"], recording["p_A"] - recording["p_B"]
         # 1 or -1: whether a positive command raises or lowers p_A - p_B
@@ -354,8 +354,8 @@ class Follower:
     def at_rate(self, rig: Rig, rate: float) -> Follower:
         """Make a filter for samples at another `rate` [Hz] that starts from the state of this filter.
 
-        Parameters, covariance and simulated states are kept, but there is no previous sample: as after a gap, the next
-        block starts the simulation anew (`next_segment`).
+        `rig`: the same machine as before. Parameters, covariance and simulated states are kept, but there is no
+        previous sample: as after a gap, the next block starts the simulation anew (`next_segment`).
         """
         follower = Follower(Machine.from_rig(rig, rate, self.machine.law), self.priors, self.sense)
         follower.theta, follower.covariance = self.theta, self.covariance
