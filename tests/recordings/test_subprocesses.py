@@ -94,7 +94,7 @@ def test_a_long_work_holds_no_other_thread_up() -> None:
     with ThreadPoolExecutor() as threads:
         long = threads.submit(run_in_subprocess, time.sleep, 1.0, limit=10.0)
         while threads.submit(run_in_subprocess, operator.add, 1, 1, limit=10.0).result() == 2 and not long.running():
-            pass
+            assert not long.done()  # else it has ended before it was seen to run
         assert run_in_subprocess(operator.add, 2, 3, limit=10.0) == 5
         assert not long.done()
 

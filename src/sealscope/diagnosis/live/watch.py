@@ -146,7 +146,7 @@ class Watch:
 
     @property
     def learned_with(self) -> tuple[Rig, Mapping[str, bool], float]:
-        """Settings with which the baseline is learned: rig, whether L/min are stated by each method, and time [h]."""
+        """Rig, whether each method states L/min, and time [h] with which the baseline is learned."""
         return self._rig, self._litres, self.learn_hours
 
     @property
