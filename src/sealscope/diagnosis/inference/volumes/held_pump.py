@@ -1,15 +1,15 @@
 """Leakage of a pump that is still connected to a loaded cylinder, just before shut valves take over the load.
 
 A press builds up its pressure, the pump maintains it for some tenths of a second, and then the valves shut. In this
-time nearly all of the pump's flow q leaks. In the last seconds before each hold,
+time nearly all of the pump's flow q leaks. In the time `held_oil.before` (`priors.toml`) before each hold,
 
     q = G (p_A - p_B) + A v + C d(p_A - p_B)/dt,
 
 with the speed v of the piston. The conductance G, the area A and the compliance C are the same in all holds of a
 recording. The fit is robust, since the pump's flow falls within the last tenth of a second while the valves shut. G
-contains every leak of the loaded side; those that the holds themselves measure are subtracted from it. The rest is the
-pump's own leakage, which no other part of the recording shows apart from that of the piston. Called from
-`volumes.recorded`; compared with healthy recordings in `volumes.rivals`.
+contains every leak of the loaded side. The leaks past the piston and to the outside, which the holds themselves
+measure, are subtracted; the rest is the pump's own leakage. Called from `volumes.recorded`; compared with healthy
+recordings in `volumes.rivals`.
 """
 
 from __future__ import annotations

@@ -229,7 +229,7 @@ class RecordedBalance:
 
     @cached_property
     def held_pump_leakage(self) -> Estimate | None:
-        """Leakage conductance of the pump [m^3/(s Pa)] in the last seconds before `chambers` shut, None if unknown."""
+        """Leakage conductance of the pump [m^3/(s Pa)] just before valves shut the chambers, None if unknown."""
         if self.chambers is None:
             return None
         return estimate_pump_leakage(self.recording, self._pumped, self.chambers.holds, self.chambers.leaks)
@@ -260,7 +260,7 @@ class RecordedBalance:
         The mean flow is compared with zero and with the typical flow of a pump that holds a load.
         """
         recording = self.recording
-        # the pump's flow may fall during the first interval, and as long as `extend_rests` extends a rest
+        # time in which the pump's flow may still fall: the first interval, and that by which `extend_rests` extends
         falling = hold.t[hold.edges[1]] - hold.t[0] + INFERENCE.rest.averaged
         begin, end = np.searchsorted(recording.t, [hold.t[0] + falling, hold.t[-1]])
         flow = self._pumped[begin:end] * recording.rate

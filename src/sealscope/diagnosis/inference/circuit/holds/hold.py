@@ -120,20 +120,21 @@ def find_charge_pressure(lower_pressure: Array, rests: NDArray[np.bool_], rate: 
 
 
 def extend_rests(rests: NDArray[np.bool_], flow: Array, rate: float) -> NDArray[np.bool_]:
-    """Extend each rest of the pump back to the time at which its lost flow has fallen to half of its level before.
+    """Extend each rest of the pump back to the time at which its flow has fallen to half of the level before.
 
-    Rests are found by the mean flow over `rest.averaged` (`priors.toml`), and therefore begin too late, by at most this
-    time. A large leak equalises the pressures within it, once the valves shut. `rests` (n,): flags of the sampling
-    intervals in which the pump rests; `flow` (n,): flow of the pump that does not move the piston [m^3/s], since a
-    piston that comes to rest is not held yet; `rate`: sampling rate [Hz].
+    Rests are found by the mean flow over the time `rest.averaged` (`priors.toml`), and therefore begin too late, by at
+    most this time. A large leak may equalise the pressures earlier, as soon as the valves shut. `rests` (n,): flags of
+    the sampling intervals in which the pump rests; `flow` (n,): flow of the pump without the part that moves the piston
+    [m^3/s], since valves do not hold a moving piston; `rate`: sampling rate [Hz].
     """
     window = max(1, round(INFERENCE.rest.averaged * rate))
-    speed, extended = np.nan_to_num(np.abs(flow)), rests.copy()
+    magnitude, extended = np.nan_to_num(np.abs(flow)), rests.copy()
     for first, _ in find_runs(rests).tolist():
         earliest = max(first - window, 0)
-        level = float(np.median(speed[max(earliest - window, 0) : earliest + 1]))
-        fast = np.flatnonzero(speed[earliest:first] > 0.5 * level)
-        extended[earliest + (fast[-1] + 1 if fast.size else 0) : first] = True
+        level = float(np.median(magnitude[max(earliest - window, 0) : earliest + 1]))
+        is_above_half = magnitude[earliest:first] > 0.5 * level
+        n_above = int(np.flatnonzero(is_above_half)[-1]) + 1 if is_above_half.any() else 0
+        extended[earliest + n_above : first] = True
     return extended
 
 
