@@ -88,6 +88,8 @@ def test_a_recording_is_added_and_the_old_file_kept(call, file, tmp_path):
 def test_what_the_machine_states_is_not_stated_twice(call, healthy, file):
     refused = call("diagnose", healthy / "run1.nc", "--machine", file, "--rig", "thesis").refused()
     assert "--rig must not stand beside --machine" in refused
+    refused = call("diagnose", healthy / "run1.nc", "--machine", file, "--rate", "0").refused()
+    assert "--rate must not stand beside --machine" in refused
 
 
 @pytest.mark.slow

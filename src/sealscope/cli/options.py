@@ -183,7 +183,7 @@ class StatedMachine:
             options = {"--baseline": baseline, "--map": maps, "--rate": rate, "--rig": rig}
             options |= {"--area": area, "--displacement": displacement, "--limit": limit}
             for name, value in options.items():
-                if value:
+                if value is not None and value != []:
                     raise InputError(f"{name} must not stand beside --machine, whose file states it")
             known_machine = read_machine(machine)
             return cls(known_machine, rig=known_machine.rig, limit=known_machine.limit)

@@ -191,6 +191,16 @@ def test_a_file_whose_name_is_no_text_is_kept_by_its_escaped_name(folder, tmp_pa
     assert [own.file for own in ss.read_machine(path).healthy] == ["a\\udcff.nc"]
 
 
+def test_files_of_one_name_in_several_folders_are_told_apart(healthy, tmp_path):
+    for day, recording in enumerate((*healthy, ss.simulate(command="3 sin(4t)", duration="20 s", seed=4)), start=1):
+        place = tmp_path / f"day{day}"
+        place.mkdir()
+        ss.write(recording, place / "run.nc")
+    machine = ss.commission(sorted(tmp_path.rglob("run.nc")))
+    assert sorted(entry.file for entry in machine.healthy) == [f"day{day}/run.nc" for day in range(1, 5)]
+    assert not machine.left_out
+
+
 def test_a_machine_without_recordings_says_so():
     assert "0 healthy" in str(ss.CommissionedMachine("a", ()))
 

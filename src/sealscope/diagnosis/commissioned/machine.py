@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import cached_property
@@ -411,20 +412,21 @@ def commission(
         map = {} if stated_rig is None else stated_rig.channel_map
     machine = CommissionedMachine(name, (), stated_rig, map, rate, limit)
     problems: list[str] = []
-    path_of: dict[str, Path] = {}  # by file name
-    recording_of: dict[str, Recording] = {}  # by file name, as many recordings as fit into memory
+    path_of: dict[str, Path] = {}  # by the labels of the recordings
+    recording_of: dict[str, Recording] = {}  # by label, as many recordings as fit into memory
     n_samples = 0
-    for path in recordings_in(paths):
+    files = recordings_in(paths)
+    for label, path in zip(_distinct_names(files), files, strict=True):
         try:
             recording = machine.read(path)
-            machine = machine._with_recording(recording, path.name, checksum_of(path))
+            machine = machine._with_recording(recording, label, checksum_of(path))
         except SealscopeError as error:
             problems.append(str(error))
             continue
-        path_of[path.name] = path
+        path_of[label] = path
         n_samples += len(recording) * len(recording.channels)
         if n_samples < _MAX_SAMPLES:
-            recording_of[path.name] = recording
+            recording_of[label] = recording
     if not machine.healthy:
         raise InputError(f"a machine must have a healthy recording that can be used, got none: {problems[0]}")
 
@@ -435,6 +437,15 @@ def commission(
 
     healthy, leaking = cross_check(machine.healthy, judge, keep)
     return replace(machine, healthy=healthy, left_out=(*problems, *leaking))
+
+
+def _distinct_names(paths: Sequence[Path]) -> list[str]:
+    """Name recordings by their files; those with equal names, by their paths within the folder common to all of them."""
+    counts = Counter(path.name for path in paths)
+    if len(counts) == len(paths):
+        return list(counts)
+    folder = os.path.commonpath([path.absolute().parent for path in paths])
+    return [path.name if counts[path.name] == 1 else path.absolute().relative_to(folder).as_posix() for path in paths]
 
 
 def checksum_of(path: str | os.PathLike[str]) -> str:
