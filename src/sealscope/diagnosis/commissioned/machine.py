@@ -440,7 +440,7 @@ def commission(
 
 
 def _distinct_names(paths: Sequence[Path]) -> list[str]:
-    """Name recordings by their files; those with equal names, by their paths within the folder common to all of them."""
+    """Label recordings by the names of their files; equal names, by the paths within the folder common to all."""
     counts = Counter(path.name for path in paths)
     if len(counts) == len(paths):
         return list(counts)
