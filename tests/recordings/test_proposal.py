@@ -57,6 +57,18 @@ from ..refusals import refusal
                 "T_oil": "Öltemperatur [°C]",
             },
         ),
+        (
+            "t;PT101 [bar];Druck A [bar];Druck B [bar];TT101 [°C]",
+            {"t": "t", "p_A": "Druck A [bar]", "p_B": "Druck B [bar]", "T_oil": "TT101 [°C]"},
+        ),
+        (
+            "t;Druck A [bar];Druck B [bar];Temp 1 [°C];oil temp [°C]",
+            {"t": "t", "p_A": "Druck A [bar]", "p_B": "Druck B [bar]", "T_oil": "oil temp [°C]"},
+        ),
+        (
+            "t;Druck A [bar];Druck B [bar];Temp 1 [°C];Temp 2 [°C];motor temperature [°C]",
+            {"t": "t", "p_A": "Druck A [bar]", "p_B": "Druck B [bar]"},
+        ),
         ("t;PG_1;PG_2;PG_tank", {"p_A": "PG_1", "p_B": "PG_2", "t": "t"}),
         (
             "s;pump pressure 1 [psi];pump pressure 2 [psi];Pressure A (psi);Pressure B (psi)",

@@ -46,16 +46,20 @@ def apply_regime(blocks: Blocks, roles: ColumnRoles, shut: bool, has_holds: bool
     - Open valves: these columns are dropped from the Gram matrices.
     - Shut valves: the flow offset in motion replaces the flow offset of all times (`terms.shut_at_rest`). The column
       for the leakage of a pump that holds the load remains only with `has_holds` (some hold lasts for seconds), and
-      only if the pump is off at other times. Else it is set to zero.
+      only if the pump is off at other times. Else it is set to zero; without such holds it is added to the column of
+      the pump that moves the piston, since a press that builds up its pressure is connected to its pump.
     """
     names = (*roles.names, "left")
     if not shut:
         columns = [k for k, name in enumerate(names) if name not in STATES]
         return replace(blocks, gram=np.asarray(blocks.gram[..., columns, :][..., columns]))
-    moving_bias, holding = names.index(MOVING_BIAS), names.index(HOLDING)
+    moving_bias, turning, holding = (names.index(name) for name in (MOVING_BIAS, TURNING, HOLDING))
     columns = [moving_bias if name == BIAS else k for k, name in enumerate(names) if name != MOVING_BIAS]
     gram = blocks.gram.copy()
     is_always_on = _rest_share(blocks, roles, TURNING, HOLDING) < NEGLIGIBLE  # the pump moves the piston or holds it
+    if not is_always_on and not has_holds:
+        gram[..., turning, :] += gram[..., holding, :]
+        gram[..., turning] += gram[..., holding]
     if not has_holds or is_always_on:
         gram[..., holding, :] = gram[..., holding] = 0.0
     return replace(blocks, gram=np.asarray(gram[..., columns, :][..., columns]))

@@ -83,6 +83,9 @@ def proposed_map(labels: Sequence[Label]) -> dict[str, str]:
         # prefer the command to the spool, which follows it
         if channel == "u" and any(guess.kind == "command" for _, guess in columns):
             columns = [column for column in columns if column[1].kind == "command"]
+        # prefer the temperature that names the oil
+        if channel == "T_oil" and any(_split_words(label.name) & _KIND["oil"] for label, _ in columns):
+            columns = [column for column in columns if _split_words(column[0].name) & _KIND["oil"]]
         if len(columns) > 1:  # prefer measured to computed columns
             columns = [column for column in columns if not _split_words(column[0].name) & _KIND["made"]]
         if len(columns) == 1 and channel.casefold() not in channel_names:
@@ -240,8 +243,9 @@ def _guess_meaning(label: Label, head_side: str = "") -> _Guess | None:
     side = head_side if words & _SIDE["head"] and head_side else _find_side(words)
     if unit is not None and same_dimension(unit, "Pa"):
         return None if words & (_KIND["other"] | _KIND["wanted"]) else _Guess("pressure", side, unit)
-    if unit is not None and words & _KIND["oil"] and same_dimension(unit, "K"):  # before `other`, which has oil, too
-        return _Guess("oil", "", unit)
+    if unit is not None and same_dimension(unit, "K"):  # before `other`, which has oil, too
+        is_oil = words & _KIND["oil"] or _is_unnamed_temperature(words)
+        return _Guess("oil", "", unit) if is_oil else None
     if words & _MEASURED["spool"]:
         return _Guess("spool", "", unit) if unit is None or _is_command_unit(unit) else None
     if unit is not None and same_dimension(unit, "m^3/s"):
@@ -263,6 +267,11 @@ def _guess_meaning(label: Label, head_side: str = "") -> _Guess | None:
         if words & words_of_kind and fits_unit and kind != "flow":
             return _Guess(kind, side, unit)
     return None
+
+
+def _is_unnamed_temperature(words: set[str]) -> bool:
+    """Return True if the words of a column's name mean a temperature but not of what, as in `TT101` or `Temp 1`."""
+    return {word for word in words if not word.isdigit()} <= _KIND["temperature"]
 
 
 def _is_command_unit(unit: str) -> bool:
