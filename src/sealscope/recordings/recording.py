@@ -196,7 +196,16 @@ class Recording:
     @property
     def unused(self) -> tuple[str, ...]:
         """Names of the columns of the file with measured pressures, positions, speeds or flows that no channel uses."""
-        names = self.provenance.get("unused", ())
+        return self._names_in_provenance("unused")
+
+    @property
+    def unused_temperatures(self) -> tuple[str, ...]:
+        """Names of the columns of the file with temperatures, if the oil's temperature is not read."""
+        return self._names_in_provenance("unused_temperatures")
+
+    def _names_in_provenance(self, key: str) -> tuple[str, ...]:
+        """Return the list of names that the provenance has under `key`, empty if it has no such list."""
+        names = self.provenance.get(key, ())
         return tuple(map(str, names)) if isinstance(names, list | tuple) else ()
 
     @property

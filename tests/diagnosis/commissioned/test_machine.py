@@ -191,6 +191,19 @@ def test_a_file_whose_name_is_no_text_is_kept_by_its_escaped_name(folder, tmp_pa
     assert [own.file for own in ss.read_machine(path).healthy] == ["a\\udcff.nc"]
 
 
+def test_a_temperature_that_is_not_read_is_named_when_a_machine_is_commissioned(healthy, tmp_path):
+    recording = healthy[0]
+    columns = [recording.t, *(recording[name] for name in ("p_A", "p_B", "x", "omega")), np.full(len(recording), 41.5)]
+    head = "t [s],p_A [Pa],p_B [Pa],x [m],omega [rad/s],TT101 [degC]"
+    np.savetxt(tmp_path / "run.csv", np.column_stack(columns), delimiter=",", header=head, comments="")
+    by_names = {name: name for name in ("p_A", "p_B", "x", "omega")}
+    unread = ss.commission(tmp_path, map=by_names)
+    assert any("TT101" in problem for problem in unread.summary.problems)
+    read = ss.commission(tmp_path, map={"*": "auto"})
+    assert not any("TT101" in problem for problem in read.summary.problems)
+    assert read.healthy[0].about["oil_degC"] == 41.5
+
+
 def test_files_of_one_name_in_several_folders_are_told_apart(healthy, tmp_path):
     for day, recording in enumerate((*healthy, ss.simulate(command="3 sin(4t)", duration="20 s", seed=4)), start=1):
         place = tmp_path / f"day{day}"

@@ -216,6 +216,10 @@ def describe_recording(recording: Recording, inspection: Inspection) -> dict[str
         description["log_units"] = log_units
     findings = inspection.findings
     problems = [finding.text for finding in findings if finding.severity != "note" or finding.code in _LOGGER_HABITS]
+    problems += [
+        f"{name} is not read: if it is the oil's temperature, then --map 'T_oil={name}', as warm oil leaks more"
+        for name in recording.unused_temperatures[:1]
+    ]
     problems += [_describe_vacuum(part, name) for name in ("p_A", "p_B") if name in part]
     problems += [_describe_glitches(part, name) for name in ("omega", "u") if name in part]
     description["wrong"] = [text for text in problems if text]

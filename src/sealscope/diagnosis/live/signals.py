@@ -79,7 +79,7 @@ class SignalWindow:
         motion = motion_columns(channels, rate)  # speed first; None if no motion is recorded
         speed = 0.0 if motion is None else top_speed(motion)
         max_speed = max(speed, float(self._rows[:, _SPEED].max(initial=0.0)) if self._rows.size else 0.0)
-        fraction_moving = 1.0 if motion is None else float(time_in_motion(motion[None, :, 0], max_speed)[0])
+        fraction_moving = 1.0 if motion is None else float(time_in_motion(motion[None, :, 0], max_speed, rate)[0])
         columns = pressure_level_rows(channels, rate, self._means, max_speed)  # of the fit of mean pressures
         single_block = {name: values[None] for name, values in channels.items()}  # arrays (1, n) of one block
         values = {**dict(log_amplitudes(single_block)), **dict(sensor_features(single_block, rate))}

@@ -80,6 +80,7 @@ class ColumnMap:
       means a date, `date` is the time column itself, which may then contain only dates.
     - `names`: channel -> its name in the file, if that differs.
     - `unused`: names of columns with measured pressures, positions, speeds and flows that are in no channel.
+    - `unused_temperatures`: names of columns with temperatures, unless one is the oil's.
     - `notes`: lines for the history of the recording.
     """
 
@@ -92,6 +93,7 @@ class ColumnMap:
     date: int | None = None
     names: dict[str, str] = field(default_factory=dict)
     unused: tuple[str, ...] = ()
+    unused_temperatures: tuple[str, ...] = ()
     notes: list[str] = field(default_factory=list)
 
     @property
@@ -387,7 +389,7 @@ def _date_columns(choice: ColumnMap) -> list[int]:
 
 
 def _note_unused(choice: ColumnMap, used: Container[int | None]) -> None:
-    """Add a note on unused columns to `choice`, and collect those with measured quantities in `choice.unused`.
+    """Add a note on unused columns to `choice`, and collect those with measured quantities and temperatures there.
 
     `used`: numbers of the used columns. The note proposes a map by which some of the unused columns could be read.
     """
@@ -398,9 +400,10 @@ def _note_unused(choice: ColumnMap, used: Container[int | None]) -> None:
     channel_names, proposed = {*choice.channels, "t"}, proposed_map(choice.labels)
     proposal = format_map({name: column for name, column in proposed.items() if name not in channel_names})
     hint = f"; map auto would also read {proposal}" if proposal else ""
-    temperatures = [label.whole for label in unused if is_temperature(label)]
-    if temperatures and "T_oil" not in channel_names:
-        hint += f"; if it is the oil's temperature: --map 'T_oil={temperatures[0]}'"
+    if "T_oil" not in channel_names:
+        choice.unused_temperatures = tuple(label.whole for label in unused if is_temperature(label))
+    if choice.unused_temperatures:
+        hint += f"; if it is the oil's temperature: --map 'T_oil={choice.unused_temperatures[0]}'"
     choice.notes.append(f"{UNUSED}: {join_names((label.whole for label in unused), 40)}{hint}")
 
 

@@ -246,7 +246,8 @@ def convert_columns(
             t, channels, units, rate, description["provenance"], (*description["history"], *notes), kind
         )
     details = {"file": request.file, "format": kind, **start, "about": dict(remarks), "columns": choice.names}
-    details |= {"unused": list(choice.unused), "log_units": log_units}
+    details |= {"unused": list(choice.unused), "unused_temperatures": list(choice.unused_temperatures)}
+    details["log_units"] = log_units
     provenance = {key: value for key, value in details.items() if value or key in start}
     return RecordingFields(t, channels, units, rate, provenance, tuple(notes), kind)
 

@@ -20,9 +20,11 @@ from numpy.typing import NDArray
 
 from sealscope.diagnosis.inference.changes.levels import motion_columns, top_speed
 from sealscope.diagnosis.inference.onset import MIN_BLOCKS, Information, StepTest, two_sided_step_test
+from sealscope.diagnosis.inference.terms import AVERAGING_TIME
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.recording import Array, Recording
+from sealscope.signals.smoothing import average_over
 
 _PRIORS = CHANGES.features
 BLOCKS, ORDER = _PRIORS.blocks, _PRIORS.order
@@ -50,13 +52,15 @@ def duty_tests(recording: Recording) -> list[StepTest]:
     return amplitude_step_tests(time[is_moving], amplitudes)
 
 
-def time_in_motion(speeds: Array, max_speed: float) -> Array:
+def time_in_motion(speeds: Array, max_speed: float, rate: float) -> Array:
     """Compute the fraction of each block's samples in which the piston moves, (K,).
 
-    `speeds` (K, length): speeds of K blocks; NaN counts as rest. A sample is in motion if its absolute speed exceeds
-    the fraction `CHANGES.levels.slowest` of `max_speed`.
+    `speeds` (K, length): speeds of K blocks at the sampling `rate` [Hz]; NaN counts as rest. A sample is in motion if
+    its speed, averaged over `AVERAGING_TIME` to remove the noise of a position, exceeds the fraction
+    `CHANGES.levels.slowest` of `max_speed` in magnitude.
     """
-    return np.asarray((np.abs(speeds) > CHANGES.levels.slowest * max_speed).mean(axis=1))
+    mean_speeds = average_over(AVERAGING_TIME, speeds, rate)
+    return np.asarray((np.abs(mean_speeds) > CHANGES.levels.slowest * max_speed).mean(axis=1))
 
 
 def is_in_motion(fractions: Array) -> NDArray[np.bool_]:
@@ -75,7 +79,7 @@ def _find_moving_blocks(recording: Recording, length: int) -> NDArray[np.bool_]:
     if motion is None:
         return np.ones(count, dtype=bool)
     speeds = motion[: count * length, 0].reshape(count, length)  # the first column is the speed
-    return is_in_motion(time_in_motion(speeds, top_speed(motion)))
+    return is_in_motion(time_in_motion(speeds, top_speed(motion), recording.rate))
 
 
 def log_amplitudes(blocks: Mapping[str, Array]) -> Iterator[tuple[str, Array]]:
