@@ -8,8 +8,9 @@ import pytest
 from sealscope.diagnosis.inference.circuit.holds.hold import find_locked_holds
 from sealscope.diagnosis.inference.circuit.holds.leaks import HeldLeaks
 from sealscope.diagnosis.inference.differences import Estimate
-from sealscope.diagnosis.inference.scatter import RecordingSums, held_pump_rise
+from sealscope.diagnosis.inference.scatter import RecordingSums, Resistance, held_pump_rise
 from sealscope.diagnosis.inference.volumes.held_pump import estimate_pump_leakage
+from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Recording
 from sealscope.units import P_ATM
 
@@ -92,11 +93,13 @@ def rise_chance(factor: float, oil: float, *, shows: bool, seed: int = 0) -> flo
 
     def day(number: int) -> RecordingSums:
         level = PUMP * factors[number] * np.exp(thinning[number] + 0.03 * random.standard_normal())
-        drop = np.array([-thinning[number] / 1.5, 0.02]) if shows else None
+        drop = 1e6 * np.exp(-thinning[number] / INFERENCE.oil.per_drop)
+        fit = Resistance(friction=1e5, friction_error=1e3, drop=drop, drop_error=0.02 * drop, top_speed=0.1)
         start_s = 1.7e9 + 86400.0 * number
         return RecordingSums(
-            np.zeros((1, 2, 2)), 3e-4, 5e6, start_s, held_pump=np.array([level, 0.02 * level]), drop_per_speed=drop
-        )
+            np.zeros((1, 2, 2)), 3e-4, 5e6, start_s, held_pump=np.array([level, 0.02 * level]),
+            resistance=np.array(fit) if shows else None,
+        )  # fmt: skip
 
     *healthy, judged = (day(number) for number in range(7))
     rise = held_pump_rise(judged, healthy)

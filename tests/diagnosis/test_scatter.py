@@ -13,6 +13,7 @@ from sealscope.diagnosis.inference.scatter import (
     Mixture,
     Population,
     RecordingSums,
+    Resistance,
     Rise,
     find_unusual_conditions,
     motion_change,
@@ -393,9 +394,11 @@ def oily_days(random: np.random.Generator, leak: float, error: float, *, shows: 
 
     def day(number: int, thinner: float) -> RecordingSums:
         level = 20.0 * PRIORS * np.exp(thinner) + (leak if number == 6 else 0.0)
-        drop = -thinner / INFERENCE.oil.per_drop if shows else random.normal(0.0, 0.3)
+        log_drop = -thinner / INFERENCE.oil.per_drop if shows else random.normal(0.0, 0.3)
+        drop = 1e6 * np.exp(log_drop + error * random.standard_normal())
         sums = RecordingSums.from_blocks(recording(random, level), (COLUMNS,), DAY * number)
-        return sums._replace(drop_per_speed=np.array([drop + error * random.standard_normal(), error]))
+        fit = Resistance(friction=1e5, friction_error=1e3, drop=drop, drop_error=error * drop, top_speed=0.1)
+        return sums._replace(resistance=np.array(fit))
 
     *healthy, judged = (day(number, thinner) for number, thinner in enumerate(thinning))
     return rise(judged, healthy, (COLUMNS,))

@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.inference.changes.motion_fit import estimate_viscous_drop
+from sealscope.diagnosis.inference.changes.motion_fit import fit_difference
+from sealscope.diagnosis.inference.scatter import RecordingSums, Resistance, predict_thinning
+from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Recording
 
 RATE, SECONDS = 100.0, 60.0
@@ -29,9 +31,10 @@ def record(drop: float = DROP, seed: int = 0, noise: float = 2e4, turned: bool =
 
 def log_drop(recording: Recording) -> tuple[float, float]:
     """Return the logarithm of the drop and its standard error."""
-    estimate = estimate_viscous_drop(recording)
-    assert estimate is not None
-    return float(estimate[0]), float(estimate[1])
+    fit = fit_difference(recording)
+    assert fit is not None
+    drop = float(np.sign(fit.friction)) * fit.drop
+    return float(np.log(drop)), fit.drop_error / drop
 
 
 def test_the_ratio_of_two_drops_is_theirs() -> None:
@@ -47,11 +50,6 @@ def test_its_standard_error_is_the_scatter_of_records() -> None:
     assert 0.6 < estimates[:, 0].std() / np.median(estimates[:, 1]) < 1.6
 
 
-def test_a_drop_that_does_not_show_counts_as_its_error() -> None:
-    for drop in (0.0, -DROP):
-        assert log_drop(record(drop, noise=2e5))[1] == pytest.approx(1.0, abs=0.5)
-
-
 def test_the_sign_of_the_motion_does_not_matter() -> None:
     plain, turned = (log_drop(record(turned=turned)) for turned in (False, True))
     assert turned == pytest.approx(plain, abs=1e-6)
@@ -60,5 +58,37 @@ def test_the_sign_of_the_motion_does_not_matter() -> None:
 def test_without_motion_or_pressures_there_is_none() -> None:
     whole = record()
     still = Recording(T, {**whole.channels, "x": np.zeros(len(T))}, whole.units, RATE)
-    assert estimate_viscous_drop(still) is None
-    assert estimate_viscous_drop(whole.only(("p_A", "x"))) is None
+    assert fit_difference(still) is None
+    assert fit_difference(whole.only(("p_A", "x"))) is None
+
+
+def predicted_oil(*days: tuple[float, float]) -> np.ndarray:
+    """Predict the oil's effect on the leakage of days with a `friction` [Pa] and a drop at top speed [Pa] each."""
+    fits = [
+        Resistance(friction=friction, friction_error=1e3, drop=drop / 0.1, drop_error=2e4, top_speed=0.1)
+        for friction, drop in days
+    ]
+    sums = [RecordingSums(np.zeros((1, 2, 2)), 3e-4, 5e6, 1.7e9, resistance=np.array(fit)) for fit in fits]
+    return predict_thinning(sums)
+
+
+def test_thinner_oil_leaks_more() -> None:
+    """With the prior exponent, and a friction that stays."""
+    thinning = predicted_oil((1e5, 2e5), (1e5, 2e5), (1e5, 1e5))
+    assert thinning[-1] == pytest.approx(INFERENCE.oil.per_drop * np.log(2.0), rel=0.05)
+
+
+def test_what_friction_gains_the_drop_loses() -> None:
+    """The resistance at top speed stays, and so does the oil."""
+    assert np.abs(predicted_oil((1.0e5, 2.0e5), (1.1e5, 1.9e5), (0.9e5, 2.1e5), (1.15e5, 1.85e5))).max() < 0.02
+
+
+def test_worn_seals_are_no_colder_oil() -> None:
+    same, worn = predicted_oil((1e5, 2e5), (1e5, 2e5), (1e5, 2e5)), predicted_oil((1e5, 2e5), (1e5, 2e5), (3e5, 2e5))
+    assert worn == pytest.approx(same, abs=0.02)
+
+
+def test_a_drop_that_does_not_show_tells_no_oil() -> None:
+    assert abs(predicted_oil((1e5, 2e5), (1e5, 2e5), (1e5, -1e3))[-1]) < INFERENCE.oil.per_drop * np.log(200.0)
+    unknown = RecordingSums(np.zeros((1, 2, 2)), 3e-4, 5e6, 1.7e9)
+    assert not predict_thinning([unknown, unknown, unknown]).any()

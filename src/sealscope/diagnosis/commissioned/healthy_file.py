@@ -25,6 +25,7 @@ from sealscope.diagnosis.healthy import SummarisedRecording, Summary
 from sealscope.diagnosis.inference.changes.pressure_bands import MIN_OCTAVES, PAIRS, Octaves
 from sealscope.diagnosis.inference.changes.signals import SIGNALS
 from sealscope.diagnosis.inference.circuit.holds.leaks import HeldLeaks
+from sealscope.diagnosis.inference.scatter import Resistance
 from sealscope.diagnosis.inference.terms import LEAK
 from sealscope.diagnosis.rms_change.blocks import DUTY
 from sealscope.diagnosis.verdict.evidence import PRESSURE_RESPONSE, RMS_CHANGE, VOLUME_BALANCE
@@ -132,7 +133,7 @@ def _check_sums(summary: Any) -> Any:
     column and the left side must have positive sums of squares, and their sum of products must obey Cauchy's
     inequality. The other arrays of the summary are checked, too: `shut_sums` (1, m + 2, m + 2) are the sums for a pump
     that valves cut off at rest, which needs two more columns; `held` are the leaks while valves hold the load; and
-    `drop_per_speed` is the logarithm of a pressure drop over speed, with its standard error.
+    `resistance` is what resists the motion (`scatter.Resistance`).
     """
     size = len(summary.terms) + 1
     if summary.sums.ndim != 3 or not len(summary.sums) or summary.sums.shape[1:] != (size, size):
@@ -144,9 +145,13 @@ def _check_sums(summary: Any) -> Any:
         raise ValueError(f"held must hold {len(HeldLeaks._fields)} numbers, got the shape {summary.held.shape}")
     if summary.held_pump is not None and summary.held_pump.shape != (2,):
         raise ValueError(f"held_pump must hold two numbers, got the shape {summary.held_pump.shape}")
-    drop = summary.drop_per_speed
-    if drop is not None and (drop.shape != (2,) or not np.abs(drop).max() < _MAX_LOGARITHM or drop[1] < 0.0):
-        raise ValueError("drop_per_speed must hold a logarithm and its standard error")
+    resistance = summary.resistance
+    if resistance is not None:
+        if resistance.shape != (len(Resistance._fields),):
+            raise ValueError(f"resistance must hold {len(Resistance._fields)} numbers, got {resistance.shape}")
+        fit = Resistance(*resistance)
+        if min(fit.friction_error, fit.drop_error, fit.top_speed) <= 0.0:
+            raise ValueError("resistance must hold positive standard errors and a positive speed")
     if LEAK not in summary.terms:
         raise ValueError(f"terms must have {LEAK!r}, got {', '.join(summary.terms)}")
     leak = summary.terms.index(LEAK)
@@ -209,7 +214,7 @@ _BALANCE = table_type(
     pressure=_Magnitude,
     start_s=(_Time, None),
     oil_degC=(_Number, None),
-    drop_per_speed=(_Array, None),
+    resistance=(_Array, None),
 )
 _RMS = table_type(
     "allow",

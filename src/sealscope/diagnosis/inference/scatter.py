@@ -249,6 +249,20 @@ class Rise(NamedTuple):
         return self.value - max_error, self.value - min_error
 
 
+class Resistance(NamedTuple):
+    """Pressure difference p_A - p_B that resists the motion: friction sign(v) + drop v at the speed v.
+
+    `friction` [Pa], `drop` [Pa per unit of the speed] and their standard errors; `top_speed`: highest speed. Each is a
+    number, or an array with one element per recording.
+    """
+
+    friction: Array
+    friction_error: Array
+    drop: Array
+    drop_error: Array
+    top_speed: Array
+
+
 class RecordingSums(NamedTuple):
     """Summary of one recording, for the comparison with other recordings of the same machine.
 
@@ -259,7 +273,7 @@ class RecordingSums(NamedTuple):
     - `held` (6,): leaks while shut valves hold the load, in the order of `holds.leaks.HeldLeaks`, or None;
     - `held_pump` (2,): leakage conductance of the pump [m^3/(s Pa)] just before such holds, and its standard deviation,
       or None;
-    - `drop_per_speed` (2,): logarithm of (pressure drop due to motion / speed) and its standard error, or None.
+    - `resistance` (5,): what resists the motion (`Resistance`), or None.
     """
 
     sums: Array
@@ -269,7 +283,7 @@ class RecordingSums(NamedTuple):
     oil_degC: float | None = None
     held: Array | None = None
     held_pump: Array | None = None
-    drop_per_speed: Array | None = None
+    resistance: Array | None = None
 
     @classmethod
     def from_blocks(
@@ -443,14 +457,16 @@ def _compare_levels(judged: RecordingSums, baseline: Sequence[RecordingSums], es
     estimate_logarithms = np.log(scale.slope(level + rises)).sum(axis=1) - 0.5 * exponents**2
     predictions = []
     for oil in oils:
+        thinned = level * np.exp(oil.thinning)  # predicted levels
         candidates = _candidate_covariances(
             sessions,
             oil,
-            relative_slope,
+            scale.slope(thinned) * thinned,
+            oil_deviation=relative_slope * oil.session_deviation,
             session_deviation=steepness * session_deviation,
             condition_deviation=relative_slope * (log_condition_excess * INFERENCE.conditions.leak),
         )
-        shifts = relative_slope * oil.thinning  # effect of the oil on z
+        shifts = scale.transform(thinned - level) - scale.transform(np.zeros(1))  # effect of the oil on z
         predicted = Population(*candidates).predict(
             judged_z - shifts[-1], healthy_z - shifts[:-1], sigma, estimate_logarithms + oil.log_probability
         )
@@ -460,7 +476,13 @@ def _compare_levels(judged: RecordingSums, baseline: Sequence[RecordingSums], es
 
 
 def _candidate_covariances(
-    sessions: Sequence[int], oil: _Oil, relative_slope: float, *, session_deviation: float, condition_deviation: float
+    sessions: Sequence[int],
+    oil: _Oil,
+    relative_slopes: Array,
+    *,
+    oil_deviation: float,
+    session_deviation: float,
+    condition_deviation: float,
 ) -> tuple[Array, Array]:
     """Build the candidate covariances of transformed leak coefficients z between recordings, with log priors.
 
@@ -472,8 +494,10 @@ def _candidate_covariances(
         Session number of each recording, the judged one last.
     oil : _Oil
         Hypothesis on the oil of the recordings.
-    relative_slope : float
-        Change of z per relative change of the leak coefficient.
+    relative_slopes : array of float, shape (n + 1,)
+        Change of z per relative change of each recording's leak coefficient.
+    oil_deviation : float
+        Standard deviation of z between sessions by unknown oil; 0 if the oil is known.
     session_deviation : float
         Prior standard deviation of z between sessions with the same oil.
     condition_deviation : float
@@ -490,13 +514,13 @@ def _candidate_covariances(
     log_priors = 0.5 * np.log(ratios) - 0.5 * ratios**2
     if len(set(sessions)) == 1:
         ratios, log_priors = np.zeros(1), np.zeros(1)
-    oil_deviation = relative_slope * oil.session_deviation  # of z between sessions, by unknown oil
     session_variances = (np.hypot(oil_deviation, session_deviation) * ratios) ** 2
     # recordings of one session share the deviation of the session
     covariances = session_variances[:, None, None] * np.equal.outer(np.array(sessions), np.array(sessions))
     # the predicted effect of the oil has errors of its slope and of its values
-    covariances = covariances + np.outer(oil.thinning, oil.thinning) * (relative_slope * oil.slope_deviation) ** 2
-    covariances += np.diag(relative_slope**2 * oil.variances)
+    effects = relative_slopes * oil.thinning
+    covariances = covariances + np.outer(effects, effects) * oil.slope_deviation**2
+    covariances += np.diag(relative_slopes**2 * oil.variances)
     covariances[:, -1, -1] += condition_deviation**2
     if oil_deviation > 0.0 and sessions[-1] not in sessions[:-1]:
         # two cases: the oil in the judged recording's session is like the oil in the healthy sessions, or unlike it
@@ -773,10 +797,8 @@ def predict_thinning(recordings: Sequence[RecordingSums]) -> Array:
 def _oil_hypotheses(recordings: Sequence[RecordingSums]) -> list[_Oil]:
     """List the hypotheses on how the oil changed the leakage of `recordings`, the judged one last.
 
-    If all recordings have an oil temperature, the temperature predicts the effect. Otherwise, if the judged recording
-    and at least one healthy one have a viscous pressure drop, there are two hypotheses: the drop shows the viscosity,
-    or the oil is unknown; a recording without a drop then has the mean viscosity, with the error of unknown oil. In all
-    other cases only the second hypothesis remains.
+    If all recordings have an oil temperature, the temperature predicts the effect. Otherwise the viscous drop of the
+    motion may show the viscosity (`_oils_by_drop`), or the oil is unknown. The most probable hypothesis is the first.
     """
     prior, zeros = INFERENCE.oil, np.zeros(len(recordings))
     temperatures = [recording.oil_degC for recording in recordings if recording.oil_degC is not None]
@@ -786,22 +808,55 @@ def _oil_hypotheses(recordings: Sequence[RecordingSums]) -> list[_Oil]:
         return [_Oil(prior.per_kelvin * warmer, zeros, slope_deviation=slope_deviation)]
     # half the log range is the standard deviation between two sessions, which is sqrt(2) times that of one session
     unknown = _Oil(zeros, zeros, session_deviation=float(np.sqrt(0.125) * np.log(prior.warmest)))
-    no_drop = np.full(2, np.nan)
-    drop, error = np.array([no_drop if r.drop_per_speed is None else r.drop_per_speed for r in recordings]).T
-    is_known = np.isfinite(drop)
-    if not (is_known[-1] and is_known[:-1].any()):
+    by_drop = _oils_by_drop(recordings, unknown.session_deviation)
+    if not by_drop:
         return [unknown]
-    drop = np.where(is_known, drop, drop[:-1][is_known[:-1]].mean())
-    variance, error_variance = unknown.session_deviation**2, (prior.per_drop * error) ** 2
-    # variance of the true drop over that of the measured one
-    reliability = np.where(is_known, variance / (variance + error_variance), 0.0)
-    by_drop = _Oil(
-        thinning=-prior.per_drop * reliability * (drop - drop[:-1].mean()),
-        variances=(1.0 - reliability) * variance,
-        log_probability=float(np.log(prior.drop_tells)),
-        slope_deviation=prior.per_drop_deviation / prior.per_drop,
-    )
-    return [by_drop, unknown._replace(log_probability=float(np.log1p(-prior.drop_tells)))]
+    oils = [*by_drop, unknown._replace(log_probability=float(np.log1p(-prior.drop_tells)))]
+    return sorted(oils, key=lambda oil: -oil.log_probability)
+
+
+def _oils_by_drop(recordings: Sequence[RecordingSums], unknown_deviation: float) -> list[_Oil]:
+    """List the hypotheses by which the viscous drop of the motion shows the oil of `recordings`, the judged one last.
+
+    What resists the motion is known well at the top speed v, as friction + drop v. Its two parts are known less well,
+    since friction varies with speed and load. There are two hypotheses:
+
+    - Friction was what it is in the healthy recordings, and drop = (resistance at v - healthy friction) / v.
+    - Friction changed, as if seals wore, and the drop is the fitted one.
+
+    Their probabilities follow from the judged friction. A drop below its standard error is replaced by this error. A
+    recording without a drop has the mean one, with the error of unknown oil, whose logarithm has the standard deviation
+    `unknown_deviation`. The list is empty if the judged recording or all healthy ones have no drop.
+    """
+    prior, no_fit = INFERENCE.oil, np.full(len(Resistance._fields), np.nan)
+    fits = Resistance(*np.array([no_fit if r.resistance is None else r.resistance for r in recordings]).T)
+    is_known = np.isfinite(fits.drop)
+    if not (is_known[-1] and is_known[:-1].any()):
+        return []
+    healthy = np.flatnonzero(is_known[:-1])
+    sign = np.sign((fits.friction / fits.friction_error)[healthy].sum()) or 1.0  # friction resists the motion
+    friction, drop = sign * fits.friction, sign * fits.drop
+    usual_friction, top_speed = (float(np.median(values[healthy])) for values in (friction, fits.top_speed))
+    drops, log_densities = [drop], [0.0]
+    if min(usual_friction, friction[-1]) > 0.0:
+        drops.append(drop + (friction - usual_friction) / top_speed)
+        change = float(np.log(friction[-1] / usual_friction))
+        log_densities = [
+            -0.5 * (change / deviation) ** 2 - float(np.log(deviation))
+            for deviation in (prior.friction_changes, prior.friction_session)
+        ]
+    log_probabilities = np.log(prior.drop_tells) + np.array(log_densities) - np.logaddexp.reduce(log_densities)
+    variance, oils = unknown_deviation**2, list[_Oil]()
+    for values, log_probability in zip(drops, log_probabilities.tolist(), strict=True):
+        shown = np.maximum(values, fits.drop_error)
+        mean = float(np.log(shown[healthy]).mean())
+        error_variance = (prior.per_drop * fits.drop_error / shown) ** 2
+        # variance of the true drop over that of the measured one
+        reliability = np.where(is_known, variance / (variance + error_variance), 0.0)
+        thinning = -prior.per_drop * reliability * (np.where(is_known, np.log(shown), mean) - mean)
+        deviation = prior.per_drop_deviation / prior.per_drop
+        oils.append(_Oil(thinning, (1.0 - reliability) * variance, log_probability, slope_deviation=deviation))
+    return oils
 
 
 def coefficient_level(gram: Array, columns: Sequence[ColumnRoles]) -> tuple[float, float]:

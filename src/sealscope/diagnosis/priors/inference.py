@@ -116,6 +116,8 @@ class OilPriors(PriorTable):
     - `shift` [h]: time in which the oil warms by the largest difference.
     - `per_drop`, `per_drop_deviation`: the leak is inversely proportional to this power of the viscous pressure drop
       of the motion; the exponent and its standard deviation.
+    - `friction_session`, `friction_changes`: standard deviations of the logarithm of the friction between days, of the
+      same seals, and of seals that wear.
     - `drop_tells`: probability that a change of this pressure drop is due to the oil and not to the load and speed of
       the machine.
     """
@@ -126,6 +128,8 @@ class OilPriors(PriorTable):
     shift: float
     per_drop: float
     per_drop_deviation: float
+    friction_session: float
+    friction_changes: float
     drop_tells: float
 
 

@@ -238,13 +238,15 @@ class DifferenceFit(NamedTuple):
     """Fit of p_A - p_B by friction, which reverses with the motion, and a drop proportional to the speed.
 
     `friction`: half the difference between the directions of motion [Pa]; `drop`: viscous pressure drop per speed, in
-    Pa per unit of the speed of `motion_columns`; `friction_error`, `drop_error`: standard errors of both.
+    Pa per unit of the speed; `friction_error`, `drop_error`: standard errors of both; `top_speed`: 99 % quantile of the
+    magnitude of the speed, in m/s where the position is recorded, else in the unit of the channel that replaces it.
     """
 
     friction: float
     friction_error: float
     drop: float
     drop_error: float
+    top_speed: float
 
 
 def fit_difference(recording: Recording, *, without_slow_changes: bool = False) -> DifferenceFit | None:
@@ -282,22 +284,6 @@ def _fit_difference(recording: Recording, without_slow_changes: bool) -> Differe
         friction_error=float(friction_error),
         drop=float(coefficients[SPEED] / motion.top_speed),
         drop_error=float(speed_error / motion.top_speed),
+        top_speed=motion.top_speed,
     )
     return fit if np.isfinite(fit).all() else None
-
-
-def estimate_viscous_drop(recording: Recording) -> Array | None:
-    """Estimate the logarithm of the viscous pressure drop [Pa] per speed, and its standard error, shape (2,).
-
-    The drop in lines and seals rises with the speed and with the viscosity of the oil. It replaces the temperature of
-    the oil if that is not recorded. A drop below its standard error is replaced by this error, so that the logarithm
-    exists. Return None without enough motion.
-    """
-    fit = fit_difference(recording)
-    if fit is None:
-        return None
-    # friction and viscous drop both resist the motion: a drop with the sign of the friction counts as positive
-    drop = max(fit.drop * np.sign(fit.friction), fit.drop_error)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        log_drop = np.array([np.log(drop), fit.drop_error / drop])
-    return log_drop if np.isfinite(log_drop).all() else None

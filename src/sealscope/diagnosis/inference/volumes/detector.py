@@ -388,7 +388,7 @@ def _sums_from_summary(summary: Summary, shut: bool = False, locked: bool = Fals
     sums = np.asarray(summary["sums"], dtype=float)
     if shut:
         sums = np.asarray(summary["shut_sums"]) if "shut_sums" in summary else add_pump_columns(sums, summary["terms"])
-    names = ["drop_per_speed", *(("held", "held_pump") if locked else ())]
+    names = ["resistance", *(("held", "held_pump") if locked else ())]
     measured = {name: np.asarray(summary[name], dtype=float) for name in names if name in summary}
     start_s, oil_degC = summary.get("start_s"), summary.get("oil_degC")
     return RecordingSums(sums, summary["flow"], summary["pressure"], start_s, oil_degC, **measured)

@@ -20,7 +20,7 @@ from sealscope.diagnosis.inference.blocks import (
     solve,
 )
 from sealscope.diagnosis.inference.changes.charge_pressure import estimate_charge_trend
-from sealscope.diagnosis.inference.changes.motion_fit import estimate_viscous_drop
+from sealscope.diagnosis.inference.changes.motion_fit import fit_difference
 from sealscope.diagnosis.inference.changes.volumes import volume_observables
 from sealscope.diagnosis.inference.circuit.holds.chambers import HeldChambers
 from sealscope.diagnosis.inference.circuit.holds.hold import (
@@ -196,8 +196,10 @@ class RecordedBalance:
             sums = sums._replace(flow=self.mean_flow)
         hold_leaks = None if self.chambers is None else np.array(self.chambers.leaks)
         pump_leakage = None if self.held_pump_leakage is None else np.array(self.held_pump_leakage)
-        drop = estimate_viscous_drop(self.recording)
-        return sums._replace(held=hold_leaks, held_pump=pump_leakage, drop_per_speed=drop)
+        resistance = fit_difference(self.recording)
+        return sums._replace(
+            held=hold_leaks, held_pump=pump_leakage, resistance=None if resistance is None else np.array(resistance)
+        )
 
     @cached_property
     def chambers(self) -> HeldChambers | None:
