@@ -121,10 +121,11 @@ class Examination:
         """Distribution of the detectors' test results in the healthy recordings (`baseline`).
 
         The test results of the judged recording are compared with this distribution. If the volume balance found that
-        valves cut the pump off while the judged machine rests, the same is assumed for the healthy recordings.
+        valves cut the pump off while the machine rests, this is assumed for the healthy recordings, too, even if the
+        pump never rests in the judged one.
         """
         leak = self.report(VOLUME_BALANCE).leak if VOLUME_BALANCE in detectors() else None
-        is_shut_at_rest = isinstance(leak, BalanceLeak) and leak.balance.shut
+        is_shut_at_rest = isinstance(leak, BalanceLeak) and (leak.balance.shut or leak.balance.locked)
         return healthy_null(self.baseline, load_rig(self.rig), shut=is_shut_at_rest)
 
     def evidence(self, name: str) -> Evidence:

@@ -563,6 +563,7 @@ def recorded_blocks(recording: Recording, rig: Rig) -> RecordedBlocks | None:
         return None
     columns = ColumnRoles(stream_balances[0])
 
+    odds = shut_odds(recorded, columns) if may_shut and has_rests(recorded, columns) else 0.0
     has_holds = may_shut and _longest_hold(samples, recording.rate, balances[0]) >= INFERENCE.held_oil.shortest
 
     def compute_regime_blocks(offset: float, shut: bool) -> Blocks:
@@ -572,14 +573,16 @@ def recorded_blocks(recording: Recording, rig: Rig) -> RecordedBlocks | None:
         """
         blocks = compute_blocks(offset)
         assert blocks is not None  # as many samples as for `recorded`
-        return apply_regime(blocks, columns, shut, has_holds) if may_shut else blocks
+        if not may_shut:
+            return blocks
+        return apply_regime(blocks, columns, shut, has_holds=has_holds, is_certain=odds > INFERENCE.rest.locked)
 
     open_regime = _build_regime(balances, partial(compute_regime_blocks, shut=False))
     if not may_shut or not has_rests(recorded, columns):
         return RecordedBlocks(open_regime, shut=None, odds=0.0)
     shut_balances = tuple(shut_at_rest(balance) for balance in balances)
     shut_regime = _build_regime(shut_balances, partial(compute_regime_blocks, shut=True))._replace(shut=True)
-    return RecordedBlocks(open_regime, shut_regime, shut_odds(recorded, columns))
+    return RecordedBlocks(open_regime, shut_regime, odds)
 
 
 def _longest_hold(samples: Mapping[str, Array], rate: float, balance: Equation) -> float:

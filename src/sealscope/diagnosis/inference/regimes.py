@@ -37,7 +37,7 @@ from sealscope.recordings.recording import Array
 NEGLIGIBLE = 1e-6
 
 
-def apply_regime(blocks: Blocks, roles: ColumnRoles, shut: bool, has_holds: bool) -> Blocks:
+def apply_regime(blocks: Blocks, roles: ColumnRoles, shut: bool, *, has_holds: bool, is_certain: bool) -> Blocks:
     """Convert blocks to the volume balance for valves that are open, or `shut`, while the pump rests.
 
     `roles`: indices of the columns of `blocks` by role; they include the leakage of a pump that moves or holds the
@@ -46,8 +46,9 @@ def apply_regime(blocks: Blocks, roles: ColumnRoles, shut: bool, has_holds: bool
     - Open valves: these columns are dropped from the Gram matrices.
     - Shut valves: the flow offset in motion replaces the flow offset of all times (`terms.shut_at_rest`). The column
       for the leakage of a pump that holds the load remains only with `has_holds` (some hold lasts for seconds), and
-      only if the pump is off at other times. Else it is set to zero; without such holds it is added to the column of
-      the pump that moves the piston, since a press that builds up its pressure is connected to its pump.
+      only if the pump is off at other times. Else it is set to zero. If it is certain that valves are shut at rest
+      (`is_certain`), and there are no such holds, it is first added to the column of the pump that moves the piston,
+      since a press that builds up its pressure is connected to its pump.
     """
     names = (*roles.names, "left")
     if not shut:
@@ -56,8 +57,8 @@ def apply_regime(blocks: Blocks, roles: ColumnRoles, shut: bool, has_holds: bool
     moving_bias, turning, holding = (names.index(name) for name in (MOVING_BIAS, TURNING, HOLDING))
     columns = [moving_bias if name == BIAS else k for k, name in enumerate(names) if name != MOVING_BIAS]
     gram = blocks.gram.copy()
-    is_always_on = _rest_share(blocks, roles, TURNING, HOLDING) < NEGLIGIBLE  # the pump moves the piston or holds it
-    if not is_always_on and not has_holds:
+    is_always_on = _is_always_on(blocks, roles)
+    if is_certain and not is_always_on and not has_holds:
         gram[..., turning, :] += gram[..., holding, :]
         gram[..., turning] += gram[..., holding]
     if not has_holds or is_always_on:
@@ -91,6 +92,11 @@ def has_rests(blocks: Blocks, roles: ColumnRoles) -> bool:
     return _rest_share(blocks, roles, TURNING) > NEGLIGIBLE
 
 
+def _is_always_on(blocks: Blocks, roles: ColumnRoles) -> bool:
+    """Return True if the pump always moves the piston or holds the load. `roles`: as for `has_rests`."""
+    return _rest_share(blocks, roles, TURNING, HOLDING) < NEGLIGIBLE
+
+
 def _rest_share(blocks: Blocks, roles: ColumnRoles, *states: str) -> float:
     """Compute the fraction of the sum of squares of p_A - p_B that lies outside of some states of the machine.
 
@@ -111,10 +117,10 @@ def shut_odds(blocks: Blocks, roles: ColumnRoles) -> float:
     `TURNING`, the additional leakage while the pump moves the piston, and `MOVING_BIAS`, the additional flow offset in
     motion (`terms.with_rests`).
     """
-    if not has_rests(blocks, roles) or len(blocks) < 2:
+    if _is_always_on(blocks, roles) or len(blocks) < 2:
         return 0.0
-    turning, moving_bias = roles.names.index(TURNING), roles.names.index(MOVING_BIAS)
-    columns = [*roles.nuisance, turning, moving_bias]
+    turning, holding, moving_bias = (roles.names.index(name) for name in (TURNING, HOLDING, MOVING_BIAS))
+    columns = [*roles.nuisance, turning, holding, moving_bias]
     grams = blocks.gram[:, 0]  # of the pump's volume balance in each block
     coefficients, covariance = fit_with_robust_covariance(grams, columns, roles.left)
     # at rest the leakage is the leak's coefficient; in motion the coefficient of the turning pump is added

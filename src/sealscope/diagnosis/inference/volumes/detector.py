@@ -211,7 +211,7 @@ class VolumeBalance:
         the median flow and pressure. `channels`: names of the recorded channels; `n_repeats`: number of times that the
         healthy recordings count, as if they had been repeated on other days.
         """
-        shut = _are_valves_shut(summaries, "shut_odds") or self._shut_log_odds(summaries, channels) > 0.0
+        shut = _are_valves_shut(summaries) or self._shut_log_odds(summaries, channels) > 0.0
         healthy = [_sums_from_summary(summary, shut) for summary in summaries]
         repetitions = [sums._replace(start_s=_shift_start(sums, k)) for k in range(n_repeats) for sums in healthy]
         flow, pressure = (float(np.median([summary[name] for summary in summaries])) for name in ("flow", "pressure"))
@@ -269,7 +269,7 @@ class VolumeBalance:
         The leakage is compared with that of the healthy recordings in `baseline` that have the same terms.
         """
         summaries = healthy_summaries(self, baseline)
-        is_locked = _are_valves_shut(summaries, "shut_odds")
+        is_locked = _are_valves_shut(summaries)
         odds = self._shut_log_odds(summaries, frozenset(recording.channels))
         balance = self.balance(recording, odds, is_locked=is_locked)
         has_flow, has_position = flow_source(recording.channels) is not None, "x" in recording
@@ -277,7 +277,7 @@ class VolumeBalance:
             return Observed(self.name, lack=_NO_BALANCE[has_position].format(recording.duration))
         if balance is None or not self._is_held_by_valves(balance, summaries):
             return Observed(self.name, lack=_NO_CREEP.format(self.rig.circuit.needed_channels))
-        balance = replace(balance, locked=is_locked or _are_valves_shut(summaries, "held_odds"))
+        balance = replace(balance, locked=is_locked)
         # summaries list the terms without those of a pump that valves cut off at rest
         names = [name for name in balance.columns[0].names if name not in (TURNING, HOLDING)]
         comparable = [summary for summary in summaries if summary["terms"] == names]
@@ -359,15 +359,14 @@ def compare_motion(
         yield observable
 
 
-def _are_valves_shut(summaries: Sequence[Summary], odds_key: str) -> bool:
+def _are_valves_shut(summaries: Sequence[Summary]) -> bool:
     """Return True if the healthy recordings show that valves cut the pump off at rest.
 
-    The mean log odds in their summaries must exceed `rest.locked` of `priors.toml`. `odds_key`: entry of the summaries
-    with these odds, "shut_odds" (from all rests) or "held_odds" (only from rests in which a load is held). The result
-    is False if no summary has this entry.
+    The mean of the log odds in their summaries must exceed `rest.locked` of `priors.toml`, either of "shut_odds" (from
+    all rests) or of "held_odds" (only from rests in which a load is held). Odds that no summary has show nothing.
     """
-    log_odds = [summary[odds_key] for summary in summaries if odds_key in summary]
-    return bool(log_odds) and float(np.mean(log_odds)) > INFERENCE.rest.locked
+    log_odds = ([summary[key] for summary in summaries if key in summary] for key in ("shut_odds", "held_odds"))
+    return any(bool(odds) and float(np.mean(odds)) > INFERENCE.rest.locked for odds in log_odds)
 
 
 def _shift_start(recorded: RecordingSums, n_ages: int) -> float | None:
