@@ -24,7 +24,7 @@ from sealscope.diagnosis.inference.terms import AVERAGING_TIME
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.recording import Array, Recording
-from sealscope.signals.smoothing import average_over
+from sealscope.signals.smoothing import TINY, average_over
 
 _PRIORS = CHANGES.features
 BLOCKS, ORDER = _PRIORS.blocks, _PRIORS.order
@@ -152,17 +152,20 @@ SENSOR_FEATURES = (
 def sensor_features(blocks: Mapping[str, Array], rate: float) -> Iterator[tuple[str, Array]]:
     """Yield the name and the values (K,) of each feature of the pressures that only a change of a sensor shifts.
 
-    The features are the sign of p_A - p_B relative to the flow, the noise of both pressures, the difference of their
+    The features are the correlation of p_A - p_B with the flow, the noise of both pressures, the difference of their
     noise, and the hum at the frequencies of the mains. The first word of a name is the kind of data that events list
     (`Observable.data`), such as "noise". All names are in `SENSOR_FEATURES`. `blocks`: samples (K, length) by channel
     name, including p_A and p_B, NaN where missing; `rate`: sampling rate [Hz].
     """
     p_A, p_B = blocks["p_A"], blocks["p_B"]
     if channel := next((name for name in ("omega", "u", "theta", "x") if name in blocks), None):
-        # friction puts p_A - p_B in phase with the flow into A (1); with exchanged or reversed sensors the sign is -1
+        # friction puts p_A - p_B in phase with the flow into A (1); with exchanged or reversed sensors it is -1
         flow = blocks[channel] if channel in ("omega", "u") else np.gradient(blocks[channel], axis=1)
         difference = p_A - p_B - np.nanmean(p_A - p_B)
-        yield "sense of p_A - p_B", np.sign(_row_statistic(np.mean, np.nanmean, difference * flow))
+        product, power_d, power_f = (
+            _row_statistic(np.mean, np.nanmean, products) for products in (difference * flow, difference**2, flow**2)
+        )
+        yield "sense of p_A - p_B", product / np.sqrt(np.maximum(power_d * power_f, TINY))
     # high-order differences contain little motion; median instead of mean, as pressure jumps at reversals are outliers
     noise_A, noise_B = (
         np.log(_row_statistic(np.median, np.nanmedian, np.diff(p, ORDER, axis=1) ** 2)) for p in (p_A, p_B)
