@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from importlib import import_module
 
 import numpy as np
@@ -118,14 +117,16 @@ def test_what_stands_in_for_a_judge_is_not_asked(recording: Recording, monkeypat
 def count_threads(patch: pytest.MonkeyPatch, owner: object, *names: str) -> dict[str, set[int]]:
     """Return, filled in by the calls, the numbers of threads of linear algebra when functions of `owner` are called."""
     threads: dict[str, set[int]] = {}
-    for name in names:
-        whole = getattr(owner, name)
 
-        def counted(name: str, whole: Callable[..., object], *inputs: object, **options: object) -> object:
+    def counted(name: str, whole: Callable[..., object]) -> Callable[..., object]:
+        def call(*inputs: object, **options: object) -> object:  # a function, which binds as a method where it is one
             threads[name] = {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"}
             return whole(*inputs, **options)
 
-        patch.setattr(owner, name, partial(counted, name, whole))
+        return call
+
+    for name in names:
+        patch.setattr(owner, name, counted(name, getattr(owner, name)))
     return threads
 
 

@@ -16,7 +16,6 @@ import numpy as np
 
 from sealscope.calls import checked_call
 from sealscope.diagnosis.commissioned.cross_check import cross_check
-from sealscope.diagnosis.commissioned.healthy_file import check_summary
 from sealscope.diagnosis.detectors.detector import log_failure, unusable_reason
 from sealscope.diagnosis.detectors.observation import healthy_surprisals, limit_threads
 from sealscope.diagnosis.detectors.registry import detectors
@@ -316,6 +315,7 @@ def _summarise(recording: Recording, rig: Rig, file: str, checksum: str) -> Summ
     Arguments, result and errors are those of `summarise_healthy`: `file` is the name of the recording, and `checksum`
     the SHA-256 of its file.
     """
+    from sealscope.diagnosis.commissioned.healthy_file import check_summary
     from sealscope.diagnosis.commissioned.summary import describe_recording
 
     inspection = inspect_recording(recording)

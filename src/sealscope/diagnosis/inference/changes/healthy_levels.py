@@ -53,6 +53,8 @@ TINY = 1e-300
 FRICTION, DRIFTS = "friction", ("drift of p_A", "drift of p_B", "drift of both")
 #: Keys of the drifts of p_A and p_B in motion, and of their standard errors.
 DRIFT_KEYS = {"drift_A", "drift_A_error", "drift_B", "drift_B_error"}
+#: Probability of the quantile of the healthy recordings' errors of sign.
+UPPER_QUARTILE = 0.75
 #: Keys of two estimates of the friction in a recording's summary, each with the key of its standard error. The second
 #: one is made without loads that change slowly.
 FRICTION_KEYS = (("friction_pressure", "friction_error"), ("friction_beside_loads", "friction_beside_loads_error"))
@@ -133,18 +135,17 @@ def _log_frictions(
 
     `key`, `error_key`: keys of friction and standard error [Pa] in the summaries `judged` and `healthy`. The usual sign
     of the friction depends on the motion's channel; the sum of friction / error over the healthy recordings has this
-    sign. As friction resists the motion, healthy frictions of the other sign show that the errors are too small. With
-    r = friction / error for the other sign, and r = 0 for the usual one, all errors are therefore multiplied by
-    sqrt(2 mean r^2) if this exceeds 1. It is the true error over the stated one if there is no friction, as half of the
-    estimates then have either sign. A friction is usable if it has the usual sign and exceeds its error. The result for
-    the judged recording is None if its friction is not usable; healthy frictions that are not usable are left out.
+    sign. As friction resists the motion, healthy frictions of the other sign show that the errors are too small. All
+    errors are therefore multiplied by the upper quartile of abs(friction) / error, taken as 0 for the usual sign, if
+    the quartile exceeds 1. A friction is usable if it has the usual sign and exceeds its error. The result for the
+    judged recording is None if its friction is not usable; healthy frictions that are not usable are left out.
     """
     known = [summary for summary in healthy if {key, error_key} <= set(summary)]
     if not known or not {key, error_key} <= set(judged):
         return None, []
     ratios = np.array([float(summary[key]) / max(float(summary[error_key]), TINY) for summary in known])
     sign = float(np.sign(ratios.sum()))
-    inflation = max(1.0, float(np.sqrt(2.0 * np.mean(np.maximum(-sign * ratios, 0.0) ** 2))))
+    inflation = max(1.0, float(np.quantile(np.maximum(-sign * ratios, 0.0), UPPER_QUARTILE)))
 
     def log_friction(summary: Summary) -> Estimate | None:
         """Return the logarithm of a recording's friction, or None if it is not usable."""
