@@ -196,12 +196,12 @@ def test_other_shells_are_answered(kind, call, monkeypatch):
 
 def test_inspect_shows_the_units_of_the_log_and_the_line_for_its_temperature(call, tmp_path):
     rows = "".join(f"{k / 500:.3f},{20 + k % 9},50,{1 + k % 7},{k * 40},{60 + k % 3}\n" for k in range(600))
-    (tmp_path / "log.csv").write_text("time_s,pA_psi,pB_psi,x_in,theta_deg,temp_degF\n" + rows)
+    (tmp_path / "log.csv").write_text("time_s,pA_psi,pB_psi,x_in,theta_deg,return_temp_degF\n" + rows)
     done = call("inspect", tmp_path / "log.csv", "--map", "auto")
     lines = {line.split()[0]: line for line in done.out.splitlines() if line.strip()}
     assert "1 to 7 in" in lines["x"] and "0 to 23960 deg" in lines["theta"] and "20 to 28 psi" in lines["p_A"]
-    assert "if it is the oil's temperature: --map 'T_oil=temp_degF'" in " ".join(done.out.split())
-    warm = call("inspect", tmp_path / "log.csv", "--map", "auto", "--map", "T_oil=temp_degF")
+    assert "if it is the oil's temperature: --map 'T_oil=return_temp_degF'" in " ".join(done.out.split())
+    warm = call("inspect", tmp_path / "log.csv", "--map", "auto", "--map", "T_oil=return_temp_degF")
     assert "60 to 62 degF" in warm.out and "oil's" not in warm.out
 
 
