@@ -5,10 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from sealscope.diagnosis.commissioned.healthy_file import check_summary
 from sealscope.diagnosis.inference.changes.motion_fit import fit_difference
 from sealscope.diagnosis.inference.scatter import RecordingSums, Resistance, predict_thinning
+from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
 from sealscope.diagnosis.priors.inference import INFERENCE
+from sealscope.parameters import load_rig
 from sealscope.recordings.recording import Recording
+from sealscope.simulation.simulate import simulate
 
 RATE, SECONDS = 100.0, 60.0
 T = np.arange(round(RATE * SECONDS)) / RATE
@@ -92,3 +96,13 @@ def test_a_drop_that_does_not_show_tells_no_oil() -> None:
     assert abs(predicted_oil((1e5, 2e5), (1e5, 2e5), (1e5, -1e3))[-1]) < INFERENCE.oil.per_drop * np.log(200.0)
     unknown = RecordingSums(np.zeros((1, 2, 2)), 3e-4, 5e6, 1.7e9)
     assert not predict_thinning([unknown, unknown, unknown]).any()
+
+
+@pytest.mark.parametrize("spoilt", [{"drop_error": 0.0}, {"friction_error": -1.0}, {"top_speed": 1e-300}])
+def test_a_resistance_that_would_be_divided_by_zero_is_refused(spoilt: dict[str, float]) -> None:
+    learnt = VolumeBalance(load_rig("thesis")).learn(simulate(duration="20 s", seed=1))
+    assert learnt is not None
+    check_summary("volume balance", learnt)
+    fit = Resistance(*learnt["resistance"])._replace(**spoilt)
+    with pytest.raises(ArithmeticError, match="resistance"):
+        check_summary("volume balance", {**learnt, "resistance": np.array(fit)})

@@ -150,7 +150,7 @@ def _check_sums(summary: Any) -> Any:
         if resistance.shape != (len(Resistance._fields),):
             raise ValueError(f"resistance must hold {len(Resistance._fields)} numbers, got {resistance.shape}")
         fit = Resistance(*resistance)
-        if min(fit.friction_error, fit.drop_error, fit.top_speed) <= 0.0:
+        if min(fit.friction_error, fit.drop_error, fit.top_speed) < 1.0 / _MAX_NUMBER:  # they are divided by
             raise ValueError("resistance must hold positive standard errors and a positive speed")
     if LEAK not in summary.terms:
         raise ValueError(f"terms must have {LEAK!r}, got {', '.join(summary.terms)}")

@@ -563,7 +563,7 @@ def recorded_blocks(recording: Recording, rig: Rig) -> RecordedBlocks | None:
         return None
     columns = ColumnRoles(stream_balances[0])
 
-    odds = shut_odds(recorded, columns) if may_shut and has_rests(recorded, columns) else 0.0
+    odds = shut_odds(recorded, columns) if may_shut else 0.0
     has_holds = may_shut and _longest_hold(samples, recording.rate, balances[0]) >= INFERENCE.held_oil.shortest
 
     def compute_regime_blocks(offset: float, shut: bool) -> Blocks:

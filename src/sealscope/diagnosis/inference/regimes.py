@@ -114,8 +114,8 @@ def shut_odds(blocks: Blocks, roles: ColumnRoles) -> float:
     The leakage at rest is compared with zero and with the leakage in motion (`rest_log_odds`). Positive log odds mean
     that valves cut the pump off. The log odds are limited to +-`rest.most` of `priors.toml`, and are 0 if the recording
     says nothing about the valves. `roles`: indices of the columns of `blocks` by role. The columns must include
-    `TURNING`, the additional leakage while the pump moves the piston, and `MOVING_BIAS`, the additional flow offset in
-    motion (`terms.with_rests`).
+    `TURNING` and `HOLDING`, the additional leakage while the pump moves the piston and while it holds the load, and
+    `MOVING_BIAS`, the additional flow offset in motion (`terms.with_rests`).
     """
     if _is_always_on(blocks, roles) or len(blocks) < 2:
         return 0.0

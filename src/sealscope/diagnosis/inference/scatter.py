@@ -252,15 +252,16 @@ class Rise(NamedTuple):
 class Resistance(NamedTuple):
     """Pressure difference p_A - p_B that resists the motion: friction sign(v) + drop v at the speed v.
 
-    `friction` [Pa], `drop` [Pa per unit of the speed] and their standard errors; `top_speed`: highest speed. Each is a
-    number, or an array with one element per recording.
+    `friction`: half the difference between the directions of motion [Pa]; `drop`: viscous pressure drop per speed, in
+    Pa per unit of the speed; `friction_error`, `drop_error`: standard errors of both; `top_speed`: 99 % quantile of the
+    magnitude of the speed, in m/s where the position is recorded, else in the unit of the channel that replaces it.
     """
 
-    friction: Array
-    friction_error: Array
-    drop: Array
-    drop_error: Array
-    top_speed: Array
+    friction: float
+    friction_error: float
+    drop: float
+    drop_error: float
+    top_speed: float
 
 
 class RecordingSums(NamedTuple):
@@ -829,14 +830,16 @@ def _oils_by_drop(recordings: Sequence[RecordingSums], unknown_deviation: float)
     `unknown_deviation`. The list is empty if the judged recording or all healthy ones have no drop.
     """
     prior, no_fit = INFERENCE.oil, np.full(len(Resistance._fields), np.nan)
-    fits = Resistance(*np.array([no_fit if r.resistance is None else r.resistance for r in recordings]).T)
-    is_known = np.isfinite(fits.drop)
+    friction, friction_error, drop, drop_error, speed = np.array(
+        [no_fit if recording.resistance is None else recording.resistance for recording in recordings]
+    ).T
+    is_known = np.isfinite(drop)
     if not (is_known[-1] and is_known[:-1].any()):
         return []
     healthy = np.flatnonzero(is_known[:-1])
-    sign = np.sign((fits.friction / fits.friction_error)[healthy].sum()) or 1.0  # friction resists the motion
-    friction, drop = sign * fits.friction, sign * fits.drop
-    usual_friction, top_speed = (float(np.median(values[healthy])) for values in (friction, fits.top_speed))
+    sign = np.sign((friction / friction_error)[healthy].sum()) or 1.0  # friction resists the motion
+    friction, drop = sign * friction, sign * drop
+    usual_friction, top_speed = (float(np.median(values[healthy])) for values in (friction, speed))
     drops, log_densities = [drop], [0.0]
     if min(usual_friction, friction[-1]) > 0.0:
         drops.append(drop + (friction - usual_friction) / top_speed)
@@ -848,9 +851,9 @@ def _oils_by_drop(recordings: Sequence[RecordingSums], unknown_deviation: float)
     log_probabilities = np.log(prior.drop_tells) + np.array(log_densities) - np.logaddexp.reduce(log_densities)
     variance, oils = unknown_deviation**2, list[_Oil]()
     for values, log_probability in zip(drops, log_probabilities.tolist(), strict=True):
-        shown = np.maximum(values, fits.drop_error)
+        shown = np.maximum(values, drop_error)
         mean = float(np.log(shown[healthy]).mean())
-        error_variance = (prior.per_drop * fits.drop_error / shown) ** 2
+        error_variance = (prior.per_drop * drop_error / shown) ** 2
         # variance of the true drop over that of the measured one
         reliability = np.where(is_known, variance / (variance + error_variance), 0.0)
         thinning = -prior.per_drop * reliability * (np.where(is_known, np.log(shown), mean) - mean)

@@ -389,7 +389,7 @@ def _date_columns(choice: ColumnMap) -> list[int]:
 
 
 def _note_unused(choice: ColumnMap, used: Container[int | None]) -> None:
-    """Add a note on unused columns to `choice`, and collect those with measured quantities and temperatures there.
+    """Add a note on unused columns to `choice`, and list those with measured quantities, and with temperatures.
 
     `used`: numbers of the used columns. The note proposes a map by which some of the unused columns could be read.
     """

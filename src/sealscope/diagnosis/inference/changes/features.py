@@ -162,10 +162,10 @@ def sensor_features(blocks: Mapping[str, Array], rate: float) -> Iterator[tuple[
         # friction puts p_A - p_B in phase with the flow into A (1); with exchanged or reversed sensors it is -1
         flow = blocks[channel] if channel in ("omega", "u") else np.gradient(blocks[channel], axis=1)
         difference = p_A - p_B - np.nanmean(p_A - p_B)
-        product, power_d, power_f = (
+        covariance, pressure_variance, flow_variance = (
             _row_statistic(np.mean, np.nanmean, products) for products in (difference * flow, difference**2, flow**2)
         )
-        yield "sense of p_A - p_B", product / np.sqrt(np.maximum(power_d * power_f, TINY))
+        yield "sense of p_A - p_B", covariance / np.sqrt(np.maximum(pressure_variance * flow_variance, TINY))
     # high-order differences contain little motion; median instead of mean, as pressure jumps at reversals are outliers
     noise_A, noise_B = (
         np.log(_row_statistic(np.median, np.nanmedian, np.diff(p, ORDER, axis=1) ** 2)) for p in (p_A, p_B)

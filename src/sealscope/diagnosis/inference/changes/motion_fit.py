@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from scipy.linalg import qr
 
 from sealscope.diagnosis.inference.balance import max_rest_rate
+from sealscope.diagnosis.inference.scatter import Resistance
 from sealscope.diagnosis.inference.terms import AVERAGING_TIME, MIN_REST
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.chambers import CHAMBERS
@@ -234,22 +235,7 @@ def remove_slow_changes(motion: Motion, design: Array, values: Array, t: Array) 
     return innovations[:, :-1], innovations[:, -1]
 
 
-class DifferenceFit(NamedTuple):
-    """Fit of p_A - p_B by friction, which reverses with the motion, and a drop proportional to the speed.
-
-    `friction`: half the difference between the directions of motion [Pa]; `drop`: viscous pressure drop per speed, in
-    Pa per unit of the speed; `friction_error`, `drop_error`: standard errors of both; `top_speed`: 99 % quantile of the
-    magnitude of the speed, in m/s where the position is recorded, else in the unit of the channel that replaces it.
-    """
-
-    friction: float
-    friction_error: float
-    drop: float
-    drop_error: float
-    top_speed: float
-
-
-def fit_difference(recording: Recording, *, without_slow_changes: bool = False) -> DifferenceFit | None:
+def fit_difference(recording: Recording, *, without_slow_changes: bool = False) -> Resistance | None:
     """Fit p_A - p_B of a recording by friction, which reverses with the motion, and a viscous drop.
 
     `without_slow_changes`: first remove loads that change slowly (`remove_slow_changes`). This also removes most of the
@@ -260,7 +246,7 @@ def fit_difference(recording: Recording, *, without_slow_changes: bool = False) 
 
 
 @np.errstate(all="ignore")
-def _fit_difference(recording: Recording, without_slow_changes: bool) -> DifferenceFit | None:
+def _fit_difference(recording: Recording, without_slow_changes: bool) -> Resistance | None:
     """Fit friction and viscous drop to p_A - p_B in motion, with their standard errors.
 
     With `without_slow_changes`, loads that change slowly are first removed (`remove_slow_changes`). The result is None
@@ -279,7 +265,7 @@ def _fit_difference(recording: Recording, without_slow_changes: bool) -> Differe
     friction_error, speed_error = influence_factor(weight) * jackknife_errors(
         design * weight[:, None], difference * weight, columns, equal_parts(len(weight))
     )
-    fit = DifferenceFit(
+    fit = Resistance(
         friction=float(coefficients[DIRECTION]),
         friction_error=float(friction_error),
         drop=float(coefficients[SPEED] / motion.top_speed),

@@ -196,10 +196,10 @@ class RecordedBalance:
             sums = sums._replace(flow=self.mean_flow)
         hold_leaks = None if self.chambers is None else np.array(self.chambers.leaks)
         pump_leakage = None if self.held_pump_leakage is None else np.array(self.held_pump_leakage)
-        resistance = fit_difference(self.recording)
-        return sums._replace(
-            held=hold_leaks, held_pump=pump_leakage, resistance=None if resistance is None else np.array(resistance)
-        )
+        fit = fit_difference(self.recording)
+        is_determined = fit is not None and min(fit.friction_error, fit.drop_error) > 0.0
+        resistance = np.array(fit) if is_determined else None
+        return sums._replace(held=hold_leaks, held_pump=pump_leakage, resistance=resistance)
 
     @cached_property
     def chambers(self) -> HeldChambers | None:

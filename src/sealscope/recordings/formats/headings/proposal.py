@@ -83,9 +83,8 @@ def proposed_map(labels: Sequence[Label]) -> dict[str, str]:
         # prefer the command to the spool, which follows it
         if channel == "u" and any(guess.kind == "command" for _, guess in columns):
             columns = [column for column in columns if column[1].kind == "command"]
-        # prefer the temperature that names the oil
-        if channel == "T_oil" and any(_split_words(label.name) & _KIND["oil"] for label, _ in columns):
-            columns = [column for column in columns if _split_words(column[0].name) & _KIND["oil"]]
+        if channel == "T_oil":  # prefer the temperature that names the oil
+            columns = [column for column in columns if _split_words(column[0].name) & _KIND["oil"]] or columns
         if len(columns) > 1:  # prefer measured to computed columns
             columns = [column for column in columns if not _split_words(column[0].name) & _KIND["made"]]
         if len(columns) == 1 and channel.casefold() not in channel_names:
