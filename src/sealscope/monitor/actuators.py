@@ -34,6 +34,7 @@ from sealscope.monitor.settings import ActuatorSettings, WatchSettings
 from sealscope.monitor.sources.source_block import SourceBlock, count_bytes
 from sealscope.monitor.supervisor import Supervisor
 from sealscope.monitor.verdicts import RecordingVerdict
+from sealscope.recordings.oil import measured_oil_temperature
 from sealscope.recordings.recording import Recording
 from sealscope.storage.plain_state import require_part, restore, save_attributes
 
@@ -47,8 +48,6 @@ DROPPED = "blocks that raised an error"
 _VERDICT_TEXTS = ("file", "verdict", "summary", "size", "odds", "reason")
 #: Length of the last samples that are kept during an alarm [s].
 _ALARM_SAMPLES_S = 120.0
-#: Plausible oil temperatures [K]: -100 to 300 deg C.
-_MIN_OIL_KELVIN, _MAX_OIL_KELVIN = 173.15, 573.15
 
 
 class AlarmEvent(NamedTuple):
@@ -135,11 +134,9 @@ class _Actuator:
 
     def _update_oil_temperature(self, samples: Recording) -> None:
         """Set `oil_celsius` to the mean of the plausible oil temperatures in `samples`, if there are any."""
-        if "T_oil" in samples and samples.units["T_oil"] == "K":
-            kelvin = samples["T_oil"]
-            kelvin = kelvin[(kelvin > _MIN_OIL_KELVIN) & (kelvin < _MAX_OIL_KELVIN)]
-            if kelvin.size:
-                self.oil_celsius = float(kelvin.mean()) - 273.15
+        oil_celsius = measured_oil_temperature(samples)
+        if oil_celsius is not None:
+            self.oil_celsius = oil_celsius
 
     def _update_alarm_samples(self, samples: Recording, *, follows: bool) -> None:
         """Append new samples to `alarm_samples` while an alarm is open; keep the last `_ALARM_SAMPLES_S` seconds.

@@ -10,12 +10,19 @@ from sealscope.recordings.recording import Recording
 def oil_temperature(recording: Recording) -> float | None:
     """Compute the mean oil temperature [deg C] of a recording; None if it is not known.
 
-    Readings of the channel T_oil that hydraulic oil can have (`oil` in `priors.toml`) are averaged. If there are none,
-    the temperature in the header of the file is returned.
+    If the channel T_oil has no plausible reading, the temperature in the header of the file is returned.
     """
-    if "T_oil" in recording and recording.units["T_oil"] == "K":
-        limits = RECORDINGS.oil
-        plausible = recording["T_oil"][(recording["T_oil"] > limits.coldest) & (recording["T_oil"] < limits.hottest)]
-        if plausible.size:
-            return float(plausible.mean()) - 273.15
-    return stated_oil_temperature(recording.provenance)
+    measured = measured_oil_temperature(recording)
+    return stated_oil_temperature(recording.provenance) if measured is None else measured
+
+
+def measured_oil_temperature(recording: Recording) -> float | None:
+    """Compute the mean reading [deg C] of the channel T_oil; None if there is no plausible one.
+
+    Readings count that hydraulic oil can have (`oil` in `priors.toml`).
+    """
+    if "T_oil" not in recording or recording.units["T_oil"] != "K":
+        return None
+    limits, kelvin = RECORDINGS.oil, recording["T_oil"]
+    plausible = kelvin[(kelvin > limits.coldest) & (kelvin < limits.hottest)]
+    return float(plausible.mean()) - 273.15 if plausible.size else None

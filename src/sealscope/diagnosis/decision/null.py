@@ -106,13 +106,13 @@ def null_key(observable: Observable) -> str:
     """Return the key under which `HealthyNull` stores an observable, such as "noise: noise of the pressures".
 
     The key consists of the observable's data and name. An observable without an onset is a comparison with healthy
-    recordings. All comparisons by the same data share one key without a name, such as "rise: against".
+    recordings. All comparisons by the same data share one key without a name, such as "details: against".
     """
     return comparison_key(observable.data) if observable.onset is None else f"{observable.data}: {observable.name}"
 
 
 def comparison_key(data: str) -> str:
-    """Return the key under which `HealthyNull` stores comparisons between recordings, such as "rise: against".
+    """Return the key under which `HealthyNull` stores comparisons between recordings, such as "details: against".
 
     `data`: kind of data, as in `Observable.data`.
     """

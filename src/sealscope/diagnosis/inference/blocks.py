@@ -7,6 +7,10 @@ blocks together is the sum of their Gram matrices. A stream and a whole recordin
 recording of hours costs no more than one of minutes. Rows are weighted once, when their block is closed
 (`row_weights`).
 
+All samples of the balance's channels count, also those that bridge a short gap. A row with a clipped sample does not
+count, and one beside a long gap by its share outside of the gap (`balance.BlockStream`). A step is sought from the
+first motion on (`RecordedBalance.running_blocks`).
+
 To estimate one coefficient g in each block, all other coefficients are eliminated (`information`). Each of them has a
 level and a slow drift, c_j(t) = sum_p c_jp P_p(t) with polynomials P_p, and a normal prior on its size (`priors.toml`).
 Let d be the column of g (the tested column), o the other columns with their drifts, y the left side and s^2 the

@@ -825,9 +825,13 @@ def _oils_by_drop(recordings: Sequence[RecordingSums], unknown_deviation: float)
     - Friction was what it is in the healthy recordings, and drop = (resistance at v - healthy friction) / v.
     - Friction changed, as if seals wore, and the drop is the fitted one.
 
-    Their probabilities follow from the judged friction. A drop below its standard error is replaced by this error. A
-    recording without a drop has the mean one, with the error of unknown oil, whose logarithm has the standard deviation
-    `unknown_deviation`. The list is empty if the judged recording or all healthy ones have no drop.
+    Their probabilities follow from the judged friction and from the healthy drops: with an unknown scatter of the oil
+    between n days, their density goes with S^(-(n - 1) / 2), where S is the sum of the squares of the logarithms about
+    their mean and of the relative errors. Splitting the resistance wrongly makes the drops scatter more.
+
+    A drop below its standard error is replaced by this error. A recording without a drop has the mean one, with the
+    error of unknown oil, whose logarithm has the standard deviation `unknown_deviation`. The list is empty if the
+    judged recording or all healthy ones have no drop.
     """
     prior, no_fit = INFERENCE.oil, np.full(len(Resistance._fields), np.nan)
     friction, friction_error, drop, drop_error, speed = np.array(
@@ -840,23 +844,26 @@ def _oils_by_drop(recordings: Sequence[RecordingSums], unknown_deviation: float)
     sign = np.sign((friction / friction_error)[healthy].sum()) or 1.0  # friction resists the motion
     friction, drop = sign * friction, sign * drop
     usual_friction, top_speed = (float(np.median(values[healthy])) for values in (friction, speed))
-    drops, log_densities = [drop], [0.0]
+    drops, log_densities = [drop], np.zeros(1)
     if min(usual_friction, friction[-1]) > 0.0:
         drops.append(drop + (friction - usual_friction) / top_speed)
         change = float(np.log(friction[-1] / usual_friction))
-        log_densities = [
-            -0.5 * (change / deviation) ** 2 - float(np.log(deviation))
-            for deviation in (prior.friction_changes, prior.friction_session)
-        ]
-    log_probabilities = np.log(prior.drop_tells) + np.array(log_densities) - np.logaddexp.reduce(log_densities)
+        deviations = np.array([prior.friction_changes, prior.friction_session])
+        log_densities = -0.5 * (change / deviations) ** 2 - np.log(deviations)
+    shown_drops = np.maximum(drops, drop_error)  # (hypotheses, n + 1)
+    healthy_logs = np.log(shown_drops[:, healthy])
+    squares = (healthy_logs - healthy_logs.mean(axis=1, keepdims=True)) ** 2
+    squares += (drop_error[healthy] / shown_drops[:, healthy]) ** 2
+    log_densities = log_densities - 0.5 * (len(healthy) - 1) * np.log(squares.sum(axis=1))
+    log_probabilities = np.log(prior.drop_tells) + log_densities - np.logaddexp.reduce(log_densities)
     variance, oils = unknown_deviation**2, list[_Oil]()
-    for values, log_probability in zip(drops, log_probabilities.tolist(), strict=True):
-        shown = np.maximum(values, drop_error)
-        mean = float(np.log(shown[healthy]).mean())
+    for shown, mean, log_probability in zip(
+        shown_drops, healthy_logs.mean(axis=1).tolist(), log_probabilities.tolist(), strict=True
+    ):
         error_variance = (prior.per_drop * drop_error / shown) ** 2
         # variance of the true drop over that of the measured one
         reliability = np.where(is_known, variance / (variance + error_variance), 0.0)
-        thinning = -prior.per_drop * reliability * (np.where(is_known, np.log(shown), mean) - mean)
+        thinning = -prior.per_drop * reliability * np.where(is_known, np.log(shown) - mean, 0.0)
         deviation = prior.per_drop_deviation / prior.per_drop
         oils.append(_Oil(thinning, (1.0 - reliability) * variance, log_probability, slope_deviation=deviation))
     return oils
