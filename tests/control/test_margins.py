@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sealscope.control import FaultTolerant, PositionPI, margins
-from sealscope.control.margins import compute_margins, open_loop
+from sealscope.control.margins import _frequency_response, compute_margins, open_loop
 from sealscope.parameters import load_rig
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.integrate import integrate_run
@@ -32,6 +32,13 @@ def test_the_gain_margin_is_where_the_loop_begins_to_swing(share, grows):
     run = integrate_run(experiment, (), step=1e-4)
     late = np.ptp(run["x"][run.t > 2.0])
     assert late > 20e-6 if grows else late < 0.2e-6
+
+
+def test_an_impulse_response_that_is_constant_but_for_rounding_is_an_integrator():
+    response = np.full(50, 0.3)
+    response[:2] += 1e-15
+    z = np.exp(1j * np.array([0.1, 1.0]))
+    np.testing.assert_allclose(_frequency_response(response, z), 0.3 / (1.0 - 1.0 / z), rtol=1e-12)
 
 
 @dataclass(frozen=True)

@@ -220,6 +220,16 @@ def test_leak_and_total_are_named_as_in_a_diagnosis() -> None:
     assert row["chance"] < 1.0 / 3652.0 and row["bound_lpm"] is None
 
 
+@pytest.mark.parametrize("times", [pytest.param(100.0, marks=pytest.mark.slow), 1e6])
+def test_a_leak_beyond_the_smallest_floating_point_chance_is_still_a_leak(times: float) -> None:
+    random = np.random.default_rng(0)
+    levels = HEALTHY * (1.0 + 0.05 * random.standard_normal(160))
+    levels[80:] += times * HEALTHY
+    trend = trend_of([reading(day, float(level)) for day, level in enumerate(levels)])
+    assert trend.verdict == "leak" and trend.alarm is not None
+    assert trend.leak.value == pytest.approx(flow(times * HEALTHY), rel=0.05)
+
+
 @pytest.mark.parametrize("size", [*(pytest.param(size, marks=pytest.mark.long) for size in (0.0, 2.0)), 1.0])
 @pytest.mark.slow
 def test_a_step_that_raises_no_alarm_is_below_the_bound(size: float) -> None:

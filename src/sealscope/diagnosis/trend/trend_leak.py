@@ -114,8 +114,9 @@ def decide_trend(
         The verdict; "cannot tell" for fewer than three recordings.
     """
     wear = episode.wear
-    # `interval` over the mean time until a healthy machine reaches this score of the test, exp(log_days)
-    chance = min(float(np.exp(np.log(interval) - episode.log_days)), 1.0)
+    # `interval` over the mean time until a healthy machine reaches this score of the test, exp(log_days); above 0 also
+    # where the exponential underflows
+    chance = float(np.clip(np.exp(np.log(interval) - episode.log_days), np.finfo(float).tiny, 1.0))
     if points[0].basis == "ringing":
         report = _report_ringing(points, wear, chance)
     else:
@@ -167,13 +168,13 @@ def _normal_rise(wear: Wear, chance: float) -> Rise | None:
     """Describe the increase of the leakage by a normal distribution that is negative with the probability `chance`.
 
     The mean is the estimated increase or, if this is 0, its upper bound. The standard deviation is the mean divided by
-    the normal quantile of 1 - `chance`. The result is None if the chance is 0, or 0.5 or more, or if the upper bound is
-    not positive.
+    the normal quantile of 1 - `chance`. The result is None if the chance is 0.5 or more, or if the upper bound is not
+    positive.
     """
     from scipy.special import ndtri
 
     score = -float(ndtri(chance))  # normal quantile of 1 - chance
-    if not (score > 0.0 and np.isfinite(score) and wear.bound > 0.0):
+    if not (score > 0.0 and wear.bound > 0.0):
         return None
     value = wear.leak.value or wear.bound
     return Rise(value, deviation=value / score, degrees_of_freedom=np.inf)

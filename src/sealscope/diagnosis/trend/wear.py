@@ -44,8 +44,8 @@ from sealscope.units import DAYS_PER_MONTH, DAYS_PER_YEAR
 
 #: Standard deviation of a flat prior, over scatter and range of the values: its square leaves half of the digits.
 _WIDE = 1e2
-#: Fraction of tau^2 added to the diagonal, which keeps the covariance positive definite.
-_JITTER = 1e-10
+#: Fractions of tau^2 and of the flat prior's variance, added to the diagonal to keep the covariance positive definite.
+_JITTER, _ROUNDING = 1e-10, 1e-13
 #: Draws from a posterior: the ends of a 95 % interval then have a relative error of a few per cent.
 _N_DRAWS = 4000
 #: Standard deviation of a normal number over its median size.
@@ -295,6 +295,7 @@ def _evaluate_grid(levels: Levels, profiles: Array, *, may_grow: bool = False) -
     # 0.3 of the range is about the standard deviation of ten normal values
     max_scatter = max(prior.scale, 0.3 * float(np.ptp(levels.value)))
     wide_variance = (_WIDE * max_scatter) ** 2
+    rounding = _ROUNDING * wide_variance
     mean_covariance = wide_variance * (levels.group == levels.group[-1])  # with the mean level of the last group
     shared = wide_variance * (levels.group[:, None] == levels.group)
     shared = shared + levels.slope_sd**2 * np.outer(levels.covariate, levels.covariate)
@@ -309,7 +310,7 @@ def _evaluate_grid(levels: Levels, profiles: Array, *, may_grow: bool = False) -
         log_prior = -prior.freedom * (math.log(tau) + 0.5 * (prior.scale / tau) ** 2)  # scaled inverse chi-square
         for r in between.lasts:
             covariance = shared + tau**2 * r * correlation
-            covariance[np.diag_indices(len(levels))] += tau**2 * (1.0 - r + _JITTER) + levels.error**2
+            covariance[np.diag_indices(len(levels))] += tau**2 * (1.0 - r + _JITTER) + levels.error**2 + rounding
             L = np.linalg.cholesky(covariance)
             z, u, G = np.split(solve_triangular(L, right_sides, lower=True, check_finite=False), [1, 2], axis=1)
             # while a recording is the last one, more of its level may be outlying, which changes only its own row of z
