@@ -49,8 +49,8 @@ def checked_call(function: Callable[P, R]) -> Callable[P, R]:
     signature = inspect.signature(function)
     parameters = signature.parameters.values()
     names = [parameter.name for parameter in parameters if parameter.kind is not parameter.VAR_KEYWORD]
-    takes_any_keyword = len(names) < len(parameters)  # it has a parameter `**kwargs`, which is not in `names`
-    if names[:1] in (["self"], ["cls"]):
+    takes_any_keyword = len(names) < len(parameters)  # `function` has `**kwargs`, which is not in `names`
+    if names[:1] in (["self"], ["cls"]):  # no keyword for callers
         del names[0]
 
     @functools.wraps(function)

@@ -134,7 +134,7 @@ def _check_owner(folder: Path, forbidden: int) -> None:
 
 
 def _make_private(folder: Path) -> None:
-    """Create a folder that only this user can read and write (mode 0700), or restrict an existing one to that.
+    """Create a folder that only this user can read and write (mode 0700), or restrict an existing one to this user.
 
     Raises OSError if the folder belongs to another user, or if others could write to it until now.
     """
@@ -254,8 +254,8 @@ def entry(function: Callable[..., Any]) -> Entry:
 def call_at(context: Any, address: Any, memory: Any, sample: Any) -> Any:
     """Call the function double f(double *memory, double *sample) at an address, and return its result.
 
-    For use in compiled code only. `address` of the function, `memory` and `sample` are addresses as 64-bit
-    integers; numba passes `context`.
+    For use in compiled code only. The function's `address`, `memory` and `sample` are addresses as 64-bit integers.
+    Numba passes `context`, and gets the signature of the call and the generator of its code (`emit_call`).
     """
 
     def emit_call(target: Any, builder: Any, signature: Any, values: Any) -> Any:
@@ -276,7 +276,7 @@ def call_at(context: Any, address: Any, memory: Any, sample: Any) -> Any:
 def address_of(context: Any, pointer: Any) -> Any:
     """Convert a pointer to a 64-bit integer, its address; for use in compiled code only.
 
-    Numba passes `context`.
+    Numba passes `context`, and gets the signature of the conversion and the generator of its code (`emit_conversion`).
     """
 
     def emit_conversion(target: Any, builder: Any, signature: Any, values: Any) -> Any:
@@ -321,7 +321,7 @@ def record_view(layout: Any) -> Callable[[Any], Any]:
     def cast_pointer(context: Any, pointer: Any) -> Any:
         """Cast a pointer to doubles to a pointer to the record, in compiled code only.
 
-        Numba passes `context`.
+        Numba passes `context`, and gets the signature of the cast and the generator of its code (`emit_cast`).
         """
 
         def emit_cast(target: Any, builder: Any, signature: Any, values: Any) -> Any:

@@ -48,9 +48,9 @@ def run_demo(folder: Path, seed: int = 1, progress: Progress | None = None) -> D
     """
     update = progress or (lambda task, share: None)
     names = [*(f"healthy/run{k + 1}.nc" for k in range(N_HEALTHY)), "healthy.nc"]
-    recordings = {}  # by file name
+    recordings = {}  # name of the file -> recording
     for k, name in enumerate(names):
-        run_seed = len(names) * seed + k  # another one for each recording and each `seed`
+        run_seed = len(names) * seed + k  # a different one for each recording and each `seed`
         healthy_experiment = Experiment.of(command=COMMAND, duration=SECONDS, seed=run_seed)
         recordings[name] = simulate_experiment(healthy_experiment).recording
         update("simulating healthy recordings", (k + 1) / len(names))

@@ -89,7 +89,7 @@ def _make_source(name: str, experiment: Experiment, settings: SimulateSettings, 
     """
 
     def play(receiver: BlockReceiver) -> None:
-        """Simulate the actuator, and submit each block of samples to `receiver` at the time at which it would end.
+        """Simulate the actuator, and submit each block of samples to `receiver` when its time is over.
 
         Blocks that the receiver's store already has are skipped; if it has all of them, nothing is simulated. Returns
         early if the receiver is stopping.

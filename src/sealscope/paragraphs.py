@@ -12,14 +12,14 @@ WIDTH = 80
 
 
 def paragraph(text: str, head: str = "", indent: int | None = None, width: int = WIDTH) -> str:
-    """Wrap `head`, followed by the text, to lines of at most `width` columns.
+    """Wrap a text to lines of at most `width` columns, the first of which begins with the text `head`.
 
     Lines after the first are indented by `indent` columns, by default the length of `head`. Words are not broken,
     even if they are longer than a line. Unprintable characters in the text are replaced.
     """
     indentation = " " * (len(head) if indent is None else indent)
     return fill(
-        printable(text, kept="\n\t"),  # which `fill` turns into blanks
+        printable(text, kept="\n\t"),  # `fill` turns these two into blanks
         width,
         initial_indent=head,
         subsequent_indent=indentation,

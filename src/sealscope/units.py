@@ -82,7 +82,7 @@ def _build_unit(row: Mapping[str, Any]) -> Unit:
 def _absolute_unit(unit: Unit) -> Unit:
     """Build the unit of absolute pressure for a unit of gauge pressure, such as `bara` for `bar`.
 
-    All pressures inside Sealscope are gauge pressures: the offset of the unit subtracts one atmosphere.
+    The SI value (value + offset) * factor is a gauge pressure, as always here: the offset is -1 atmosphere, in `unit`.
     """
     return unit._replace(offset=-_TABLES["absolute"]["atmosphere"] / unit.factor)
 
@@ -229,6 +229,7 @@ def parse_unit(text: str) -> Unit:
     pressure = _parse_marked_pressure(text)
     if pressure is not None:
         return pressure
+    # a hyphen between letters, as in N-m, stands for a product
     normalised = re.sub(r"(?<=[A-Za-z])-(?=[A-Za-z])", " ", text.replace("**", "^").translate(_CHARACTERS))
     try:
         tokens = _tokenize(normalised.strip())
@@ -303,14 +304,14 @@ def _convert_exactly(value: Fraction, conversion: _Conversion) -> float:
     """Convert one number exactly and round it once; infinite if it exceeds the range of doubles.
 
     `conversion`: (factor, power of pi, first offset, second offset), as `_conversion` returns it. The result is
-    (value + first offset) * factor * pi^power - second offset.
+    (value + first offset) * factor * pi^power - second offset; with a power of pi, rounding errors of doubles remain.
     """
-    factor, pi_power, offset_before, offset_after = conversion
-    exact = (value + offset_before) * factor
+    factor, pi_power, first_offset, second_offset = conversion
+    exact = (value + first_offset) * factor
     try:
         if pi_power == 0:
-            return float(exact - offset_after)
-        return float(float(exact) * math.pi**pi_power - float(offset_after))
+            return float(exact - second_offset)
+        return float(float(exact) * math.pi**pi_power - float(second_offset))
     except OverflowError:
         return math.inf if exact > 0 else -math.inf
 
@@ -334,18 +335,18 @@ def to_si(
     if scalar:
         number = float(values)  # type: ignore[arg-type]
         return _convert_exactly(Fraction(repr(number)), conversion) if math.isfinite(number) else number
-    factor, pi_power, offset_before, offset_after = conversion
+    factor, pi_power, first_offset, second_offset = conversion
     result = np.array(values, dtype=np.float64)
-    if offset_before:
-        result += float(offset_before)
+    if first_offset:
+        result += float(first_offset)
     if factor.numerator == 1 and float(factor.denominator) == factor.denominator:
         result /= float(factor.denominator)  # more exact than a product with the rounded factor
     else:
         result *= float(factor)
     if pi_power:
         result *= math.pi**pi_power
-    if offset_after:
-        result -= float(offset_after)
+    if second_offset:
+        result -= float(second_offset)
     return result
 
 
@@ -361,7 +362,7 @@ def from_si(
     This is the inverse of `to_si`, with the same precision. Raises InputError if `unit` has another dimension; the
     message states `name`, the unit, the expected dimension and the file `place`.
     """
-    _find_conversion(unit, si_unit, name, place)
+    _find_conversion(unit, si_unit, name, place)  # raises the error on `unit`; that of `to_si` would be on `si_unit`
     return to_si(values, si_unit, unit, name=name, place=place)
 
 

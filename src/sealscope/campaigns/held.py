@@ -71,7 +71,7 @@ class PlannedHold(NamedTuple):
         return self.conductance * difference / LITRE_PER_MINUTE
 
     def as_dict(self) -> dict[str, Any]:
-        """Convert the hold to plain JSON values, with the leak as a flow [L/min] at its initial p_A - p_B."""
+        """Convert the hold to plain JSON values; the smallest leak is a flow [L/min] at the initial p_A - p_B."""
         return {
             "duration_s": self.duration,
             "pressure_A_Pa": self.pressure_A,
@@ -82,9 +82,10 @@ class PlannedHold(NamedTuple):
         }
 
     def text(self, stated_pressure: float) -> str:
-        """Format the hold as text, with the leak as a flow at the pressure difference `stated_pressure` [Pa].
+        """Format the planned hold as text, with the smallest leak that it detects.
 
-        A is the loaded side, which is pressed against the stop.
+        The leak is stated as a flow [L/min] at the pressure difference `stated_pressure` [Pa]. Chamber A has the higher
+        pressure, which presses the piston against the stop.
         """
         found = f"{self._lpm(stated_pressure):.2g} L/min" if self.finds_a_leak else "no leak, however large"
         high, low = self.pressure_A / 1e6, self.pressure_B / 1e6
@@ -188,7 +189,7 @@ def _decay_per_conductance(rig: Rig) -> float:
     which include an assumed dead volume.
     """
     oil, cylinder = INFERENCE.held_oil, rig.cylinder
-    length = cylinder.L * (0.5 + oil.dead)
+    length = cylinder.L * (0.5 + oil.dead)  # half the stroke, and the dead volume of a chamber
     return float((1.0 / cylinder.A_A + 1.0 / cylinder.A_B) / (length * oil.compressibility))
 
 
@@ -203,9 +204,10 @@ def draw_hold(rig: Rig, hold: PlannedHold, conductance: float, flow: float, seed
     random = np.random.default_rng(seed)
     cylinder, sensors = rig.cylinder, rig.sensors
     t = np.arange(round((BEFORE + hold.duration) * MAX_RATE)) / MAX_RATE
-    # p_A - p_B falls exponentially once the valves are shut, at the time `BEFORE`
-    loss = hold.difference * -np.expm1(-conductance * _decay_per_conductance(rig) * np.maximum(t - BEFORE, 0.0))
-    fraction_A = cylinder.A_B / (cylinder.A_A + cylinder.A_B)  # of the loss, inverse to the volumes
+    # p_A - p_B falls exponentially once the valves are shut, at the time `BEFORE`; expm1: exp - 1
+    decay_rate = conductance * _decay_per_conductance(rig)
+    loss = hold.difference * -np.expm1(-decay_rate * np.maximum(t - BEFORE, 0.0))
+    fraction_A = cylinder.A_B / (cylinder.A_A + cylinder.A_B)  # A's part of the loss, inverse to the volume
     p_A, p_B = (
         pressure + np.hypot(sensor.noise, sensors.common_noise) * random.standard_normal(t.size)
         for pressure, sensor in (
@@ -215,7 +217,7 @@ def draw_hold(rig: Rig, hold: PlannedHold, conductance: float, flow: float, seed
     )
     x = sensors.x.noise * random.standard_normal(t.size)
     sides = CylinderSides(cylinder.A_A, cylinder.A_B, low=-0.5 * cylinder.L, high=0.5 * cylinder.L)
-    locked_holds = find_locked_holds((t, p_A, p_B, x), rests=t[1:] >= BEFORE, rate=MAX_RATE)
+    locked_holds = find_locked_holds((t, p_A, p_B, x), rests=t[1:] >= BEFORE, rate=MAX_RATE)  # intervals at rest
     chambers = HeldChambers(locked_holds, sides, begin=float(t[0]), end=float(t[-1]), charge=hold.pressure_B)
     held = np.array(chambers.leaks)
     return RecordingSums(sums=np.zeros((1, 1, 1)), flow=flow, pressure=hold.difference, held=held)

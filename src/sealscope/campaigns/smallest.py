@@ -165,7 +165,7 @@ class RecordingPlan(NamedTuple):
             f"  {row.duty!s:<34}{self._format_flow(row.conductance):>14}{self._format_flow(row.separable):>18}"
             for row in comparable
         ]
-        notes = [row for row in self.compared if row.note]
+        notes = [row for row in self.compared if row.note]  # the first is printed
         lines += [paragraph(f"left out: {row.duty}: {row.note}", head="  ", indent=4) for row in notes[:1]]
         return "\n".join(lines)
 
@@ -257,7 +257,7 @@ def _separation_ratio(blocks: Blocks, columns: Sequence[ColumnRoles]) -> float:
     if PUMP not in column.names or len(columns) > 1:
         return np.inf
     middle = len(blocks) // 2
-    gram = blocks.gram[:, 0].sum(axis=0)  # of the only equation
+    gram = blocks.gram[:, 0].sum(axis=0)  # 0: the only equation
     gram_after_step = blocks.gram[middle:, 0].sum(axis=0)
     constants = np.array(column.nuisance)
     steps = np.array([column.leak, column.names.index(PUMP)])

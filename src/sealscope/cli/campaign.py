@@ -123,7 +123,7 @@ def _campaign_folder(plan: AnyPlan, stated: Path | None) -> Path:
 
 
 def _format_progress(state: CampaignProgress) -> str:
-    """Format the numbers of records done and failed, and the computing time on one core: per record, and all left."""
+    """Format the numbers of records done and failed, and the time of one core for each record and for the rest."""
     text = f"records: {state.done} of {state.records} done"
     if state.failed:
         text += f", {state.failed} of them failed"

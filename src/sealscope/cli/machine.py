@@ -62,8 +62,8 @@ def commission(
         def add_recordings(machine: CommissionedMachine) -> CommissionedMachine:
             """Add the files to the healthy recordings of a machine, and return the changed machine.
 
-            If `--since` states the date of a repair, it is noted in the machine, and recordings before it are
-            dropped.
+            If `--since` states the date of a repair, the repair is noted in the machine, and recordings before the
+            repair are dropped.
             """
             if repair_s is not None:
                 repair_mark = JudgedAlarm(alarm="", mark="repaired", date_s=repair_s, onset_s=repair_s)

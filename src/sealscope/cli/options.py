@@ -210,7 +210,7 @@ class StatedMachine:
         """Read the recording in a file, or on standard input for the file `-`.
 
         A commissioned machine reads the file by the channel map and rate in the machine's file. Otherwise the options
-        of the call apply, and the channel map of the rig, but only to files that have the columns of this map. Raises
+        of the call apply. Without `--map`, the channel map of the rig is used for files that have its columns. Raises
         UnreadableFile for a folder or an unreadable file.
         """
         if self.commissioned is not None:
@@ -352,8 +352,9 @@ def _replace_parameter(
 def _build_assumed_rig(name: str | None, area: Sequence[str] | None, displacement: str | None) -> Rig | None:
     """Build the rig that `--rig`, `--area` and `--displacement` describe; return None without these options.
 
-    `name`: rig by name or file; `area`: piston area, or those of the sides A and B; `displacement`: of the pump; each
-    as text, None if not given. Without `--rig` all other values are assumed. Raises InputError for an invalid option.
+    `name`: name or file of a rig; `area`: text of the piston area, or of those of sides A and B; `displacement`: text
+    of the pump's displacement; each is None if not given. Without `--rig` all other values are assumed. Raises
+    InputError for an invalid option.
     """
     from sealscope.diagnosis.verdict.machine import unstated_rig
     from sealscope.parameters import load_rig
@@ -445,7 +446,7 @@ def attempt(file: Path, work: Callable[[], T]) -> T | None:
 def check_folder(file: Path) -> None:
     """Check before a long run that the folder of the file to write exists; raise InputError otherwise.
 
-    Also remove temporary files that earlier calls left in the folder, if they were stopped while they wrote this file.
+    Also remove the temporary files of earlier calls that were stopped while they wrote this file.
     """
     from sealscope.storage import atomic
 

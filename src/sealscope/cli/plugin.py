@@ -33,7 +33,7 @@ def new(
     module = name.replace(" ", "_")
     if keyword.iskeyword(module):
         raise InputError(f"a detector's name must be no word of Python's, got {name!r}")
-    # by the names in the templates
+    # text for each placeholder in the templates
     values = {"words": name, "dashed": name.replace(" ", "-"), "module": module, "cls": name.title().replace(" ", "")}
     target_folder = folder or Path(values["dashed"])
     if target_folder.exists():

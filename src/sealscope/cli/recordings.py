@@ -356,7 +356,7 @@ def inspect(
         raise InputError("--save-map must stand with --rig and its file, and with the --map options to be saved")
     machine = stated if stated.has_map else replace(stated, channel_map="auto")
     is_complete = True
-    columns: dict[str, str] | None = None  # by channel: its column, in the first readable file if the map is `auto`
+    columns: dict[str, str] | None = None  # column of each channel; `auto` is resolved by the first readable file
     for file, recording in machine.read_all(files, joined=join):
         if recording is None:
             is_complete = False
@@ -375,10 +375,11 @@ def inspect(
 
 
 def _resolve_map(channel_map: ChannelMap, file: Path, recording: Recording) -> dict[str, str]:
-    """Return a map, channel -> column, in which `auto` is replaced by the columns chosen by their names in a recording.
+    """Return the columns of a channel map, in which `auto` is replaced by the columns that were found by their names.
 
-    A map without `auto` is returned unchanged. `file`: file from which the `recording` was read. With `auto` the result
-    is empty if the file was converted from another one, because the recording then states the columns of the other.
+    The result is the column of each channel; a map without `auto` is returned unchanged. `recording`: the recording
+    read from `file` by this map. With `auto` the result is empty if the file was converted from another one, because
+    the recording then states the columns of that other file.
     """
     from sealscope.recordings.formats.columns import explicit_columns, reconstruct_map, uses_names
 

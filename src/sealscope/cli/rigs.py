@@ -90,7 +90,7 @@ def new(
 def _ask_size(label: str, unit: str) -> str:
     """Ask the user at the terminal for a size of the machine, such as the stroke; return the answer as text.
 
-    `label`: name of the size, which is shown with the `unit` of an answer that states none.
+    `label`: name of the size; `unit`: unit of an answer that states none. Both are shown to the user.
     """
     return str(prompt(f"{label} [{unit}]"))
 

@@ -109,7 +109,7 @@ def _count_known(readings: Sequence[LeakReading], machine: CommissionedMachine) 
 def _check_output(output: Path, files: Sequence[Path]) -> None:
     """Raise InputError if a trend cannot be written to `output`, or would replace one of the recordings `files`.
 
-    Also remove temporary files that earlier calls left in the folder, if they were stopped while they wrote this file.
+    Also remove the temporary files of earlier calls that were stopped while they wrote this file.
     """
     from sealscope.reporting.template import parse_page_path
 

@@ -127,7 +127,7 @@ def start_law(controller: Controller) -> CompiledLaw:
 
 
 def reraise_python_error(law: CompiledLaw) -> None:
-    """Raise the exception of a controller written in Python that failed while `law` was called; else do nothing.
+    """Raise the exception with which a Python controller failed while `law` was called; without one, do nothing.
 
     The Python controller is `law` itself, or the inner controller whose law `law` calls.
     """

@@ -46,7 +46,7 @@ def drive_voltage(m: Any, flow: float, dp: float) -> float:
     `m.decay` is exp(-corner/rate) at the sampling rate.
     """
     if m.Q_N > 0.0:  # a servo valve
-        valve_drop = max(m.p_s - math.copysign(dp, dp * flow), _MIN_VALVE_FRACTION * m.p_s)  # p_s - sign(flow) dp
+        valve_drop = max(m.p_s - math.copysign(dp, dp * flow), _MIN_VALVE_FRACTION * m.p_s)  # copysign: sign(flow) dp
         u = m.u_N * flow / (m.Q_N * math.sqrt(0.5 * valve_drop / m.dp_N))
         return u + min(max(_OVERLAP_GAIN * u, -m.dead_volts), m.dead_volts)  # type: ignore[no-any-return]
     omega = flow / m.displacement

@@ -115,9 +115,9 @@ def _linearise(rig: Rig, rate: float, speed: float, load: float) -> tuple[Array,
 
     # pushed=(True,): the equations take an additional load
     p = rig_numbers(rig) if load == 0.0 else rig_numbers(rig)._replace(pushed=(True,))
-    steps = max(2, math.ceil(1.2 / (rate * min(1e-3, longest_step(p)))))  # per sample; with 20 % in reserve
+    steps = max(2, math.ceil(1.2 / (rate * min(1e-3, longest_step(p)))))  # steps of at most 1 ms; 20 % in reserve
     h = 1.0 / (rate * steps)
-    implicit = IMPLICIT if p.throttled else EXPLICIT
+    implicit = IMPLICIT if p.throttled else EXPLICIT  # throttles make the equations stiff
     euler = rig.motor.integrator == "euler"
     nodes = step_nodes(implicit, h).size
 
@@ -229,9 +229,11 @@ def compute_margins(f: Array, L: NDArray[np.complex128], speed: float = 0.0, dam
     crossover = np.interp(unit_gain, indices, f)
     phase_margin = np.angle(-np.interp(unit_gain, indices, L))  # arg L + pi
     real = np.interp(_crossings(L.imag), indices, L.real)  # L where it crosses the real axis
-    gain = float(np.min(-1.0 / real[(real < 0.0) & (real > -1.0)], initial=math.inf))  # a larger gain moves these to -1
+    below_unit_gain = real[(real < 0.0) & (real > -1.0)]  # a larger gain moves these to -1
+    gain = float(np.min(-1.0 / below_unit_gain, initial=math.inf))
     phase = float(np.min(np.abs(phase_margin), initial=math.inf))
-    delay = float(np.min(np.mod(phase_margin, 2.0 * math.pi) / (2.0 * math.pi * crossover), initial=math.inf))
+    delays = np.mod(phase_margin, 2.0 * math.pi) / (2.0 * math.pi * crossover)  # a delay T lowers the phase by 2 pi f T
+    delay = float(np.min(delays, initial=math.inf))
     peak = float(np.max(1.0 / np.abs(1.0 + L)))
     return Margins(speed, gain, phase, float(np.max(crossover, initial=0.0)), delay, peak, damped)
 
@@ -239,4 +241,4 @@ def compute_margins(f: Array, L: NDArray[np.complex128], speed: float = 0.0, dam
 def _crossings(values: Array) -> Array:
     """Find where `values` (n,) change their sign, as fractional indices (m,) by linear interpolation."""
     k = np.flatnonzero(np.diff(values > 0.0))
-    return k + values[k] / (values[k] - values[k + 1])
+    return k + values[k] / (values[k] - values[k + 1])  # no division by 0: the signs differ

@@ -30,8 +30,8 @@ _memory_at = record_view(FOLLOWING)
 def following_voltage(m: Any, measured: Any) -> float:
     """Compute the voltage [V] of a sample by PI control with velocity feed-forward (`PositionPI`), within +-u_max.
 
-    The drive delivers the flow A v_c at this voltage. A is the piston area of the chamber with the higher pressure, and
-    v_c = v_target + k_v e + k_i integral of e dt the commanded velocity, with the error e = target - x. `m`: a record
+    The drive delivers the flow A v_c at this voltage. A is the piston area of the chamber with the higher pressure. The
+    commanded velocity is v_c = v_target + k_v e + k_i integral of e dt, with the error e = target - x. `m`: a record
     `FOLLOWING`, whose integral and averaged p_A - p_B are updated; `measured`: a `Measured`.
     """
     m.dp += m.pressure_gain * (measured.p_A - measured.p_B - m.dp)
@@ -39,7 +39,7 @@ def following_voltage(m: Any, measured: Any) -> float:
     velocity = measured.target_speed + m.k_v * error + m.integral
     area = m.area_A if m.dp > 0.0 else m.area_B
     u = drive_voltage(m.drive, velocity * area, m.dp)
-    # at the limit of the voltage the integral may only decrease
+    # at the limit of the voltage, the error is integrated only if its sign is opposite to the voltage's
     if abs(error) > m.dead_band and (abs(u) < m.u_max or u * error < 0.0):
         m.integral += m.k_i_T * error  # k_i_T: the gain k_i times the sampling interval
     return min(max(u, -m.u_max), m.u_max)  # type: ignore[no-any-return]
@@ -100,7 +100,7 @@ class PositionPI:
         if isinstance(drive, Drive):
             drive = replace(drive, droop=0.0)  # a pump's speed is computed as if there were no load
         else:
-            # each direction opens two edges; the edge with less overlap opens first
+            # each direction opens two edges, first the one with less overlap; 0.5: mean of both directions
             overlap = max(0.0, 0.5 * (min(valve.o_PA, valve.o_BT) + min(valve.o_PB, valve.o_AT)))
             gains.setdefault("dead_volts", valve.u_N * overlap / valve.x_max)
         return cls(rig.cylinder.A_A, rig.cylinder.A_B, drive, rig.daq.u_max, **gains)  # type: ignore[arg-type]

@@ -53,8 +53,8 @@ def is_installed(name: str) -> bool:
 def check_controller_name(name: str) -> None:
     """Check that `name` is a built-in or installed controller, or has the form of a user's controller.
 
-    A user's controller is written ``MODULE:NAME`` or ``FILE.py:NAME``. Such a controller is not imported, so that it
-    may not exist. Raises InputError for any other name.
+    A user's controller is written ``MODULE:NAME`` or ``FILE.py:NAME``. Such a controller is not imported, and need
+    not exist. Raises InputError for any other name.
     """
     module_or_file, _, attribute = name.rpartition(":")
     if not is_installed(name) and not (module_or_file and attribute):
@@ -124,7 +124,7 @@ def _find_module_file(module: str) -> Path | None:
     `module`: dotted name, such as "my_package.control".
     """
     parts = module.split(".")
-    folders = None  # of the package that contains the module, None for a top-level module
+    folders = None  # folders of the package that contains the module, None for a top-level module
     for depth in range(1, len(parts) + 1):
         name = ".".join(parts[:depth])
         specs = (finder.find_spec(name, folders) for finder in sys.meta_path)

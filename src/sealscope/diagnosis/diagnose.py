@@ -125,6 +125,7 @@ class Examination:
         pump never rests in the judged one.
         """
         leak = self.report(VOLUME_BALANCE).leak if VOLUME_BALANCE in detectors() else None
+        # `shut`: the valves cut the pump off at rest; `locked`: they also hold the load then
         is_shut_at_rest = isinstance(leak, BalanceLeak) and (leak.balance.shut or leak.balance.locked)
         return healthy_null(self.baseline, load_rig(self.rig), shut=is_shut_at_rest)
 
@@ -164,7 +165,7 @@ class Examination:
         probability = self.false_alarm_probability
         with np.errstate(all="ignore"):
             evidence = decide(self.report(name), reports, self.null, probability, weigh_rivals=weigh_rivals)
-        # convert fractions of the examined part of the recording, as the detector states them, to those of the whole
+        # the detector states fractions of the examined part; converted to fractions of the whole recording
         judged_until = self.judged_until * evidence.judged_until
         return replace(evidence, share=self.share * evidence.share, judged_until=judged_until)
 
@@ -259,7 +260,7 @@ def _list_baseline(recording: object, baseline: Recording | Sequence[Healthy]) -
 
     Raises InputError if the judged `recording` or an entry of the baseline is of another type, such as a path.
     """
-    is_single = isinstance(baseline, Recording | str | os.PathLike)
+    is_single = isinstance(baseline, Recording | str | os.PathLike)  # a path is refused below, with a hint
     if not is_single and not isinstance(baseline, Iterable):
         raise InputError(f"baseline must be a Recording or a sequence of Recordings, got {type(baseline).__name__}")
     healthy: list[Any] = [baseline] if is_single else list(cast(Iterable[Any], baseline))

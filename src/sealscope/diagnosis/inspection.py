@@ -92,15 +92,17 @@ def _inspect(recording: Recording, names: Sequence[str]) -> Inspection:
     chambers = chambers_of(recording)
     part, corrections, stuck, share = correct_samples(recording)  # `stuck`: names of channels that repeat one value
     findings = (*inspect(recording.only(names)), *corrections)
-    on_chambers = [finding for finding in findings if finding.channel in chambers]
-    defects = [finding for finding in on_chambers if finding.code == "constant"]
+    chamber_findings = [finding for finding in findings if finding.channel in chambers]
+    defects = [finding for finding in chamber_findings if finding.code == "constant"]
     defects += [finding for finding in findings if finding.channel in stuck and finding.code == "stuck"]
-    mostly_clipped = [finding for finding in on_chambers if finding.code == "clipped" and finding.count > len(part) / 2]
+    clipped = [finding for finding in chamber_findings if finding.code == "clipped"]
+    mostly_clipped = [finding for finding in clipped if finding.count > len(part) / 2]
     if len(mostly_clipped) == len(chambers):  # one clipped chamber is no obstacle: the other chamber is judged
         defects += mostly_clipped
     distrust = f"the pressures cannot be trusted: {defects[0].text}" if defects else None
     if distrust is None and len(part) >= SHORTEST and (reason := find_implausibility(part)):
         distrust = f"this is no recording of a hydraulic machine: {reason}"
+    # fraction of all samples up to the end of `part`
     judged_until = np.count_nonzero(recording.t <= part.t[-1]) / len(recording) if len(part) else 0.0
     return Inspection(part, findings, distrust, share, float(judged_until))
 
@@ -130,7 +132,7 @@ def select_comparable(judged: Inspection, baseline: Sequence[Healthy]) -> Baseli
 
     - it cannot be trusted,
     - it lacks a chamber pressure of the judged recording, or has it in another unit,
-    - it has the same samples as the judged recording, or as another baseline with more channels.
+    - it has the same samples as the judged recording, or as another baseline with at least as many channels.
 
     Differences of speed, load and temperature are accepted, as the detectors allow for them.
     """

@@ -50,7 +50,7 @@ def detection_by_size(leaks: npt.ArrayLike, hits: npt.ArrayLike, confidence: flo
 
 
 def proven_size(rows: list[SizeDetection], detection: float = 0.9) -> float:
-    """Find the smallest tested size from which on all tested sizes are proven to be detected.
+    """Find the smallest tested size such that this and all larger tested sizes are proven to be detected.
 
     `rows`: results for each size; `detection`: the probability of detection to be proven. A size is proven if the
     lower confidence bound of its proportion is at least `detection`. For example, 29 hits of 29 prove 90 % at 95 %
@@ -116,7 +116,7 @@ def _fit_coefficients(design: Array, n: Array, k: Array, *, firth: bool) -> Arra
             residual += n * p * (1.0 - p) * np.einsum("ij,jk,ik->i", design, inverse, design) * (0.5 - p)
         return -_log_likelihood(design, n, k, eta, firth=firth), -design.T @ residual
 
-    start = np.array([_log_odds((k.sum() + 0.5) / (n.sum() + 1.0)), 0.0])  # the same detection at all sizes
+    start = np.array([_log_odds((k.sum() + 0.5) / (n.sum() + 1.0)), 0.0])  # slope 0; 0.5: never 0 or 1
     return np.asarray(minimize(loss, start, jac=True, method="BFGS", options={"gtol": 1e-9}).x, dtype=np.float64)
 
 
@@ -179,7 +179,7 @@ class HitMiss:
         from scipy.special import expit, ndtri
 
         x = _log_sizes(size)
-        v = self.covariance  # of intercept and slope
+        v = self.covariance  # covariance of intercept and slope
         z = float(ndtri(0.5 + as_probability(confidence, "confidence") / 2.0))
         margin = z * np.sqrt(v[0, 0] + 2.0 * v[0, 1] * x + v[1, 1] * x * x)
         eta = self.intercept + self.slope * x
@@ -210,12 +210,12 @@ class HitMiss:
         if not 0.5 <= confidence < 1.0:
             raise InputError(f"confidence must be from 0.5 to 1, got {confidence}")
         log_odds = _log_odds(detection)
-        allowed_drop = 0.5 * float(ndtri(confidence)) ** 2  # of the log-likelihood
+        allowed_drop = 0.5 * float(ndtri(confidence)) ** 2  # largest drop of the log-likelihood
         if not self.slope > 0.0 or self.log_likelihood - self.null <= allowed_drop:  # a curve of slope 0 is allowed
             return math.inf
 
         def excess_drop(log_size: float) -> float:
-            """Compute the drop of the profile log-likelihood from its maximum to a size, minus the allowed drop.
+            """Compute how far the profile log-likelihood is below its maximum at a size, minus the allowed drop.
 
             `log_size`: natural logarithm of the size. The result is 0 at the bound.
             """
@@ -231,7 +231,8 @@ class HitMiss:
             upper += step
             if step > _MAX_SPANS * log_range:
                 return math.inf
-        return _exp_size(float(brentq(excess_drop, lower, upper, xtol=1e-10 * max(1.0, abs(upper)))))
+        log_bound = brentq(excess_drop, lower, upper, xtol=1e-10 * max(1.0, abs(upper)))
+        return _exp_size(float(log_bound))
 
     @property
     def a50(self) -> float:
@@ -267,7 +268,7 @@ class HitMiss:
             value = _log_likelihood(design, self.tested, self.hits, eta, firth=self.estimator == "firth")
             return -value if math.isfinite(value) else 1e300
 
-        width = max(float(np.abs(x - log_size).max()), 1e-300)  # never 0, as the next line divides by it
+        width = max(float(np.abs(x - log_size).max()), 1e-300)  # never 0, as it divides below
         return -float(minimize_scalar(loss, bracket=(0.0, 1.0 / width), options={"xtol": 1e-9}).fun)
 
 

@@ -35,7 +35,7 @@ def find_root(function: Callable[[float], float], low: float, high: float) -> fl
     if f_a == 0.0 or f_b == 0.0:
         return high if f_a == 0.0 else low
     best = a
-    fraction = 0.5  # of the way from a to b; 0.5 is a bisection
+    fraction = 0.5  # fraction of the way from a to b; 0.5 bisects
     for _ in range(_MAX_STEPS):
         x = a + fraction * (b - a)
         f_x = function(x)

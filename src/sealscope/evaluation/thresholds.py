@@ -113,7 +113,7 @@ def quantile_threshold(
         )
     tail = (1.0 - confidence) / 2.0
     return Threshold(
-        value=float(np.partition(values, n - rank)[n - rank]),
+        value=float(np.partition(values, n - rank)[n - rank]),  # the `rank`-th largest
         false_alarm_probability=false_alarm,
         promise=promise,
         rank=rank,

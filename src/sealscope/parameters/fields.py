@@ -64,8 +64,8 @@ def with_unit(number: float, unit: str) -> str:
 def format_broken_rule(error: ValidationError, model: type[BaseModel]) -> str:
     """Format one of the errors found by pydantic as a line such as "SYMBOL must be ..., got ...".
 
-    `model`: class of the group of parameters that could not be made. The line states the first error, or that of an
-    unknown name if there is one (`format_error`). If the broken rule is a bound, such as "must be > 0", the parameter's
+    `model`: class of the group of parameters that could not be made. The line states the first error, but an unknown
+    name before any other error (`format_error`). If the broken rule is a bound, such as "must be > 0", the parameter's
     unit follows the bound.
     """
     first = error.errors(include_url=False)[0]

@@ -111,8 +111,9 @@ def _load_file(path: Path, place: str) -> Rig:
 
     `place`: name of the file in messages.
     """
-    head, entries, columns = _read_layers(path, place, visited=())
-    rig = Rig.from_entries(entries, name=head.get("name", path.stem), title=head.get("title", ""), place=place)
+    rig_table, entries, columns = _read_layers(path, place, visited=())
+    name, title = rig_table.get("name", path.stem), rig_table.get("title", "")
+    rig = Rig.from_entries(entries, name=name, title=title, place=place)
     return rig.with_channel_map(columns) if columns else rig
 
 
@@ -170,10 +171,10 @@ def _read_layers(path: Path, place: str, visited: tuple[Path, ...]) -> _RigFile:
         tree = {name: table for name, table in tree.items() if name not in MACHINE_TABLES}
         if not set(tree) - {"map"}:
             raise InputError(f"a machine's file must state an area to be a rig, got none: commission it anew ({place})")
-    head = tree.pop("rig", {})
-    if not isinstance(head, dict):
-        raise InputError(f"rig must be a table, got {head!r} ({place})")
-    for key, value in head.items():
+    rig_table = tree.pop("rig", {})
+    if not isinstance(rig_table, dict):
+        raise InputError(f"rig must be a table, got {rig_table!r} ({place})")
+    for key, value in rig_table.items():
         if key not in ("name", "title", "extends"):
             raise InputError(f"rig.{key} is not known; [rig] has name, title and extends ({place})")
         if not isinstance(value, str) or not value.strip():
@@ -187,7 +188,7 @@ def _read_layers(path: Path, place: str, visited: tuple[Path, ...]) -> _RigFile:
         )
     entries: dict[str, ParameterEntry] = {}
     columns: dict[str, str] = {}
-    base = head.get("extends")
+    base = rig_table.get("extends")
     if base in rig_names():
         _, entries, columns = _read_layers(_PACKAGED / f"{base}.toml", f"rigs/{base}.toml", (*visited, file))
     elif base is not None and "\0" not in base and _is_path(base):
@@ -196,4 +197,4 @@ def _read_layers(path: Path, place: str, visited: tuple[Path, ...]) -> _RigFile:
         raise InputError(
             f"extends must be a packaged rig ({', '.join(rig_names())}) or a .toml file, got {base!r} ({place})"
         )
-    return _RigFile(head, entries | flatten_entries(tree.items(), place), channel_map or columns)
+    return _RigFile(rig_table, entries | flatten_entries(tree.items(), place), channel_map or columns)

@@ -111,7 +111,8 @@ def valve_rig_text(
     _check_arguments(name, sizes)
     assumed = f"assumed: that of {base.name}"
     usual_drop = "assumed: usual of servo valves; proportional valves are rated at 5 bar"
-    # the motor is scaled as if `n_motors` motors of the base rig were on one shaft, connected in parallel
+    # the motor is scaled as if `n_motors` motors of the base rig were on one shaft, connected in parallel; this number
+    # is the ratio of the pumps' torques
     n_motors = rated_flow / _SUPPLY_SPEED * setting / (base.pump.q_b * base.supply.p_set)
     motor = {key: f"{base[f'motor.{key}'] * n_motors:.4g}" for key in ("i_max", "J_M", "B_M")}  # type: ignore[operator]
     motor |= {key: f"{base[f'motor.{key}'] / n_motors:.4g}" for key in ("R_c", "L_c")}  # type: ignore[operator]

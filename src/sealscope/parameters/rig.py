@@ -137,7 +137,7 @@ class Rig(Part):
             swept = getattr(cylinder, symbol) * cylinder.L / 2.0
             if swept >= volume:
                 rule = f'must be > {symbol} L/2 = {with_unit(swept, "m^3")} when volumes = "position"'
-                # V as it was stated; the difference rounded
+                # V is shown as stated, V - V_rod rounded
                 text, value = ("V - V_rod", with_unit(volume, "")) if volume < V else ("V", str(volume))
                 raise ValueError(f"cylinder.{text} {rule}, got {value}")
         if makeup.G_relief > 0 and makeup.check_valves == "absent":
@@ -301,7 +301,7 @@ class Rig(Part):
         if not source.strip():
             raise InputError("source must not be blank")
         entries = self._stated_entries()
-        names_by_parameter: dict[str, str] = {}  # as the caller wrote them
+        names_by_parameter: dict[str, str] = {}  # dotted name -> name that the caller wrote
         for name, value in overrides.items():
             full_name = resolve_name(name, declared_names())
             if full_name in names_by_parameter:
@@ -382,8 +382,8 @@ class Rig(Part):
 
         `place`: where the values come from, for messages. Raises InputError for invalid values.
         """
-        head = tree.get("rig")
-        name, title = (head.get("name", ""), head.get("title", "")) if isinstance(head, Mapping) else ("", "")
+        table = tree.get("rig")
+        name, title = (table.get("name", ""), table.get("title", "")) if isinstance(table, Mapping) else ("", "")
         parts = ((key, item) for key, item in tree.items() if key != "rig")
         return cls.from_entries(flatten_entries(parts, place), name=str(name), title=str(title), place=place)
 

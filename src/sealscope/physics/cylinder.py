@@ -53,7 +53,7 @@ def hard_stop_force(x: float, v: float, L: float, k_stop: float, d_stop: float) 
     The stops are at x = +-L/2. Each is a stiff spring `k_stop` [N/m] with a damper `d_stop` [N s/m]. It acts only while
     the piston touches it, and never pulls. `x` [m]: position of the piston from mid-stroke; `v` [m/s]: its velocity.
     """
-    side = math.copysign(1.0, x)  # of the nearer stop: +1 at L/2, -1 at -L/2
+    side = math.copysign(1.0, x)  # the nearer stop: +1 at L/2, -1 at -L/2
     depth = abs(x) - 0.5 * L
     force = max(k_stop * depth + d_stop * (side * v), 0.0)
     return select(depth > 0.0, -side * force, 0.0)  # type: ignore[no-any-return]

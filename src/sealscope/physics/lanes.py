@@ -364,7 +364,7 @@ def load(array: Any, row: int) -> Any:
     """Load one row of a C-ordered array as lanes, a vector of numbers.
 
     The array's shape is (..., WIDTH) of doubles, or (..., SINGLE_WIDTH) in single precision. `row` counts the rows
-    through all leading axes.
+    through all leading axes. Only compiled code can call this function, whose body `_lower_load` builds.
     """
 
 
@@ -388,7 +388,8 @@ register_lowering(load, 2, _loaded_type, _lower_load)
 def store(array: Any, row: int, value: Any) -> None:
     """Write lanes, a vector of numbers, to one row of a C-ordered array.
 
-    `row` counts the rows through all leading axes, as in `load`.
+    `row` counts the rows through all leading axes, as in `load`. Only compiled code can call this function, whose body
+    `_lower_store` builds.
     """
 
 
@@ -411,7 +412,7 @@ register_lowering(store, 3, _stored_type, _lower_store)
 
 
 def broadcast(value: Any) -> Any:
-    """Copy one number into every lane of a vector of doubles."""
+    """Copy one number into every lane of a vector of doubles, in compiled code that `_lower_broadcast` builds."""
 
 
 def _lower_broadcast(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:

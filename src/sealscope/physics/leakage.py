@@ -28,9 +28,9 @@ def piston_leakage(dp: float, G: float, C: float, dp_0: float) -> float:
     """Compute the leakage Q_L [m^3/s] from chamber A to B through a laminar gap and an orifice in parallel.
 
     `dp` = p_A - p_B [Pa]; `G`: conductance of the gap [m^3/(s Pa)]; `C`: flow coefficient of the orifice
-    [m^3/(s Pa^0.5)], which is linear in dp below about `dp_0` [Pa] (`orifice_flow`).
+    [m^3/(s Pa^0.5)], whose flow is linear in dp for |dp| below about `dp_0` [Pa] (`orifice_flow`).
     """
-    if not any_lane(C > 0.0):
+    if not any_lane(C > 0.0):  # no orifice
         return laminar_leakage(dp, G)
     return laminar_leakage(dp, G) + orifice_flow(dp, C, dp_0)
 

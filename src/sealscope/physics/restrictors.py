@@ -83,6 +83,7 @@ def _solve_scaled_flow(b: float, a: float) -> float:
         d = 1.0 + r_4
         slope = 2.0 * r * r_4 + a * d  # first derivative of the left side, times d
         curvature = w * (r * r_2 * r_4) * (10.0 + 2.0 * r_4)  # its second derivative, times d^3
+        # Halley's step, its numerator and denominator multiplied by d^3
         step = 2.0 * residual * d * d * slope / (2.0 * d * slope * slope - residual * curvature)
         w = w - step
         # convergence is cubic: after this step the relative error is of the order of (step/w)^3 r^2/(a + r)^2
@@ -142,7 +143,8 @@ def filtered_flow(
     linear in Q in both cases, `implicit_orifice_flow` solves the equation for either case.
     """
     shut_flow = implicit_orifice_flow(total, g + R, c_forward, c_reverse, dp_0)
-    filter_fraction = 1.0 / (1.0 + G_bypass * R)  # of additional flow while the valve is open
+    # while the valve is open, dp_f = filter_fraction R (Q + G_bypass p_bypass) for Q > 0
+    filter_fraction = 1.0 / (1.0 + G_bypass * R)
     open_total = total - math.copysign(G_bypass * R * p_bypass * filter_fraction, total)
     open_flow = implicit_orifice_flow(open_total, g + R * filter_fraction, c_forward, c_reverse, dp_0)
     return select(R * abs(shut_flow) > p_bypass, open_flow, shut_flow)  # type: ignore[no-any-return]

@@ -256,7 +256,7 @@ def pack_numbers(p: RigNumbers) -> Any:
 
 @contracted
 def limit_state(y: State, p: RigNumbers) -> State:
-    """Limit the motor current and the spool of a servo valve in a state, after a step of the solver.
+    """Limit the motor current and a servo valve's spool in the state `y`, after a step of the solver.
 
     - The current is limited to +-i_max, the spool's position to its stroke, and its speed to +-v_max.
     - Pressures that are no states of the rig are set: without lines p_1 = p_A and p_2 = p_B; with a servo valve p_2 is
@@ -295,13 +295,13 @@ def vapour_floor(q: float, p: RigNumbers) -> float:
 
 @contracted
 def pressures_of(y: State, p: RigNumbers) -> Pressures:
-    """Compute the pressures p_A, p_B, p_1, p_2 [Pa] in a state, none below the vapour pressure (`vapour_floor`)."""
+    """Compute the pressures p_A, p_B, p_1, p_2 [Pa] in the state `y`, none below the vapour pressure."""
     return vapour_floor(y[P_A], p), vapour_floor(y[P_B], p), vapour_floor(y[P_1], p), vapour_floor(y[P_2], p)
 
 
 @contracted
 def speed_error(y: State, u: float, p: RigNumbers) -> float:
-    """Compute the motor's speed error [rad/s], set speed minus actual speed.
+    """Compute the motor's speed error [rad/s] in the state `y`: set speed minus actual speed.
 
     The command `u` [V] sets the speed omega_per_volt u. In a valve-controlled rig, where the motor drives the pump of
     the supply, the set speed is `omega_P`.
@@ -313,7 +313,7 @@ def speed_error(y: State, u: float, p: RigNumbers) -> float:
 
 @contracted
 def pump_difference(y: State, p: RigNumbers) -> float:
-    """Compute the pressure difference across the pump [Pa], port 1 minus port 2.
+    """Compute the pressure difference across the pump [Pa] in the state `y`, port 1 minus port 2.
 
     In a rig with neither lines nor servo valve, the ports are connected to the chambers A and B directly.
     """
@@ -328,15 +328,15 @@ def friction_force(y: State, applied: float, p: RigNumbers) -> tuple[float, floa
     """Compute the friction force [N] on the piston, and the rate [m/s] at which LuGre's bristles deflect.
 
     The force is that of eqs. (4.20)-(4.22), unless the rig has Karnopp's or LuGre's law instead. The rate is 0 in a rig
-    without LuGre's law. The friction of a motion along -x is multiplied by the rig's parameter `backward`. `applied`
-    [N]: sum of all other forces on the piston. In `p`, an optional law such as `sticking` (Karnopp's) is an empty tuple
-    if the rig does not have it.
+    without LuGre's law. The friction of a motion along -x is multiplied by the rig's parameter `backward`. `y`: state;
+    `applied` [N]: sum of all other forces on the piston. In `p`, an optional law such as `sticking` (Karnopp's) is an
+    empty tuple if the rig does not have it.
     """
     v = y[VELOCITY]
     F_C = friction.coulomb_friction(
         vapour_floor(y[P_A], p), vapour_floor(y[P_B], p), p.F_pr, p.F_cfr, p.coulomb_of_difference
     )
-    F_v, breakaway, no_rate = p.F_v, p.K_brk * F_C, 0.0 * v  # a zero of v's type: a number or lanes
+    F_v, breakaway, no_rate = p.F_v, p.K_brk * F_C, 0.0 * v  # 0.0 * v: a zero of v's type, a number or lanes
     if len(p.one_sided) > 0:
         breakaway = select(applied < 0.0, p.backward * breakaway, breakaway)
         side = select(v < 0.0, p.backward, 1.0)
@@ -353,7 +353,8 @@ def friction_force(y: State, applied: float, p: RigNumbers) -> tuple[float, floa
 def filter_resistances(y: State, p: RigNumbers) -> tuple[float, float]:
     """Compute the resistances [Pa s/m^3] of the filters in lines A and B.
 
-    The resistance of a clogging filter grows with the oil volume that has passed it (`clogged_resistance`).
+    The resistance of a clogging filter grows with the oil volume that has passed it (`clogged_resistance`). The state
+    `y` contains this volume.
     """
     if len(p.clogging) == 0:  # an empty tuple: the rig's filters do not clog
         return p.R_A, p.R_B
@@ -371,7 +372,7 @@ def implicit_flows(
     at the end of the stage solves d + g Q(d) = total (`implicit_orifice_flow`). `total_A`, `total_B` [Pa]: the drops if
     nothing flowed in the stage; `g_A`, `g_B` [Pa s/m^3]: their fall over the stage per unit flow. A filter in series
     with the throttle has the additional drop R Q, so that its resistance R is added to g. With a bypass valve of the
-    filter, `filtered_flow` solves the equation.
+    filter, `filtered_flow` solves the equation. `y`: state, from which the resistances follow (`filter_resistances`).
     """
     if len(p.filtered) > 0:  # an empty tuple in a rig without filters
         R_A, R_B = filter_resistances(y, p)
@@ -432,7 +433,7 @@ def density_ratio(pressure: float, reference: float, p: RigNumbers) -> float:
     """Compute the ratio of the oil's densities at two pressure states, `pressure` and `reference` [Pa gauge].
 
     A pressure state may fall below the vapour pressure, where the oil boils, so that mass is conserved
-    (`vapour_floor`). Below the vapour pressure the density falls by the constant bulk modulus at the vapour pressure.
+    (`vapour_floor`). There, the density falls with the bulk modulus that holds at the vapour pressure.
     """
     if len(p.aerated) == 0:  # an empty tuple, no air in the oil: one bulk modulus, whether the oil boils or not
         return oil_density_ratio(pressure - reference, p.K_oil)
@@ -525,7 +526,7 @@ def external_pressure_rates(y: State, p: RigNumbers) -> tuple[Pressures, float]:
     makeup_1, makeup_2 = make_up_flows(y, p)
     out_A, out_B = external.external_leakage(y[P_A], p.G_ext_A), external.external_leakage(y[P_B], p.G_ext_B)
     p_up = makeup_pressure(y, p)
-    # drawn from the accumulator at its pressure, and entering the circuit at the pressure of side 1 or 2
+    # each flow as drawn at the accumulator's pressure, and as it enters the circuit at the pressure of side 1 or 2
     drawn_1, makeup_1 = flows_at_both_ends(makeup_1, p_up, y[P_1] if len(p.throttled) > 0 else y[P_A], p)
     drawn_2, makeup_2 = flows_at_both_ends(makeup_2, p_up, y[P_2] if len(p.throttled) > 0 else y[P_B], p)
     fed = drawn_1 + drawn_2
@@ -561,8 +562,8 @@ def valve_flows(y: State, p: RigNumbers) -> tuple[float, float, float, float]:
 def supply_compliance(p_1: float, p: RigNumbers) -> float:
     """Compute the compliance [m^3/Pa] of the supply line: the oil it takes in per unit rise of its pressure.
 
-    It is (V_1 + V_oil)/K + V_gas/(n p_abs) at the supply pressure `p_1` [Pa gauge], with the gas V_gas and the oil
-    V_oil = V_acc - V_gas in the supply's accumulator.
+    It is (V_1 + V_oil)/K + V_gas/(n p_abs) at the supply pressure `p_1` [Pa gauge], with the oil's bulk modulus K, the
+    gas V_gas, its polytropic exponent n, and the oil V_oil = V_acc - V_gas in the supply's accumulator.
     """
     V_gas = external.gas_volume(p_1, p.p_pre, p.V_acc, p.n_acc)
     oil_compliance = (p.V_1 + p.V_acc - V_gas) / bulk_modulus(p_1, p)
@@ -573,7 +574,8 @@ def supply_compliance(p_1: float, p: RigNumbers) -> float:
 def valve_rates(y: State, Q_1: float, p: RigNumbers) -> Pressures:
     """Compute the pressure rates dp_A/dt, dp_B/dt, dp_1/dt, dp_2/dt [Pa/s] that a servo valve and its supply cause.
 
-    `Q_1` [m^3/s]: flow of the pump into the supply, whose pressure is p_1. The return's pressure p_2 is constant.
+    `y`: state; `Q_1` [m^3/s]: flow of the pump into the supply, whose pressure is p_1. The return's pressure p_2 is
+    constant.
     """
     p_A, p_B, p_P, p_T = y[P_A], y[P_B], y[P_1], y[P_2]
     Q_PA, Q_AT, Q_PB, Q_BT = valve_flows(y, p)

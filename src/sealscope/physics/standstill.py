@@ -48,8 +48,9 @@ def pressures_at_standstill(force: float, p: RigNumbers) -> tuple[float, float]:
     V_A, V_B = p.V_A, p.V_B
     if len(p.throttled) > 0:  # an empty tuple in a rig without lines; their oil belongs to sides A and B
         V_A, V_B = V_A + p.V_1, V_B + p.V_2
-    missing_force = force - p.p_charge * (p.A_A - p.A_B)  # [N], not carried by the charge pressure
-    # [Pa m^3]: bulk modulus times the oil volume displaced from side B to A; over a side's volume: its pressure change
+    missing_force = force - p.p_charge * (p.A_A - p.A_B)  # [N] that the charge pressure does not carry
+    # bulk modulus times the oil volume that moves from side B to A [Pa m^3]; divided by a side's volume, it is the
+    # change of that side's pressure
     modulus_times_volume = missing_force / (p.A_A / V_A + p.A_B / V_B)
     return p.p_charge + modulus_times_volume / V_A, p.p_charge - modulus_times_volume / V_B
 
@@ -71,7 +72,7 @@ def stand_still(y: Any, x: float, force: float, p: RigNumbers) -> int:
     y[P_B] = y[P_2] = p_B
     y[CURRENT] = pump_torque(p_A - p_B, p.q_b) / p.C_m
     y[INTEGRAL] = p.R_c * y[CURRENT] / p.K_i if p.K_i > 0.0 else 0.0
-    if not min(p_A, p_B) >= -P_ATM:
+    if not min(p_A, p_B) >= -P_ATM:  # also for NaN
         return BELOW_VACUUM
     return 0 if abs(y[CURRENT]) <= p.i_max and p.R_c * abs(y[CURRENT]) <= p.V_max else BEYOND_DRIVE
 
@@ -82,8 +83,8 @@ def pressures_behind_valve(force: float, A_A: float, A_B: float, p_1: float, p_2
 
     `force` [N]: load against +x; `A_A`, `A_B` [m^2]: piston areas; `p_1`, `p_2` [Pa]: pressures of supply and return.
     p_A + p_B = p_1 + p_2, because the edges to supply and return are equal and have equal pressure drops (Merritt,
-    Hydraulic Control Systems, 1967, section 5.2). This mean pressure is also assumed for an overlapped valve, which may
-    trap another one.
+    Hydraulic Control Systems, 1967, section 5.2). The same sum is assumed for an overlapped valve, although it may trap
+    oil at other pressures.
     """
     p_A = (force + A_B * (p_1 + p_2)) / (A_A + A_B)
     return p_A, p_1 + p_2 - p_A
@@ -99,7 +100,7 @@ def supply_at_standstill(force: float, x: float, p: RigNumbers) -> tuple[float, 
     y[POSITION], y[P_2] = x, p.p_return
     low = p.p_return
     high = low + p.p_set + p.q_b * p.omega_P / p.G_set  # here the relief valve takes more than the pump delivers
-    p_A, p_B = low, low
+    p_A, p_B = low, low  # overwritten in the loop
     for _ in range(200):  # more halvings than doubles resolve
         middle = 0.5 * (low + high)
         p_A, p_B = pressures_behind_valve(force, p.A_A, p.A_B, middle, p.p_return)
@@ -168,7 +169,7 @@ def _fill_standstill_state(rig: Rig, y: np.ndarray, x: float, force: float, p: R
     if len(p.lossy) > 0:  # an empty tuple in a rig without friction of motor and pump
         y[CURRENT] += friction_torque(y[OMEGA], p_1 - y[P_2], p.q_b, p.T_f, p.C_f, p.k_h, p.omega_f) / m.C_m
     volts = m.R_c * y[CURRENT] + m.C_e * y[OMEGA]
-    y[INTEGRAL] = volts / m.K_i
+    y[INTEGRAL] = volts / m.K_i  # `Rig` checks that K_i > 0 where there is a supply
     if y[CURRENT] > m.i_max or volts > m.V_max:
         raise InputError(
             f"the drive must hold the supply at {p_1:.4g} Pa and {y[OMEGA]:.4g} rad/s, which takes {y[CURRENT]:.4g} A "

@@ -57,7 +57,7 @@ def estimate_period(signal: Array, rate: float) -> float | None:
     resampled = resampled - resampled.mean()
     if not np.any(resampled):
         return None
-    spectrum = np.abs(np.fft.rfft(resampled, 2 * n)) ** 2  # of 2 n samples with zeros: the lags do not wrap around
+    spectrum = np.abs(np.fft.rfft(resampled, 2 * n)) ** 2  # with n zeros added: lags do not wrap around
     correlation = np.fft.irfft(spectrum)[:n] / np.arange(n, 0, -1)  # divided by the number of products at each lag
     correlation = correlation / correlation[0]
     max_lag = min(n // _MIN_REPETITIONS, int(_CYCLE.longest * rate / stride))
@@ -73,7 +73,7 @@ def estimate_period(signal: Array, rate: float) -> float | None:
     # the first of the nearly highest peaks: later ones are at multiples of the period
     first_high = peaks[tail[peaks] >= tail[peaks].max() - _EQUAL_PEAKS][0]
     k = int(first + 1 + first_high)
-    left, peak, right = correlation[k - 1 : k + 2]
+    left, peak, right = correlation[k - 1 : k + 2]  # left <= peak > right: the denominator below is not 0
     lag = (k + 0.5 * (left - right) / (left - 2 * peak + right)) * stride / rate  # vertex of the parabola through these
     return float(lag) if lag >= _MIN_PERIOD else None
 

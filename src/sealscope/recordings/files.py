@@ -68,6 +68,7 @@ def _detect_format(path: Path) -> str:
         return format_name
     if any(_BEGINS["netcdf"].match(head, offset) for offset in (512, 1024, 2048, 4096)):  # after a user block of HDF5
         return "netcdf"
+    # name of a format that is recognised but not read
     foreign: str | None = next((words for begins, words in _FOREIGN.items() if begins.match(head)), None)
     if foreign is None and (binary := _find_format(head, is_text=False)):
         return binary

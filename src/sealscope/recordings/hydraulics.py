@@ -57,7 +57,7 @@ def _describe_speed_mismatch(recording: Recording) -> str | None:
     if theta.size < _PRIORS.samples or not np.isfinite(theta + omega).all():
         return None
     turning_rate = np.gradient(theta, n_mean / recording.rate)
-    product, square = abs(float(turning_rate @ omega)), float(turning_rate @ turning_rate)
+    product, square = abs(float(turning_rate @ omega)), float(turning_rate @ turning_rate)  # the sign does not matter
     ratio = product / max(square, np.finfo(float).tiny)  # least-squares scale of the speed
     is_correlated = product >= _PRIORS.correlation * np.sqrt(square * float(omega @ omega)) > 0.0
     if not is_correlated or 1.0 / _PRIORS.misfit <= ratio <= _PRIORS.misfit:

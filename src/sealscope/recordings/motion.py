@@ -95,7 +95,7 @@ def describe_hold(recording: Recording) -> str | None:
 
 def find_runs(flags: NDArray[np.bool_]) -> NDArray[np.intp]:
     """Find the runs of True in `flags` (n,): first index and length of each (k, 2)."""
-    edges = np.flatnonzero(np.diff(np.r_[False, flags, False].astype(np.int8)))
+    edges = np.flatnonzero(np.diff(np.r_[False, flags, False].astype(np.int8)))  # starts and ends in turn
     return np.column_stack([edges[::2], edges[1::2] - edges[::2]])
 
 

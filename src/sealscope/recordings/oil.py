@@ -19,7 +19,7 @@ def oil_temperature(recording: Recording) -> float | None:
 def measured_oil_temperature(recording: Recording) -> float | None:
     """Compute the mean reading [deg C] of the channel T_oil; None if there is no plausible one.
 
-    Readings count that hydraulic oil can have (`oil` in `priors.toml`).
+    Only temperatures that hydraulic oil can have (`oil` in `priors.toml`) are averaged.
     """
     if "T_oil" not in recording or recording.units["T_oil"] != "K":
         return None

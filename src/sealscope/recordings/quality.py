@@ -171,6 +171,7 @@ def _creep_findings(recording: Recording) -> list[Finding]:
     means = np.array([np.nanmean(part) if np.isfinite(part).any() else np.nan for part in parts])
     steps = np.diff(means)
     creep_rate = float(np.median(steps)) * _CREEP.parts / duration
+    # if the median is 0, the ratios are not finite, and the steps not even
     is_even = np.all((steps / np.median(steps) > _CREEP.even[0]) & (steps / np.median(steps) < _CREEP.even[1]))
     if not (is_even and abs(creep_rate) >= _CREEP.rate):
         return []
@@ -354,8 +355,8 @@ def find_rails(values: Array, stuck: NDArray[np.intp] | None = None, low_end: bo
     The range is that of the values. With `low_end` False only its high end is examined. An end is clipped in two cases:
 
     - Far more samples have this value than any of the five nearest values, and the signal enters or leaves the longest
-      run of them by a jump of more than 3.5 quantisation steps, or 1.5 for a long run. This excludes the crest of a
-      slow quantised signal, whose nearest values have nearly as many samples, and a square wave.
+      run of them (3 samples or more) by a jump of more than 3.5 quantisation steps, or 1.5 for a long run. This
+      excludes a square wave, and the crest of a slow quantised signal, whose nearest values are nearly as frequent.
     - One of the runs `stuck` (k, 2), first index and length of each as from `find_stuck`, has this value.
     """
     if not values.size:
@@ -393,7 +394,7 @@ def fast_length(count: int) -> int:
     but scipy.fft is not loaded.
     """
     odd_factors = (3**i * 5**j for i in range(40) for j in range(28) if 3**i * 5**j < 2 * count)
-    # times the smallest power of two >= count / factor
+    # times the smallest power of two >= count / factor; higher powers of 3 and 5 exceed any count
     return min((factor << max(0, (-(-count // factor) - 1).bit_length()) for factor in odd_factors), default=count)
 
 
@@ -426,7 +427,8 @@ def find_hum(values: Array, rate: float) -> list[HumLine]:
     spectrum = np.fft.rfft(detrended, n_fft)
     squared_amplitudes = (spectrum.real**2 + spectrum.imag**2) * (2.0 / window.sum()) ** 2
     bin_width = rate / n_fft
-    # a Hann window spreads a line over bins: the sum of amplitude^2 / 2 over these is 1.5 n_fft / n times its power
+    # power from `hum.lowest` on (1e-9: rounding). A Hann window spreads a line over bins: the sum of amplitude^2 / 2
+    # over these is 1.5 n_fft / n times its power
     power = float(squared_amplitudes[math.ceil(_HUM.lowest / bin_width - 1e-9) :].sum()) / 2 / (1.5 * n_fft / n)
     lines = []
     for mains in (50.0, 60.0):

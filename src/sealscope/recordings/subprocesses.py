@@ -79,7 +79,7 @@ class _Process:
         """
         process = self._process
         assert process.stdin is not None and process.stdout is not None
-        # kills the process if the alarm of `_set_limits` does not; a fresh process also needs time to start
+        # kills the process 1 s after the alarm of `_set_limits` should have; a fresh process also needs time to start
         killer = Timer(limit + 1.0 + _MAX_START_TIME * self._is_fresh, process.kill)
         killer.daemon = True
         killer.start()
@@ -89,6 +89,7 @@ class _Process:
             value, remote_traceback = pickle.load(process.stdout)
             is_spent = bool(pickle.load(process.stdout))
         except (EOFError, OSError, pickle.UnpicklingError):
+            # a process that a signal has ended returns minus the number of the signal
             timed_out = not killer.is_alive() or process.wait() == -getattr(signal, "SIGALRM", 0)
             failure = f"took over {limit:g} s" if timed_out else "crashed"
             raise CrashedSubprocessError(f"the library that reads it {failure}") from None
@@ -110,7 +111,7 @@ _idle: list[_Process] = []
 
 def _take_process() -> _Process:
     """Take an idle subprocess that is still alive, or start a new one."""
-    with suppress(IndexError):
+    with suppress(IndexError):  # none is idle
         while True:
             process = _idle.pop()
             if process.is_alive:

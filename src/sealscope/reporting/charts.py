@@ -150,12 +150,12 @@ def channel_charts(recording: Recording, pressure_unit: str) -> list[Chart]:
     """
     charts = []
     for key, title, height, members in _CHANNELS:
-        units: dict[str, list[ChartLine]] = {}
+        lines_by_unit: dict[str, list[ChartLine]] = {}
         for name, style in zip(members, "ab", strict=False):  # "a", "b": styles of the first and second line
             if name in recording and np.isfinite(recording[name]).any():
                 unit, values = display_values(recording, name, pressure_unit)
-                units.setdefault(unit, []).append(ChartLine(name, style, values))
-        for i, (unit, lines) in enumerate(units.items()):
+                lines_by_unit.setdefault(unit, []).append(ChartLine(name, style, values))
+        for i, (unit, lines) in enumerate(lines_by_unit.items()):
             charts.append(Chart(f"{key}-{i}", "channels", title, unit, tuple(lines), height=height))
     return charts
 
@@ -211,6 +211,7 @@ def course_charts(diagnosis: Diagnosis, *, height: int = 190) -> list[Chart]:
     if course is None or not np.isfinite(course.lpm).any():
         return []
     low, high = (np.where(np.isfinite(end), end, np.nan) for end in (course.low, course.high))
+    # the interval is drawn as a band between its ends, whatever their style
     lines = (ChartLine("leak", "a", course.lpm), ChartLine("low", "d1", low), ChartLine("high", "d1", high))
     bottom, top = _y_limits(course.lpm, low, high)
     level = diagnosis.repair_lpm
@@ -378,7 +379,7 @@ def render_still(
     margin = 0.04 * (high - low)
     low, high = chart.limits or (low - margin, high + margin)
     lines = [np.clip(line, low, high) for line in lines]
-    ends = (span[0], span[1] if span[1] > span[0] else span[0] + 1)
+    ends = (span[0], span[1] if span[1] > span[0] else span[0] + 1)  # [s], an axis of at least some length
     # the margin below has room for the labels of the time axis
     picture = Picture(860.0, float(chart.height), ends, (low, high), margins=(0.0, 0.0, 0.0, 20.0))
     picture.frame(count=4)

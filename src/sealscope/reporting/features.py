@@ -122,7 +122,7 @@ def parts_to_compare(diagnosis: Diagnosis, recording: Recording) -> Parts:
     """Choose the parts of a recording to compare: before and after the interval of the onset, or the two halves.
 
     The halves are compared if no onset was found. If the halves are too short for `HALF_WINDOWS` RMS windows each, the
-    first part is the whole recording and the second is empty, because a difference of short halves would reflect the
+    first part is the whole recording and the second is empty: a difference of such short halves would reflect the
     motion of the piston and not the seal.
     """
     t, _ = ordered_time(recording.t, recording.rate)

@@ -21,8 +21,8 @@ def severity_key(diagnosis: Diagnosis) -> tuple[int, float, float, str]:
     Diagnoses are ordered by the first of these entries in which they differ; unknown numbers are 0:
 
     - verdict: 0 for leak, 1 for cannot tell, 2 for no leak
-    - negative ratio of the leak to the repair limit
-    - negative flow [L/min] of the leak, or of the total leakage if the leak has none
+    - negative ratio of the leak to the repair limit, so that larger ratios come first
+    - negative flow [L/min] of the leak or, if this flow is unknown, of the total leakage
     - name of the file
     """
     severity = diagnosis.severity

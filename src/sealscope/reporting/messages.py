@@ -50,7 +50,7 @@ def number(value: float | None, digits: int = 3) -> str:
         return "∞" if value > 0 else "−∞"
     text = f"{value:.{digits}g}"
     if 1e-6 <= abs(value) < 1e9:
-        places = max(0, digits - 1 - floor(log10(abs(value))))
+        places = max(0, digits - 1 - floor(log10(abs(value))))  # decimals that give `digits` significant digits
         text = f"{value:.{places}f}"
         text = text.rstrip("0").rstrip(".") if "." in text else text
     return text.replace("-", "−")
@@ -240,6 +240,7 @@ def total_leakage(diagnosis: Diagnosis, *, basis: bool = True) -> str | None:
     if leakage.lpm is None or leakage.interval_lpm is None:
         return _leakage_fraction(leakage, pressure)
     low, high = leakage.interval_lpm
+    # `not end > 0.0` is also true for NaN
     key = "none" if not high > 0.0 else "at_most" if not low > 0.0 else "interval"
     figures = {"lpm": number(leakage.lpm, 2), "low": number(low, 2), "high": number(high, 2)}
     text = say(f"leakage.{key}", pressure=pressure, **figures)
@@ -467,9 +468,9 @@ _FILE_COLUMNS = 22
 def table_line(diagnosis: Diagnosis, start_s: float | None = None) -> str:
     """Format a diagnosis as a line of a table: file, date, verdict and leak flow in L/min.
 
-    Further lines state the next step or, for `cannot tell`, the reason, after the cause if one is named and the verdict
-    is not `leak`. There are no further lines for `no leak` without a cause. A file name that is longer than its column
-    stands on a separate line. `start_s`: start of the recording [s since 1970], None to leave the date blank.
+    Further lines state the next step or, for `cannot tell`, the reason. Unless the verdict is `leak`, a named cause
+    stands before this text. There are no further lines for `no leak` without a cause. A file name that is longer than
+    its column stands on a separate line. `start_s` [s since 1970]: start of the recording, None for a blank date.
     """
     file = PurePath(diagnosis.file).name
     date = "" if start_s is None else datetime.fromtimestamp(start_s, UTC).date().isoformat()

@@ -101,7 +101,7 @@ def report(
 
 
 def write_page(path: str | os.PathLike[str], recording: Recording, diagnosis: Diagnosis, **options: Any) -> Path:
-    """Write the page of a diagnosis with `report`; deprecated, and its arguments are in an older order.
+    """Write the page of a diagnosis as `report` does; deprecated, and `path` stands before `recording`.
 
     `options`: further arguments of `report`.
     """

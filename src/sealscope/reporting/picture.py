@@ -104,7 +104,7 @@ class Picture:
         `x`, `y`: values of the axes; `digits`: decimals of the coordinates in pixels.
         """
         is_drawn = np.isfinite(y)
-        is_first = is_drawn & ~np.append(False, is_drawn[:-1])  # of each uninterrupted piece
+        is_first = is_drawn & ~np.append(False, is_drawn[:-1])  # the point before is not drawn: a new piece begins
         points = zip(is_first[is_drawn], self.x(x[is_drawn]), self.y(y[is_drawn]), strict=True)
         return "".join(f"{'M' if first else 'L'}{left:.{digits}f} {top:.{digits}f}" for first, left, top in points)
 

@@ -76,7 +76,7 @@ def _inline_styles(page: str) -> str:
     sheet = re.search(r"<style>(.*?)</style>", page, re.DOTALL)
     if sheet is None:
         return page
-    values: dict[str, str] = {}  # by variable; those for print come later and replace the others
+    values: dict[str, str] = {}  # value of each variable; values for print come later and replace the others
     for block in re.findall(r"(?:^|@media print\{)\s*:root\{([^}]*)\}", sheet[1], re.MULTILINE):
         values |= dict(re.findall(r"(--[\w-]+):([^;]+)", block))
     resolved_sheet = re.sub(r"var\((--[\w-]+)\)", lambda match: values.get(match[1], match[0]), sheet[1])
@@ -99,6 +99,7 @@ def _is_complete_pdf(data: bytes) -> bool:
         return False
     offset = int(end[1])
     table_head = data[offset : offset + 20]  # "xref", or the object of a compressed table such as "12 0 obj"
+    # the pattern covers the start of the file, "%PDF", and the start of the table
     return re.match(rb"%PDF.*(xref|\d+ \d+ obj)", data[:4] + table_head) is not None
 
 
@@ -121,15 +122,16 @@ def _write_by_browser(
         source = Path(folder) / "page.html"
         source.write_text(page, encoding="utf-8", errors="backslashreplace")
         command = [browser, *_OPTIONS, *options, f"--user-data-dir={folder}/profile"]
-        limits: dict[str, Any] = {"stdin": subprocess.DEVNULL, "timeout": _BROWSER_TIMEOUT}
+        run_options: dict[str, Any] = {"stdin": subprocess.DEVNULL, "timeout": _BROWSER_TIMEOUT}
         if hasattr(os, "geteuid") and os.geteuid() == 0:
             command.append("--no-sandbox")  # the sandbox does not start for the user root
         try:
-            result = subprocess.run([*command, source.as_uri()], capture_output=True, check=False, **limits)
+            result = subprocess.run([*command, source.as_uri()], capture_output=True, check=False, **run_options)
         except (OSError, subprocess.TimeoutExpired) as error:
             raise InputError(f"a browser must end within {_BROWSER_TIMEOUT:g} s, got: {error} ({browser})") from None
     data = target.read_bytes() if target.is_file() else b""
     if not is_complete(data):
+        # a list with the last line of the messages
         last_line = result.stderr.decode(errors="replace").strip().splitlines()[-1:] or ["no message"]
         got = f"status {result.returncode}: {last_line[0][:160]}"
         got += f", and {len(data)} bytes: is the disk full?" if data else ""

@@ -25,7 +25,8 @@ class DrawnTimes:
     - `starts`, `stops` (k,): samples [start, stop) of each bucket
     - `width`: number of samples in a full bucket, 1 if all samples are drawn
     - `fine`: range of samples that are all drawn, whatever the width
-    - `breaks`: indices, before the insertion, at which points are inserted that interrupt the line at gaps in time
+    - `breaks`: indices of the points before which NaN is inserted to interrupt the line at gaps in time, counted
+      without the inserted points
     - `by_sample`: True if the time stamps do not increase; the times are then the numbers of the samples over the
       sampling rate
     """
@@ -42,8 +43,8 @@ class DrawnTimes:
         """Reduce the values (n,) of a channel to the points (m,) that are drawn at the times `t`.
 
         Each bucket, a group of successive samples, gives two points: its minimum and its maximum. The minimum is first
-        if the bucket's last value is not below the first. A bucket of one sample gives one point. A bucket without
-        finite samples gives NaN. A NaN, which interrupts the line, is also inserted at each gap in time.
+        if the last value is not below the first value of the bucket. A bucket of one sample gives one point; without
+        finite samples the points are NaN. A NaN, which interrupts the line, is also inserted at each gap in time.
         """
         values = np.where(np.isfinite(values), values, np.nan)
         low = np.fmin.reduceat(values, self.starts)
@@ -101,6 +102,7 @@ def choose_drawn_times(
     sizes = stops - starts
     first_points = np.append(0, np.cumsum(np.where(sizes > 1, 2, 1)))  # index of each bucket's first point
     breaks = first_points[np.searchsorted(starts, gaps)]
+    # the point that interrupts the line has the time of the last sample before the gap
     times = np.insert(_interleave(t[starts], t[stops - 1], sizes), breaks, t[gaps - 1])
     return DrawnTimes(times, starts, stops, width, fine, breaks, by_sample)
 

@@ -92,9 +92,10 @@ def edge_samples(wavelet: str = "db8", levels: int = 4, transform: Transform = "
     The detail d_j of a sample depends on before_j earlier and after_j later samples (`reach`). The two counts are:
 
     - stationary: before_j and after_j;
-    - decimated: ``2^j ceil(2 before_j / 2^j) - before_j``, the sample at which the first coefficient without padding
-      begins, and after_j;
-    - reconstructed: both ``before_j + after_j = (L - 1)(2^j - 1)``, for analysis and synthesis with L taps together.
+    - decimated: ``2^j k - before_j`` and after_j. Coefficient k begins at sample ``2^j k - before_j`` and depends on
+      before_j samples before it, so the first one without padding is ``k = ceil(2 before_j / 2^j)``;
+    - reconstructed: before_j + after_j at both ends, since analysis and synthesis both reach beyond a sample. This is
+      ``(L - 1)(2^j - 1)`` for filters of L taps.
     """
     _check_choice(transform, Transform, "transform")
     stationary = reach(wavelet, levels)
@@ -102,8 +103,8 @@ def edge_samples(wavelet: str = "db8", levels: int = 4, transform: Transform = "
         return stationary
     if transform == "decimated":
         step = 2 ** np.arange(1, levels + 1, dtype=np.int64)
-        # -(-a // b) is a / b, rounded up
-        before = -(-2 * stationary[:, 0] // step) * step - stationary[:, 0]
+        first_coefficient = -(-2 * stationary[:, 0] // step)  # -(-a // b) is a / b, rounded up
+        before = first_coefficient * step - stationary[:, 0]
         return np.stack([before, stationary[:, 1]], axis=1)
     total_reach = stationary.sum(axis=1)
     return np.stack([total_reach, total_reach], axis=1)

@@ -24,5 +24,5 @@ def average_over(seconds: float, values: Array, rate: float) -> Array:
         return np.asarray(uniform_filter1d(values, size))
     fraction = uniform_filter1d(is_known.astype(float), size)
     average = uniform_filter1d(np.where(is_known, values, 0.0), size)
-    has_known_value = fraction * size > 0.5  # their number in the window, up to rounding
+    has_known_value = fraction * size > 0.5  # `fraction` * `size` is the number of known values, up to rounding
     return np.where(has_known_value, average / np.maximum(fraction, TINY), np.nan)

@@ -88,13 +88,13 @@ class DetailStream:
         self.wavelet = wavelet
         self.threads = require_positive_int(threads, "threads")
         low, high = (np.repeat(taps[:, None], WIDTH, axis=1) for taps in decomposition_filters(wavelet))
-        self.first, self.delay = (int(samples) for samples in reach(wavelet, self.levels)[-1])
+        self.first, self.delay = (int(samples) for samples in reach(wavelet, self.levels)[-1])  # deepest level
         self.settling = self.first + self.delay
         dilations = 2 ** np.arange(self.levels)
-        level_delays = len(low) // 2 * (2**self.levels - 2 * dilations)  # so that all levels lag like the deepest
+        level_delays = len(low) // 2 * (2**self.levels - 2 * dilations)  # give all levels the lag of the deepest
         # number of earlier samples that the filters of all levels need
         self._history = max(self.delay, int(np.max(level_delays + (len(low) - 1) * dilations)))
-        groups = -(-self._shape_2d[1] // WIDTH)
+        groups = -(-self._shape_2d[1] // WIDTH)  # rounded up
         self.taps = low, high  # each (taps, WIDTH), as the kernels take them
         # (groups, rows of the table, levels, samples, WIDTH)
         self.buffers = aligned_zeros((groups, self._shape_2d[0], self.levels, self._history + CHUNK, WIDTH))
@@ -190,7 +190,7 @@ class DetailStream:
     def from_state(cls, state: dict[str, Any], *, threads: int = 1) -> DetailStream:
         """Make a stream that continues from a saved `state_dict`, with results as if it had not been interrupted.
 
-        Raises InputError if the state is not valid.
+        `threads`: number of threads, as for a new stream. Raises InputError if the state is not valid.
         """
         channels, levels, wavelet = (require_part(state, name, object) for name in ("channels", "levels", "wavelet"))
         table = tuple(channels) if isinstance(channels, list) else channels

@@ -102,10 +102,10 @@ class RmsStream:
         if isinstance(skip, bool) or not isinstance(skip, (int, np.integer)) or skip < 0:
             raise InputError(f"skip must be a whole number >= 0 samples, got {skip!r}")
         self._piece = math.gcd(self.size, self.step)  # samples in a piece; windows consist of whole pieces
-        self._skip = int(skip)
-        self._next_end = int(first) + self.size
+        self._skip = int(skip)  # samples still to be dropped at the beginning
+        self._next_end = int(first) + self.size  # sample number just after the next window
         self._rest: Array | None = None  # samples of an incomplete piece, (..., fewer than piece)
-        self._sums: Array | None = None  # sums of squares of the pieces of later windows, (..., pieces)
+        self._sums: Array | None = None  # sums of squares of the pieces that coming windows need, (..., pieces)
         self._n_unused = 0  # number of coming pieces that lie between two windows (if step > size), to be skipped
 
     def update(self, block: ArrayLike) -> WindowedRms:
@@ -145,7 +145,7 @@ class RmsStream:
         sums = sums[..., n_skipped:]
         values = _rms_of_pieces(sums, self.size, self.step)
         n_windows = values.shape[-1]
-        n_finished = n_windows * (self.step // self._piece)  # pieces before the next window; some may not be here yet
+        n_finished = n_windows * (self.step // self._piece)  # pieces before the next window; some may be still to come
         self._n_unused += max(0, n_finished - sums.shape[-1])
         self._sums = sums[..., n_finished:].copy()
         ends = self._next_end + self.step * np.arange(n_windows, dtype=np.int64)
@@ -202,6 +202,7 @@ def _rms_of_pieces(sums: Array, size: int, step: int) -> Array:
     n_windows = max(0, (sums.shape[-1] - pieces_per_window) // pieces_per_step + 1)
     squares = np.zeros((*sums.shape[:-1], n_windows))
     if n_windows:
-        for i in range(pieces_per_window):  # piece i of all windows
-            squares += sums[..., i : i + (n_windows - 1) * pieces_per_step + 1 : pieces_per_step]
+        for i in range(pieces_per_window):  # add piece i of all windows
+            last = i + (n_windows - 1) * pieces_per_step  # in the last window
+            squares += sums[..., i : last + 1 : pieces_per_step]
     return np.asarray(np.sqrt(squares / size))

@@ -76,8 +76,7 @@ def apply_effects(rig_value: T, effects: Sequence[Effect], field: str, t: Array)
     """Compute one parameter at times t [s] as (value in the rig + sum of addends) x product of factors.
 
     `rig_value`: value of the parameter in the rig, without effects; `field`: name of the parameter; `effects`: changes
-    of any parameters over time, from which those of this parameter are applied. If there are none of this parameter,
-    `rig_value` is returned.
+    of any parameters over time, from which those of this parameter are applied. Without any, `rig_value` is returned.
     """
     value: T | Array = rig_value
     for effect in sorted(effects, key=lambda effect: not effect.additive):  # sums before products
@@ -167,9 +166,10 @@ class Schedule:
         middles: Array = np.asarray(0.5 * (self.bounds[:-1] + self.bounds[1:]) / rate, dtype=np.float64)
         values = changing_values(effects, base, middles)
         table = np.array(list(values.values()))  # (parameters, blocks)
-        differs = np.r_[True, np.any(table[:, 1:] != table[:, :-1], axis=0)]  # True: from the block before it
+        # for each block: do its parameters differ from those of the block before it? True for the first block
+        differs = np.r_[True, np.any(table[:, 1:] != table[:, :-1], axis=0)]
         self.bounds = np.r_[self.bounds[:-1][differs], n_out]
-        # optional parts of the model are compiled in, so that all blocks have those that any of them needs
+        # optional parts of the model are compiled in, so that every block has the parts that any block needs
         options: dict[str, Any] = {}
         if any(name.startswith("G_ext") and np.any(series > 0) for name, series in values.items()):
             options["open_circuit"] = (True,)
@@ -184,11 +184,11 @@ class Schedule:
 
         Each item is (start, stop, parameters): the outputs start <= k < stop have these model parameters.
         """
-        k = int(np.searchsorted(self.bounds, first, side="right")) - 1
+        block = int(np.searchsorted(self.bounds, first, side="right")) - 1  # the block that contains output `first`
         while first < last:
-            stop = min(int(self.bounds[k + 1]), last)
-            yield first, stop, self.numbers[k]
-            first, k = stop, k + 1
+            stop = min(int(self.bounds[block + 1]), last)
+            yield first, stop, self.numbers[block]
+            first, block = stop, block + 1
 
 
 @dataclass(frozen=True)
@@ -364,7 +364,7 @@ class ParameterDrift:
 
         def build_effect(name: str, power: float) -> Effect:
             """Build the change of one parameter: the drift is added if absolute, else (1 + drift)^power is a factor."""
-            if self.absolute:  # without a limit for instruments, which do not divide a run into blocks
+            if self.absolute:  # an instrument needs no limit: its changes do not divide a run into blocks
                 max_change = _ABSOLUTE_MAX_CHANGES.get(name, math.inf)
                 return Effect(name, self.shape.value_at, max_change, additive=True, breakpoints=breakpoints)
             return Effect(

@@ -26,7 +26,7 @@ def outputs_per_sample(rate: float, controller_rate: float, min_outputs: int) ->
     both rates.
     """
     for outputs in range(min_outputs, _MAX_OUTPUTS_PER_SAMPLE + 1):
-        spacing = rate * outputs / controller_rate  # outputs per controller sample, which must be a whole number
+        spacing = rate * outputs / controller_rate  # outputs per controller sample: must be a whole number >= 1
         if spacing >= 1.0 - 1e-9 and abs(spacing - round(spacing)) < 1e-9 * spacing:
             return outputs
     raise InputError(
@@ -55,10 +55,10 @@ class Feedback:
         t = np.arange(samples + 1) / controller.rate
         inputs = np.zeros((samples + 1, 5))  # time, target, its speed, noise of p_A and p_B (`Loop.inputs`)
         inputs[:, 0], inputs[:, 1] = t, target.value_at(t)
-        # the voltage of a sample acts from `delay` to `delay + 1` samples later
+        # a sample's voltage acts from `delay` to `delay + 1` samples later; the speed is the target's mean speed then
         target_ahead = target.value_at(t + controller.delay / controller.rate)
         inputs[:-1, 2] = np.diff(np.broadcast_to(target_ahead, t.shape)) * controller.rate
-        random = np.random.default_rng([seed, 2])  # 2: not the random numbers of the instruments
+        random = np.random.default_rng([seed, 2])  # 2: a stream independent of the instruments' noise
         sensors = rig.sensors
         inputs[:-1, 3:] = random.standard_normal((samples, 2)) * (sensors.p_A.noise, sensors.p_B.noise)
         self._inputs = inputs

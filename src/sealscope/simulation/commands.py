@@ -116,7 +116,7 @@ class Alternating:
 
     def volts(self, t: Array) -> Array:
         """Compute the voltage u [V] of the sine that is active at each of the times t [s]; 0 before t = 0."""
-        durations = np.array([2.0 * np.pi * periods / sine.omega for periods, sine in self.parts])  # of the parts [s]
+        durations = np.array([2.0 * np.pi * periods / sine.omega for periods, sine in self.parts])  # of each part [s]
         ends = np.cumsum(durations)
         time_in_cycle = np.mod(t, ends[-1])
         part = np.minimum(np.searchsorted(ends, time_in_cycle, side="right"), ends.size - 1)
@@ -150,7 +150,10 @@ class Polyline:
         return self.value_at(t)
 
     def breakpoints(self) -> tuple[float, ...]:
-        """Return the times [s] at which the slope changes or the value jumps; () for 1000 points or more."""
+        """Return the times [s] at which the slope changes or the value jumps; () for 1000 points or more.
+
+        The solver divides a run at these times, and too many of them would slow it.
+        """
         return tuple(map(float, np.unique(self.t))) if self.t.size < _MAX_BREAKPOINTS else ()
 
     def onset(self) -> float:
@@ -265,7 +268,7 @@ class PseudoRandom:
 
     def volts(self, t: Array) -> Array:
         """Compute the voltage u [V] of the pseudo-random command at times t [s]; 0 before t = 0."""
-        interval = np.clip(np.floor(t / self.hold), 0.0, 2.0**63).astype(np.uint64)
+        interval = np.clip(np.floor(t / self.hold), 0.0, 2.0**63).astype(np.uint64)  # clipped to what the type holds
         first_state = np.random.SeedSequence(self.seed).generate_state(1, np.uint64)
         state = first_state + (interval + np.uint64(1)) * np.uint64(GOLDEN)  # each interval adds the increment once
         for shift, factor in MIX:

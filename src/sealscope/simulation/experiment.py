@@ -193,10 +193,10 @@ class Experiment:
         """
         from sealscope.parameters import load_rig
 
-        quantities: dict[str, Any] = {}  # in SI units, by argument
+        quantities: dict[str, Any] = {}  # values in SI units by argument
         for declared in fields(arguments):
             value, unit = getattr(arguments, declared.name), declared.metadata["unit"]
-            if unit and value is declared.default:  # may be None
+            if unit and value is declared.default:  # a default is in SI units already, or None
                 quantities[declared.name] = value
             elif unit:
                 quantities[declared.name] = parse_quantity(value, unit, name=declared.name, finite=False)
@@ -355,7 +355,7 @@ class Experiment:
         inputs = [identity_values(self.command), *(identity_values(leak) for leak in self.leaks)]
         inputs += [identity_values(change) for change in (*self.faults, *self.drifts)]
         solver = [self.method, self.step, self.allow_unresolved]
-        solver += [] if self.error is None else [self.error]  # keys without it must not change between versions
+        solver += [] if self.error is None else [self.error]  # without an error, keys must stay those of older versions
         inputs += [identity_values(added) for added in (self.load, self.active_controller) if added is not None]
         text = json.dumps([self.describe(), values, inputs, solver], sort_keys=True, default=str)
         return hashlib.sha256(text.encode()).hexdigest()[:16]

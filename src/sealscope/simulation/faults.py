@@ -92,12 +92,12 @@ class FaultRow:
 
     def parse(self, text: str) -> Fault | None:
         """Parse a text such as "pump leak x3 from 90 s" as a fault of this kind; return None for any other text."""
-        pattern = self.pattern.format(**_PATTERNS).replace(" ", r"\s+") + _WHEN[self.when]
+        pattern = self.pattern.format(**_PATTERNS).replace(" ", r"\s+") + _WHEN[self.when]  # a blank stands for blanks
         match = re.fullmatch(pattern, text, re.IGNORECASE)
         if match is None:
             return None
         groups = match.groupdict()
-        channel_or_side = groups.get("at") or ""  # of a faulty sensor, or of a part that is at side A or B
+        channel_or_side = groups.get("at") or ""  # the channel of a faulty sensor, or the side A or B of a part
         if not self.is_sensor_fault:
             channel_or_side = channel_or_side.upper()
         return Fault(
@@ -105,7 +105,7 @@ class FaultRow:
             value=self._parse_value(groups),
             at=channel_or_side,
             opening=parse_opening(groups),  # the extent of the fault over time, such as "from 90 s"
-            frequency_factor=_parse_number(groups.get("frequency") or "1"),  # of the command
+            frequency_factor=_parse_number(groups.get("frequency") or "1"),  # factor on the command's frequency
         )
 
     def _parse_value(self, groups: Groups) -> float:
@@ -179,7 +179,7 @@ class Fault:
         """
         row = self.row
         if row.needs is not None:
-            pattern, rule = row.needs  # of a parameter's name, and the beginning of the message
+            pattern, rule = row.needs  # pattern of a parameter's name, and beginning of the message
             if rig[name := pattern.format(at=self.at)] == 0:
                 raise InputError(f"{rule} {name} > 0, got 0 ({self})")
         if self.name in _EFFECTS:
@@ -189,7 +189,7 @@ class Fault:
             max_change = FAULT_MAX_CHANGE * max(abs(size), 1e-3)  # above 0 for a factor of 1
         else:
             healthy, size = 0.0, self._addend(rig)
-            max_change = FAULT_MAX_CHANGE * size or math.inf
+            max_change = FAULT_MAX_CHANGE * size or math.inf  # infinite for size 0, which changes nothing
         return tuple(
             Effect(
                 name.format(at=self.at, gain=GAIN_PARAMETERS.get(self.at)),
@@ -216,7 +216,7 @@ class Fault:
         """Return the time span over which a stuck sensor repeats its reading, in a tuple; () for any other fault."""
         if self.name != "sensor stuck":
             return ()
-        never_ends = self.opening.y[-1] > 0  # the opening at its last point, which stays
+        never_ends = self.opening.y[-1] > 0  # the opening stays as at its last point
         stop = math.inf if never_ends else float(self.opening.t[-1])
         return (Hold(self.at, self.onset(), stop),)
 
@@ -286,7 +286,7 @@ class ChangedDuty:
         of the fault over time, 0 to 1.
         """
         start, stop = self.change.opening.rise or (math.inf, math.inf)  # a fault of the duty always has a rise
-        opening_integral = np.maximum(t - start, 0.0)
+        opening_integral = np.maximum(t - start, 0.0)  # for a jump of the opening at `start`
         if stop > start:
             ramp_time = np.minimum(opening_integral, stop - start)
             opening_integral = ramp_time**2 / (2.0 * (stop - start)) + np.maximum(t - stop, 0.0)
@@ -313,7 +313,7 @@ def _shut_off_effects(fault: Fault, rig: Rig) -> tuple[Effect, ...]:
     line = rig.line
     if line.orifices == "absent":
         raise InputError(f"a shut-off valve must be in a line (line.orifices = present), got absent ({fault})")
-    c_line = orifice_coefficient(line.C_d, math.pi / 4.0 * line.d_line**2, rig.fluid.rho)  # of the full cross-section
+    c_line = orifice_coefficient(line.C_d, math.pi / 4.0 * line.d_line**2, rig.fluid.rho)  # free line
     open_coefficients = throttle_coefficients(rig.with_overrides({"line.open_A": 1.0, "line.open_B": 1.0}))
     initial_opening = line.open_A if fault.at == "A" else line.open_B
 

@@ -44,7 +44,8 @@ def anti_alias_taps(factor: int, delay: float = 0.0) -> Array:
     reach = FILTER_REACH * factor
     offsets = np.arange(-reach, reach + 1) + delay
     window = np.i0(_KAISER_BETA * np.sqrt(np.maximum(0.0, 1.0 - (offsets / reach) ** 2))) / np.i0(_KAISER_BETA)
-    cutoff = _CUTOFF_FRACTION / factor if factor > 1 else 1.0  # relative to the signal's Nyquist frequency
+    # relative to the signal's Nyquist frequency; 1 if no values are dropped, because then nothing can alias
+    cutoff = _CUTOFF_FRACTION / factor if factor > 1 else 1.0
     taps = np.sinc(cutoff * offsets) * window
     return np.asarray(taps / taps.sum())
 
@@ -81,6 +82,7 @@ def filter_first_order(values: Array, lag: float, rate: float) -> Array:
     decay = math.exp(-1.0 / (lag * rate))
     mean_decay = (1.0 - decay) * lag * rate  # mean of exp(-t/lag) over one interval
     b_0 = 1.0 - mean_decay
+    # y_k = decay y_(k-1) + b_0 x_k + (mean_decay - decay) x_(k-1), with `zi` settled at the first value of the signal x
     output, _ = lfilter([b_0, mean_decay - decay], [1.0, -decay], values, zi=[(1.0 - b_0) * values[0]])
     return np.asarray(output)
 
@@ -95,7 +97,8 @@ def sample_with_jitter(sample: Callable[[Array], Array], values: Array, lateness
     center = sample(values)
     if lateness is None:
         return center
-    left, right = sample(np.r_[values[:1], values[:-1]]), sample(np.r_[values[1:], values[-1:]])  # one value off
+    # the samples one interval of `values` earlier and later
+    left, right = sample(np.r_[values[:1], values[:-1]]), sample(np.r_[values[1:], values[-1:]])
     return np.asarray(center + 0.5 * lateness * (right - left) + 0.5 * lateness**2 * (right - 2.0 * center + left))
 
 

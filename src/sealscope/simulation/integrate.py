@@ -190,7 +190,7 @@ def integrate_run(
     if duration is None:
         duration = (round(experiment.duration * experiment.rate) + FILTER_REACH) / experiment.rate
     if step is not None:
-        error = None  # not checked
+        error = None  # with a step stated here the error is not checked
     elif error is None:
         error = experiment.error_allowed
     rate = experiment.rate * oversampling(experiment)
@@ -246,7 +246,7 @@ def run_with_sized_leaks(
     initial_leaks = _start_of_search(leaks)
     if not any(leak.mean for leak in leaks):
         return initial_leaks, integrate_run(experiment, initial_leaks, progress=report_time)
-    is_first_run = True
+    is_first_run = True  # it has the sought coefficients 0, so that these leaks do not change the pump's flow
 
     def measure(coefficients: Array) -> tuple[Array, tuple[tuple[Leak, ...], Trajectory]]:
         """Simulate the n leaks with `coefficients` (n,), and compute each leak's mean flow per unit of coefficient.
@@ -300,8 +300,9 @@ def integrate(
     """Integrate a rig from standstill over `duration` [s], with outputs at `rate` [Hz].
 
     `inputs`: command and leakage; `x_0` [m]: position at the start; `load`: load in addition to the rig's own;
-    `feedback`: a controller whose voltage replaces the command; `effects`: changes of the model's parameters within
-    the run (`Schedule`); `progress` is called with the simulated time reached [s].
+    `feedback`: a controller whose voltage replaces the command; `effects`: changes of the model's parameters within the
+    run (`Schedule`); `method`: integration method (`choose_method`); `progress` is called with the simulated time
+    reached [s].
 
     A stated `step` [s] is rounded down to a divisor of the output interval. If `step` is None, ever shorter steps are
     tried until a step passes a check. The first is the longest that resolves the rig, at most `LONGEST_STEP`; the last
@@ -314,7 +315,7 @@ def integrate(
     - a state is not finite;
     - a pressure falls below vacuum;
     - the step cannot resolve the rig, the leak or an end stop that was hit;
-    - a stated step fails the check.
+    - a stated step fails the check, unless it is as short as the last step that would be tried.
 
     `allow_unresolved` permits all of these but a state that is not finite.
     """
@@ -341,8 +342,8 @@ def integrate(
         feedback=feedback,
     )
     windows = [] if error is None else comparison_windows(n_out, rate)
-    bounds = {0, n_out}
-    max_steps = steps_per_output(rate, LONGEST_STEP / MAX_STEP_REFINEMENT)  # per output, as `n_steps`
+    bounds = {0, n_out}  # outputs at which the run stops
+    max_steps = steps_per_output(rate, LONGEST_STEP / MAX_STEP_REFINEMENT)  # most steps per output that are tried
     if step is None:  # the run stops at the end of each window, so that a step that fails is abandoned at once
         bounds |= {bound for window in windows for bound in window}
         max_G, max_C = inputs.max_leakage(np.arange(n_out) / rate)
@@ -352,7 +353,7 @@ def integrate(
         n_steps = steps_per_output(rate, step)
     while True:
         run.refuse_unresolved(n_steps)
-        check = StepErrorCheck(rig, rate, error or PRESSURE_TOLERANCE)
+        check = StepErrorCheck(rig, rate, error or PRESSURE_TOLERANCE)  # without `error` nothing is checked
         excess = 0.0  # largest ratio of an error to its tolerance
         rows = np.empty((n_out, len(OUTPUTS)))
         y = start_state.copy()
@@ -376,7 +377,8 @@ def integrate(
                 f"the run is under-resolved: halving the step of {h:.3g} s ({run.method}) moves "
                 f"{check.describe_worst()}; take a smaller step, or state an error instead of a step"
             )
-        # the error goes with h^4; at most twice the steps, because the estimate for a step far too long is unreliable
+        # the error goes with h^4, here with a margin of 10 %; at most twice the steps, because the error that is found
+        # at a step far too long is unreliable
         refinement = min(2.0, (1.1 * excess) ** 0.25) if math.isfinite(excess) else 2.0
         n_steps = min(max(n_steps + 1, math.ceil(n_steps * refinement)), max_steps)
 
@@ -442,7 +444,7 @@ class _Integration:
                     refuse_long(h, longest_step(p, max_G, max_C), "the leak")
                 steps = slice((k - first) * n_steps, (end - first) * n_steps)
                 out = rows[k - origin : end - origin]
-                # in the order of `advance` and `advance_closed`
+                # the arguments that `advance` and `advance_closed` share, in their order
                 arguments = G[steps], C[steps], F[steps], pack_numbers(p), self.euler, n_steps
                 if self.feedback is None:
                     advance(implicit, y, h, u[steps], *arguments, out)
@@ -473,7 +475,8 @@ class _Integration:
     def _check_rows(self, p: RigNumbers, h: float, rows: Array, first: int) -> None:
         """Check outputs that were integrated with steps of h [s].
 
-        `rows` (n, 21): the outputs, of which the first has the index `first` in the run. Raises SimulationFailed if
+        `rows` (n, 21): the outputs, of which the first has the index `first` in the run; `p`: the model's parameters at
+        these outputs. Raises SimulationFailed if
         an output is not finite. Unless the experiment allows unresolved runs, also raises it if a pressure is below
         vacuum or if the step is too long for an end stop that was hit.
         """
@@ -561,7 +564,7 @@ class StepErrorCheck:
         difference of a pressure.
         """
         self._tolerance = tolerance
-        self._outputs_per_sample = max(1, round(rate / rig.daq.sample_rate))  # a sample of the recording
+        self._outputs_per_sample = max(1, round(rate / rig.daq.sample_rate))  # for samples of the recording
         sensors = [getattr(rig.sensors, name) for name in CHAMBERS]
         # four columns: p_A at the step and at half the step, then p_B
         self._noise_variances = np.repeat([sensor.noise**2 + rig.sensors.common_noise**2 for sensor in sensors], 2)
@@ -581,13 +584,13 @@ class StepErrorCheck:
         """
         pressure_error = SAFETY * float(np.sqrt(np.mean(np.square(coarse - fine), axis=0)).max(initial=0.0))
         self.pressure_error = max(self.pressure_error, pressure_error)
-        if not pressure_error <= self._tolerance:
+        if not pressure_error <= self._tolerance:  # also for NaN
             return pressure_error / self._tolerance
         self._add_detail_squares(coarse, fine)
         if self._samples == 0:
             return pressure_error / self._tolerance
         recorded_rms = np.sqrt(self._squares / self._samples + self._noise_variances)
-        coarse_rms, fine_rms = recorded_rms[:, ::2], recorded_rms[:, 1::2]
+        coarse_rms, fine_rms = recorded_rms[:, ::2], recorded_rms[:, 1::2]  # both alternate in the columns
         detail_error = float(np.max(np.abs(coarse_rms - fine_rms) / np.where(fine_rms > 0, fine_rms, 1.0)))
         self.detail_error = max(self.detail_error, detail_error)
         return max(pressure_error / self._tolerance, detail_error / DETAIL_TOLERANCE)
@@ -612,7 +615,7 @@ class StepErrorCheck:
 
         from sealscope.signals.filters import reach
 
-        before, after = reach("db8", LEVELS)[-1]
+        before, after = reach("db8", LEVELS)[-1]  # [-1]: the highest level reaches furthest
         # both runs' p_A, then both runs' p_B
         runs = np.array([run[:: self._outputs_per_sample, column] for column in range(2) for run in (coarse, fine)])
         n = runs.shape[1] // 2**LEVELS * 2**LEVELS  # the stationary transform needs a multiple

@@ -264,6 +264,8 @@ def powers(outputs: Mapping[str, Array], rig: Rig) -> dict[str, Array]:
 def compare_trajectories(experiment: Experiment, coarse: Trajectory, fine: Trajectory) -> tuple[Difference, ...]:
     """Compare two runs of an experiment, `coarse` at a solver step and `fine` at a shorter one.
 
+    Returns the differences of
+
     - speed, angle, position and velocity, by their rms difference, without a tolerance;
     - the four pressures, by their rms difference;
     - the wavelet details d1 to d4 of p_A and p_B, by the change of their RMS, which includes the sensors' noise.
@@ -281,7 +283,7 @@ def compare_trajectories(experiment: Experiment, coarse: Trajectory, fine: Traje
         noise_variance = getattr(experiment.rig.sensors, name).noise ** 2 + experiment.rig.sensors.common_noise**2
         coarse_details, fine_details = (details(decimate(run[name], factor, n)) for run in (coarse, fine))
         inside = coarse_details.inside()
-        limits = [inside.start, inside.stop]  # of one segment, the [0] below
+        limits = [inside.start, inside.stop]  # a single segment: the row [0] below
         coarse_rms = np.sqrt(mean_squares(coarse_details, limits)[0] + noise_variance)
         fine_rms = np.sqrt(mean_squares(fine_details, limits)[0] + noise_variance)
         for level, quantity in enumerate(QUANTITIES[:4]):  # d1 to d4, not d3d4

@@ -26,12 +26,12 @@ _MIN_SLOPE = 0.1
 def leak_flow(leak: Leak, t: Array, dp: Array, dp_0: float) -> Array:
     """Compute the flow |Q_L| (n,) [m^3/s] of a leak at times `t` (n,) [s] under `dp` (n,) = p_A - p_B [Pa].
 
-    The flow is a G |dp| for a laminar leak and a C sqrt|dp| for an orifice, with the leak's opening a at t, 0 to 1, and
+    The flow is s G |dp| for a laminar leak and s C sqrt|dp| for an orifice, with the leak's opening s at t, 0 to 1, and
     its coefficient G or C. The flow of an orifice is linear in dp for |dp| below about `dp_0` [Pa].
     """
     from sealscope.physics.leakage import laminar_leakage, leakage_series
 
-    coefficient = (leak.coefficient or 0.0) * leak.opening.value_at(t)  # G or C
+    coefficient = (leak.coefficient or 0.0) * leak.opening.value_at(t)  # s G or s C
     if leak.law == "laminar":
         return np.asarray(np.abs(laminar_leakage(dp, coefficient)))  # type: ignore[arg-type]
     G = np.zeros_like(coefficient)
@@ -81,8 +81,9 @@ def size_leaks(
 
     A coefficient has the unit m^3/(s Pa) for a laminar leak, m^3/(s Pa^0.5) for an orifice. `coefficients`: start
     values, which are kept for leaks without a stated mean flow. `measure(coefficients)` simulates the rig. It returns
-    the mean flow [m^3/s] of each leak divided by its coefficient (n,), and the run in any form. Returns the
-    coefficients found, and the run with them. `progress` is called with the task and its completed fraction.
+    the mean flow [m^3/s] of each leak per unit of its coefficient (n,), also where the coefficient is 0, and the run in
+    any form. Returns the coefficients found, and the run with them. `progress` is called with the task and its
+    completed fraction.
 
     A small leak's flow is proportional to its coefficient, because friction sets the pressure difference. A large
     leak's flow grows less, and its coefficient is found step by step (`next_coefficient`). Raises SimulationFailed
@@ -108,7 +109,7 @@ def size_leaks(
         next_coefficients = coefficients.copy()
         for k in indices:
             previous = previous_coefficients[k], previous_flows[k]
-            latest_flow = flows[k] if coefficients[k] > 0.0 else unit_flows[k]  # as `next_coefficient` asks for
+            latest_flow = flows[k] if coefficients[k] > 0.0 else unit_flows[k]  # as `next_coefficient` takes it
             next_coefficients[k] = next_coefficient(means[k], previous, latest=(coefficients[k], latest_flow))
         previous_coefficients, previous_flows = coefficients, flows
         coefficients = next_coefficients

@@ -195,14 +195,14 @@ def _read_force(path: str, words: str) -> Force:
     for any other table.
     """
     with open_regular(path, "a recorded load") as file:
-        head = file.readline(4096).decode("utf-8-sig", "replace")
-        headings = [re.fullmatch(r"\s*(\w+)\s*\[([^\]]+)\]\s*", cell) for cell in head.split(",")]
+        first_line = file.readline(4096).decode("utf-8-sig", "replace")
+        headings = [re.fullmatch(r"\s*(\w+)\s*\[([^\]]+)\]\s*", cell) for cell in first_line.split(",")]
         columns = {match[1]: _Column(k, match[2]) for k, match in enumerate(headings) if match}
-        arguments = [name for name in ("t", "x", "v") if name in columns]  # of the function F
+        arguments = [name for name in ("t", "x", "v") if name in columns]  # columns over which F may be stated
         if "F" not in columns or not arguments or arguments == ["x", "v"]:
             raise InputError(
                 "a recorded load must have the columns t [s] and F [N], or F [N] with one of x [m] and v [m/s], got "
-                f"{head.strip()[:80]!r} ({path})"
+                f"{first_line.strip()[:80]!r} ({path})"
             )
         try:
             table = np.loadtxt(
@@ -227,7 +227,7 @@ def _read_force(path: str, words: str) -> Force:
 
 
 def _unit_pattern(units: Mapping[str, float]) -> str:
-    """Build the regular expression that matches any of the units; blanks within a unit may be left out."""
+    """Build the regular expression that matches any of the units, the longest first; their blanks may be left out."""
     return "|".join(re.escape(unit).replace("\\ ", r"\s*") for unit in sorted(units, key=len, reverse=True))
 
 
@@ -266,7 +266,7 @@ def _extract_terms(text: str, letter: str) -> tuple[Breakpoints, str]:
     terms = pattern.findall(text)
     if not terms:
         return (), text
-    common_slope = 0.0  # of the terms without a start
+    common_slope = 0.0  # sum of the slopes of the terms without a start
     breakpoints = []
     for sign, magnitude, unit, start, start_unit in terms:
         slope = float(f"{sign}{magnitude}") * slope_units[_match_unit(unit, slope_units)]

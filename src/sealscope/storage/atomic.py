@@ -99,7 +99,7 @@ def remove_temporaries(folder: Path, target: str | None = None) -> None:
     """
     paths = folder.rglob(".*.part") if target is None else folder.glob(".*.part")
     for path in paths:
-        match = _TEMPORARY.fullmatch(path.name)
+        match = _TEMPORARY.fullmatch(path.name)  # has the target's name, cut to `_MAX_NAME` characters
         if match is None or (target is not None and match["target"] != target[:_MAX_NAME]):
             continue
         with suppress(OSError):
@@ -116,7 +116,7 @@ def _is_alive(process: int) -> bool:
     if os.name == "nt":  # signal 0 would end the process
         return True
     try:
-        os.kill(process, 0)
+        os.kill(process, 0)  # sends nothing, but fails if there is no such process
     except ProcessLookupError:
         return False
     except OSError:

@@ -88,6 +88,7 @@ def format_error(error: ValidationError, entry_name: Callable[[str], str] = str,
     place = entry_name(entry) + "".join(inner_names)
     if plain_rule := _PLAIN_RULES.get(chosen["type"]):
         return f"{place} {plain_rule}"
+    # pydantic writes "Input should be ..." and "tuple"
     rule = re.sub(r"^\w+ should", "must", chosen["msg"].removeprefix("Value error, ")).replace("tuple", "list") + unit
     # the validators of this project state the value in their own text
     value = "" if chosen["type"] == "value_error" else f", got {repr(chosen['input'])[:60]}"

@@ -93,9 +93,11 @@ class PriorTable:
     """
 
     def __init__(self, **values: Any) -> None:
+        """Set the keys of the table, in its `__dict__` because `__setattr__` refuses."""
         vars(self).update(values)
 
     def __setattr__(self, name: str, value: Any) -> None:
+        """Refuse to change a key of the table."""
         raise AttributeError(f"a table of priors is frozen, got {name} = {value!r}")
 
 
@@ -176,7 +178,8 @@ def _check_keys(rows: Collection[str], names: Collection[str], optional: Collect
 def _estimate_memory(text: str) -> int:
     """Estimate an upper limit of the memory [bytes] that a TOML text will take once it is parsed.
 
-    The estimate counts tables, keys and values without parsing the text.
+    Tables, elements of arrays of tables (`n_rows`), keys and values are counted without parsing the text, and each
+    count is multiplied by the memory that one of them takes.
     """
     n_tables = n_rows = 0  # a dotted key makes a table for each dot
     for line in StringIO(text):

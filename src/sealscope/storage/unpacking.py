@@ -19,7 +19,7 @@ def max_unpacked_size(path: Path) -> int:
     a tenth of its size, and a log of constant channels to a hundredth. Holes of a sparse file take no size on the disk.
     """
     status = path.stat()
-    disk_bytes = 512 * getattr(status, "st_blocks", 0)  # 0 where the file system does not say
+    disk_bytes = 512 * getattr(status, "st_blocks", 0)  # 512 bytes a block; 0 where the file system does not say
     return min(MAX_UNPACKED, max(_MIN_LIMIT, _MAX_EXPANSION * min(status.st_size, disk_bytes or status.st_size)))
 
 

@@ -51,13 +51,13 @@ def noise_free_mean_squares(
     `condition`: inputs of the test; `leak`: text of the leak, None for no leak; `x_0` [m]: position of the piston at
     the start; `values`: parameters that override the test's. Raises the errors of the simulation.
     """
-    duration = ANALYSED + SETTLING + 128.0 / rig.daq.sample_rate  # d4 depends on 120 later samples
+    duration = ANALYSED + SETTLING + 128.0 / rig.daq.sample_rate  # 128: more than the 120 later samples of d4
     values = {**experiment_values(condition), **(values or {})}
     experiment = Experiment.of(rig=rig, command=condition.command, set=values, leak=leak, duration=duration, x_0=x_0)
     _, trajectory = run_with_sized_leaks(experiment)
     factor = oversampling(experiment)  # outputs of the solver for each sample
     rate = experiment.rate
-    bounds = [round(SETTLING * rate), round((SETTLING + ANALYSED) * rate)]
+    bounds = [round(SETTLING * rate), round((SETTLING + ANALYSED) * rate)]  # samples at the ends of the analysed part
     sampled = (decimate(trajectory[chamber], factor, round(duration * rate)) / PSI for chamber in CHAMBERS)
     return np.concatenate([mean_squares(details(pressure), bounds) for pressure in sampled])
 
@@ -148,9 +148,9 @@ def predicted_sheet(
     healthy_rig = _scale_parameters(rig.with_overrides(h.overrides) if h.overrides else rig, h.factors)
     leaking_rig = _scale_parameters(healthy_rig, h.leaking_factors)
     leak_free: dict[tuple[str, float], Array] = {}  # mean squares by operating condition, which several tests share
-    rms = np.empty((len(conditions), 2, len(CHAMBERS), len(QUANTITIES)))
+    rms = np.empty((len(conditions), 2, len(CHAMBERS), len(QUANTITIES)))  # 2: without and with the leak
     for row, condition in enumerate(conditions):
-        # less than 1, as a closed throttle would stop the flow
+        # at most 0.99, as a closed throttle would stop the flow
         closed = {"line.closed_B": min(0.99, condition.closed_pct / 100.0 + h.extra_closing_B)}
         if condition.group not in leak_free:
             leak_free[condition.group] = noise_free_mean_squares(healthy_rig, condition, x_0=h.x_0, values=closed)
@@ -223,7 +223,7 @@ def hypotheses_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
 
     The first row is the measured sheet itself. A quick reproduction simulates only the first two hypotheses.
     """
-    assert context.sheet is not None  # the item needs it
+    assert context.sheet is not None  # the item needs the measured data sheet
     sheet = context.sheet
     change_columns = [(c, q) for c in CHAMBERS for q in ("d2", "d3", "d4")]  # chamber and quantity
     level_columns = [(c, q) for c, q in change_columns if q != "d2"]

@@ -172,7 +172,7 @@ def read_sheet(folder: Path) -> tuple[DataSheet, str]:
 def _parse_number(row: dict[str, str], column: str, number: int, path: Path, *, allow_zero: bool = False) -> float:
     """Parse the number in a column of a row of the data sheet.
 
-    `number`, `path`: number of the row and file, for messages. Raises InputError unless the value is > 0, or >= 0 if
+    `number`, `path`: row number and file, for messages. Raises InputError unless the value is > 0, or >= 0 if
     `allow_zero`.
     """
     try:
@@ -193,7 +193,7 @@ def _check_condition(row: dict[str, str], condition: Condition, path: Path) -> N
     """
     leak, amplitude, omega = (_parse_number(row, column, condition.number, path) for column in _POSITIVE_COLUMNS)
     closed = _parse_number(row, _CLOSED_COLUMN, condition.number, path, allow_zero=True)
-    command = f"{amplitude:g} sin({'' if omega == 1 else f'{omega:g}'}t)"
+    command = f"{amplitude:g} sin({'' if omega == 1 else f'{omega:g}'}t)"  # such as "3 sin(4t)"
     row_condition = Condition(condition.number, command, closed, leak, (row[_LEVEL_COLUMN] or "").strip())
     if row_condition != condition:
         expected, actual = (

@@ -29,6 +29,7 @@ def sine_fit(t: Array, values: Array, *omegas: float) -> SineFit:
     and the angular frequencies `omegas` [rad/s].
     """
     phases = np.outer(t, omegas)
+    # the time is centred, which makes the fit more accurate and does not change the slope
     basis = np.column_stack([np.ones(t.size), t - t.mean(), np.cos(phases), np.sin(phases)])
     fitted = np.linalg.lstsq(basis, values, rcond=None)[0]
     cosines, sines = np.split(fitted[2:], 2)

@@ -70,7 +70,7 @@ class CampaignCase(CaseInputs):
 
 
 def digest(value: Any) -> str:
-    """Compute the SHA-256 hash (hex) of a value's JSON text, in which objects without a JSON form are their `repr`."""
+    """Compute the SHA-256 hash (hex) of a value's JSON text, with the `repr` of objects that JSON does not have."""
     text = json.dumps(value, sort_keys=True, ensure_ascii=True, allow_nan=False, default=repr)
     return hashlib.sha256(text.encode()).hexdigest()
 
@@ -81,7 +81,7 @@ def profile_key(name: str) -> str:
     The hash does not depend on the path of the profile's file.
     """
     profile = load_profile(name)
-    # the name seeds the draws of machines; a profile with `seeds` shares the draws of that profile
+    # seeds of cases derive from the name; `seeds` replaces it in a renamed profile that must draw the same cases
     return digest(repr(replace(profile, name=profile.seeds or profile.name, place="")))
 
 
@@ -153,7 +153,7 @@ def interleave_cases(cases: Sequence[CampaignCase]) -> list[CampaignCase]:
     """
     groups = [(case.use, case.leak_lpm, case.law, case.fault) for case in cases]
     n_total, n_listed = Counter(groups), Counter[Any]()
-    positions = []  # of each case within its group, from 0 to 1
+    positions = []  # position of each case within its group, from 0 to 1
     for group in groups:
         positions.append((n_listed[group] + 0.5) / n_total[group])
         n_listed[group] += 1
@@ -164,7 +164,7 @@ def iter_sources() -> Iterator[Path]:
     """Yield the package's source files on which the result of a record may depend."""
     for path in sorted(_PACKAGE.rglob("*")):
         name = path.relative_to(_PACKAGE).as_posix()
-        is_left_out = any(f"{name}/".startswith(f"{part}/") for part in _NOT_IN_ROWS)
+        is_left_out = any(f"{name}/".startswith(f"{part}/") for part in _NOT_IN_ROWS)  # "/": whole names only
         if path.suffix in (".py", ".toml") and not is_left_out:
             yield path
 

@@ -38,7 +38,7 @@ def _iter_files(plan: RecordedPlan, folder: Path) -> Iterator[tuple[RecordingSet
     for recordings in plan.sets:
         files = iter_inner_files(folder, folder.glob(recordings.files))
         paths = sorted(files, key=lambda path: numeric_sort_key(path.name))
-        selected = paths[recordings.first - 1 : recordings.end - 1]
+        selected = paths[recordings.first - 1 : recordings.end - 1]  # `first` counts from 1, `end` is excluded
         if not selected:
             raise InputError(f"a set's files must be there, got none for {recordings.files!r} ({folder})")
         yield from ((recordings, path) for path in selected)
@@ -73,7 +73,7 @@ def _stroke_direction(recording: Recording) -> str:
     if not all(name in recording for name in CHAMBERS):
         return "both"
     dp = recording["p_A"] - recording["p_B"]
-    mean_over_rms = float(dp.mean() / max(np.sqrt(np.mean(dp**2)), np.finfo(float).tiny))
+    mean_over_rms = float(dp.mean() / max(np.sqrt(np.mean(dp**2)), np.finfo(float).tiny))  # tiny: no division by 0
     return "both" if abs(mean_over_rms) <= _MIN_ONE_SIDEDNESS else "out" if mean_over_rms > 0 else "in"
 
 

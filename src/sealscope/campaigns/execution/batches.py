@@ -86,7 +86,7 @@ def check_plan(plan: SimulatedPlan, cases: Sequence[CampaignCase]) -> None:
         fault = parse_plan_fault(group.fault, plan.onset_s) if group.fault else None
         if fault is not None and fault.row.is_sensor_fault:
             raise refusal(f"no fault of a sensor, got {group.fault!r}")
-    first_cases = {repr(case.levels): case for case in reversed(cases)}  # by combination of levels
+    first_cases = {repr(case.levels): case for case in reversed(cases)}  # first of equal levels
     for case in first_cases.values():
         try:
             experiment = experiment_with_flow_leak(plan, case)

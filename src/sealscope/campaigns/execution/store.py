@@ -89,6 +89,7 @@ def _plug_ins(plan: SimulatedPlan) -> dict[str, str]:
 
     A plan with `diagnose` runs all plug-ins.
     """
+    # all but the scorers, which are no plug-ins
     bases = {detector.base for name in plan.detectors if (detector := parse_detector_name(name)).scorer is None}
     return {
         name: plug_in.fingerprint
@@ -120,7 +121,7 @@ def read_plan_rows(plan: SimulatedPlan, folder: Path) -> dict[str, CaseRow]:
     of its case.
     """
     rows_by_id = read_rows(folder)
-    if rows_by_id:
+    if rows_by_id:  # rows from another mode or program code can still be read
         _check_same_inputs(folder, read_head(folder) or {}, collect_row_inputs(plan), ignored=("mode", "code"))
     detectors = set(plan.detectors)
     plan_rows: dict[str, CaseRow] = {}
@@ -181,9 +182,10 @@ def begin_campaign(folder: Path, row_inputs: Mapping[str, Any]) -> None:
 def _check_same_inputs(
     folder: Path, existing: Mapping[str, Any], row_inputs: Mapping[str, Any], ignored: Collection[str] = ()
 ) -> None:
-    """Check that the head in a campaign's folder has the same inputs as new rows; raise InputError otherwise.
+    """Check that the campaign stored in `folder` has the same inputs as new rows; raise InputError otherwise.
 
-    `existing`: entries of the head; `row_inputs`: inputs of the new rows; `ignored`: entries that may differ.
+    `existing`: entries of the campaign's head, the file that lists the inputs of its stored rows; `row_inputs`: inputs
+    of the new rows; `ignored`: names of the entries that may differ.
     """
     for key, name in _SHARED_ENTRIES.items():
         if key not in ignored and existing.get(key) != row_inputs[key]:

@@ -46,7 +46,7 @@ def iter_results(
         yield from ((item, task(item)) for item in items)
         return
     waiting = iter(items)
-    lost_items: list[Item] = []  # whose process died
+    lost_items: list[Item] = []  # items whose process died
     is_retry = False
     idle: list[Executor] = []
     busy: dict[Future[Result], tuple[Executor, Item]] = {}
@@ -87,7 +87,7 @@ def iter_results_in_order(
 
     The result is None if the process of the item died twice (`iter_results`).
     """
-    results: dict[int, Result | None] = {}  # by number of the item; not yielded yet
+    results: dict[int, Result | None] = {}  # results not yet yielded, by number of the item
     next_number = 0
     for (number, _), result in iter_results(partial(_run_numbered, task), enumerate(items), jobs):
         results[number] = result

@@ -111,7 +111,7 @@ class Alarms:
         """
 
         def cell_key(record: JudgedRow) -> tuple[float, str]:
-            """Return the size of a record's leak and its levels as text, since texts and numbers have no order."""
+            """Return the size of a record's leak, and its levels as text, since mixed types cannot be sorted."""
             return record.size, repr(tuple(record.row.levels.items()))
 
         for name, records in drop_other_faults(self.verdicts).items():
@@ -165,7 +165,7 @@ class Alarms:
             record.alarm and matches_cause(named_cause(statement), expected_cause(record.row.fault))
             for record, statement in statements
         ]
-        without_statement = [False] * (len(group) - len(statements))
+        without_statement = [False] * (len(group) - len(statements))  # these records name no cause
         return AlarmFractions(
             detector=detector,
             alarms=self._proportion(record.alarm for record in group),

@@ -73,8 +73,8 @@ def iter_rocs(verdicts: Verdicts, confidence: float) -> Iterator[SizeRoc]:
     """Yield ROC curves of each detector that has scores: for all leaks together, and for each planned mean flow.
 
     `verdicts`: by detector, its verdict on each record; `confidence`: confidence level of the curves' intervals. A
-    record without a score counts as if its score were the lowest. A curve is left out unless there are at least two
-    records with a leak and two without.
+    record without a score counts as if its score were lower than all others. A curve is left out unless there are at
+    least two records with a leak and two without.
     """
     for name, records in verdicts.items():
         scores = [record.row.score(name) if record.row.error is None else None for record in records]

@@ -95,6 +95,7 @@ def build_tables(
     """
     knowledge = {name: row.as_row() for name, row in (known or {}).items()}
     factors = list(dict.fromkeys(name for cell in judgement.cells for name in cell.levels))
+    # by table, the objects that fill its rows; a dictionary names several objects for one row
     rows: dict[str, Iterable[Any]] = {
         "table": (*judgement.table, *judgement.overall),
         "pod": ({"pod": pod, "at": entry} for pod in judgement.pods for entry in pod.sizes),

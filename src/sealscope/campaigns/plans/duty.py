@@ -92,6 +92,7 @@ def parse_plan_fault(text: str, onset_s: float) -> Fault:
     The fault starts at `onset_s` [s] unless the text states a time, as in "pump leak x3 from 20 s". Raises InputError
     if the text names no fault.
     """
+    # a time is stated as "from 20 s" or "growing from 20 s to 60 s"
     has_time = any(f" {word} " in f" {text} " for word in ("from", "growing"))
     fault = parse_fault(text if has_time else f"{text} from {onset_s:g} s")
     if fault is None:

@@ -170,8 +170,8 @@ class _JudgedPlan(_Plan):
     def _load_assumed(self, default: Rig | None) -> Rig | None:
         """Load the rig that detectors may assume, and replace its parameters by the values in the plan's `assume_set`.
 
-        The rig is `assume` of the plan, else `default`, else the packaged rig `thesis`. Returns None if there is
-        neither a plan's nor a default rig, and no value in `assume_set`.
+        The rig is the plan's `assume`, else `default`, else the packaged rig `thesis`. Returns None if `assume` and
+        `default` are None and there are no values to replace.
         """
         rig = default if self.assume is None else load_rig(self.assume)
         if not self.assume_set:
@@ -268,7 +268,7 @@ class RecordedPlan(_JudgedPlan):
 
     @cached_property
     def assumed(self) -> Rig | None:
-        """The rig that detectors may assume, or None if the plan states no rig."""
+        """The rig that detectors may assume, or None if the plan states neither a rig nor values to replace."""
         return self._load_assumed(default=None)
 
 

@@ -66,7 +66,7 @@ def read_plan(tree: Mapping[str, Any], place: str = "plan") -> AnyPlan:
     of the file, for messages; files that the plan names are relative to its folder.
     """
     plan = _parse_tables(tree, place)
-    default_view = {} if plan.channels is None else {"": plan.channels}  # of detectors without "@"
+    default_view = {} if plan.channels is None else {"": plan.channels}  # for detectors without "@"
     plan = replace(
         plan,
         title=plan.title or plan.name,
@@ -88,20 +88,22 @@ def read_plan(tree: Mapping[str, Any], place: str = "plan") -> AnyPlan:
 
 
 def _parse_tables(tree: Mapping[str, Any], place: str) -> AnyPlan:
-    """Build a plan from all tables of its file; its files and factors are not checked yet.
+    """Build a plan from the parsed tables `tree` of its file, without a check of its factors and of the files it names.
 
     The entries of [campaign] and of [recordings] become fields of the plan, and so does each other table as a whole.
-    Raises InputError, with the name of the entry and its table, if an entry is unknown or has a wrong value.
+    `place`: path of the file, for messages. Raises InputError, with the name of the entry and its table, if an entry is
+    unknown or has a wrong value.
     """
-    source = next((name for name in _KINDS if name in tree), "records")
+    source = next((name for name in _KINDS if name in tree), "records")  # name of the table that lists the records
     plan_class, tables, source_entries = _KINDS[source]
     for key in tree:
         if key not in tables:
             table_names = ", ".join(f"[{name}]" for name in tables)
             raise InputError(f"[{key}] is not known; a plan with [{source}] has {table_names} ({place})")
     entries = {**tree, "place": place}
-    full_names = {name: name for name in tables}  # by entry, its name in messages
-    for table in ("campaign", source) if source_entries else ("campaign",):  # [[records]] stays as it is
+    full_names = {name: name for name in tables}  # names in messages, by entry
+    merged_tables = ("campaign", source) if source_entries else ("campaign",)  # [[records]] stays as it is
+    for table in merged_tables:
         values = entries.pop(table, {})
         if not isinstance(values, Mapping):
             raise InputError(f"{table} must be a table, got {values!r} ({place})")

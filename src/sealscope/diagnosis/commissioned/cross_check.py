@@ -25,9 +25,9 @@ def cross_check(
 ) -> tuple[tuple[SummarisedRecording, ...], tuple[str, ...]]:
     """Diagnose each healthy recording against all others, and leave out those that seem to leak.
 
-    `judge(recording, reference)` diagnoses a recording against the healthy recordings `reference`. With `keep`, no
-    recording is left out. None is left out either if at least half of the recordings seem to leak, as there is no
-    healthy majority. Fewer than `MIN_RECORDINGS` recordings are not judged.
+    `judge(recording, reference)` diagnoses a recording against the healthy recordings `reference`. No recording is left
+    out with `keep`, or if at least half of the recordings seem to leak, as there is then no healthy majority. Fewer
+    than `MIN_RECORDINGS` recordings are not judged.
 
     Returns the remaining recordings, and for each recording left out a line with the reason. If a remaining recording
     shows a leak or another event, the event is added to the problems that this recording lists.

@@ -74,6 +74,7 @@ def table_type(extra: Literal["allow", "ignore"] = "ignore", **value_types: Any)
     dropped ("ignore").
     """
     config = ConfigDict(strict=True, allow_inf_nan=False, extra=extra)
+    # pydantic's `...` marks a value that must be present
     fields = {name: kind if isinstance(kind, tuple) else (kind, ...) for name, kind in value_types.items()}
     return create_model("Table", __config__=config, **fields)  # type: ignore[call-overload]
 
@@ -132,8 +133,9 @@ def _check_sums(summary: Any) -> Any:
     are the `terms` and, as the last one, the left side, which is a flow. `terms` must include the leak. The leak's
     column and the left side must have positive sums of squares, and their sum of products must obey Cauchy's
     inequality. The other arrays of the summary are checked, too: `shut_sums` (1, m + 2, m + 2) are the sums for a pump
-    that valves cut off at rest, which needs two more columns; `held` are the leaks while valves hold the load; and
-    `resistance` is what resists the motion (`scatter.Resistance`).
+    that valves cut off at rest, which needs two more columns; `held` are the leaks while valves hold the load;
+    `held_pump` are the pump's leakage just before these times and its standard deviation; and `resistance` is what
+    resists the motion (`scatter.Resistance`).
     """
     size = len(summary.terms) + 1
     if summary.sums.ndim != 3 or not len(summary.sums) or summary.sums.shape[1:] != (size, size):
@@ -150,12 +152,12 @@ def _check_sums(summary: Any) -> Any:
         if resistance.shape != (len(Resistance._fields),):
             raise ValueError(f"resistance must hold {len(Resistance._fields)} numbers, got {resistance.shape}")
         fit = Resistance(*resistance)
-        if min(fit.friction_error, fit.drop_error, fit.top_speed) < 1.0 / _MAX_NUMBER:  # they are divided by
+        if min(fit.friction_error, fit.drop_error, fit.top_speed) < 1.0 / _MAX_NUMBER:  # these are divisors
             raise ValueError("resistance must hold positive standard errors and a positive speed")
     if LEAK not in summary.terms:
         raise ValueError(f"terms must have {LEAK!r}, got {', '.join(summary.terms)}")
     leak = summary.terms.index(LEAK)
-    squares = summary.sums[:, [leak, -1], [leak, -1]]  # (E, 2): of the leak's column and of the left side
+    squares = summary.sums[:, [leak, -1], [leak, -1]]  # (E, 2): sums of squares of leak and left side
     product = summary.sums[:, leak, -1]
     if not (squares > 0.0).all() or not (product**2 <= _ROUNDING * squares.prod(axis=1)).all():
         raise ValueError("sums must be those of squares and products of a leak and a flow, got none such")
@@ -261,7 +263,7 @@ _ABOUT = {
 
 
 def _restore_arrays(value: Any, name: str) -> Any:
-    """Convert packed arrays in a parsed JSON value, at any depth, to numpy arrays.
+    """Convert packed arrays in a parsed JSON value, in tables at any depth, to numpy arrays.
 
     A packed array is a table with the keys "shape" and "f8", where "f8" holds the bytes. `name` is the name of the
     value. Raises ValueError with the name of an array that cannot be restored.
@@ -326,7 +328,8 @@ def _format_json(value: Any) -> bytes:
 def check_summary(method: str, summary: Summary) -> None:
     """Raise ArithmeticError unless a detector's summary can be stored and read back.
 
-    For example, infinite numbers cannot be stored. `method` is the name of the detector.
+    For example, infinite numbers cannot be stored. An ArithmeticError tells that the recording is the cause, and not a
+    defect of a built-in detector (`log_failure`). `method` is the name of the detector.
     """
     try:
         convert_type(_BY_METHOD, parse_json(_format_json({method: summary})))
@@ -345,7 +348,7 @@ def format_summary(recording: SummarisedRecording) -> Line:
     except (TypeError, ValueError) as error:
         raise InputError(f"the summary of {recording.file} must hold plain finite values, got: {error}") from None
     line = Line(sha256(data).hexdigest(), data)
-    parse_summary(line, recording.file, recording.file)
+    parse_summary(line, recording.file, recording.file)  # raises InputError if it is not valid
     return line
 
 
@@ -404,8 +407,8 @@ def read_lines(path: Path) -> list[Line]:
 
 def write_lines(lines: Collection[Line], path: Path) -> None:
     """Write a file of summaries as a whole; raise InputError if it would be too large or cannot be written."""
-    size = len(_HEAD) + sum(len(line.data) + _DIGITS + 2 for line in lines)  # with a blank and a line feed
-    max_line = max((len(line.data) + 2 * _DIGITS for line in lines), default=0)  # with a margin
+    size = len(_HEAD) + sum(len(line.data) + _DIGITS + 2 for line in lines)  # 2: a blank and a line feed
+    max_line = max((len(line.data) + 2 * _DIGITS for line in lines), default=0)  # longest line, with a margin
     if size > MAX_SIZE or len(lines) > _MAX_SUMMARIES or max_line > _MAX_LINE:
         limits = f"{_MAX_SUMMARIES} summaries of {_MAX_LINE} bytes and {MAX_SIZE} bytes in all"
         raise InputError(

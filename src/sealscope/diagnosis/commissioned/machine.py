@@ -204,6 +204,7 @@ class CommissionedMachine:
         summarised = summarise_healthy(recording, rig, file, checksum)
         if copy := next((earlier for earlier in self.healthy if earlier.digest == summarised.digest), None):
             raise InputError(f"a healthy recording must be new, got the samples of {copy.file} ({file})")
+        # sorted by date; recordings of unknown date come first
         healthy = sorted((*self.healthy, summarised), key=lambda entry: (entry.start_s or 0.0, entry.file))
         return replace(self, healthy=tuple(healthy))
 
@@ -302,8 +303,9 @@ def _is_own_output(file: Path) -> bool:
 def summarise_healthy(recording: Recording, rig: Rig, file: str, checksum: str = "") -> SummarisedRecording:
     """Compute the summaries of a healthy recording by all detectors that can use the recording.
 
-    `file` is the name of the recording and `checksum` the SHA-256 of its file. A detector that fails is left out, and
-    its error is logged. Raises InputError if the recording cannot be trusted, or if no detector can use it.
+    `rig` states the sizes of the machine that the detectors assume, `file` is the name of the recording and `checksum`
+    the SHA-256 of its file. A detector that fails is left out, and its error is logged. Raises InputError if the
+    recording cannot be trusted, or if no detector can use it.
     """
     with limit_threads():
         return _summarise(recording, rig, file, checksum)
@@ -312,8 +314,8 @@ def summarise_healthy(recording: Recording, rig: Rig, file: str, checksum: str =
 def _summarise(recording: Recording, rig: Rig, file: str, checksum: str) -> SummarisedRecording:
     """Compute the summaries of a healthy recording by all detectors, without a limit on the number of threads.
 
-    Arguments, result and errors are those of `summarise_healthy`: `file` is the name of the recording, and `checksum`
-    the SHA-256 of its file.
+    Arguments, result and errors are those of `summarise_healthy`: `rig` states the assumed sizes of the machine, `file`
+    is the name of the recording, and `checksum` the SHA-256 of its file.
     """
     from sealscope.diagnosis.commissioned.healthy_file import check_summary
     from sealscope.diagnosis.commissioned.summary import describe_recording
@@ -336,7 +338,7 @@ def _summarise(recording: Recording, rig: Rig, file: str, checksum: str) -> Summ
                 log_failure(name, distribution, error)
     if not summaries:
         raise InputError(f"a healthy recording must hold channels that a method reads, got none such ({file})")
-    if (levels := HealthyLevels().learn(part)) is not None:
+    if (levels := HealthyLevels().learn(part)) is not None:  # friction, drifts and spectra, beside the detectors
         summaries[HealthyLevels.name] = levels
     return SummarisedRecording(
         file,
@@ -412,8 +414,8 @@ def commission(
         map = {} if stated_rig is None else stated_rig.channel_map
     machine = CommissionedMachine(name, (), stated_rig, map, rate, limit)
     problems: list[str] = []
-    path_of: dict[str, Path] = {}  # by the labels of the recordings
-    recording_of: dict[str, Recording] = {}  # by label, as many recordings as fit into memory
+    path_of: dict[str, Path] = {}  # path of each recording, by its label
+    recording_of: dict[str, Recording] = {}  # recordings by label, as many as fit into memory
     n_samples = 0
     files = recordings_in(paths)
     for label, path in zip(_distinct_names(files), files, strict=True):
@@ -440,9 +442,9 @@ def commission(
 
 
 def _distinct_names(paths: Sequence[Path]) -> list[str]:
-    """Label recordings by the names of their files; equal names, by the paths within the folder common to all."""
+    """Label recordings by the names of their files, or by the paths within their common folder if names are equal."""
     counts = Counter(path.name for path in paths)
-    if len(counts) == len(paths):
+    if len(counts) == len(paths):  # no two names are equal
         return list(counts)
     folder = os.path.commonpath([path.absolute().parent for path in paths])
     return [path.name if counts[path.name] == 1 else path.absolute().relative_to(folder).as_posix() for path in paths]

@@ -223,7 +223,7 @@ def _write_files(machine: CommissionedMachine, target: Path) -> None:
     new text could not be read back.
     """
     data = _format_text(machine, target)
-    _convert_tree(parse_toml(data, "a machine's file", str(target)), str(target))
+    _convert_tree(parse_toml(data, "a machine's file", str(target)), str(target))  # raises InputError
     backup = target.with_suffix(".toml.bak")
     present_lines, named_checksums = dict[str, Line](), list[str]()
     for path in (target, backup):
@@ -287,12 +287,12 @@ def _hash_parts(tree: Mapping[str, Any]) -> dict[bytes, str]:
 
 
 def _find_change(origin: Origin, present: Mapping[bytes, str], written: Mapping[bytes, str]) -> str | None:
-    """Find a change of a machine's file since loading that writing would undo; None if there is none.
+    """Find a change of a machine's file by another process, which writing would undo; None if there is none.
 
     `origin` holds the hashes of the file's parts at loading, `present` those of the file now, and `written` those of
-    the file to be written; the last two map a hash to the description of a change (`_hash_parts`). A change is a
-    present part that is neither in `origin` nor in `written`, or a part in both `origin` and `written` that is no
-    longer present. Returns the description of the first change.
+    the file to be written; the last two map a hash to the description of a change (`_hash_parts`). A change is an
+    added part, which is present but neither in `origin` nor in `written`, or a removed part, which is in both of these
+    but no longer present. Returns the description of the first change.
     """
     changes = [text for part, text in present.items() if part not in origin.parts and part not in written]
     changes += [text for part, text in written.items() if part in origin.parts and part not in present]
@@ -300,7 +300,7 @@ def _find_change(origin: Origin, present: Mapping[bytes, str], written: Mapping[
 
 
 def _read_checked(path: Path) -> dict[str, Any]:
-    """Read the tables of a machine's file and check all but the rig's; raise InputError if a value is not valid."""
+    """Read the tables of a machine's file and check all but those of the rig; raise InputError if one is not valid."""
     tree = _read_tree(path, str(path))
     _convert_tree(tree, str(path))
     return tree
@@ -356,7 +356,7 @@ def _summaries_path(path: Path, tree: Mapping[str, Any]) -> Path:
 
 
 def _build_tree(machine: CommissionedMachine, path: Path) -> dict[str, Any]:
-    """Build the nested tables of a machine's file at `path`, from which the name of the file of summaries follows."""
+    """Build the nested tables of a machine's file at `path`, which also gives the name of the file of summaries."""
     from importlib.metadata import version
 
     machine_table = {

@@ -100,11 +100,11 @@ class MachineSummary:
         display_units = {name: _display_unit(healthy, name, unit) for name, unit in units.items()}
         starts = [recording.start_s for recording in healthy if recording.start_s is not None]
         dates = sorted(datetime.fromtimestamp(start, UTC).date().isoformat() for start in starts)
-        span = f", {' to '.join(dict.fromkeys((dates[0], dates[-1])))}" if dates else ""
+        span = f", {' to '.join(dict.fromkeys((dates[0], dates[-1])))}" if dates else ""  # equal dates once
         noise = []
         for name, value in self.noise.items():
             unit, display_unit = units.get(name, ""), display_units.get(name, "")
-            # a difference, as some units have a zero of their own
+            # difference to the converted 0, as some units, such as deg C, have another zero
             deviation = from_si(value, display_unit, unit) - from_si(0.0, display_unit, unit) if unit else value
             noise.append(f"{name} {deviation:.2g} {display_unit}")
         seconds = sum(recording.seconds for recording in healthy)
@@ -151,6 +151,7 @@ def _describe_rig(rig: Rig | None) -> str:
         return rig.title or rig.name
     parts = []
     if rig.states("cylinder.A_A", "cylinder.A_B"):
+        # equal areas are named once
         areas = dict.fromkeys(f"{1e6 * area:.4g}" for area in (rig.cylinder.A_A, rig.cylinder.A_B))
         parts.append(f"piston {' and '.join(areas)} mm^2")
     if rig.states("pump.q_b"):
@@ -189,7 +190,7 @@ def _format_duty(healthy: Sequence[SummarisedRecording], pressure_unit: str) -> 
     texts = []
     for unit, values in ranges.items():
         if values:
-            ends = dict.fromkeys(f"{end:.3g}" for end in (min(values), max(values)))
+            ends = dict.fromkeys(f"{end:.3g}" for end in (min(values), max(values)))  # equal ends once
             texts.append(f"{' to '.join(ends)} {unit}")
     return ", ".join(texts)
 
@@ -255,6 +256,7 @@ def summarise_machine(
     channels = frozenset(with_balance[0].units if with_balance else ())
     if not (summaries and equations(rig, channels)):
         return MachineSummary(terms={}, noise=noise, smallest=None, problems=problems)
+    # [0]: Gram matrix of the first balance, as a rig with a servo valve has several
     terms = _estimate_terms([np.asarray(summary["sums"], dtype=float)[0] for summary in summaries], rig, channels)
     smallest = _smallest_leak(VolumeBalance(rig), summaries, channels) if len(summaries) > 1 else None
     return MachineSummary(terms, noise, smallest, problems)
@@ -310,7 +312,7 @@ def _smallest_leak(balance: VolumeBalance, summaries: Sequence[Summary], channel
         """Estimate the smallest detectable rise of the conductance [m^3/(s Pa)], after more days of healthy recordings.
 
         `n_repeats`: multiple of the present number of healthy days. The rise is detected with the probability `power`
-        of `priors.toml`.
+        of `priors.toml`. It is the test's threshold plus the normal quantile of `power`, in standard deviations.
         """
         rise = balance.predict_rise(summaries, channels, n_repeats)
         return float((rise.threshold(FALSE_ALARM_PROBABILITY) + ndtri(_PRIORS.power)) * rise.deviation)
@@ -380,7 +382,8 @@ def _describe_glitches(part: Recording, name: str) -> str:
     values = part[name]
     if len(values) < 3:
         return ""
-    medians = np.median([values[:-2], values[1:-1], values[2:]], axis=0)  # of each sample and its two neighbours
+    # median of each sample and its two neighbours; the first and the last sample have only one
+    medians = np.median([values[:-2], values[1:-1], values[2:]], axis=0)
     high, low = np.quantile(values, (0.99, 0.01))
     value_range = float(high - low)
     if not (value_range > 0.0 and np.any(np.abs(values[1:-1] - medians) > value_range)):

@@ -120,6 +120,7 @@ def _healthy_level(healthy: tuple[SummarisedRecording, ...], rig: Rig) -> Health
         return None
     # the highest level may be due to the warmest oil, which limits how far the lowest one is below it
     low = max(min(levels), max(levels) / INFERENCE.oil.warmest)
+    # the machine is known to be healthy until the start of the last recording
     known_s = max((recording.start_s for recording in healthy if recording.start_s is not None), default=0.0)
     mean, deviation = float(np.mean(levels)), float(np.std(levels, ddof=1))
     return HealthyLevel(mean, low, high=max(levels), deviation=deviation, known_s=known_s, count=len(levels))
@@ -136,12 +137,12 @@ def _leak_conductance(recording: SummarisedRecording, rig: Rig) -> float | None:
     if summary is None or len(balances) != 1:
         return None
     roles = ColumnRoles(balances[0])
-    gram = np.asarray(summary["sums"], dtype=float)[0]
+    gram = np.asarray(summary["sums"], dtype=float)[0]  # Gram matrix of the only balance
     n_columns = roles.left + 1  # the left side is the last column
     if gram.shape != (n_columns, n_columns):
         return None
     # without a column for the pump's leakage, which lies in parallel, the leak's column stands for both
     nuisance = [k for k in roles.nuisance if k != roles.leak and roles.names[k] != PUMP]
     *_, leak_coefficient = fit_columns(gram, roles, [*nuisance, roles.leak])
-    conductance = float(leak_coefficient * float(summary["scale"]))
+    conductance = float(leak_coefficient * float(summary["scale"]))  # `scale`: true over computed flow
     return conductance if np.isfinite(conductance) else None

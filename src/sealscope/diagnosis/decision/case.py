@@ -163,7 +163,7 @@ class Case:
         leak = self.leak
         if leak is None or leak.step_rise is None or leak.rise_onset is not None:
             return True
-        rise, step_log_ratio = leak.step_rise  # log likelihood ratio of a rise by this step to no rise
+        rise, step_log_ratio = leak.step_rise  # log likelihood ratio: the step caused the rise, against no rise
         within_factor = sum(log_bayes_factor(test.chance) for test in self.tests if test.name == WITHIN)  # 0 or 1 test
         return within_factor + step_log_ratio > log_bayes_factor(rise.chance)
 
@@ -200,11 +200,12 @@ class Case:
     def _probability_of_causes(self, causes: Sequence[str], data_kind: str) -> float | None:
         """Compute the probability that one of the causes changed a kind of data, against other causes and chance.
 
-        The result is None, and the causes must not be named, unless three limits of `priors.toml` are exceeded:
+        The result is None, as the causes must not be named, unless three limits (`[explanation]` of `priors.toml`) are
+        exceeded:
 
-        - `explanation.happened` by the probability against other causes and chance,
-        - `explanation.named` by the probability against other causes alone,
-        - 1 - `explanation.sure` by the latter probability of each single cause.
+        - the probability against other causes and chance must be above `happened`,
+        - the probability against other causes alone must be above `named`,
+        - for each cause alone, the probability against other causes must be above 1 - `sure`.
         """
         limits = DECISION.explanation
         by_cause = [probability_of(self.explanations, causes=[cause], data_kind=data_kind) for cause in causes]
@@ -219,6 +220,7 @@ class Case:
         events = [event for event in load_events() if event.cause == cause and any(map(event.affects, tests))]
 
         def probability(event: Event) -> float:
+            """Return the probability that the event changed this kind of data."""
             return probability_of(self.explanations, event.name, data_kind=data_kind)
 
         return max(events, key=probability).description
@@ -232,7 +234,7 @@ def _leak_tests(case: Case, leak: LeakMeasure) -> tuple[LeakTest, ...]:
     - LEVEL: without healthy recordings, a level above the limit in the rig's file.
 
     Two tests share the allowed false-alarm probability. The fraction `questions.within` of `priors.toml` goes to WITHIN
-    if the other test is AGAINST, and to LEVEL if that is the other test.
+    if the other test is AGAINST, and to LEVEL if that is the other test. The rest goes to the other test of the two.
     """
     from scipy.special import ndtr, ndtri  # standard normal distribution and its inverse
 
@@ -245,6 +247,7 @@ def _leak_tests(case: Case, leak: LeakMeasure) -> tuple[LeakTest, ...]:
         probability = reserved if rise is not None else allowed - reserved
         key = step_key(leak.provider)
         chance = case.null.calibrate(key, step.chance)
+        # the p-value before calibration, which the calibration converts to `probability`
         threshold = step.threshold(case.null.uncalibrated_chance(key, probability))
         tests.append(LeakTest(WITHIN, step.score, threshold, chance=chance, probability=probability))
     if rise is not None:
@@ -252,7 +255,7 @@ def _leak_tests(case: Case, leak: LeakMeasure) -> tuple[LeakTest, ...]:
         threshold = rise.threshold(probability)
         tests.append(LeakTest(AGAINST, rise.score, threshold, chance=rise.chance, probability=probability))
     if excess is not None:  # in standard deviations, i.e. standard normal without a leak
-        probability = reserved or allowed
+        probability = reserved or allowed  # all of it if this is the only test
         threshold, chance = float(-ndtri(probability)), float(ndtr(-excess))
         tests.append(LeakTest(LEVEL, excess, threshold, chance=chance, probability=probability))
     return tuple(tests)
@@ -269,8 +272,8 @@ def step_key(provider: str) -> str:
 def _change_tests(case: Case) -> tuple[LeakTest, ...]:
     """Make the test for a leak from the report of a detector that does not measure leakage.
 
-    Of the detector's test results (observables) that a leak changes, the one with the smallest p-value gives the score,
-    and its calibrated p-value (`HealthyNull.chance`). The result is empty if a leak changes none of them.
+    Of the detector's test results (observables) that a leak changes, the one with the smallest p-value gives the score
+    and the calibrated p-value (`HealthyNull.chance`). The result is empty if a leak changes none of them.
 
     As the detector states no threshold, it is estimated: the score for which the calibrated p-value equals the allowed
     false-alarm probability, if scores are proportional to the logarithm of the p-value that the detector states.

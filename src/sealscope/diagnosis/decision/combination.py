@@ -93,4 +93,5 @@ def _explain_undecided(ranked: Sequence[Evidence], usable: Sequence[Evidence]) -
     else:
         built_in = [decision for decision in ranked if decision.detector in (*ORDER, RMS_CHANGE)] or list(ranked)
         undecided = Evidence(CANNOT_TELL, built_in[-1].reason if built_in else "there is no detector")
+    # the combined evidence belongs to no single detector
     return replace(undecided, detector="", parts=tuple(ranked), usable=True)

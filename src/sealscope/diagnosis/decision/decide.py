@@ -98,7 +98,7 @@ def _evidence_without_leak(case: Case) -> Evidence:
     leakage is measured, the evidence states this bound. If another event than a leak explains a rare change, the
     evidence states the cause of this event.
     """
-    alarm = next(iter(case.alarms), None)
+    alarm = next(iter(case.alarms), None)  # an alarm that has a better explanation than a leak
     leak, other = case.leak, case.other_event
     bound = _leak_bound(case, alarm)
     judged_bound, max_bound = _bound_and_limit(case, bound)
@@ -168,6 +168,7 @@ def _size_fields(leak: LeakMeasure, flow: Flow | None) -> dict[str, Any]:
     fields: dict[str, Any] = {"relative": leak.relative(flow)}
     if leak.lpm_per_flow is None:
         return {**fields, "refuses": frozenset({"leak_lpm"})}
+    # errors of the estimate, and of the displacement or piston area that scales all flows
     half_width = WITHIN_95 * float(np.hypot(flow.deviation, flow.value * leak.size_deviation))
     min_factor, max_factor = leak.flow_factors
     low, high = min_factor * max(flow.value - half_width, 0.0), max_factor * (flow.value + half_width)
@@ -179,14 +180,14 @@ def _leak_bound(case: Case, alarm: LeakTest | None) -> float:
     """Compute the 95 % upper bound of a leak's mean flow [m^3/s].
 
     `alarm`: the first test that raised an alarm, None if no test did. If a leak may have caused the alarm, the bound is
-    at least the upper end of this leak's 95 % interval. The bound is infinite if the leakage was not measured. It is
-    also infinite if the pump's mean flow is above 0, and the bound would be as large.
+    at least the upper end of this leak's 95 % interval. The result is infinite if the leakage was not measured, or if
+    the bound is not below the pump's mean flow, provided that the pump moves.
     """
     leak = case.leak
     if leak is None:
         return np.inf
     bound = leak.bound_flow
-    mean_pump_flow, _ = leak.pump_flow  # over the whole recording
+    mean_pump_flow, _ = leak.pump_flow  # mean over the whole recording
     if alarm is not None and case.leak_probability(alarm) > 1.0 - DECISION.explanation.sure:
         flow = leak.step_flow if alarm.name == WITHIN else leak.rise_flow
         if flow is not None:

@@ -31,7 +31,7 @@ class Event:
 
     @property
     def is_sized(self) -> bool:
-        """True if the event has a prior on the sizes of its changes, by which unusually large or small ones count less.
+        """True if the event has a prior on the sizes of its changes, by which changes of unusual size count less.
 
         Events with a cause, which a verdict may name, have such a prior. It is part of `Observable.advantage`.
         """

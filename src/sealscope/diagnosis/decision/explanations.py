@@ -96,7 +96,7 @@ def explain(
     events = load_events()
     log_factors = [(observable, _log_factor(observable, chance(observable), rise)) for observable in observables]
     factors = _compare_by_likelihood(_correct_for_misfit(log_factors))
-    gains_of = {event.name: _possible_gains(event, factors, rise) for event in events}
+    gains_of = {event.name: _possible_gains(event, factors, rise) for event in events}  # log Bayes factors
     supported = [
         event for event in events if max(sum(gains.values()) for gains in gains_of[event.name]) > MIN_LOG_FACTOR
     ]
@@ -107,7 +107,8 @@ def explain(
     weights = np.exp(logarithms - logarithms.max())
     weights /= weights.sum()
     order = np.argsort(-weights, kind="stable")
-    odds = np.exp(np.minimum(logarithms, MAX_LOG_ODDS))  # no event has the prior 1 and explains no change
+    # odds against the empty set of events, whose logarithm is 0: its prior is 1, and it explains no change
+    odds = np.exp(np.minimum(logarithms, MAX_LOG_ODDS))
     return tuple(Explanation(groups[k], float(weights[k]), posteriors[k].data, float(odds[k])) for k in order)
 
 
@@ -212,7 +213,8 @@ def _gains_at_onset(event: Event, factors: Sequence[tuple[Observable, float]]) -
     - Side effects of the event on further data count only if an affected observable supports the event. Their factors
       are limited to the largest factor of an affected observable: a much clearer side effect has another cause.
 
-    For each kind of data the largest factor is returned, with the log odds of the prior on the size of the change.
+    Each factor is increased by the log odds by the prior on the size of the change. For each kind of data the largest
+    sum is returned, at least 0.
     """
     affected = [(observable, gain) for observable, gain in factors if event.affects(observable)]
     if not affected:
@@ -238,11 +240,11 @@ def _log_factor(observable: Observable, chance: float, rise: LeakRise | None) ->
     """Compute the log Bayes factor of the hypothesis that an observable has changed, against no change.
 
     `chance`: probability that a healthy recording has at least the observable's score; `rise`: leakage above that of
-    healthy recordings. If the leakage rises, an alternative description of the same change, such as an external leak,
-    seems to rise as well. An observable that is an alternative states its log likelihood ratio to the leak
-    (`log_ratio_to_leak`), and its log factor is at most
+    healthy recordings. If the leakage rises, a quantity that describes the same change, such as an external leakage,
+    seems to rise as well. The observable of such a quantity states the log likelihood ratio of its description of the
+    change to that by a leak (`log_ratio_to_leak`), and its log factor is at most
 
-        log factor of the rise + log likelihood ratio of the alternative to the leak.
+        log factor of the rise + this log likelihood ratio.
     """
     factor = log_bayes_factor(chance)
     if observable.log_ratio_to_leak is None or rise is None:
@@ -254,8 +256,8 @@ def _log_factor(observable: Observable, chance: float, rise: LeakRise | None) ->
 def log_bayes_factor(chance: float) -> float:
     """Compute the largest log Bayes factor for a change that a p-value `chance` = c allows.
 
-    c is the probability of such a score without a change. The result is -log(-e c log c) for c < 1/e, else 0 (T.
-    Sellke et al., 2001).
+    c is the probability of at least the observed score without a change. The result is -log(-e c log c) for c < 1/e,
+    else 0 (T. Sellke et al., 2001).
     """
     if chance >= np.exp(-1.0):
         return 0.0

@@ -45,7 +45,8 @@ class HealthyNull:
         """Compute the probability that a healthy recording has at least the score of an observable.
 
         It is the p-value that the detector states for the observable, corrected by the p-values that it states for
-        healthy recordings of the machine (`calibrate`).
+        healthy recordings of the machine (`calibrate`). `inflations` are possible mean surprisals of healthy
+        recordings, and `weights` the probabilities of these means.
         """
         weights, inflations = self._inflation(null_key(observable))
         return min(float(weights @ np.exp(-observable.surprisal / inflations)), 1.0)
@@ -53,8 +54,8 @@ class HealthyNull:
     def calibrate(self, key: str, chance: float) -> float:
         """Correct the p-value `chance` that a detector states for a test, by those it stated for healthy recordings.
 
-        The corrected p-value is the sum over k of w_k chance^(1/lambda_k). lambda_k are possible mean surprisals of
-        healthy recordings, and w_k their posterior weights, given the `surprisals` under the `key` of the test.
+        The corrected p-value is the sum over k of w_k chance^(1/lambda_k). lambda_k (`inflations`) are possible mean
+        surprisals of healthy recordings, and w_k their posterior weights, given the `surprisals` by the test's `key`.
         """
         weights, inflations = self._inflation(key)
         log_chance = np.log(max(chance, np.finfo(float).tiny))
@@ -87,7 +88,8 @@ def _inflation_posterior(surprisals: Sequence[float]) -> tuple[Array, Array]:
     """Compute posterior weights and values of lambda, the mean of exponentially distributed surprisals -log(p-value).
 
     Both arrays have the shape (NODES + 1,); the first value is 1, for a detector that states its p-values correctly.
-    The likelihood of n surprisals is lambda^-n exp(-their sum / lambda). Without surprisals both arrays are [1].
+    The prior of the other values is exponential in log lambda. The likelihood of n surprisals is
+    lambda^-n exp(-their sum / lambda). Without surprisals both arrays are [1].
     """
     priors = DECISION.null
     if not len(surprisals):

@@ -32,7 +32,7 @@ _MIN_RINGING_RATE: float = RMS_PRIORS.rate.ringing
 
 @cache
 def _texts() -> Mapping[str, Mapping[str, str]]:
-    """Read `texts.toml` once: its tables by name, each a mapping from key to text."""
+    """Read the tables of `texts.toml` by name, each a mapping from key to text; the result is cached."""
     return tomllib.loads((files("sealscope.diagnosis.decision") / "texts.toml").read_text("utf-8"))
 
 
@@ -127,7 +127,7 @@ def _ringing_text(evidence: Evidence, ringing: Ringing | None, provider: str) ->
     to healthy recordings or, without these, to the start of the same recording.
 
     - Verdict `cannot tell`: the text says that a fall by this limit would not show; otherwise, that no fall is larger.
-    - Too low a sampling rate: the text also says so or, if there are unassigned columns, names these instead.
+    - Too low a sampling rate: the text also says so or, if the recording has unused columns, names these instead.
     - Ringing not measured (None): the text says that the detector called `provider` sees no change.
     """
     if ringing is None:

@@ -82,7 +82,8 @@ def make_observable(
     onset : tuple of float, optional
         Time of the change with its 95 % interval [s]: (value, low, high).
     """
-    score = -2.0 * float(np.log(max(chance, np.finfo(float).tiny)))  # finite for a chance of 0
+    # 2: as scores are twice a log likelihood ratio; tiny: so that a chance of 0 has a finite score
+    score = -2.0 * float(np.log(max(chance, np.finfo(float).tiny)))
     interval = None if onset is None else Interval(*onset)
     return Observable(name=name, data=PLUG_IN, score=score, chance=float(chance), onset=interval, size=float(size))
 

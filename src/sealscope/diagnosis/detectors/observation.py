@@ -148,7 +148,7 @@ def _compute_surprisals(recording: Recording, rig: Rig) -> Mapping[str, float]:
     """
     surprisals = _max_surprisals(observe_signals(recording))
     balance = VolumeBalance(rig)
-    reports: Mapping[bool, Observed] = {}  # by whether the pump is cut off at rest
+    reports: Mapping[bool, Observed] = {}  # reports by whether the pump is cut off at rest
     if unusable_reason(balance, recording) is None:
         try:
             with np.errstate(all="ignore"):
@@ -164,7 +164,7 @@ def _compute_surprisals(recording: Recording, rig: Rig) -> Mapping[str, float]:
 
 
 def _max_surprisals(report: Observed) -> dict[str, float]:
-    """Collect the largest surprisal of each observable in a report that is tested for a change within the recording.
+    """Collect from a report the largest surprisal of each observable that is tested for a change within the recording.
 
     A surprisal is -log of the p-value that the detector states. Returns surprisals by key (`null.null_key`). The test
     for a step of the leak is included, with the key `case.step_key`.

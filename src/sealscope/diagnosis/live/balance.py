@@ -66,7 +66,7 @@ class BlockConductance(NamedTuple):
         Conductance of pump and piston together, and its standard error [m^3/(s Pa)]. Values of `g` can be compared
         between blocks, as they do not shift when later blocks improve the other coefficients of the volume balance.
     total : float
-        Conductance by the latest estimates of the other coefficients [m^3/(s Pa)].
+        Conductance with the latest estimates of the other coefficients [m^3/(s Pa)].
     offset : float
         Standard error of the conductance that is common to all blocks, due to the other coefficients and to the
         machine's sizes [m^3/(s Pa)].
@@ -134,9 +134,9 @@ BlockResult = Sequence[BlockConductance] | NotJudged
 def _fit_to_blocks(model: Coefficients, grams: Any, column_order: Any, rows: Any) -> None:
     """Fit the coefficients of a volume balance to K blocks together and store them in `model`.
 
-    `grams` (K, m, m) are the products of the balance's columns in each block, and `rows` (K,) the number of equations
-    in each block. `column_order` (n + 2,) holds the indices of these columns: n nuisances (terms other than the
-    leak), the leak, and the left side, which is the measured volume.
+    `grams` (K, m, m) are the products of all m columns of the balance in each block, and `rows` (K,) the number of
+    equations in each block. `column_order` (n + 2,) holds the indices of the columns to use: n nuisances (terms other
+    than the leak), the leak, and the left side, which is the measured volume.
     """
     for k in range(len(grams)):
         load_block(model, grams[k], column_order)
@@ -150,10 +150,10 @@ def _estimate_leak(
 ) -> tuple[float, float, float, float]:
     """Estimate the leak's coefficient in one block of a volume balance.
 
-    `gram` (m, m) are the products of the balance's columns, summed over the `n_equations` equations of the block.
-    `column_order` (n + 2,) holds the indices of these columns: n nuisances (terms other than the leak), the leak, and
-    the left side. With `updates_model`, the block is also added to the sums in `model`, from which the nuisances'
-    coefficients are computed. Returns (w, w g, w s, w^2 V) with
+    `gram` (m, m) are the products of all m columns of the balance, summed over the `n_equations` equations of the
+    block. `column_order` (n + 2,) holds the indices of the columns to use: n nuisances (terms other than the leak), the
+    leak, and the left side. With `updates_model`, the block is also added to the sums in `model`, from which the
+    nuisances' coefficients are computed. Returns (w, w g, w s, w^2 V) with
 
     - g: the estimate;
     - w: its precision;
@@ -196,8 +196,8 @@ class LiveBalance:
         self.cause: Cause = "piston or pump leak" if rig.circuit.pump_feeds_chambers else "piston leak"
         self.litres = self.states_flow(rig) if litres is None else litres
         self._roles = tuple(map(ColumnRoles, self._balances))
-        self._n_columns = self._roles[0].left + 1
-        nuisances = [[k for k in roles.nuisance if k != roles.leak] for roles in self._roles]
+        self._n_columns = self._roles[0].left + 1  # the left side is the last column
+        nuisances = [[k for k in roles.nuisance if k != roles.leak] for roles in self._roles]  # not the leak
         self._column_orders = [
             np.array([*nuisance, roles.leak, roles.left])
             for nuisance, roles in zip(nuisances, self._roles, strict=True)
@@ -205,7 +205,7 @@ class LiveBalance:
         self._models = [
             Coefficients(*(np.zeros(shape) for shape in coefficient_shapes(len(nuisance)))) for nuisance in nuisances
         ]
-        self._precision = 0.0  # of a usual block's conductance; 0 before the coefficients are learned
+        self._precision = 0.0  # precision of a usual block's conductance; 0 before the coefficients are learned
         self._moving = 0  # number of successive blocks that move far more than the usual ones
         self._stored: Blocks | None = None  # the last blocks, packed
         self._waiting = 0  # number of stored blocks that await the first fit of the coefficients
@@ -216,7 +216,7 @@ class LiveBalance:
 
     @staticmethod
     def states_flow(rig: Rig) -> bool:
-        """Test whether a rig states the piston areas or the pump displacement that L/min need."""
+        """Test whether a rig states the sizes (piston areas or pump displacement) from which L/min are computed."""
         return rig.states(*rig.circuit.size_parameters)
 
     def take(self, run: SampleRun) -> Iterator[BlockResult]:
@@ -243,7 +243,7 @@ class LiveBalance:
     def _make_stream(self) -> BlockStream:
         """Build the object that divides samples at the present sampling rate into blocks.
 
-        It also stores the samples of each complete block, of which `_take_blocks` computes further features.
+        This object also stores the samples of each complete block, from which `_take_blocks` computes features.
         """
 
         def store_samples(begin: float, samples: Mapping[str, Array]) -> None:
@@ -252,7 +252,7 @@ class LiveBalance:
         return BlockStream(self._balances, self._rate, BLOCK_SECONDS, on_samples=store_samples)
 
     def _take_blocks(self, blocks: Blocks | None) -> Iterator[BlockResult]:
-        """Process complete blocks of samples, and yield the result of each: conductances, or why there are none.
+        """Process complete blocks of samples, and yield the result of each: conductances, or a `NotJudged`.
 
         `blocks` hold the sums of the volume balance, None if no block is complete. The samples of the same blocks have
         been stored (`_closed_samples`); their features are added to `_signals`.
@@ -301,8 +301,8 @@ class LiveBalance:
         The median precision of the conductances becomes the usual precision. Blocks at standstill are left out of the
         result.
         """
-        for e, (model, column_order) in enumerate(zip(self._models, self._column_orders, strict=True)):
-            grams = np.ascontiguousarray(blocks.gram[:, e])  # of balance e in each block
+        for number, (model, column_order) in enumerate(zip(self._models, self._column_orders, strict=True)):
+            grams = np.ascontiguousarray(blocks.gram[:, number])  # products of one balance in each block
             _fit_to_blocks(model, grams, column_order, blocks.rows)
         solutions = [self._solve_block(block, updates_model=False) for block in _split(blocks)]
         self._precision = float(np.median([precision for precision, *_ in solutions]))
@@ -311,7 +311,10 @@ class LiveBalance:
 
     @property
     def _half_stride(self) -> float:
-        """Time [s] by which a block's samples extend beyond its first and last equation: half the equations' step."""
+        """Time [s] by which the samples of a block begin before its first equation, and end after its last one.
+
+        It is half the time between successive equations.
+        """
         return 0.5 * stride_samples(self._rate) / self._rate
 
     def _sample_times(self, block: Blocks) -> tuple[float, float]:
@@ -326,9 +329,9 @@ class LiveBalance:
     def _solve_block(self, block: Blocks, updates_model: bool = True) -> tuple[float, ...]:
         """Estimate the leak in a block from all volume balances of the machine together.
 
-        Returns (w, w g, w s, w^2 V), each summed over the balances: `_estimate_leak` gives the estimate g by one
-        balance, its precision w, shift s and variance V. With `updates_model`, the block also updates the other
-        coefficients of the balances.
+        For each balance, `_estimate_leak` gives the estimate g with its precision w, a shift s and a variance V. The
+        result is the sums of w, w g, w s and w^2 V over the balances. With `updates_model`, the block also updates the
+        other coefficients of the balances.
         """
         n_equations = float(block.rows[0])
         results = [
@@ -340,7 +343,7 @@ class LiveBalance:
     def _estimate_block(self, block: Blocks, updates_model: bool = True) -> BlockConductance | NotJudged:
         """Estimate the leakage conductance in a block from the volume balance.
 
-        - `total` is the conductance by the latest estimates of the balance's other coefficients.
+        - `total` is the conductance with the latest estimates of the balance's other coefficients.
         - `g` is `total` minus a shift, which keeps the series of `g` continuous while these estimates improve.
         - `sd` is the part of the standard error that is due to this block alone, and `offset` the part that is common
           to all blocks.
@@ -356,6 +359,7 @@ class LiveBalance:
         if not precision > min_precision:
             return NotJudged.with_count(end, "at standstill")
         total = weighted_total / precision
+        # errors of the other coefficients, and of the machine's sizes
         offset = math.hypot(math.sqrt(weighted_variance) / precision, self.size_error * total)
         g, sd = total - weighted_shift / precision, precision**-0.5
         pressure, pump_flow = float(block.mean_pressure()[0]), float(block.flow[0])
@@ -389,7 +393,7 @@ class LiveBalance:
         if len(blocks) < MIN_BLOCKS:
             return ()
         centred = remove_pressure_offset(blocks, self._roles)
-        volumes = volume_observables(centred, blocks, self._balances, self._roles, oil_loss={})
+        volumes = volume_observables(centred, blocks, self._balances, self._roles, oil_loss={})  # oil: not tested
         # the samples of a block begin less than a block before the time range of its equations
         return (*volumes, *self._signals.observables(since - BLOCK_SECONDS))
 
@@ -437,7 +441,7 @@ def _volume_square(block: Blocks) -> float:
 
 
 def size_error(rig: Rig) -> float:
-    """Return the relative standard error of all flows, due to the size by which the flow is computed.
+    """Return the relative standard error of all flows, due to the error of the size from which they are computed.
 
     This size is the pump's displacement or, behind a servo valve, the piston area.
     """
@@ -455,7 +459,7 @@ def live_equations(rig: Rig, names: Sequence[str], with_tested_terms: bool = Fal
     for balance in equations(rig, frozenset(names)):
         if balance.by_command:
             continue
-        # fitted terms (`Term.nuisance`) are unknown in any machine; the leak past the piston is one of them
+        # fitted terms (`Term.nuisance`) have unknown coefficients in any machine, as the leak past the piston has
         terms = [term for term in balance.terms if (term.nuisance or with_tested_terms) and term.name != PUMP]
         balances.append(balance._replace(terms=tuple(terms)))
     return balances

@@ -73,7 +73,7 @@ class Coefficients(NamedTuple):
 
 
 def coefficient_shapes(n: int) -> tuple[tuple[int, ...], ...]:
-    """Return the shapes of the six arrays of a `Coefficients` in their order, for n nuisances."""
+    """Return the shapes of the arrays of a `Coefficients` with n nuisances: sums, values, ..., block, matrix."""
     return (n + 2, n + 2), (n,), (n,), (6,), (n + 2, n + 2), (n, n + 3)
 
 
@@ -95,7 +95,7 @@ def add_block(model: Any, rows: float, weight: float, has_stepped: bool) -> None
     """Add the products in `model.block` to the sums over earlier blocks, which lose weight exponentially.
 
     `model` is a `Coefficients`, `rows` the number of equations in the block, and `weight` the weight of the block, 0 to
-    1. The leak's coefficient is assumed to take a random step before each block, so that its earlier value is
+    1. The leak's coefficient is assumed to take a random step before each block, and its value before this step is
     eliminated. The variance of this step is that of the block's estimate of the leak or, if `has_stepped`, infinite.
     With the sums S, their column S_l and diagonal element S_ll of the leak, and the block's products B,
 
@@ -133,7 +133,7 @@ def _solve(model: Any) -> None:
     """
     sums, n = model.sums, len(model.matrix)
     leak, left_side = n, n + 1  # indices of these columns, after those of the n unknowns
-    leak_energy = max(sums[leak, leak], TINY)
+    leak_energy = max(sums[leak, leak], TINY)  # never 0, as it divides
     for i in range(n):
         model.matrix[i, n] = sums[i, left_side] - sums[i, leak] * sums[leak, left_side] / leak_energy
         for j in range(n):
@@ -150,6 +150,8 @@ def _sum_residual_squares(sums: Any, solution: Any) -> float:
     nuisances.
     """
     n, square, leak_moment = len(solution), 0.0, 0.0
+    # with the left side y, the columns X of the nuisances c and the column l of the leak, the sum is
+    # y'(y - X c) - c'X'(y - X c) - (l'(y - X c))^2 / l'l
     for i in range(n + 2):
         residual = sums[i, n + 1]  # product of column i with the left side less the nuisances
         for j in range(n):
@@ -168,16 +170,16 @@ def fit_coefficients(model: Any) -> None:
     """Compute a volume balance's coefficients other than the leak's, and the variance of its equations.
 
     The coefficients are the least-squares estimate from the sums over blocks in `model`, a `Coefficients`. The variance
-    is the residual sum of squares over the number of equations. Both are stored in `model`.
+    is the residual sum of squares divided by the number of equations. Both are stored in `model`.
     """
     n = len(model.matrix)
     solution = model.matrix[:, n:]
-    solution[:] = 0.0
+    solution[:] = 0.0  # only column 0, the estimate, is needed
     _solve(model)
     for i in range(n):
         model.values[i] = solution[i, 0]
     square = _sum_residual_squares(model.sums, solution)
-    rounding = 1e-14 * model.sums[n + 1, n + 1]  # a residual of exact data is no smaller
+    rounding = 1e-14 * model.sums[n + 1, n + 1]  # a smaller residual is due to rounding
     model.numbers[NOISE] = max(square, rounding, TINY) / model.numbers[ROWS]
 
 
@@ -186,10 +188,11 @@ def _learn_block(model: Any, rows: float, g: float) -> float:
     """Add the products in `model.block` to the sums over blocks, update the usual noise, and return the block's weight.
 
     `model` is a `Coefficients`, `rows` the number of equations in the block, and `g` the leak's coefficient in this
-    block. The usual noise is the variance of an equation's residual, averaged over earlier blocks with fading memory.
-    The residual variance of this block over the usual noise is stored as `MISFIT`. The weight of the block is 1, or
-    `JUMP`^2 / MISFIT if this is less. If g differs from its earlier estimate by more than `JUMP` standard deviations,
-    the leak has stepped, and earlier blocks do not constrain it any more.
+    block. Column n of `model.matrix` holds the n coefficients other than the leak's (`_solve`). The usual noise is the
+    variance of an equation's residual, averaged over earlier blocks with fading memory. `MISFIT` is the residual
+    variance of this block divided by the usual noise. The weight of the block is 1, or `JUMP`^2 / MISFIT if this is
+    less. If g differs from its earlier estimate by more than `JUMP` standard deviations, the leak has stepped, and
+    earlier blocks do not constrain it any more.
     """
     sums, numbers, n = model.sums, model.numbers, len(model.matrix)
     variance = max(_sum_residual_squares(model.block, model.matrix[:, n:]), 0.0) / rows
@@ -201,7 +204,8 @@ def _learn_block(model: Any, rows: float, g: float) -> float:
         moment -= sums[n, i] * model.matrix[i, n]
     step = g - moment / information
     energy = max(model.block[n, n], TINY)
-    # variances of the block's estimate, of the leak's random step, which is assumed as large, and of the earlier one
+    # variances of g, of the leak's random step, assumed to be equal to it, and of the earlier estimate; as successive
+    # equations overlap, all are raised by the factor OVERLAP
     step_variance = OVERLAP * numbers[NOISE] * (2.0 / (energy * weight) + 1.0 / information)
     has_stepped = step**2 > JUMP**2 * step_variance
     add_block(model, rows, weight, has_stepped)
@@ -232,7 +236,8 @@ def estimate_leak(model: Any, rows: float, is_learned: bool) -> tuple[float, flo
         solution[i, 1] = block[i, n]
         solution[i, 2] = block[i, n] - energy * (model.leak_products[i] / usual_energy)
     _solve(model)
-    # sums: product of the leak's column with left side less nuisances, (b - b_u)' C^-1 (b - b_u), b' C^-1 b
+    # moment: product of the leak's column with the left side less the nuisances; unusual: (b - b_u)' C^-1 (b - b_u);
+    # systematic: b' C^-1 b
     moment, unusual, systematic = block[n, n + 1], 0.0, 0.0
     numbers[SHIFT] *= _SHIFT_DECAY
     for i in range(n):
@@ -246,9 +251,10 @@ def estimate_leak(model: Any, rows: float, is_learned: bool) -> tuple[float, flo
     g, weight = moment / energy, 1.0
     if is_learned:
         weight = _learn_block(model, rows, g)
-    # errors of the nuisances add to the noise of the series only if b differs from b_u
+    # errors of the nuisances add to the noise of the series only if b differs from b_u; as successive equations
+    # overlap, all variances are raised by the factor OVERLAP
     precision = energy / (OVERLAP * numbers[NOISE] * (1.0 / weight + max(unusual, 0.0) / energy))
-    systematic_variance = max(systematic, 0.0) * OVERLAP * numbers[NOISE] * (precision / energy) ** 2
+    systematic_variance = max(systematic, 0.0) * OVERLAP * numbers[NOISE] * (precision / energy) ** 2  # w^2 V
     return precision, precision * g, precision * numbers[SHIFT], systematic_variance
 
 

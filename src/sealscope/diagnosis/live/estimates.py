@@ -117,7 +117,7 @@ class WatchedLeak:
 
     @property
     def rarity(self) -> float:
-        """Probability that a healthy machine scores as high in the test, over the allowed probability of a false alarm.
+        """Probability that a healthy machine scores as high in the test, divided by the `allowed` probability.
 
         The result is at least 1e-9 and at most 1.
         """
@@ -191,7 +191,7 @@ def find_level_rise(
     if healthy.count < 2:
         return None
     max_healthy = INFERENCE.oil.warmest * max(healthy.low, 0.0)
-    scatter = healthy.deviation**2 * (1.0 + 1.0 / healthy.count)  # of one more healthy mean about their average
+    scatter = healthy.deviation**2 * (1.0 + 1.0 / healthy.count)  # variance of one more healthy mean about the average
     variance = deviation**2 + scatter
     degrees_of_freedom = (healthy.count - 1) * (variance / max(scatter, np.finfo(float).tiny)) ** 2
     degrees_of_freedom = min(degrees_of_freedom, 1e9)  # beyond it Student's t is normal

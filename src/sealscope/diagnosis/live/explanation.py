@@ -50,8 +50,8 @@ def explain_rise(observables: Sequence[Observable], data: str, onset: Interval, 
     `observables` are the results of tests for changes, and `onset` is the interval in which the increase began [s].
     `data` is the kind of data (`Observable.data`) from which the leakage is estimated, "volumes" or "response".
     Changes of this kind that began outside the interval are ignored. `is_settled` is True if enough blocks have
-    followed to distinguish a leak to the outside from a sensor fault; before, only a leak past piston or pump counts as
-    a leak.
+    followed to distinguish a leak to the outside from a sensor fault; until then, only a leak past piston or pump
+    counts as a leak.
 
     The result is a leak if leaks are more probable than all other events together, else the most probable other events.
     It is `UNKNOWN` if no change of the kind `data` is significant (p-value below `_MAX_CHANCE`), or if none of the
@@ -63,6 +63,7 @@ def explain_rise(observables: Sequence[Observable], data: str, onset: Interval, 
     significant_changes = [
         observable for observable in at_onset if observable.data == data and observable.chance < _MAX_CHANCE
     ]
+    # only sets of events that explain a change of the leakage
     explanations = [explanation for explanation in explain(at_onset) if data in explanation.data]
     if probability_of(explanations, *leak_names) > _MIN_PROBABILITY.leak:
         if not any(event.affects(change) for event in leak_events for change in significant_changes):

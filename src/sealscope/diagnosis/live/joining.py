@@ -210,4 +210,4 @@ def _find_lack(samples: Recording, names: Sequence[str]) -> str:
 
 def _count_leading(flags: NDArray[np.bool_]) -> int:
     """Count the True values at the beginning of an array (n,), before the first False."""
-    return int(np.argmin(flags)) if not flags.all() else flags.size
+    return int(np.argmin(flags)) if not flags.all() else flags.size  # argmin: index of the first False

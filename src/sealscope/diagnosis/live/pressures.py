@@ -118,7 +118,7 @@ class PressureEstimator:
         with their second half and as many new samples. Samples before a gap that do not fill a block are dropped.
         """
         if not run.follows:
-            self._held[:] = math.nan
+            self._held[:] = math.nan  # no reading is stuck so far
             self._samples = self._samples[:, :0]
         samples = np.hstack([self._samples, [run.t, *(run.channels[name] for name in _READ)]])
         # numbers of samples: for the first fit, and in a block
@@ -247,9 +247,10 @@ class PressureEstimator:
         self._rows = np.vstack([stored, row])
         # `excess`: chi square of the block above its mean, in standard deviations
         is_described = bool(np.isfinite(follower.theta).all()) and follower.excess < _PRIORS.described
-        variance = float(sums.gram[0, 0]) / max(sums.samples, 1.0)  # of the residuals, row 0 of the Gram matrix
+        variance = float(sums.gram[0, 0]) / max(sums.samples, 1.0)  # row 0 of the Gram matrix: residuals
         if math.isfinite(variance):
-            # a geometric mean with fading memory, in which a block counts with 0.1 to 10 times the earlier mean
+            # a geometric mean with fading memory; a block counts with at least 1 Pa^2, and with 0.1 to 10 times the
+            # earlier mean
             ratio = float(np.clip(max(variance, 1.0) / follower.variance, 0.1, 10.0))
             n_blocks = _PRIORS.usual if is_described and not is_settling else _RESUMING
             follower.variance *= ratio ** (1.0 / n_blocks)

@@ -142,4 +142,5 @@ def decide_on_stream(leak: LiveLeak | None, false_alarm_probability: float, lack
     are weighed before a test raises the alarm (module `explanation`).
     """
     report = Observed(WATCH, lack=lack, leak=leak)
+    # neither reports of other detectors, nor healthy recordings
     return decide(report, (), HealthyNull(), false_alarm_probability, weigh_rivals=False)

@@ -119,10 +119,10 @@ class StepDetector:
 
         The first block after `forget` only sets the level of the filters.
         """
-        self._unit = self._unit or deviation  # of the first block; estimates are stored in this unit
+        self._unit = self._unit or deviation  # deviation of the first block, the unit of stored estimates
         g, variance = g / self._unit, (deviation / self._unit) ** 2
         self._blocks += 1
-        elapsed_blocks = (begin - self._end) / (end - begin) + 1.0  # from the end of the last block to that of this one
+        elapsed_blocks = (begin - self._end) / (end - begin) + 1.0  # between the ends of the last block and this one
         self._end = end
         if not np.isfinite(elapsed_blocks):  # the first block after `forget`
             self._level[:], self._level_variance[:] = g, variance
@@ -134,7 +134,7 @@ class StepDetector:
         if may_begin:
             self._add_onsets(begin, end)
         response = 1.0 - self._sums[_FOLLOWED]  # f
-        if may_begin:  # of a step that begins in this block: its mean over the block
+        if may_begin:  # a step that begins in this block acts in a part of the block
             response[:, -len(PARTS) :] = PARTS
         square = innovation**2 / innovation_variance
         self._sums[_FOLLOWED] += gain * response
@@ -149,8 +149,9 @@ class StepDetector:
     def _update_walks(self, variance: Array, square: Array) -> None:
         """Update the scale of the noise and the probability of each random walk after a block.
 
-        For each walk in `WALKS` a Kalman filter has given the innovation e of the block (measured minus predicted
-        estimate) and the variance S of e. `variance` (q, 1) is S, and `square` (q, 1) is e^2 / S.
+        The scale of the noise is `_squares` / `_count`. For each walk in `WALKS` a Kalman filter has given the
+        innovation e of the block (measured minus predicted estimate) and the variance S of e. `variance` (q, 1) is S,
+        and `square` (q, 1) is e^2 / S.
         """
         square = np.maximum(square, _MIN_SQUARE)
         if self._count >= _N_WARM:
@@ -189,7 +190,7 @@ class StepDetector:
     def log_e(self, min_log_e: float = -np.inf) -> float:
         """Compute the logarithm of the evidence M that the coefficient has risen.
 
-        M is the sum over all blocks in which the rise may begin, of the likelihood ratio of a step to no step. The
+        M is the sum of the likelihood ratios of a step to no step, one for each block in which the rise may begin. A
         ratio is averaged over the possible random walks of the healthy coefficient (`WALKS`), the prior variances of
         the step (`SIZES`), and the onsets within a block (`PARTS`). In a healthy machine the mean number of blocks
         until M exceeds a number A is at least A. The result is minus infinity if no rise can have begun yet, or if a
@@ -203,6 +204,7 @@ class StepDetector:
         # fraction of T that a step of the best size explains, less than 1 so that its logarithm is finite
         explained = np.minimum(np.maximum(a, 0.0) ** 2 / (b * T), 1.0 - 1e-15)
         max_log_ratio = -0.5 * float(np.min(self._onsets[:, _N] * np.log1p(-explained)))
+        # M is at most the largest ratio times the number of blocks
         if max_log_ratio + np.log(len(self._onsets) / len(PARTS)) <= min_log_e:
             return -np.inf
         return float(np.logaddexp.reduce(self._log_terms().ravel()))
@@ -210,9 +212,9 @@ class StepDetector:
     def _log_likelihoods(self) -> Array:
         """Compute the log likelihood (q, j) of each random walk q, given no step since each onset j.
 
-        For n innovations with variances S and the sum T of their squares over S, it is -(n log T + sum of log S) / 2.
-        The value at the onset is subtracted, and the log prior of the walk is added (`_add_onsets`). A constant equal
-        for all q is left out.
+        With the variances S of n innovations and the sum T of their squares, each divided by S, the log likelihood is
+        -(n log T + sum of log S) / 2. The value at the onset is subtracted, and the log prior of the walk is added
+        (`_add_onsets`). A constant equal for all q is left out.
         """
         n, log_T = self._onsets[:, _N], np.log(self._sums[_T])
         return np.asarray(self._sums[_LOG_PRIOR] - 0.5 * (n * log_T + self._log_variances))
@@ -255,10 +257,10 @@ class StepDetector:
         # for each walk and onset the sums of f e / S, f^2 / S and e^2 / S: e is the error of a prediction, S its
         # variance, and f the response of e to a unit step (`take`)
         a, b, T = self._sums[_A : _T + 1]
-        # Student's t posterior of the size, for each v, q and j
+        # mean and variance of the size's posterior, Student's t, for each v, q and j
         precision = b + 1.0 / SIZES[:, None, None]
         sizes = a / precision
-        freedom = np.maximum(self._onsets[:, _N] - 2.0, 1.0)
+        freedom = np.maximum(self._onsets[:, _N] - 2.0, 1.0)  # the variance is n/(n - 2) times the squared scale
         variances = np.maximum(T - a * sizes, 0.0) / freedom / precision
         size = float((weights * sizes).sum())
         deviation = float(np.sqrt((weights * (variances + (sizes - size) ** 2)).sum()))
@@ -267,9 +269,10 @@ class StepDetector:
         mean_time = float(onset_probabilities @ times)
         order = np.argsort(times, kind="stable")
         low_index, high_index = np.searchsorted(np.cumsum(onset_probabilities[order]), [0.025, 0.975])
-        earliest, latest = times[order[low_index]], times[order[min(high_index, len(order) - 1)]]
+        sorted_times = times[order]
+        earliest, latest = sorted_times[low_index], sorted_times[min(high_index, len(order) - 1)]
         # the last onsets (one for each of `PARTS`) are in one block; the latest of them comes first
-        latest_in_block = float((times - block_begins)[-len(PARTS)])  # from the begin of the block [s]
+        latest_in_block = float((times - block_begins)[-len(PARTS)])  # time after the begin of the block [s]
         resolution = latest_in_block / len(PARTS)  # about the distance between neighbouring onsets
         interval = Interval(mean_time, float(earliest) - resolution, float(latest) + resolution)
         return LiveRise(STEP, 2.0 * log_evidence, interval, self._unit * size, self._unit * deviation)
@@ -285,7 +288,8 @@ class StepDetector:
         # for each walk and onset the sums of f e / S, f^2 / S and e^2 / S: e is the error of a prediction, S its
         # variance, and f the response of e to a unit step (`take`)
         a, b, T = self._sums[_A : _T + 1]
-        # least-squares size of a step at each onset and for each walk, and its standard error
+        # least-squares size of a step at each onset and for each walk, and its standard error; b > 0, as already
+        # the first block after the onset responds to a step
         sizes = a / b
         residual_squares = np.maximum(T - a * sizes, np.finfo(float).tiny)
         deviations = np.sqrt(residual_squares / self._onsets[:, _N] / b)
@@ -297,7 +301,7 @@ class StepDetector:
 
     @property
     def noise(self) -> float:
-        """Variance of the estimates' prediction errors (innovations) over the variance that the Kalman filter predicts.
+        """Ratio of the actual to the predicted variance of the Kalman filter's prediction errors (innovations).
 
         The ratio is averaged over the blocks, with fading memory, and over `step.stated` (`priors.toml`) additional
         blocks with the ratio 1. The filter is for a random walk whose variance in a block is a tenth of the first
@@ -318,10 +322,11 @@ class StepDetector:
 
 
 def _select_onsets(block: int, onsets: Array) -> NDArray[np.bool_]:
-    """Flag the possible onsets of a step to keep, (j,): all of the last `RECENT` blocks, and fewer of older blocks.
+    """Select the possible onsets of a step to keep: all of the last `RECENT` blocks, and fewer of older blocks.
 
-    Older onsets are kept only at the start of a block, on a grid of blocks that becomes coarser with age, up to the
-    age `HORIZON`. `block` is the number of the present block. `onsets` (j, 4) has the columns `_N` to `_BLOCK_BEGIN`.
+    Returns flags (j,), True for an onset to keep. Older onsets are kept only at the start of a block, on a grid of
+    blocks that becomes coarser with age, up to the age `HORIZON`. `block` is the number of the present block. `onsets`
+    (j, 4) has the columns `_N` to `_BLOCK_BEGIN`.
     """
     _, onset_block, time, block_begin = onsets.T
     age = block - onset_block

@@ -75,12 +75,12 @@ class SignalWindow:
         if not all(np.isfinite(values).all() for values in channels.values()):
             return
         if not self._means.size:
-            self._means = np.array([channels["p_A"].mean(), channels["p_B"].mean()])
+            self._means = np.array([channels["p_A"].mean(), channels["p_B"].mean()])  # subtracted from all blocks
         motion = motion_columns(channels, rate)  # speed first; None if no motion is recorded
         speed = 0.0 if motion is None else top_speed(motion)
         max_speed = max(speed, float(self._rows[:, _SPEED].max(initial=0.0)) if self._rows.size else 0.0)
         fraction_moving = 1.0 if motion is None else float(time_in_motion(motion[None, :, 0], max_speed, rate)[0])
-        columns = pressure_level_rows(channels, rate, self._means, max_speed)  # of the fit of mean pressures
+        columns = pressure_level_rows(channels, rate, self._means, max_speed)  # rows of the mean pressures' fit
         single_block = {name: values[None] for name, values in channels.items()}  # arrays (1, n) of one block
         values = {**dict(log_amplitudes(single_block)), **dict(sensor_features(single_block, rate))}
         features = [float(values[name][0]) if name in values else np.nan for name in FEATURES]
@@ -107,7 +107,7 @@ class SignalWindow:
         features = {name: values for name, values in columns if np.isfinite(values).any()}
         duty = {name: features.pop(name) for name in DUTY if name in features}
         sensors = ((name, feature_step_test(moving_time, values)) for name, values in features.items())
-        return run_tests(  # which ends a test whose numbers overflow
+        return run_tests(  # a test whose numbers overflow ends early
             lambda: duty_observables(amplitude_step_tests(moving_time, duty)),
             lambda: sensor_observables((name, test) for name, test in sensors if test is not None),
             lambda: level_observables(self._test_levels(rows, time)),
@@ -128,7 +128,7 @@ class SignalWindow:
                 break
             groups = rows[-n_groups * size :].reshape(n_groups, size, -1)
             gram = groups[:, :, _GRAM].sum(axis=1).reshape(n_groups, n_columns, n_columns)
-            max_samples = float(groups[:, :, _SAMPLES].sum(axis=1).max())  # of a group
+            max_samples = float(groups[:, :, _SAMPLES].sum(axis=1).max())  # largest number in a group
             values = fit_pressure_levels(gram, max_samples, self._means)
             if values is not None:  # None if a group moves in one direction only
                 return pattern_tests(time[-n_groups * size :].reshape(n_groups, size).mean(axis=1), values)

@@ -109,7 +109,7 @@ class Watch:
         healthy: HealthyLevel | None = None,
     ) -> None:
         self.false_alarms_per_1000_h, self.learn_hours = false_alarms_per_1000_h, learn_hours
-        self._false_alarm_probability(STEP, LiveBalance.block_seconds)
+        self._false_alarm_probability(STEP, LiveBalance.block_seconds)  # raises InputError for an impossible rate
         if not 0.0 < learn_hours <= 1000.0:
             raise InputError(f"learn_hours must be > 0 and at most 1000 h, got {learn_hours:g}")
         self._rig, self.healthy = rig, healthy
@@ -133,7 +133,7 @@ class Watch:
         """
         rate: float = self.false_alarms_per_1000_h
         fraction_of_alarms = getattr(_PRIORS, test)
-        rate_per_probability: float = 1000.0 / fraction_of_alarms * 3600.0 / seconds  # tests in 1000 h / fraction
+        rate_per_probability: float = 1000.0 / fraction_of_alarms * 3600.0 / seconds  # rate at a probability of 1
         min_rate, max_rate = 1e-12 * rate_per_probability, 0.05 * rate_per_probability  # supported probabilities
         if not min_rate <= rate <= max_rate:
             raise InputError(f"false_alarms_per_1000_h must be {min_rate:.2g} to {max_rate:.3g}, got {rate:g}")
@@ -146,7 +146,7 @@ class Watch:
 
     @property
     def learned_with(self) -> tuple[Rig, Mapping[str, bool], float]:
-        """Rig, whether each method states L/min, and time [h] with which the baseline is learned."""
+        """Settings of the learning: the rig, for each method whether L/min are stated, and the time to learn [h]."""
         return self._rig, self._litres, self.learn_hours
 
     @property
@@ -182,7 +182,8 @@ class Watch:
         """
         leak = self.leak
         if leak is not None:
-            return decide_on_stream(self._measure(self._estimator or self._make_estimator(), leak), leak.allowed)
+            estimator = self._estimator or self._make_estimator()
+            return decide_on_stream(self._measure(estimator, leak), leak.allowed)
         probability = self._false_alarm_probability(STEP, self.block_seconds)
         measure = None if self._estimator is None or not len(self._compared) else self._measure(self._estimator, None)
         if measure is None or not math.isfinite(measure.bound_flow):
@@ -210,9 +211,9 @@ class Watch:
                 bound_flow=math.inf,  # a detected leak needs neither a bound nor the pump's flow
                 pump_flow=(0.0, 0.0),
             )
-        # a rise above the threshold that nothing explains yet must not be a leak
+        # a step may exceed the threshold before it is explained: it must not be reported as a leak yet
         threshold = -2.0 * math.log(self._false_alarm_probability(STEP, self.block_seconds))
-        score = min(max(2.0 * self._detector.log_e(), 0.0), threshold * (1.0 - 1e-6))
+        score = min(max(2.0 * self._detector.log_e(), 0.0), threshold * (1.0 - 1e-6))  # twice the log e-value
         pressure, pump_flow = (float(self._compared[name].mean()) for name in ("pressure", "pump_flow"))
         bound = estimator.orifice_factor * self._detector.bound() * pressure * (1.0 + UPPER_95 * estimator.size_error)
         return make_measure(
@@ -220,7 +221,7 @@ class Watch:
             cause=estimator.cause,
             flow_per_conductance=pressure,
             bound_flow=bound,
-            pump_flow=(pump_flow, pump_flow),  # over all samples, and while the pump delivers
+            pump_flow=(pump_flow, pump_flow),  # mean over all samples, and while the pump delivers
         )
 
     def update(self, samples: Recording, *, follows: bool = True) -> list[BlockEstimate]:
@@ -372,7 +373,7 @@ class Watch:
         if not len(self._compared):
             self._since = block.begin
         self._detector.take(block.begin, block.end, block.g, block.sd)
-        self._compared = np.append(self._compared[1 - RECENT :], row)
+        self._compared = np.append(self._compared[1 - RECENT :], row)  # the last `RECENT` blocks
 
     def _learn(self, estimator: Estimator, block: BlockConductance) -> None:
         """Add a block to the baseline, the healthy state; freeze the baseline after `learn_hours` of operation.
@@ -390,7 +391,7 @@ class Watch:
         """Test for a step of the conductance up to `block`, and raise the alarm if a leak explains the step.
 
         For `RECENT` blocks after the alarm, a step with a higher score replaces onset and size of the leak. Returns
-        True if a step was found that a leak does not explain, or not yet. `estimator` is the source of the
+        True if a step was found and a leak does not explain it, or not yet. `estimator` is the source of the
         conductances.
         """
         leak = self.leak
@@ -507,7 +508,7 @@ class Watch:
         self.leak = WatchedLeak(
             raised_s=raised_s,
             onset_s=rise.interval.value,
-            onset_interval_s=rise.interval[1:],
+            onset_interval_s=rise.interval[1:],  # low and high
             leak_lpm=None,
             leak_interval_lpm=None,
             conductance_before=before,
@@ -520,16 +521,16 @@ class Watch:
             score=rise.score,
             threshold=threshold,
         )
-        evidence = self.evidence  # which computes the flow of the new `self.leak`
+        evidence = self.evidence  # states the flow of the new `self.leak`
         self.leak = replace(self.leak, leak_lpm=evidence.leak_lpm, leak_interval_lpm=evidence.leak_interval_lpm)
 
     def _blocks_of_leak(self, leak: WatchedLeak) -> NDArray[Any]:
-        """Return the stored blocks that begin after the latest possible onset of the leak, or else the last block."""
+        """Return the stored blocks that begin after the latest possible onset of the leak; if none, the last block."""
         is_after = self._compared["end"] - self.block_seconds >= leak.onset_interval_s[1]
         return self._compared[is_after] if is_after.any() else self._compared[-1:]
 
     def with_cycle_means(self, estimate: BlockEstimate) -> BlockEstimate:
-        """Replace the flows in the last block's estimate by means over more blocks, so as to average over cycles.
+        """Replace the flows in the last block's estimate by means over more blocks, and so over cycles of the machine.
 
         The means are over the blocks since the tests restarted, as they do after a pause or a change of duty. After an
         alarm, the means are over the blocks since the onset of the leak. At most the last `RECENT` blocks are used.
@@ -551,6 +552,7 @@ class Watch:
             return estimate
         lpm = blocks["pressure"] / LITRE_PER_MINUTE  # flow per unit of conductance
         mean_lpm = float(lpm.mean())
+        # `noise`: actual over stated variance of the conductances
         errors = blocks["sd"] * lpm * math.sqrt(self._detector.noise)
         if estimator.states_level:
             total = mean_flow(blocks["total"] * lpm, errors)
@@ -575,6 +577,7 @@ class Watch:
 
         ``"version"`` is the version of the format.
         """
+        # an estimator for other channels than those in use is not saved, as the next samples would replace it
         estimator = self._estimator if self._estimator is not None and self._estimator.method == self.method else None
         return {
             "version": STATE_VERSION,

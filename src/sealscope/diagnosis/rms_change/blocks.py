@@ -137,7 +137,7 @@ def _measure_blocks(recording: Recording, transformed: list[Details], bounds: In
     with np.errstate(divide="ignore", over="ignore"):
         energies = np.concatenate([mean_squares(signal, bounds) for signal in transformed], axis=1)
         log_rms = 0.5 * np.log(energies)
-        duty_log_rms = 0.5 * np.log(segment_means(squares, bounds) + floor)  # of command, its rate, and load
+        duty_log_rms = 0.5 * np.log(segment_means(squares, bounds) + floor)  # rows: command, its rate, load
     direction = segment_means(load[None], bounds) / np.exp(duty_log_rms[-1:])  # mean over RMS of the load
     return log_rms, np.vstack([duty_log_rms, direction]).T
 
@@ -168,6 +168,7 @@ def cut_blocks(recording: Recording) -> RmsBlocks:
             mean = values.mean(axis=0) if len(values) else 0.0
             for phase in np.unique(phase_of_block):
                 values[phase_of_block == phase] += mean - values[phase_of_block == phase].mean(axis=0)
+    # starts of the complete blocks, and the end of the last one
     end = times[1:][is_complete][-1:] if is_complete.any() else times[:1]
     edges = np.append(times[:-1][is_complete], end)
     n_left_out = int(np.count_nonzero(~is_complete))

@@ -47,7 +47,7 @@ class RmsChange:
         """Create the detector; `rig` is ignored, as the method needs no assumption on the machine."""
 
     def usable(self, recording: Recording) -> str | None:
-        """Return None if chamber pressures are recorded, long enough, and vary; otherwise the reason why not."""
+        """Return the reason why a recording cannot be judged; None if its pressures are long enough and vary."""
         if missing := describe_missing_chambers(recording):
             return missing
         if len(recording) < min_samples():
@@ -107,9 +107,9 @@ def observe_within(blocks: RmsBlocks, rate: float, unused: tuple[str, ...] = ())
     without details whose step has a p-value of 0.5 or more. `rate` is the sampling rate [Hz], and `unused` are recorded
     columns that belong to no channel. If a detail has too little information, the report states only this reason.
     """
-    changes = dict[str, tuple[StepTest, float]]()  # by detail: the more significant test, and the size of its step
+    changes = dict[str, tuple[StepTest, float]]()  # by detail: the more significant test, and the change of the log RMS
     judged_steps, bounds = list[StepTest](), list[float]()
-    likelihoods, weights = change_information(blocks)  # of the ringing's changes; fractions of energy without noise
+    likelihoods, weights = change_information(blocks)  # changes of the ringing; fractions of energy that is not noise
     for name, likelihood, weight in zip(blocks.names, likelihoods, weights, strict=True):
         steps = step_tests(likelihood, signs=(1.0, -1.0))
         if not steps:
@@ -121,14 +121,14 @@ def observe_within(blocks: RmsBlocks, rate: float, unused: tuple[str, ...] = ())
             judged_steps.append(step)
             bounds.append(max(up.bound(), down.bound()))
     rarest = min(judged_steps, key=lambda step: step.chance)
-    # a step that half of all healthy recordings show says nothing of the onset
+    # a step that half of all healthy recordings would show (p-value 0.5) tells nothing about the onset
     onset_likelihood = np.sum([step.likelihood for step in judged_steps if step is rarest or step.chance < 0.5], axis=0)
     onset = replace(rarest, likelihood=onset_likelihood, best=int(onset_likelihood.argmax())).onset()
     observables = [
         _make_observable(name, size, step.score, step.chance, blocks.chambers, onset)
         for name, (step, size) in changes.items()
     ]
-    # `judged_until`: blocks that were left out anywhere count as not judged at the end of the recording
+    # blocks that were left out may lie anywhere; `judged_until` counts them as if they were the last ones
     return Observed(
         RmsChange.name,
         tuple(observables),
@@ -179,10 +179,10 @@ def compare_summaries(
     levels = np.array([_summary_levels(summary, chambers) for summary in summaries])
     judged_levels, judged_duty = _summary_levels(judged, chambers), np.asarray(judged["duty"], dtype=float)
     observables, bounds = list[Observable](), list[float]()
-    # changes of the ringing, and the fractions of energy without noise
+    # changes of the ringing, and fractions of energy that is not noise
     rises, weights = estimate_rises(judged_levels, judged_duty, levels, duties, times)
     for name, rise, weight in zip(column_names(chambers), rises, weights, strict=True):
-        change = rise._replace(value=abs(rise.value))
+        change = rise._replace(value=abs(rise.value))  # a fall is tested like a rise of the same size
         score = 2.0 * change.log_ratio(change.value)
         observables.append(_make_observable(name, weight * rise.value, score, change.chance, chambers))
         if _is_judged(name):

@@ -25,7 +25,7 @@ from sealscope.signals.details import QUANTITIES
 
 
 def subtract_noise(log_rms: Array, healthy: Array) -> tuple[Array, Array]:
-    """Compute the change of the log RMS of wavelet details without noise, and the fraction of energy without noise.
+    """Compute the change of the log RMS of wavelet details without noise, and the fraction of energy that is not noise.
 
     `log_rms` (n, 5 per chamber): values of n blocks or recordings; `healthy` (k, 5 per chamber): values from which the
     machine's mean energy S_j in each detail d_j is estimated, as the energy of d_j minus the energy of d1. The noise
@@ -38,7 +38,7 @@ def subtract_noise(log_rms: Array, healthy: Array) -> tuple[Array, Array]:
     Both results have the shape of `log_rms`.
     """
     y, weight = np.array(log_rms), np.ones_like(log_rms)
-    min_signal_fraction = RMS_PRIORS.walk.least  # S_j is the difference of two estimates, which may be negative
+    min_signal_fraction = RMS_PRIORS.walk.least  # S_j is a difference of two estimates, which might be negative
     for d1 in range(0, log_rms.shape[1], len(QUANTITIES)):  # column of each chamber's d1
         noise = np.exp(2.0 * log_rms[:, d1])
         d3, d4, product = (d1 + QUANTITIES.index(name) for name in ("d3", "d4", "d3d4"))
@@ -61,7 +61,7 @@ def change_information(blocks: RmsBlocks) -> tuple[list[Information], Array]:
     and the mean of each column's fraction of energy that is not noise.
     """
     changes, weight = subtract_noise(blocks.log_rms, blocks.log_rms)
-    variances = np.mean(np.diff(changes, axis=0) ** 2, axis=0) / 2.0  # the difference of two has twice the variance
+    variances = np.mean(np.diff(changes, axis=0) ** 2, axis=0) / 2.0  # a difference has twice the variance
     features = DUTY[:-1]  # without the direction, as the mean differences between phases are already removed
     duty = (blocks.duty - blocks.duty.mean(axis=0))[:, : len(features)]
     exponent_sd = np.array([getattr(RMS_PRIORS.duty, name) for name in features])
@@ -72,13 +72,13 @@ def change_information(blocks: RmsBlocks) -> tuple[list[Information], Array]:
     machine_walk = walks.duty if blocks.cycle is None else walks.machine
     results = list[Information]()
     for name, y, w, variance in zip(blocks.names, changes.T, weight.T, variances, strict=True):
-        drift = (walks.noise if name.startswith("d1 ") else machine_walk) * walk_scale
+        drift_scale = (walks.noise if name.startswith("d1 ") else machine_walk) * walk_scale
         precision, vector = w**2 / variance, w * y / variance
         # eliminate the exponents of the duty, which have normal priors
         weighted = precision[:, None] * duty
         gain = weighted @ np.linalg.inv(duty.T @ weighted + np.diag(exponent_sd**-2))
         precision, vector = np.diag(precision) - gain @ weighted.T, vector - gain @ (duty.T @ vector)
-        results.append(Information(time, precision, vector, slope=drift, walk=drift))
+        results.append(Information(time, precision, vector, slope=drift_scale, walk=drift_scale))
     return results, weight.mean(axis=0)
 
 
@@ -97,11 +97,13 @@ def estimate_rises(
     are separated by pauses. Its variance is stated in `priors.toml` (`recordings.session`), and its rate is unknown.
     """
     prior, walk, n = RMS_PRIORS.recordings, RMS_PRIORS.walk, len(healthy)
-    exponents = np.array([getattr(RMS_PRIORS.duty, name) for name in DUTY])
-    effects = (np.vstack([healthy_duty, duty]) - duty) * exponents
+    exponent_sd = np.array([getattr(RMS_PRIORS.duty, name) for name in DUTY])
+    # effects of exponents of one standard deviation, relative to the judged recording (last row)
+    effects = (np.vstack([healthy_duty, duty]) - duty) * exponent_sd
     # quantiles of the half-Cauchy prior on the standard deviation that the process gains in `walk.time`
     probabilities = (np.arange(walk.tried) + 0.5) / walk.tried
     walk_sd = walk.machine * np.tan(0.5 * np.pi * probabilities)
+    # within a time t, short compared with 1/rate, the process gains the variance 2 rate t session^2
     rates = (walk_sd / prior.session) ** 2 / (2.0 * walk.time)
     elapsed, same_session = np.zeros((n + 1, n + 1)), np.ones((n + 1, n + 1))  # without dates: one session
     if times is not None:
@@ -114,6 +116,6 @@ def estimate_rises(
     weight = weights[1:].mean(axis=0)
     rises = []
     for judged_g, healthy_g, w in zip(y[0] / weight, y[1:].T / weight[:, None], weight, strict=True):
-        scatter = float(np.hypot(prior.scatter, prior.error / w))
+        scatter = float(np.hypot(prior.scatter, prior.error / w))  # g = y / w has the error of y over w
         rises.append(population.rise(judged_g[None], healthy_g[None], scatter, prior.freedom))
     return rises, weight

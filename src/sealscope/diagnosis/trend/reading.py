@@ -171,11 +171,11 @@ def _estimate_level(part: Recording, rig: Rig, machine: AssumedMachine) -> dict[
         }
     log_rms, _ = measure_levels(part)
     judged_columns = [QUANTITIES.index(name) for name in JUDGED]
-    log_rms_by_chamber = log_rms.reshape(-1, len(QUANTITIES))
+    log_rms_by_chamber = log_rms.reshape(-1, len(QUANTITIES))  # a row for each chamber
     damping = float(-np.mean(log_rms_by_chamber[:, judged_columns]))
     if np.isfinite(damping):
         return fields | {"basis": "ringing", "level": damping, "error": TREND.reading.ringing}
-    # without repetitions
+    # each reason once
     reasons = list(dict.fromkeys(lack for lack in (balance_lack, response_lack) if lack is not None))
     reasons = reasons or ["the pressures do not ring"]
     return {"problem": "no detector states a level: " + "; ".join(reasons)}
@@ -188,7 +188,7 @@ def _balance_fields(solution: RecordedBalance, machine: AssumedMachine) -> dict[
     times those of the balance. `machine`: assumed machine, of which only the piston area is used.
     """
     size = solution.size
-    total = solution.conductance  # with its 95 % interval
+    total = solution.conductance  # value and 95 % interval
     return {
         "basis": "volume balance",
         "level": total.value * size.scale,
@@ -216,7 +216,7 @@ def scatter_prior(basis: Basis, usual: float) -> ScatterPrior:
     if basis == "pressure response":
         return ScatterPrior(PRESSURE.conductance.level, between.freedom)
     scale = between.volume_balance * abs(usual) if basis == "volume balance" else between.ringing
-    return ScatterPrior(max(scale, float(np.finfo(float).tiny)), between.freedom)
+    return ScatterPrior(max(scale, float(np.finfo(float).tiny)), between.freedom)  # must be above 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -267,9 +267,9 @@ def build_timeline(
     ordered = _sort_by_time(readings, every)
     notes = _note_problems(ordered)
     points = []
-    scales: list[float | None] = []  # of the first reading of each group
+    scales: list[float | None] = []  # ratio of the first reading of each group
     for reading, note in zip(ordered, notes, strict=True):
-        group, start = -1, reading.start or 0.0
+        group, start = -1, reading.start or 0.0  # no start is None after sorting
         if not note:
             changes = [abs(_relative_change(reading.scale, scale)) for scale in scales]
             group = next((k for k, change in enumerate(changes) if change <= TREND.reading.scale), len(scales))
@@ -300,7 +300,7 @@ def _sort_by_time(readings: Sequence[LeakReading], every: float | None) -> list[
             "names (press_20240531.csv, press_20240531_0730.csv), or give every (such as 1d) where they were made at "
             "equal intervals, in the order of their names"
         )
-    return sorted(ordered, key=lambda reading: reading.start or 0.0)
+    return sorted(ordered, key=lambda reading: reading.start or 0.0)  # no start is None any more
 
 
 def _note_problems(readings: Sequence[LeakReading]) -> list[str]:

@@ -116,9 +116,9 @@ class Trend:
     @property
     def reason(self) -> str:
         """Reason for the verdict in one line, with the false-alarm rate."""
-        fell = bool(self.episodes) and self.episodes[-1].fell
+        is_repaired = bool(self.episodes) and self.episodes[-1].fell  # the last period began with a repair
         rate = f"1 false alarm in {self.years:g} machine-years"
-        return f"{self.decision.reason}{' since the repair' if fell else ''} ({rate})"
+        return f"{self.decision.reason}{' since the repair' if is_repaired else ''} ({rate})"
 
     @property
     def wear(self) -> Wear | None:
@@ -363,7 +363,7 @@ def _add_episodes(trend: Trend) -> Trend:
     if averages is not levels:  # recordings nearest to the averages
         rows = tuple(rows[int(np.argmin(np.abs(levels.t - t)))] for t in averages.t)
     decision = decide_trend(
-        [points[row] for row in rows[episodes[-1].begin :]],
+        [points[row] for row in rows[episodes[-1].begin :]],  # since the last repair
         episodes[-1],
         trend_units_per_level=trend_units_per_level,
         pressure=trend.pressure,
@@ -379,7 +379,7 @@ def _add_values(trend: Trend, levels: Levels) -> tuple[tuple[TrendPoint, ...], t
     `levels` are the converted levels of the compared points. Returns (points, findings).
     """
     points, findings = [*trend.points], [*trend.findings]
-    _, excess = outlier_excess(levels)  # in the whole series
+    _, excess = outlier_excess(levels)  # beyond the limit of outliers, judged in the whole series
     outliers = np.flatnonzero(excess)
     remark = "apart from the recordings before and after: it counts as if it were near"
     for k, row in enumerate(trend.rows):
@@ -398,7 +398,7 @@ def _count_healthy(trend: Trend) -> int:
 
     Copies count as one recording. The result is at least 1.
     """
-    digests = dict.fromkeys(point.digest for point in trend.points)  # equal for copies, in the order of time
+    digests = dict.fromkeys(point.digest for point in trend.points)  # in the order of time, copies once
     healthy_digests = list(digests)[: trend.healthy]
     return max(1, sum(trend.points[row].digest in healthy_digests for row in trend.rows))
 
@@ -418,14 +418,14 @@ def _convert_levels(trend: Trend) -> _ConvertedLevels:
 
     Levels that are conductances [m^3/(s Pa)] are converted to L/min at the trend's pressure, or to % of the mean level
     of the healthy recordings. If the oil temperature of every recording is known, conductances are also converted to
-    the temperature of the first recording. A level of the ringing, minus the logarithm of an RMS, is converted to its
-    difference from the healthy mean, times 100, in %.
+    the temperature of the first recording. A level of the ringing is the negative logarithm of an RMS, and is converted
+    to 100 times its difference from the healthy mean, i.e. to %.
     """
     compared = [trend.points[k] for k in trend.rows]
     t, group, value, error = (
         np.array([getattr(point, name) for point in compared]) for name in ("day", "group", "level", "error")
     )
-    usual = float(np.mean(value[: _count_healthy(trend)]))  # of the healthy recordings
+    usual = float(np.mean(value[: _count_healthy(trend)]))  # mean level of the healthy recordings
     prior = scatter_prior(trend.basis or "ringing", usual)
     warming, slope_sd = np.zeros(t.size), 0.0  # warming of the oil [K], standard deviation of the level's change per K
     temperatures = [point.temperature for point in compared if point.temperature is not None]

@@ -147,6 +147,7 @@ def _measure_leak(
     # for a laminar leak, k = 1; for other laws there is a further factor.
     flow_factors = pressure_ratio ** (1.0 - np.array(EXPONENTS))
     leak_sd = (wear.leak.high - wear.leak.low) / (2.0 * WITHIN_95)
+    # converted as a leak: a flow over the pressure is a level
     pump_flow = float(np.median([point.pump / point.pressure for point in points])) * trend_units_per_level
     pump_flow = pump_flow if np.isfinite(pump_flow) else 0.0
     size_deviation = max(point.size_error for point in points)
@@ -186,7 +187,7 @@ def _total_leakage(total: Interval, size_deviation: float, pressure: float) -> T
     `total`: leakage with the 95 % interval of its estimate [L/min]; `size_deviation`: relative standard error of all
     flows due to area and displacement; `pressure`: pressure difference at which the flow is stated [Pa].
     """
-    half_width = WITHIN_95 * total.value * size_deviation  # due to the sizes
+    half_width = WITHIN_95 * total.value * size_deviation  # part of the error that is due to the sizes
     below, above = (float(np.hypot(end - total.value, half_width)) for end in (total.low, total.high))
     return TotalLeakage(total.value, (total.value - below, total.value + above), pressure)
 
@@ -197,7 +198,8 @@ def _report_ringing(points: Sequence[TrendPoint], wear: Wear, chance: float) -> 
     The ringing is an oscillation, measured by the RMS of the pressures' wavelet details. `chance` is the probability of
     such a decrease in a healthy machine. The ringing gives no upper bound of a leak.
     """
-    size = -wear.leak.value / 100.0  # change of the logarithm, from %
+    size = -wear.leak.value / 100.0  # change of the log RMS; the leak is in %
+    # a score is twice the logarithm of a likelihood ratio, here of 1 / chance
     fall = Observable(name="fall of the ringing", data=DETAILS, score=-2.0 * np.log(chance), chance=chance, size=size)
     ringing = None
     if wear.onset is not None:
@@ -225,7 +227,7 @@ def _rival_changes(points: Sequence[TrendPoint], wear: Wear) -> tuple[Observable
     before. Only recordings whose balance has the same terms as that of the last recording are used. The result is empty
     if there are no such recordings before the onset, or if the last recording has several balances or no balance.
     """
-    names = [roles.names for roles in points[-1].terms]  # of the terms of each balance
+    names = [roles.names for roles in points[-1].terms]  # names of the terms of each balance
     sums_before, sums_since = (
         [point.sums for point in part if point.sums is not None and [roles.names for roles in point.terms] == names]
         for part in _split_at_onset(points, wear)

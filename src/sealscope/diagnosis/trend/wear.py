@@ -131,13 +131,14 @@ class Levels:
         """Average levels of successive recordings, so that about `max_count` levels remain, to limit computing time.
 
         An average is over up to ceil(n / `max_count`) of the n recordings, all of one group. As no average spans two
-        groups, some more than `max_count` may remain. Times and covariates are averaged, too; the standard error of an
-        average is sqrt(sum of error^2) / number. With n <= `max_count` the levels are returned unchanged.
+        groups, slightly more than `max_count` may remain. Times and covariates are averaged, too. The standard error of
+        an average is sqrt(sum of error^2) / number. With n <= `max_count` the levels are returned unchanged.
         """
         size = math.ceil(len(self) / max_count)
         if size <= 1:
             return self
-        runs = np.split(np.arange(len(self)), np.flatnonzero(np.diff(self.group)) + 1)  # of one group each
+        # successive recordings of one group
+        runs = np.split(np.arange(len(self)), np.flatnonzero(np.diff(self.group)) + 1)
         parts = [run[k : k + size] for run in runs for k in range(0, run.size, size)]
         error = np.array([math.sqrt(np.sum(self.error[rows] ** 2)) / rows.size for rows in parts])
         t, value, covariate = (
@@ -156,9 +157,10 @@ def outlier_excess(levels: Levels) -> tuple[Array, Array]:
         sign(d) max(abs(d) - L, 0).
 
     Two successive levels beyond the limit on the same side are a change of the machine. The excess of a level is
-    therefore 0 if the level before it is also beyond, and for the first level of a group. Returns two variants, each
-    (n,). The first treats each level as the latest level. The second is for the whole series: the excess is also 0 if
-    the next level is beyond the limit on the same side, and for the last level of a group.
+    therefore 0 if the level before it is also beyond the limit. The first level of a group has the excess 0, too.
+    Returns two variants, each (n,). The first treats each level as the latest level. The second is for the whole
+    series: the excess is also 0 if the next level is beyond the limit on the same side, and for the last level of a
+    group.
     """
     excess_as_last, excess = np.zeros((2, len(levels)))
     for group in np.unique(levels.group):
@@ -214,15 +216,16 @@ class _Changes(NamedTuple):
         scales = TREND.change
         begin = np.arange(max(n_healthy, 1), len(levels))  # first recording after each change
         step = (np.arange(len(levels))[:, None] >= begin).astype(float)
+        # months since the last recording before the change
         growth = np.maximum(levels.t[:, None] - levels.t[begin - 1], 0.0) / DAYS_PER_MONTH
         slopes = [] if steps_only else [DAYS_PER_MONTH / levels.interval / n for n in scales.intervals]
         n_steps = len(scales.steps)
         # each row of the following arrays belongs to one scale
         scale = np.array([*scales.steps, *slopes], dtype=float)[:, None]
         grows = np.arange(scale.size)[:, None] >= n_steps
-        # w_j is shared equally by steps and growths, and by the scales of each
+        # the weight w_j, the time before the change, is shared equally by steps and growths, and by the scales of each
         n_rivals = np.where(grows, len(slopes), n_steps) * (1.0 if steps_only else 2.0)
-        with np.errstate(divide="ignore"):
+        with np.errstate(divide="ignore"):  # no weight for a change between recordings of one time
             log_weight = np.log(np.clip(levels.t[begin] - levels.t[begin - 1], 0.0, scales.wait) / n_rivals)
         profile_index = np.arange(begin.size) + begin.size * grows  # profiles of growths follow those of steps
         fields = np.broadcast_arrays(profile_index, scale, begin, grows, log_weight)  # (scales, begins) each
@@ -291,12 +294,13 @@ def _evaluate_grid(levels: Levels, profiles: Array, *, may_grow: bool = False) -
     between, prior = TREND.between, levels.prior
     # outlying part of each level: while its recording is the last one, and in the whole series
     outlying_as_last, outlying = outlier_excess(levels)
-    values = levels.value - levels.value[0] - outlying
+    values = levels.value - levels.value[0] - outlying  # the first level is added again below
     # 0.3 of the range is about the standard deviation of ten normal values
     max_scatter = max(prior.scale, 0.3 * float(np.ptp(levels.value)))
     wide_variance = (_WIDE * max_scatter) ** 2
     rounding = _ROUNDING * wide_variance
-    mean_covariance = wide_variance * (levels.group == levels.group[-1])  # with the mean level of the last group
+    # covariance of each level with the mean level of the last group
+    mean_covariance = wide_variance * (levels.group == levels.group[-1])
     shared = wide_variance * (levels.group[:, None] == levels.group)
     shared = shared + levels.slope_sd**2 * np.outer(levels.covariate, levels.covariate)
     if may_grow:
@@ -307,7 +311,8 @@ def _evaluate_grid(levels: Levels, profiles: Array, *, may_grow: bool = False) -
     right_sides = np.column_stack([values, mean_covariance, profiles])
     nodes = []
     for tau in np.geomspace(0.1 * prior.scale, 10.0 * max_scatter, between.nodes):
-        log_prior = -prior.freedom * (math.log(tau) + 0.5 * (prior.scale / tau) ** 2)  # scaled inverse chi-square
+        # scaled inverse chi-square, as a density of log tau, in which the grid is uniform
+        log_prior = -prior.freedom * (math.log(tau) + 0.5 * (prior.scale / tau) ** 2)
         for r in between.lasts:
             covariance = shared + tau**2 * r * correlation
             covariance[np.diag_indices(len(levels))] += tau**2 * (1.0 - r + _JITTER) + levels.error**2 + rounding
@@ -315,12 +320,12 @@ def _evaluate_grid(levels: Levels, profiles: Array, *, may_grow: bool = False) -
             z, u, G = np.split(solve_triangular(L, right_sides, lower=True, check_finite=False), [1, 2], axis=1)
             # while a recording is the last one, more of its level may be outlying, which changes only its own row of z
             z_as_last = z - ((outlying_as_last - outlying) / L.diagonal())[:, None]
-            # sum of z^2 up to each recording, with the last term as for the last recording; the same for b
+            # sum of z^2 up to each recording, with the last term of each sum from `z_as_last`; the same for b
             square = np.cumsum(z**2) - (z**2 - z_as_last**2)[:, 0]
             log_null = log_prior - np.cumsum(np.log(L.diagonal())) - 0.5 * square
             # a change of size delta has the likelihood ratio exp(b delta - a delta^2/2)
             a, b = np.cumsum(G**2, axis=0), np.cumsum(G * z, axis=0) - G * (z - z_as_last)
-            # mean level of the last group, given all levels without a change, and its variance
+            # mean level of the last group and its variance, given all levels, if nothing has changed
             level = float(levels.value[0] + u[:-1, 0] @ z[:-1, 0] + u[-1, 0] * z_as_last[-1, 0])
             variance = wide_variance - float(u[:, 0] @ u[:, 0])
             nodes.append(_Node(float(tau), log_null, a, b, level, variance, G.T @ u[:, 0]))
@@ -370,7 +375,7 @@ def score_changes(levels: Levels, n_healthy: int = 1, *, falls: bool = False, ma
     n, changes = len(levels), _Changes.enumerate(levels, n_healthy, steps_only=falls)
     # sums over the grid of tau and r: prior times likelihood with each change, and without a change
     log_terms, log_null = np.full((n, changes.begin.size), -np.inf), np.full(n, -np.inf)
-    if not changes.begin.size:
+    if not changes.begin.size:  # no change can begin: R = 0
         return ChangeScores(log_null, np.zeros(n, dtype=np.int64))
     for node in _evaluate_grid(levels, changes.profiles, may_grow=may_grow):
         log_null = np.logaddexp(log_null, node.log_null)
@@ -391,9 +396,9 @@ def _draw_normal(random: np.random.Generator, mean: Array, sd: Array, *, positiv
     from scipy.special import ndtr, ndtri
 
     p_negative = ndtr(-mean / sd) if positive else np.zeros(len(mean))
-    # inverse distribution function of random probabilities
+    # random probabilities, which the inverse distribution function converts to numbers
     p = p_negative + (1.0 - p_negative) * random.random(len(mean))
-    return np.asarray(mean + sd * ndtri(np.clip(p, 1e-300, 1.0 - 1e-16)))  # clipped, so that it is finite
+    return np.asarray(mean + sd * ndtri(np.clip(p, 1e-300, 1.0 - 1e-16)))  # clipped, as ndtri is infinite at 0 and 1
 
 
 class _Draws(NamedTuple):
@@ -418,10 +423,11 @@ class _Draws(NamedTuple):
         """
         random = np.random.default_rng(20)  # a fixed seed, so that results repeat
         nodes = _evaluate_grid(levels, changes.profiles)
+        # [-1]: after the last recording
         a, b = (np.stack([getattr(node, name)[-1][changes.profile_index] for node in nodes]) for name in ("a", "b"))
         scale = changes.scale * np.array([[node.tau] for node in nodes])
         v = 1.0 / (a + scale**-2)  # variance of the size, before any truncation to > 0; its mean is b v
-        normal_log_ratio = 0.5 * (np.log(v) + b * b * v) - np.log(scale)
+        normal_log_ratio = 0.5 * (np.log(v) + b * b * v) - np.log(scale)  # log mean ratio for a normal prior
         log_ratio = normal_log_ratio if signed else _log_mean_ratio(a, b, scale)
         log_weight = np.array([[node.log_null[-1]] for node in nodes]) + log_ratio + changes.log_weight
         weight = np.exp(log_weight - log_weight.max())
@@ -484,6 +490,7 @@ class Wear(NamedTuple):
 
 def _interval_of_draws(draws: Array) -> Interval:
     """Compute the median and the 95 % interval of random draws (d,), some of which may be infinite."""
+    # "lower" takes one of the draws, as infinite ones cannot be interpolated
     low, median, high = np.quantile(draws, [0.025, 0.5, 0.975], method="lower")
     return Interval(float(median), float(low), float(high))
 
@@ -500,6 +507,7 @@ def estimate_wear(levels: Levels, allowed_rise: float | None, change_begin: int 
     is_long = levels.t[-1] - levels.t[0] >= 1.0  # [days]
     # without a change the growth may begin with the first recording
     months = (levels.t - levels.t[0]) / DAYS_PER_MONTH if is_long else np.zeros(len(levels))
+    # prior scale: 100 times the scatter in each interval
     even_growth = _Changes.from_profile(months, _WIDE * DAYS_PER_MONTH / levels.interval)
     changes = _Changes.enumerate(levels, 1) if is_changed else even_growth
     draws = _Draws.sample(levels, changes, signed=not is_changed)
@@ -520,6 +528,7 @@ def estimate_wear(levels: Levels, allowed_rise: float | None, change_begin: int 
         days = _days_to_limit(current_level, growth, limit)
         reach = _interval_of_draws(days) if is_long else Interval(math.nan, 0.0, math.inf)
     unknown = Interval(math.nan, -math.inf, math.inf)
+    # if a growth is more probable than a step, the draws of a step do not count for the growth
     return Wear(
         total=_interval_of_draws(current_level),
         leak=leak,
@@ -540,7 +549,7 @@ def _days_to_limit(level: Array, growth: Array, limit: float) -> Array:
     `level`, `growth` (d,): present level and growth per month, in the unit of the limit. The result is 0 if the level
     has reached the limit, and infinite if it does not grow.
     """
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore"):  # a division by a growth of 0 is not used
         days = np.where(growth > 0.0, (limit - level) / growth, math.inf) * DAYS_PER_MONTH
     return np.where(level >= limit, 0.0, days)
 
@@ -551,7 +560,7 @@ def _estimate_healthy_range(levels: Levels) -> tuple[Interval, float]:
     Returns the mean level and the standard deviation between recordings. The interval of the mean level contains 95 %
     of the levels of single recordings, with their scatter and standard errors.
     """
-    no_change = _Changes.from_profile(np.zeros(len(levels)), scale=1.0)
+    no_change = _Changes.from_profile(np.zeros(len(levels)), scale=1.0)  # without an effect, whatever the scale
     draws = _Draws.sample(levels, no_change)
     error_variance = float(np.mean(levels.error[levels.group == levels.group[-1]] ** 2))
     noise = np.random.default_rng(21).standard_normal(draws.tau.size)  # a fixed seed, so that results repeat
@@ -594,10 +603,12 @@ def find_episodes(
         alarm, end = rise.find_alarm(days), _find_repair(remaining, rise, n_healthy, days)
         if alarm is not None and alarm >= end:  # an alarm after the repair belongs to the next episode
             alarm = None
-        change_begin = None if alarm is None else int(rise.begin[end - 1])
+        change_begin = None if alarm is None else int(rise.begin[end - 1])  # by all recordings of the period
         wear = estimate_wear(remaining.select(slice(0, end)), allowed_rise, change_begin)
         alarm_row, log_days = None if alarm is None else begin + alarm, float(rise.log_R[:end].max())
+        # each period but the first begins with a repair, a fall of the level
         episodes.append(Episode(begin, begin + end, alarm_row, log_days, wear, fell=bool(episodes)))
+        # n recordings (`end`) add n - 1 degrees of freedom to the knowledge of the scatter
         prior = ScatterPrior(wear.scatter, levels.prior.freedom + min(end - 1, _MAX_FREEDOM))
         levels = replace(levels, prior=prior)
         begin, n_healthy = begin + end, 1

@@ -157,8 +157,8 @@ class Diagnosis(Evidence):
     def measured_ratio(self) -> tuple[float, tuple[float, float]] | None:
         """Measured over assumed value of the ratio of pump displacement to piston area, with 95 % interval (low, high).
 
-        The figures are those of the deciding detector if it has measured the ratio, otherwise those of the first other
-        detector that has. The result is None if no detector has.
+        The figures are those of the deciding detector or, if it has not measured the ratio, those of the first other
+        detector that has measured it. The result is None if no detector has measured it.
         """
         for decision in (self, *self.parts):
             if decision.ratio is not None and decision.ratio_interval is not None:
@@ -179,7 +179,8 @@ class Diagnosis(Evidence):
     def _condition(self) -> str:
         """Name of the condition in `states.toml` that corresponds to the verdict, such as "leak" or "no change".
 
-        For the verdict `no leak` it depends on whether healthy leakage is known, and whether this leakage is usual.
+        For the verdict `no leak` it depends on whether the leakage is known to be healthy and, if so, is usual
+        (`is_baseline`), else on the deciding detector.
         """
         if self.verdict != NO_LEAK:
             return self.verdict
@@ -227,8 +228,8 @@ class Diagnosis(Evidence):
         """True if the recording may serve as a baseline, as no leak was found and its leakage is usual.
 
         The leakage is usual if at least 1 in 20 healthy recordings scores as high in the comparison with healthy
-        recordings. The result is False without this comparison, if a cause of a change is stated, or if an undetected
-        leak could be the whole total leakage.
+        recordings. The result is False without this comparison, or if a cause of a change is stated. It is also False
+        if the total leakage is surely above 0, and an undetected leak could be the whole of it.
         """
         comparison = self._find_test(AGAINST)
         if self.verdict != NO_LEAK or self.cause is not None or comparison is None or not _is_usual(comparison):

@@ -144,8 +144,8 @@ def severity(evidence: Evidence, limit: RepairLimit) -> Severity | None:
     if evidence.verdict != LEAK or (evidence.leak_lpm is None and evidence.relative is None):
         return None
     relative = evidence.relative or RelativeLeak()
-    flow_lpm = evidence.leak_lpm, evidence.leak_interval_lpm  # value and 95 % interval
-    creep = relative.creep, relative.creep_interval  # the same [m/s]
+    flow_lpm = evidence.leak_lpm, evidence.leak_interval_lpm  # value and 95 % interval [L/min]
+    creep = relative.creep, relative.creep_interval  # value and 95 % interval [m/s]
     if limit.kind == "flow":
         of_limit = _convert_figure(*flow_lpm, factor=LITRE_PER_MINUTE / limit.value)
     else:

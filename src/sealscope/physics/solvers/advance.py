@@ -44,11 +44,11 @@ def advance(
 ) -> None:
     """Integrate the state `y` (14,) in place over n steps of h [s], with outputs before each `every`-th step.
 
-    - `implicit`: `IMPLICIT` or `EXPLICIT`, the integration method. With `euler_integral` the explicit method changes
-      the speed controller's integral only at the end of each step (`rk4_step`).
+    - `implicit`: the integration method, `IMPLICIT` or `EXPLICIT` (an empty tuple). With `euler_integral` the explicit
+      method changes the speed controller's integral only at the end of each step (`rk4_step`).
     - `u`, `G`, `C`, `F` (n, nodes): inputs at the times within each step that the method needs (`step_nodes`). They are
       the command [V], the leakage coefficients [m^3/(s Pa)] and [m^3/(s Pa^0.5)] of the piston (`piston_leakage`), and
-      the load [N] in addition to the rig's own, of shape (0, 0) if there is none.
+      a load [N] in addition to the rig's own. Without such a load `F` is (0, 0).
     - `numbers`: parameters of the model. `rows` (n // every, 21): receives the outputs.
     """
     z = state_of(y)
@@ -90,7 +90,7 @@ def advance_closed(
     If the controller returns a voltage that is not finite, the integration stops there, with fewer outputs than `rows`
     has.
     """
-    spacing, n_rows = loop.counters[SPACING], rows.shape[0]  # outputs per sample of the controller, and in all
+    spacing, n_rows = loop.counters[SPACING], rows.shape[0]  # outputs per sample of the controller; all outputs
     u = np.empty((spacing * every, G.shape[1]))
     first = 0  # first row that is not yet written
     while first < n_rows:
@@ -98,7 +98,7 @@ def advance_closed(
         if (start + first) % spacing == 0 and not sample_controller(loop, k, y):
             break
         u[:] = loop.volts[k]
-        last = min((k + 1) * spacing - start, n_rows)
+        last = min((k + 1) * spacing - start, n_rows)  # up to this row `loop.volts[k]` acts
         begin, end = first * every, last * every
         load = F[begin:end] if F.shape[0] > 0 else F
         volts, outputs = u[: end - begin], rows[first:last]

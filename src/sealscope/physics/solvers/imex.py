@@ -59,7 +59,7 @@ W = (82889 / 524892, 0.0, 15625 / 83664, 69875 / 102672, -2260 / 8211, GAMMA)
 
 @contracted
 def _add_stage(z: State, h: float, e: float, f: State, i: float, s: Pressures) -> State:
-    """Compute the state z + h (e f + i s), the contribution of one Runge-Kutta stage to the state z.
+    """Add the contribution h (e f + i s) of one Runge-Kutta stage to the state z; return the sum.
 
     `f`: explicit rates of all states; `s`: implicit rates of the four pressures; `e`, `i`: coefficients of `f` and `s`
     in the method's tableau; `h` [s]: length of the step.
@@ -73,9 +73,9 @@ def _solve_stage(z: State, h: float, p: RigNumbers) -> tuple[State, Pressures]:
 
     `h` [s]: length of the step; `z`: the state without the implicit rates of this stage. If bulk moduli and densities
     depend on the pressures, the stage is solved repeatedly (`MAX_STAGE_ITERATIONS`). In the body, r [Pa/m^3] is the
-    pressure rate of an oil volume per unit flow, and g [Pa s/m^3] the fall of a throttle's pressure difference over the
-    stage per unit flow. Boiling oil keeps its pressure, so its r is 0. In `p`, an optional law such as `boiling` is an
-    empty tuple if the rig does not have it.
+    pressure rate of an oil volume per unit flow, total [Pa] the pressure difference of a throttle if nothing flowed in
+    the stage, and g [Pa s/m^3] the fall of this difference over the stage per unit flow. Boiling oil keeps its
+    pressure, so its r is 0. In `p`, an optional law such as `boiling` is an empty tuple if the rig does not have it.
     """
     V_A, V_B = rig.volumes_at(z[POSITION], p)
     step = GAMMA * h
@@ -116,7 +116,8 @@ def imex_step(y: State, h: float, u: Nodes, G: Nodes, C: Nodes, F: Nodes, p: Rig
 
     The tuples hold the inputs at the six `IMEX_NODES` of the step: command `u` [V], leakage coefficients `G`
     [m^3/(s Pa)] and `C` [m^3/(s Pa^0.5)], and load `F` [N]. Stage k solves for its state z and its implicit rates
-    s_k, then evaluates its explicit rates f_k. E_k and I_k are the rows of the tableaus, W the weights.
+    s_k, then evaluates its explicit rates f_k. E_k and I_k are the rows of the tableaus, W the weights. `p`: the rig's
+    parameters.
     """
     Q_A, Q_B = rig.throttle_flows(y, p)
     s1 = rig.throttle_rates(y, Q_A, Q_B, p)
@@ -133,6 +134,7 @@ def imex_step(y: State, h: float, u: Nodes, G: Nodes, C: Nodes, F: Nodes, p: Rig
     z = _add_stage(_add_stage(z, h, E_5[2], f3, I_5[2], s3), h, E_5[3], f4, I_5[3], s4)
     z, s5 = _solve_stage(z, h, p)
     f5 = rig.rates_without_throttles(z, u[4], G[4], C[4], F[4], p)
+    # W is the implicit row of stage 6, and also has the weights of the step; W[1] = 0, so that s2 does not enter
     z = _add_stage(_add_stage(y, h, E_6[0], f1, W[0], s1), h, E_6[2], f3, W[2], s3)
     z = _add_stage(_add_stage(add_step(z, h * E_6[1], f2), h, E_6[3], f4, W[3], s4), h, E_6[4], f5, W[4], s5)
     z, s6 = _solve_stage(z, h, p)
@@ -149,7 +151,7 @@ def implicit_step(
     """Integrate the state `z` over step number `step` by the implicit-explicit method; return the new state.
 
     `h` [s]: length of the step. `u`, `G`, `C` and `F` (n, 6) hold the inputs of n steps at the `IMEX_NODES`, one step
-    in a row (`imex_step`). `F` is read only if the rig has an additional load.
+    in a row (`imex_step`). `F` is read only if the rig has an additional load. `p`: the rig's parameters.
     """
     volts = (u[step, 0], u[step, 1], u[step, 2], u[step, 3], u[step, 4], u[step, 5])
     laminar = (G[step, 0], G[step, 1], G[step, 2], G[step, 3], G[step, 4], G[step, 5])

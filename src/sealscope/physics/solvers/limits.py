@@ -90,7 +90,7 @@ def longest_step(p: RigNumbers, G: float = 0.0, C: float = 0.0) -> float:
     speed_loop_step = _longest_mode_step(p.R_c / p.L_c + B_M / p.J_M, loop_stiffness)
     # stiffness of the oil columns and the load's spring, over the mass [1/s^2]
     column_stiffness = (p.K_oil * max(p.A_A**2 / V_A + p.A_B**2 / V_B for V_A, V_B in ends) + p.k_load) / p.M_eq
-    F_C = p.F_pr + (0.0 if p.coulomb_of_difference else p.F_cfr * 2.0 * p.p_charge)
+    F_C = p.F_pr + (0.0 if p.coulomb_of_difference else p.F_cfr * 2.0 * p.p_charge)  # p_A = p_B = p_charge
     friction_slope = F_C * p.K_brk / p.v_th + p.F_v
     if p.literal_bracket:
         friction_slope = F_C * (p.K_brk + p.F_v * p.v_th) / p.v_th
@@ -131,8 +131,10 @@ def _longest_valve_step(p: RigNumbers, end_volumes: tuple[tuple[float, float], .
     Each part gives a limit by `_longest_mode_step`. `end_volumes`: (V_A, V_B) [m^3] at each end of the stroke.
     """
     overlaps = (p.o_PA, p.o_AT, p.o_PB, p.o_BT)
-    edge_slope = p.Q_N / math.sqrt(p.dp_N * p.dp_lam)  # of one edge at full stroke, laminar
-    chamber_slope = edge_slope * (1.0 + 2.0 * max(0.0, *(-o for o in overlaps)) / p.x_max)  # both edges of a chamber
+    edge_slope = p.Q_N / math.sqrt(p.dp_N * p.dp_lam)  # dQ/dp of one edge at full stroke, laminar
+    largest_underlap = max(0.0, *(-overlap for overlap in overlaps))
+    # upper limit for both edges of a chamber together: the underlap adds to the opening of each
+    chamber_slope = edge_slope * (1.0 + 2.0 * largest_underlap / p.x_max)
     # stiffness of the oil in the smaller chamber and in the supply line, whose accumulator may be empty [Pa/m^3]
     chamber_stiffness = p.K_oil * max(1.0 / volume for volumes in end_volumes for volume in volumes)
     supply_stiffness = p.K_oil / p.V_1

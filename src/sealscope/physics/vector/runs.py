@@ -163,7 +163,7 @@ def advance(
         z = load_state(y, g * states)
         gain_and_offset = (load(drive, 2 * g), load(drive, 2 * g + 1))
         leak, run_totals = load_leak(leaks, g * LEAK_ROWS), load_totals(totals, g * N_TOTALS)
-        out = (g * pressures.shape[1] + begin) * CHANNELS
+        pressure_row = (g * pressures.shape[1] + begin) * CHANNELS  # rows are counted over all axes but the lanes
         for cell in range(cells):
             q = load_numbers(table, (g * cells + cell) * fields, p)
             steps_to_output = 0  # a cell begins at an output
@@ -171,10 +171,10 @@ def advance(
                 t = (start + step) * h
                 if steps_to_output == 0:
                     steps_to_output = every
-                    store(pressures, out, vapour_floor(z[P_A], q))
-                    store(pressures, out + 1, vapour_floor(z[P_B], q))
-                    out += CHANNELS
-                    run_totals = _add_output(z, leak, t + nodes[0], run_totals, q)
+                    store(pressures, pressure_row, vapour_floor(z[P_A], q))
+                    store(pressures, pressure_row + 1, vapour_floor(z[P_B], q))
+                    pressure_row += CHANNELS
+                    run_totals = _add_output(z, leak, t + nodes[0], run_totals, q)  # nodes[0]: just inside the step
                 steps_to_output -= 1
                 if len(implicit) > 0:
                     imex_inputs = _imex_inputs(t, nodes, shape, step, gain_and_offset, leak, q)

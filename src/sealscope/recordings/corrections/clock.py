@@ -70,12 +70,13 @@ def _longest_dense_stretch(t: Array, rate: float) -> slice:
 
     `t` (n,): increasing times [s]; `rate` [Hz]: number of samples that a complete recording has per second.
     """
-    # rows before a row, less the fewest permitted before it: a stretch is dense enough if the surplus of its last row
-    # is not below that of its first row
+    # surplus of a row: number of rows before it, less the smallest number permitted up to its time. A stretch is dense
+    # enough if the surplus of its last row is not below that of its first row
     first_time = t[:1].sum()  # 0 if there are no rows
     surplus = np.arange(t.size) - (1.0 - MAX_GAP_FRACTION) * rate * (t - first_time)
     max_later_surplus = np.maximum.accumulate(surplus[::-1])[::-1]
-    # for each first row, the last row whose surplus is not below its own
+    # for each first row, the last row whose surplus is not below its own; with minus signs, as `searchsorted` needs
+    # increasing values
     last = np.searchsorted(-max_later_surplus, -surplus, side="right") - 1
     first = int(np.argmax(last - np.arange(t.size))) if t.size else 0
     return slice(first, int(last[first]) + 1 if t.size else 0)

@@ -93,7 +93,7 @@ def correct_samples(recording: Recording) -> CorrectedSamples:
 
 def _set_missing(recording: Recording, flags: Mapping[str, NDArray[np.bool_]]) -> Recording:
     """Set flagged samples of a recording to NaN; `flags`: channel -> flags (n,) of its samples."""
-    channels = {name: np.where(rows, np.nan, recording[name]) for name, rows in flags.items()}
+    channels = {name: np.where(is_flagged, np.nan, recording[name]) for name, is_flagged in flags.items()}
     return replace(recording, channels={**recording.channels, **channels}) if channels else recording
 
 
@@ -115,10 +115,10 @@ def remove_holes(recording: Recording) -> Recording:
     All channels become NaN in the rows of `flag_holes`. Short gaps stay filled, and the result has no `bridged` flags.
     Returns the same recording if there are no long gaps.
     """
-    rows = flag_holes(recording)
-    if not rows.any():
+    is_hole = flag_holes(recording)
+    if not is_hole.any():
         return recording
-    return replace(_set_missing(recording, dict.fromkeys(recording.channels, rows)), bridged=None)
+    return replace(_set_missing(recording, dict.fromkeys(recording.channels, is_hole)), bridged=None)
 
 
 def _resample(recording: Recording) -> tuple[Recording, list[Finding]]:

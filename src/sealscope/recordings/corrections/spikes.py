@@ -60,12 +60,12 @@ def find_spikes(values: Array) -> NDArray[np.intp]:
         return np.empty(0, dtype=np.intp)
     steps = np.diff(values[known])
     step_sizes = np.abs(steps)
-    # for a sample that leaps and returns, the smaller of its two changes; 0 for other samples
+    # jumps[k]: if sample k + 1 leaps and returns, the smaller of its two changes, else 0
     jumps = np.where(steps[:-1] * steps[1:] < 0.0, np.minimum(step_sizes[:-1], step_sizes[1:]), 0.0)
     thinned_sizes = step_sizes[:: max(1, step_sizes.size // _N_CHANGES)]  # enough for a quantile
     usual_step = float(np.quantile(thinned_sizes, 0.9))
     threshold = _PRIORS.times * usual_step + _MIN_QUANTA * estimate_quantum(values[known])
-    # larger change just before or after the leap; the slope also counts the mean change across the leap
+    # larger change just before or after the leap; the slope is the larger of this and the mean change across the leap
     outer_steps = np.maximum(np.append(0.0, step_sizes[:-2]), np.append(step_sizes[2:], 0.0))
     slopes = np.maximum(0.5 * np.abs(steps[:-1] + steps[1:]), outer_steps)
     rows = []

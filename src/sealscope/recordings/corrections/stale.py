@@ -145,6 +145,7 @@ def _find_equal_runs(values: Array) -> tuple[NDArray[np.intp], NDArray[np.bool_]
     jump. A jump is a change by more than `_MIN_JUMP` times the channel's resolution (`estimate_quantum`).
     """
     starts = np.flatnonzero(np.r_[True, values[1:] != values[:-1]])
+    # flags of jumps at the starts of all runs but the first, which are also the ends of all runs but the last
     jumps = np.abs(np.diff(values)[starts[1:] - 1]) > _MIN_JUMP * estimate_quantum(values)
     return starts, np.r_[False, jumps] & np.r_[jumps, False]
 
@@ -184,6 +185,7 @@ def _flag_held(t: Array, values: Array, period: float) -> NDArray[np.bool_]:
     known = np.flatnonzero(np.isfinite(values))
     starts, _ = _find_equal_runs(values[known])
     times = t[known]
+    # time of the first sample of each sample's run
     run_start = times[starts][np.searchsorted(starts, np.arange(known.size), side="right") - 1]
     period_index = np.floor((times - run_start) / period + 1e-6)  # 1e-6: rounding of the times
     is_held = np.zeros(t.size, dtype=bool)
@@ -194,11 +196,11 @@ def _flag_held(t: Array, values: Array, period: float) -> NDArray[np.bool_]:
 def _flag_repeated_rows(channels: list[Array]) -> NDArray[np.bool_]:
     """Flag the rows (n,) in which a logger got no new readings and repeated the previous row.
 
-    Each of `channels` (n,) that varies repeats its sample in such a row. A run of such rows is a candidate if it has at
-    most two rows, and one channel jumps by more than `_MIN_JUMP` quantisation steps both to the repeated reading and to
-    the row after the run. The candidates are flagged if their number is at least `stale.repeats` (`priors.toml`) times
-    the number of repeated rows expected by chance. The expected number assumes that channels repeat samples
-    independently, and is at least the fraction `stale.fewest` of all rows.
+    Each of `channels` (n,) that varies repeats its sample in such a row. A run of one or two such rows is a candidate
+    if one channel jumps, by more than `_MIN_JUMP` quantisation steps, both to the repeated reading and to the row after
+    the run. The candidates are flagged if their number is at least `stale.repeats` (`priors.toml`) times the number of
+    repeated rows expected by chance. The expected number assumes that channels repeat samples independently, and is at
+    least the fraction `stale.fewest` of all rows.
     """
     moving = [values for values in channels if np.isfinite(values).any() and np.nanmax(values) > np.nanmin(values)]
     if not moving or moving[0].size < _PRIORS.runs:

@@ -131,8 +131,8 @@ def _fit_signs(recording: Recording, speed: Array, magnitude: Array) -> Array:
     speed, difference, magnitude = (np.where(known, values, 0.0) for values in (speed, difference, magnitude))
     motion = np.column_stack([np.maximum(speed, 0.0), np.minimum(speed, 0.0)])
     step_scale = np.maximum(_average_nearby(np.abs(np.diff(magnitude)), recording.rate), np.finfo(float).tiny)
-    # log odds against a change of sign after a sample: changes are rare, and the steps of the signed values have a
-    # Laplace density
+    # log odds against a change of sign after a sample: a change makes the step of the signed values larger by twice the
+    # smaller magnitude, such steps have a Laplace density, and changes are rare
     cost_of_change = 2.0 * np.minimum(magnitude[1:], magnitude[:-1]) / step_scale
     cost_of_change += max(0.0, np.log(recording.rate / _PRIORS.changes))
     speed_variance = _noise_variance(speed, recording.rate)
@@ -142,19 +142,20 @@ def _fit_signs(recording: Recording, speed: Array, magnitude: Array) -> Array:
     for _ in range(_MAX_ITERATIONS):
         # the pump moves the piston and replaces leakage, so that no coefficient is negative
         areas = np.maximum(np.linalg.lstsq(motion, sign * magnitude, rcond=None)[0], 0.0)
-        by_motion = motion @ areas
-        # noise of the position, and errors in proportion to the flow, as by delays
+        motion_flow = motion @ areas
+        # the variance is due to noise of the position, and to errors in proportion to the flow, such as by delays
         variance = areas.max() ** 2 * speed_variance + (_PRIORS.error * magnitude) ** 2 + np.finfo(float).tiny
-        energy = max(float(np.sum(difference**2 / variance)), np.finfo(float).tiny)
-        conductance = max(float(np.sum(difference * leak_flow / variance)) / energy, 0.0)
-        predicted = by_motion + conductance * difference
-        # log of the ratio of two normal densities, of a positive over a negative sign
+        # weighted least squares; 0 without a pressure difference
+        information = max(float(np.sum(difference**2 / variance)), np.finfo(float).tiny)
+        conductance = max(float(np.sum(difference * leak_flow / variance)) / information, 0.0)
+        predicted = motion_flow + conductance * difference
+        # log of the ratio of two normal densities, that for a positive sign over that for a negative one
         log_odds = 2.0 * magnitude * predicted / variance
         previous_sign = sign
         sign = _most_likely_signs(log_odds, cost_of_change)
         if np.array_equal(sign, previous_sign):
             break
-        leak_flow = sign * magnitude - by_motion
+        leak_flow = sign * magnitude - motion_flow
     return sign
 
 
@@ -185,10 +186,10 @@ def _average_nearby(values: Array, rate: float) -> Array:
 def _draw_noise_signs(values: Array, rate: float) -> Array:
     """Restore the zero mean of noise that is recorded without its sign, by random signs; return values (n,).
 
-    Noise alone is recorded where the local mean of the `values` (n,), sampled at `rate` [Hz], is at most sqrt(2 / (pi -
-    2)) = 1.32 times their local standard deviation, as for the magnitude of normal noise, plus the error of this ratio.
-    The standard deviation is estimated from second differences, which hardly contain the motion. Elsewhere the values
-    are returned as they are. The signs are the same in every call.
+    The magnitude of normal noise has a mean of sqrt(2 / (pi - 2)) = 1.32 times its standard deviation. Noise alone is
+    recorded where the ratio of local mean to local standard deviation of the `values` (n,), sampled at `rate` [Hz], is
+    at most 1.32 plus three standard errors. The standard deviation is estimated from second differences, which hardly
+    contain the motion. Elsewhere the values are returned as they are. The signs are the same in every call.
     """
     if values.size < 3:
         return values
@@ -219,7 +220,8 @@ def _most_likely_signs(log_odds: Array, cost_of_change: Array) -> Array:
     for k, (evidence, cost) in enumerate(zip(log_odds.tolist(), [0.0, *cost_of_change.tolist()], strict=True)):
         odds = min(max(odds, -cost), cost) + evidence
         path_odds[k] = odds
-    # a sample whose odds exceed the cost of the next change keeps its sign whatever follows; the others take the next
+    # a sample whose odds exceed the cost of the next change keeps its sign whatever follows; the others take
+    # the sign of the next such sample, and the last sample keeps its own
     decided = np.abs(path_odds) > np.append(cost_of_change, 0.0)
     decided[-1:] = True
     following = np.flatnonzero(decided)[np.searchsorted(np.flatnonzero(decided), np.arange(log_odds.size))]

@@ -98,7 +98,7 @@ def _parse_number(cell: str, cell_with_point: str, decimal: str) -> float:
     `decimal`: decimal separator; `cell_with_point`: the cell with "." as the decimal separator.
     """
     with suppress(ValueError):
-        return np.nan if "_" in cell_with_point else float(cell_with_point)
+        return np.nan if "_" in cell_with_point else float(cell_with_point)  # Python takes 1_000 for a number
     text = cell.strip().replace("\u2212", "-")
     if match := _GROUPED[decimal].fullmatch(text):
         text = text.replace(match["separator"], "")
@@ -110,8 +110,8 @@ def _parse_number(cell: str, cell_with_point: str, decimal: str) -> float:
 def has_prefixes(rows: Sequence[Sequence[str]]) -> bool:
     """Test whether the numbers in `rows` of cells end in SI prefixes, such as `170.3m`, and not in units.
 
-    An ending such as `k` or `u`, which are not units, is a prefix. So are the endings of a column in which they differ
-    from number to number, or in which some numbers other than zero have none.
+    Endings that are never units, such as `k` and `u`, are prefixes. All endings in a column are prefixes if they differ
+    from number to number, or if some of its numbers other than zero have no ending.
     """
     prefixes_by_column: dict[int, set[str]] = {}
     for row in rows:
@@ -124,8 +124,8 @@ def has_prefixes(rows: Sequence[Sequence[str]]) -> bool:
                 prefixes_by_column.setdefault(column, set()).add(match["prefix"])
             elif re.search("[1-9]", digits):  # zero needs no prefix
                 prefixes_by_column.setdefault(column, set()).add("")
-    no_units = {"k", "u", "\u00b5", "\u03bc"}
-    return any(len(prefixes) > 1 or prefixes & no_units for prefixes in prefixes_by_column.values())
+    never_units = {"k", "u", "\u00b5", "\u03bc"}
+    return any(len(prefixes) > 1 or prefixes & never_units for prefixes in prefixes_by_column.values())
 
 
 def expand_prefixes(line: str) -> str:

@@ -215,11 +215,11 @@ def _find_column(labels: Sequence[Label], name: str, description: str, mapped: b
 
 
 def _parse_mapping(labels: Sequence[Label], channel: str, column_text: str) -> Formula[int]:
-    """Parse the column that a user's map gives for a channel to a formula of column numbers.
+    """Convert the entry of a channel in a user's map to a formula of column numbers.
 
-    `column_text`: the name of a column, possibly with a unit, or a formula of several columns. The unit is that in
-    `column_text`, else that in the heading, else that at the end of the column's name. Raises InputError if a column
-    does not exist, or if a formula without a unit has columns in different units.
+    `column_text`: the entry, i.e. a column's name, possibly with a unit, or a formula of several columns. The unit is
+    that in `column_text`, else that in the heading, else that at the end of the column's name. Raises InputError if a
+    column does not exist, or if a formula without a unit has columns in different units.
     """
     description = f"{column_text}, mapped to {channel},"
     name_before_blank, _, unit_after_blank = column_text.rpartition(" ")
@@ -230,7 +230,7 @@ def _parse_mapping(labels: Sequence[Label], channel: str, column_text: str) -> F
             return Formula({column: 1.0}, 0.0, _find_unit(labels[column], channel) if unit is None else unit)
     try:
         formula = parse_formula(column_text)
-    except InputError:
+    except InputError:  # without an operator the text is meant as a name
         if any(operator in column_text for operator in "*+"):
             raise
         formula = Formula({column_text: 1.0})
@@ -367,6 +367,7 @@ def _choose_time_columns(choice: ColumnMap) -> None:
         time = parts["hour"] if choice.time is None else choice.time
         time = dates[0] if dates and "year" not in parts else time  # the date to which the parts are added
         names = ", ".join(labels[i].whole for i in dict.fromkeys((time, *parts.values())))
+        # the unit counts only if the values prove to be no parts of a time: a time column found by name is then in s
         choice.time_label = Label(names, names, "s" if choice.time is not None else None)
         choice.time, choice.parts = time, parts
         return
@@ -410,11 +411,11 @@ def _note_unused(choice: ColumnMap, used: Container[int | None]) -> None:
 def choose_columns(labels: Sequence[Label], request: Request, stated_rate: float | None = None) -> ColumnMap:
     """Choose the columns of a table to read, and the channel of each.
 
-    With a requested sampling rate no time is read. Without a time column the rate is the `stated_rate` [Hz] of the
-    file. "auto" in a map stands for the channels that are guessed from the names and units of the columns that the map
-    does not use (`proposed_map`). A column in the map takes precedence over a column with the channel's name. Raises
-    InputError if a column in the map does not exist, if no column is a channel, if there is neither time nor rate, and
-    for a unit of the wrong dimension.
+    `labels`: headings of all columns; `request`: the user's map, channel -> column, and sampling rate. With a requested
+    rate no time is read. Without a time column the rate is the `stated_rate` [Hz] of the file. If the map contains
+    "auto", the columns that it does not name are assigned to channels by their names and units (`proposed_map`). A
+    column in the map takes precedence over a column with the channel's name. Raises InputError if a column in the map
+    does not exist, if no column is a channel, if there is neither time nor rate, and for a unit of the wrong dimension.
     """
     choice = ColumnMap(labels, stated_rate)
     columns = explicit_columns(request.map)
@@ -424,6 +425,7 @@ def choose_columns(labels: Sequence[Label], request: Request, stated_rate: float
         for channel, column_text in columns.items():
             with suppress(InputError):  # raised again by `_apply_map`
                 mapped_columns.update(_parse_mapping(labels, channel, column_text).factors)
+        # no channel is proposed for an empty heading
         other_labels = [Label("", "") if column in mapped_columns else label for column, label in enumerate(labels)]
         columns = {**proposed_map(other_labels), **columns}
     _apply_map(choice, columns)
@@ -448,13 +450,13 @@ def choose_columns(labels: Sequence[Label], request: Request, stated_rate: float
                 f"got columns {_format_columns(labels)}"
             )
         choice.notes.append(f"no time column: sampled at {stated_rate:g} Hz, as the file says")
-    if choice.time is not None:
+    if choice.time is not None:  # a column of dates completes a time column that has only times of day
         choice.date = next((i for i in _date_columns(choice) if i not in used), None)
     _note_unused(choice, {*used, choice.date})
     if rate is not None:  # the time is named in the notes, but not read
         choice.time = choice.time_label = choice.date = None
     elif "t" not in columns and not choice.parts and choice.time is not None:
-        # a time column with the name of a date may contain only dates
+        # without columns of hours, minutes, ... (`parts`) a time column that is called a date may have only dates
         is_date = labels[choice.time].name.casefold() in WORDS["date"]
         choice.date = choice.time if is_date else choice.date
     # channels in the order of their columns

@@ -37,7 +37,7 @@ def read_mdf(path: Path, request: Request) -> RecordingFields:
             def read_seconds(number: int = number) -> Any:
                 """Read the times (n,) [s] of a group of channels, and the time stamp of 0 s.
 
-                The stamp is None if the file has no date.
+                The stamp is None if the file has no date. The default fixes `number` to the present group.
                 """
                 return np.asarray(file.get_master(number), dtype=np.float64), start
 

@@ -157,8 +157,8 @@ def _read_texts(data: Any, name: str, file_size: int) -> list[str]:
     """Read a data set of texts (n,), in chunks if the lengths of the texts vary, to bound the memory.
 
     Many cells may refer to the same text, which can be as long as the file. A chunk therefore has at most
-    `_CHUNK_BYTES` / `file_size` [bytes] cells, but at least 1 and at most `_CHUNK_TEXTS`. `name`: the data set in
-    messages. Raises InputError for too many or too long texts, and for lists or references.
+    `_CHUNK_BYTES` / `file_size` cells, but at least 1 and at most `_CHUNK_TEXTS`. `name`: the data set in messages;
+    `file_size`: size of the file [bytes]. Raises InputError for too many or too long texts, and lists or references.
     """
     import h5py
 

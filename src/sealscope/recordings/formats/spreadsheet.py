@@ -43,7 +43,7 @@ def read_spreadsheet(path: Path, request: Request) -> RecordingFields:
         try:
             table = _read_sheet(sheet, request, str(path))
         except InputError as error:
-            first_error = first_error if number else error
+            first_error = first_error if number else error  # that of the first sheet, number 0
             continue
         table = table._replace(kind="spreadsheet", provenance=table.provenance | {"format": "spreadsheet"})
         unread = [name for name in workbook.sheet_names if name != sheet.name]

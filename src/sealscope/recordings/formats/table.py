@@ -145,7 +145,8 @@ def build_fields(
 ) -> RecordingFields:
     """Build the fields of a recording from the series in a file; raise InputError if they do not fit together.
 
-    If no columns can be chosen but the series form a long table, each name in that table is read as a column.
+    If no columns can be chosen but the series form a long table, in which each row is one sample of a named channel,
+    each of these names is read as a column.
 
     - `series`: named columns of samples.
     - `request`: the user's choice of the columns.
@@ -169,6 +170,7 @@ def build_fields(
         channel_series, more_notes = _pivot_long_table(series, long_columns, prepare)
         table = build_fields(channel_series, request, kind, remarks)
         return table._replace(history=(*more_notes, *table.history))
+    # the series to read; `_CLOCK_LABEL`, which may come after all series, is not one
     kinds = {column: kind_read for column, kind_read in choice.columns.items() if column < len(candidates)}
     members = {column: candidates[column] for column in kinds}
     if prepare is not None:
@@ -248,7 +250,7 @@ def convert_columns(
     details = {"file": request.file, "format": kind, **start, "about": dict(remarks), "columns": choice.names}
     details |= {"unused": list(choice.unused), "unused_temperatures": list(choice.unused_temperatures)}
     details["log_units"] = log_units
-    provenance = {key: value for key, value in details.items() if value or key in start}
+    provenance = {key: value for key, value in details.items() if value or key in start}  # no empty ones
     return RecordingFields(t, channels, units, rate, provenance, tuple(notes), kind)
 
 
@@ -267,7 +269,7 @@ def _convert_channels(
         if unit != units[name]:
             log_units[name] = unit
         channels[name] = to_si(formula.values(columns), unit, units[name], name=name)
-        if not any(channels[name] is cells for cells in columns.values()):
+        if not any(channels[name] is cells for cells in columns.values()):  # not an array of the caller
             channels[name].setflags(write=False)  # so that the recording does not copy it
     return channels, units, log_units
 
@@ -358,9 +360,9 @@ def timedelta_seconds(times: Any) -> Array:
 def _make_names_unique(series: Sequence[Series]) -> tuple[list[Series], list[str]]:
     """Give each series of a file a unique name; return the series, and lines for the history.
 
-    Of several series with one name, that in the group with most series named like channels keeps the name; of groups
-    with equally many, that in the group with most samples. The others are called by their paths, `group/name`. Series
-    without groups are returned unchanged.
+    Of several series with one name, one keeps it: that of the group with most series named like channels or, among
+    groups with equally many, with most samples. The others are called by their paths, `group/name`. Series without
+    groups are returned unchanged.
     """
     if all(member.group == "" for member in series):
         return list(series), []
@@ -440,6 +442,7 @@ def _align_clocks(choice: ColumnMap, used: dict[int, Series]) -> tuple[dict[int,
         if member.clock is not None and member.clock.key != base.clock.key:
             values, note = _resample(values, member, t[known], start)
             notes += [f"{channel_of[column]} {note}"] if note else []
+        # resampled values are already at the known times only
         columns[column] = values if len(values) == np.count_nonzero(known) else values[known]
     t = t[known]
     assert choice.time is not None
@@ -536,7 +539,7 @@ class _LongTable:
         return Series("", label, rows.size, lambda: read_rows().channels["u"], clock)
 
     def _read_rows(self, label: Label, rows: NDArray[np.intp]) -> RecordingFields:
-        """Convert the rows of one channel that have a time to the fields of a recording.
+        """Convert the rows of one channel, except those without a time, to the fields of a recording.
 
         `rows` (k,): indices of the channel's rows in the table; `label`: its name, for messages. Raises InputError if
         too many samples are words.
@@ -560,7 +563,7 @@ class _LongTable:
             return fields.t, np.datetime64(round(provenance["start_epoch_s"] * 1e9), "ns")
         if "start" in provenance:
             return fields.t, np.datetime64(provenance["start"]).astype("datetime64[ns]")
-        # stamps of which the provenance states no start are times of day without a date
+        # if the provenance states no start, stamps are times of day without a date
         is_time_of_day = times.dtype.kind == "M" and times.size > 0
         return fields.t, np.nanmin(times) if is_time_of_day else None
 
@@ -578,7 +581,7 @@ def _pivot_long_table(
     value_column, validity_column = column_by_kind["value"], column_by_kind.get("valid")
     text_columns = [column_by_kind[kind] for kind in ("name", "unit") if kind in column_by_kind]
     labels = [Label("", "") if column in text_columns else member.label for column, member in enumerate(series)]
-    if "timestring" in {label.name.casefold() for label in labels}:  # WinCC has exact times in a second column
+    if "timestring" in {label.name.casefold() for label in labels}:  # WinCC's exact times, in 1e-6 days
         days = Label("Time_ms", "t", "microday since 1899-12-30")
         labels = [days if label.name.casefold() == "time_ms" else label for label in labels]
     # the values are read in counts, so that they are not converted
@@ -587,7 +590,7 @@ def _pivot_long_table(
     assert choice.time is not None  # `choose_columns` raises InputError without a time
     choice.notes.clear()
     kinds = dict.fromkeys(text_columns, "texts") | ({} if validity_column is None else {validity_column: "any"})
-    kinds |= choice.columns | {value_column: "any"}
+    kinds |= choice.columns | {value_column: "any"}  # "any": numbers, with inf in place of words
     kinds[choice.time] = kinds.pop(choice.time)  # the time comes last
     notes = [*prepare(kinds, choice.date)] if prepare else []
     columns = {column: _read_samples(series[column], as_time=kind == "time") for column, kind in choice.columns.items()}

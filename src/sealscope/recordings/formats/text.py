@@ -109,7 +109,7 @@ def read_text_parts(path: Path, request: Request, every: float) -> Iterator[Reco
     description = None if layout.description is None else parse_description(layout.description)
     time_columns = _find_channel_times(layout.labels)
     choice = None
-    with suppress(InputError):
+    with suppress(InputError):  # the log may be a long table
         choice = choose_columns(layout.labels, request, layout.rate)
     if choice is None or time_columns:
         try:
@@ -139,7 +139,7 @@ def read_text_parts(path: Path, request: Request, every: float) -> Iterator[Reco
     first = next(blocks, None)
     is_reversed = first is not None and choice.time is not None and is_falling(first.columns[choice.time])
     if first is not None and every < inf and not is_reversed:
-        # convert a copy of the first block for its rate, then start the time again
+        # convert a copy of the first block, as `join_blocks` empties it, for its rate; then start the time again
         rows_per_part = max(1, round(every * make_part([first[:]], state).rate))
         state = TimeState(state.head, state.rate, state.resolution)
     pending: list[_Block] = []
@@ -334,8 +334,8 @@ class _Log:
     def _split_rows(self, first_line: int, block: bytes, is_cut: bool) -> tuple[list[list[str]], Sequence[int]]:
         """Split a block of bytes of the log into rows of cells; also return the line number of each row.
 
-        Lines that are not samples are left out. `first_line`: number of the block's first line; `is_cut`: the file ends
-        within the block's last line, whose incomplete number is then missing.
+        Lines that are not samples are left out. `first_line`: number of the block's first line, from 1; `is_cut`: the
+        file ends within the block's last line, whose incomplete number is then missing.
         """
         lines = _decode_lines(block, self.layout)
         samples = self._select_samples(lines, max(0, self.layout.first_row + 1 - first_line))
@@ -359,7 +359,7 @@ class _Log:
     def _read_by_arrow(self, first_line: int, block: bytes, end: int) -> _Block | None:
         """Read the rows of a block of bytes by pyarrow, and count them.
 
-        `first_line`: number of the block's first line; `end`: number of bytes up to the end of its last complete line.
+        `first_line`: number of the block's first line, from 1; `end`: number of bytes of its complete lines.
         Returns None, and counts no rows, unless all cells to read are plain finite numbers or missing.
         """
         from pyarrow import ArrowInvalid, csv, float64, py_buffer
@@ -439,7 +439,7 @@ class _Log:
                     f"(line {line_numbers[line]}, {self.place})"
                 )
             rows.append(row)
-        return rows[:-1]
+        return rows[:-1]  # without the empty line
 
     def _remove_text_rows(
         self, rows: list[list[str]], line_numbers: Sequence[int]
@@ -562,7 +562,7 @@ class _Log:
         try:
             return parse_stamps(texts, bool(self.day_first)), word_rows
         except ValueError as error:
-            bad_row = int(error.args[0])
+            bad_row = int(error.args[0])  # as `parse_stamps` states
             raise InputError(f"{_STAMP_RULE}, got {cells[bad_row]!r} {format_place(bad_row)}") from None
 
     def _detect_day_first(self) -> bool:

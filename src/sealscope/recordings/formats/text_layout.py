@@ -149,9 +149,9 @@ def _used_width(row: Sequence[str]) -> int:
 def _detect_dialect(body: Sequence[str]) -> tuple[str, str, int]:
     """Detect (delimiter, decimal separator, number of cells in a row) from some lines of a log.
 
-    All pairs of `_DIALECTS` are tried. The best is the one with which the largest fraction of the cells that are not
-    missing are values, i.e. numbers or time stamps, in rows of one width. For lines without values the result is (",",
-    ".", 1).
+    All pairs of `_DIALECTS` are tried, and rated by the fraction of cells, missing ones aside, that are values (numbers
+    or time stamps) in rows of one width. This is the width with most values; these must be half of all values or more.
+    For lines without values the result is (",", ".", 1).
     """
     ranks: dict[tuple[str, str, int], tuple[float, float, bool, int]] = {}
     text = "\n".join(body)
@@ -241,7 +241,7 @@ def _parse_heading(
             for line, row in zip(lines_above, rows, strict=False)
             if row[0].strip().casefold() in WORDS["row"]["label"]
         ]
-        description_lines = [*label_lines, *lines_above[n_lines:]][::-1]
+        description_lines = [*label_lines, *lines_above[n_lines:]][::-1]  # from the top down
         return apply_descriptions(labels, [split_cells(line, delimiter) for line in description_lines]), n_lines
     if lines_above[0].startswith(COMMENTS) and not lines_above[0].startswith(DESCRIPTION_MARK):
         names_in_comment = split_names(lines_above[0].lstrip('#%/!" ').rstrip('"'))
@@ -270,7 +270,7 @@ def _parse_keyed_rows(rows: Sequence[Sequence[str]]) -> tuple[list[Label], int] 
 
 
 def _parse_stacked_rows(rows: Sequence[Sequence[str]]) -> tuple[list[Label], int]:
-    """Parse heading rows without keys: a row of names, and possibly others.
+    """Parse heading rows without keys: a row of names, and possibly other rows.
 
     `rows`: cells of the rows, from the lowest up. Rulers such as `----` may stand below the names, units below or above
     them, and names of groups of columns on top; the name of a group is put before the names of its columns. Returns
@@ -421,7 +421,7 @@ def _find_first_row(lines: Sequence[str], body: Sequence[str], delimiter: str, d
     may_begin_with_word = any(
         not flags[0] and not is_missing(row[0]) for row, flags in zip(rows, is_value_cell, strict=True)
     )
-    min_cells = max(1, min(width, (numeric_columns or [0])[-1] + 1))
+    min_cells = max(1, min(width, (numeric_columns or [0])[-1] + 1))  # up to the last numeric column
     for index, line in enumerate(lines):
         cells = split_cells(line, delimiter) if _is_content(line) else []
         if len(cells) < min_cells or not (may_begin_with_word or is_value(cells[0], decimal) or is_missing(cells[0])):

@@ -114,7 +114,7 @@ def _parse_stamp(text: str) -> dict[str, str | None] | None:
         return None  # six digits are a time of day only after a date of eight digits
     if month and not month.isdecimal():
         name = month.casefold()
-        parts["month"] = _MONTHS.get(name[:4], _MONTHS.get(name[:3]))
+        parts["month"] = _MONTHS.get(name[:4], _MONTHS.get(name[:3]))  # beginnings have 4 or 3 letters
     return None if month and parts["month"] is None else parts
 
 
@@ -290,7 +290,7 @@ def nominal_rate(t: Array) -> float:
     if steps.size and np.isfinite(span) and steps.min() > 0:
         mean = span / steps.size
         max_deviation = float(np.abs(t - t[0] - mean * np.arange(t.size)).max())
-        if max_deviation < _MAX_ROUNDING * mean:  # the rounding of stamps limits the error of the mean interval
+        if max_deviation < _MAX_ROUNDING * mean:  # by rounding, which may shift both ends of the span
             return _shortest_decimal(1.0 / mean, max(_MIN_SLACK, min(2 * max_deviation / span, _MAX_SLACK)))
     steps = steps[np.isfinite(steps) & (steps > 0)]
     if not steps.size:
@@ -363,16 +363,16 @@ def _remove_jumps(t: Array, step: float, single: bool) -> Array | None:
     is_coarse = median_step * _TOLERANCE >= 0.1 * abs(step)  # ordinary intervals could look like jumps
     if not jumps.size or (single and jumps.size > 1) or is_coarse:
         return None
-    return t - step * np.searchsorted(jumps + 1, np.arange(t.size), side="right")
+    return t - step * np.searchsorted(jumps + 1, np.arange(t.size), side="right")  # jumps up to each sample
 
 
 def _convert_numbers(values: Array, unit: str | None, name: str, state: TimeState) -> _Seconds:
     """Convert a time column of numbers (n,) to seconds.
 
     Returns (times (n,) [s], provenance of the start, lines for the history). `unit`: unit of the column, which may also
-    state an origin, as in `days since 1899-12-30`; None if it is to be guessed from the magnitude of the numbers. Only
-    this guess uses `name`, the name of the column in messages, and `state`, the state of the column after the previous
-    part of the log, and updates `state`. Raises InputError if no row has a number.
+    state an origin, as in `days since 1899-12-30`; None if it is to be guessed from the magnitude of the numbers. Two
+    arguments serve only this guess: `name`, the column in messages, and `state`, the state of the column after the
+    previous part of the log, which is updated. Raises InputError if no row has a number.
     """
     finite = values[np.isfinite(values)]
     if not finite.size:
@@ -399,8 +399,8 @@ def _convert_without_unit(values: Array, finite: Array, name: str, state: TimeSt
     """Convert a time column of numbers (n,) without a unit to seconds.
 
     Returns (times (n,) [s], provenance of the start, lines for the history). `finite` (m,): the finite `values` of this
-    part of the log. The size and the steps of those in the first part show if they are days or seconds, and since when.
-    `name`: the column in messages; `state`: state of the column after the previous part, which is updated. Raises
+    part of the log. Size and steps of the finite values of its first part show if all are days or seconds, and since
+    when. `name`: the column in messages; `state`: state of the column after the previous part, which is updated. Raises
     InputError if the numbers count rows.
     """
     first = float(finite[0])
@@ -491,8 +491,8 @@ def time_base(
 def _space_shared_times(t: Array, state: TimeState) -> tuple[float, Array] | None:
     """Spread samples that share a time, because the times of the log have coarse steps, evenly over these steps.
 
-    `t` (n,): times [s]. Returns (step [s], new times (n,)). None if a time is missing, if the times step back, or if
-    the steps do not have about equally many samples, two or more. If a part of a log is too short for estimating the
+    `t` (n,): times [s]. Returns (step [s], new times (n,)). None if a time is missing, if the times step back, or
+    unless all steps have about equally many samples, at least two. If a part of a log is too short for estimating the
     step, step and rate are those in `state`, unless the part has a gap.
     """
     steps = np.diff(t)
@@ -513,6 +513,6 @@ def _space_shared_times(t: Array, state: TimeState) -> tuple[float, Array] | Non
         resolution, rate = state.resolution, state.rate
     else:
         return None
-    # each new time is that of its first sample, with the index `changes` + 1, to within one interval
+    # a time in the log is that of its first sample, whose index is `changes` + 1, to within one interval
     first_time = float(np.median(t[changes + 1] - (changes + 1) / rate)) if changes.size else float(t[0])
     return resolution, first_time + np.arange(t.size) / rate

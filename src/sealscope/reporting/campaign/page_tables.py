@@ -79,8 +79,8 @@ class CauseTable(NamedTuple):
     """The table of the causes that one detector names, as text.
 
     `columns`: causes that are named; `rows`: for each true cause, its name, its number of records, and for each column
-    the fraction of these records with the column's cause named; `right`, `covered`: fraction of all records for which
-    exactly the true cause is named, and for which the true cause or an ambiguous cause that includes it is named.
+    the fraction of these records for which the column's cause is named; `right`: fraction of all records for which
+    exactly the true cause is named; `covered`: the same if an ambiguous cause that includes the true one counts, too.
     """
 
     detector: str

@@ -95,7 +95,7 @@ def history_pictures(ordered: Sequence[Judged]) -> dict[str, Picture] | None:
     days = [(entry.start_s or 0.0) / DAY if has_dates else float(k + 1) for k, entry in enumerate(ordered)]
     limit = ordered[-1].diagnosis.limit_lpm
     # values above 8 times the median would flatten the others; they are drawn as a symbol at the top
-    max_shown = 8.0 * float(np.median([lpm for lpm, *_ in known_levels])) or math.inf
+    max_shown = 8.0 * float(np.median([lpm for lpm, *_ in known_levels])) or math.inf  # inf for a median of 0
     shown_values = [value for lpm, _, high in known_levels for value in (lpm, high)]
     shown_values = [value for value in shown_values if value <= max_shown and value < math.inf]
     shown_values += [] if limit is None or limit > max_shown else [limit]
@@ -104,7 +104,8 @@ def history_pictures(ordered: Sequence[Judged]) -> dict[str, Picture] | None:
     def format_day(day: float) -> str:
         """Format a value of the time axis as a date, or if there are no dates, as the number of a recording.
 
-        `day`: time in days since 1970 or, without dates, the number of a recording; "" for a number that is not whole.
+        `day`: time in days since 1970 or, without dates, the number of a recording. Returns "" for a number that is not
+        whole, since no recording has it.
         """
         if has_dates:
             return stamp(day * DAY, days[-1] - days[0])

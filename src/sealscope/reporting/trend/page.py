@@ -104,8 +104,9 @@ def _draw_trend(trend: Trend, picture: Picture) -> None:
     days = [trend.points[row].day for row in trend.rows]
     for episode in trend.episodes:
         healthy = episode.wear.healthy
-        end = text.healthy_end(episode.wear)
-        picture.box("healthy", days[episode.begin], days[min(episode.end, len(days) - 1)], healthy.low, end)
+        healthy_high = text.healthy_end(episode.wear)
+        stop = days[min(episode.end, len(days) - 1)]  # the next episode's first recording, if there is one
+        picture.box("healthy", days[episode.begin], stop, healthy.low, healthy_high)
         if episode.alarm is not None:
             picture.mark("mark", days[episode.alarm])
     for point in trend.repairs:
@@ -119,7 +120,7 @@ def _draw_trend(trend: Trend, picture: Picture) -> None:
         title = f"{point.file}: {point.value:.3g} {trend.unit}"
         picture.point(style, point.day, point.value, (point.low or 0.0, point.high or 0.0), title)
     for episode in trend.episodes:
-        picture.line("course", *np.transpose(_fitted_line(days, episode)))
+        picture.line("course", *np.transpose(_fitted_line(days, episode)))  # days and levels of the vertices
 
 
 def _y_limits(trend: Trend) -> tuple[float, float]:

@@ -97,7 +97,7 @@ def figures(trend: Trend) -> dict[str, str]:
     if wear is None:
         return dict.fromkeys(("total", "leak", "healthy", "since", "growth", "limit"), "")
     at_pressure = "" if trend.pressure is None else f" at {number(trend.pressure / BAR, 2)} bar"
-    # without a rig, levels are in percent of the first one
+    # without a rig, levels are in percent of the first recording's level
     reference = " of the first; no rig was stated" if trend.unit == "%" and trend.basis != "ringing" else ""
     high = healthy_end(wear)
     is_whole = high == wear.healthy.high

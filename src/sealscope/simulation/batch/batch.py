@@ -110,7 +110,7 @@ class Batch:
 
 
 def _index_of(name: str, names: tuple[str, ...], what: str) -> int:
-    """Return the index of `name` in `names`; raise InputError for another name. `what`: word for names in the error."""
+    """Return the index of `name` in `names`; raise InputError for another name. `what`: noun for them in messages."""
     if name not in names:
         raise InputError(f"{what} must be one of {', '.join(names)}, got {name!r}")
     return names.index(name)
@@ -187,7 +187,7 @@ def simulate_batch(
         raise InputError(f"bounds must rise within 0 .. {first.duration:g} s, got {edges.tolist()}")
     n = len(experiments)
     rms = np.empty((n, len(CHAMBERS), edges.size - 1, len(QUANTITIES)))
-    # filled set by set
+    # the sets of runs fill the arrays one by one
     batch = Batch(rms, edges, mean_leak_lpm=np.empty(n), coefficients=np.empty(n), steps=np.empty(n))
     completed = 0.0
     for experiment_set in sets:
@@ -211,7 +211,7 @@ def simulate_batch(
 def _run_set(
     experiment_set: ExperimentSet, batch: Batch, error: float, threads: int, progress: Callable[[float], None]
 ) -> None:
-    """Simulate a set of experiments, and write the results into their rows of `batch`.
+    """Simulate a set of experiments on `threads` threads, and write the results into their rows of `batch`.
 
     `error` [Pa]: allowed rms error of a pressure; `progress` is called with the completed fraction of the set.
     """
@@ -221,7 +221,7 @@ def _run_set(
     step = stated_step or choose_step(experiment_set, coefficients, error)
     if any(member.leak.mean for member in members):
         coefficients = _size_leaks(experiment_set, step, coefficients, threads)
-        # again with the coefficients found, because large leaks need short steps
+        # choose again with the coefficients found, because large leaks need short steps
         step = stated_step or min(step, choose_step(experiment_set, coefficients, error))
     run = SetRun(experiment_set, step, coefficients, flow_coefficients=coefficients, bounds=batch.bounds)
     run.run_all(threads, progress)
@@ -264,8 +264,8 @@ def longest_allowed_step(experiment_set: ExperimentSet, coefficients: Array) -> 
 def _size_leaks(experiment_set: ExperimentSet, step: float, coefficients: Array, threads: int) -> Array:
     """Find the leakage coefficients (runs,) that give the stated mean flows of a set's leaks.
 
-    The search starts from `coefficients`, which are kept for leaks without a stated mean flow. `step` [s]: longest
-    step of the solver if the set does not state one.
+    The search starts from `coefficients`, which are kept for leaks without a stated mean flow, and simulates the set on
+    `threads` threads. `step` [s]: longest step of the solver if the set does not state one.
     """
     members, stated_step = experiment_set.members, experiment_set.experiment.step
     mean_flows = np.array([member.leak.mean or 0.0 for member in members])

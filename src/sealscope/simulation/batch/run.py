@@ -106,7 +106,7 @@ def refuse_unbatchable(experiment: Experiment, row: int) -> None:
         violated_rules.append(f"no fault of a sensor, got {', '.join(map(str, experiment.faults))}")
     if leaks and experiment.changes_viscosity:
         violated_rules.append("no leak while the oil's temperature changes")
-    not_modelled = ["daq.jitter"]  # by the instruments of a batch (`batch.signals`)
+    not_modelled = ["daq.jitter"]  # parameters that the instruments of a batch do not model (`batch.signals`)
     not_modelled += [
         f"sensors.{name}.{symbol}"
         for name in CHAMBERS
@@ -295,7 +295,7 @@ def build_instrument_rows(members: Sequence[Member], first: int, last: int) -> A
     rows = np.array([_pressure_instruments(run.rig, run.readings(), ends, samples) for run in experiments])
     for row, experiment in zip(rows, experiments, strict=True):
         if row[:, HUM].any():
-            random = np.random.default_rng([experiment.seed, 1])  # 1: not the random numbers of the noise
+            random = np.random.default_rng([experiment.seed, 1])  # 1: a stream independent of the noise
             row[:, HUM_PHASE] = random.random(len(CHAMBERS))
     return rows
 
@@ -377,7 +377,7 @@ class SetRun:
         from sealscope.physics.vector.runs import CHANNELS, MIN_PRESSURE, N_TOTALS
 
         members = experiment_set.members
-        common = experiment_set.experiment  # for the settings that all members share
+        common = experiment_set.experiment  # has the settings that all members share
         self.experiment_set, self.n_runs, self.channels = experiment_set, len(members), CHANNELS
         self.method = choose_method(common.rig, common.method)
         self.oversampling = oversampling_of(common.rate, step)
@@ -388,7 +388,7 @@ class SetRun:
         self.n_outputs = (self.n_samples + FILTER_REACH) * self.oversampling
         self.nodes = step_nodes(IMPLICIT if self.method == "imex" else EXPLICIT, self.step)
         self.cells = build_cells(members, self.n_outputs, rate)
-        self.numbers = members[0].numbers  # for its choices only; the runs' numbers are in the table of the cells
+        self.numbers = members[0].numbers  # only its choices are used; the runs' numbers are in the cells
         leaks = build_leak_rows(members, coefficients, flow_coefficients)
         checked_cases = set()  # members that share parameters and leak are checked once
         for member, (G, C) in zip(members, leaks[:, :2].tolist(), strict=True):
@@ -425,6 +425,7 @@ class SetRun:
         filters = np.zeros((self.n_runs, self.channels, self.taps_before + self.taps_after + 1))
         for run_and_channel, delay in np.ndenumerate(delays):
             taps = taps_by_delay[float(delay)]
+            # the middle of the taps is `int(delay)` outputs before output n; the taps contain the rest of the delay
             start = self.taps_before - int(delay) - taps.size // 2
             filters[run_and_channel][start : start + taps.size] = taps
         self.taps = pack_lanes(filters, self.width)
@@ -439,7 +440,7 @@ class SetRun:
         from sealscope.simulation.batch.noise import noise_keys
         from sealscope.simulation.batch.signals import QUANTITIES
 
-        before, after = reach()[-1]
+        before, after = reach()[-1]  # [-1]: the highest level reaches furthest
         samples = np.round(bounds * self.experiment_set.experiment.rate).astype(np.int64)
         self.segments = np.clip(samples, before, self.n_samples - after)
         self.sums = np.zeros((self.n_groups, self.channels, self.segments.size - 1, QUANTITIES, self.width))
@@ -465,6 +466,7 @@ class SetRun:
                     progress(completed)
 
         with ThreadPoolExecutor(threads) as pool:
+            # `list` waits for all threads, and raises an exception of any of them
             list(pool.map(lambda groups: self._run_groups(groups, add_progress), itertools.pairwise(bounds)))
 
     def _chunks(self) -> list[_Chunk]:
@@ -491,7 +493,8 @@ class SetRun:
     def _readable_samples(self, stop: int) -> int:
         """Count the samples of the recording that the anti-alias filter can compute from the outputs before `stop`.
 
-        An output is a time at which the solver writes its results.
+        An output is a time at which the solver writes its results. Sample m needs the outputs up to number
+        m `oversampling` + `taps_after`.
         """
         if stop == self.n_outputs:
             return self.n_samples
@@ -536,6 +539,7 @@ class SetRun:
                     pressures[:, :history] = pressures[:, history : history + 1]  # constant before the beginning
                 end_sample = self._readable_samples(stop)
                 if end_sample > n_read:
+                    # index in `pressures` of the first output that sample `n_read` needs; index 0 is start - history
                     first_tap = n_read * self.oversampling - self.taps_before - (start - history)
                     sense_lanes(
                         local_groups, pressures, first_tap, self.oversampling, self.taps[a:b], n_read, end_sample,
@@ -543,6 +547,7 @@ class SetRun:
                         wavelet.taps, wavelet.buffers, self.segments, self.sums[a:b],
                     )  # fmt: skip
                     n_read = end_sample
+                # the last outputs become the history of the next chunk
                 pressures[:, :history] = pressures[:, stop - start : stop - start + history].copy()
             add_progress((stop - start) / self.n_outputs * (b - a) / self.n_groups)
 
@@ -622,7 +627,7 @@ class SetRun:
     def rms(self) -> Array:
         """Compute the RMS of the wavelet details of p_A and p_B in each segment, (runs, 2, segments, 5).
 
-        The details are d1, d2, d3, d4 [Pa] and the product d3 d4 [Pa^2].
+        The details are d1, d2, d3, d4 [Pa] and the product d3 d4 [Pa^2]. A segment without samples gives NaN.
         """
         n_samples = np.diff(self.segments)[:, None]
         with np.errstate(invalid="ignore", divide="ignore"):

@@ -141,7 +141,9 @@ def add_reading_squares(
     n_taps, stride, sum_rows = taps.shape[2], factor * CHANNELS, (bounds.size - 1) * QUANTITIES
     low, high = wavelet
     capacity = buffers.shape[3]
-    history, delay = capacity - CHUNK, low.shape[0] // 2 * ((1 << LEVELS) - 1)  # samples by which details lag readings
+    history = capacity - CHUNK
+    # the details lag the readings by half the lengths of the filters of all levels, dilated by 1, 2, 4 and 8 samples
+    delay = low.shape[0] // 2 * ((1 << LEVELS) - 1)
     details = np.empty((LEVELS, CHUNK, WIDTH))
     for g in range(groups[0], groups[1]):
         key = load(keys, g)
@@ -153,6 +155,7 @@ def add_reading_squares(
             n = min(CHUNK, last - start)
             source = (g * pressures.shape[1] + first_output) * CHANNELS + (start - first) * stride
             a, b = start_A + history, start_B + history
+            # -CHANNELS: each further tap multiplies the next output
             filter_rows(pressures, source, stride, -CHANNELS, taps, A * n_taps, n_taps, buffers, a, n)
             filter_rows(pressures, source + 1, stride, -CHANNELS, taps, B * n_taps, n_taps, buffers, b, n)
             for i in range(n):

@@ -88,7 +88,7 @@ def centred_start(rig: Rig, command: Command | Position | str, duration: float) 
     if not rig.circuit.pump_feeds_chambers:
         flow_per_volt = drive_of(rig).unloaded_flow(1.0)
         positions = dt * np.cumsum(volts) * flow_per_volt / area
-        centre = 0.5 * (min(positions.min(), 0.0) + max(positions.max(), 0.0))
+        centre = 0.5 * (min(positions.min(), 0.0) + max(positions.max(), 0.0))  # 0: the path's start
         return float(np.clip(-centre, -half_stroke, half_stroke))
     integral = angle = min_angle = max_angle = 0.0
     for omega_d in map(float, motor.omega_per_volt * volts):
@@ -115,7 +115,7 @@ def _draw_path(random: np.random.Generator, shapes: tuple[str, ...], duration: f
     The range is maximum minus minimum. `shapes`: names of the courses to choose from, "linear" and "wander" (a smooth
     random walk); `warms`: True for a linear course that always rises, False for one that rises or falls at random.
     """
-    # all are drawn for either shape, so that later draws do not depend on the shape
+    # all numbers are drawn for either shape, so that later draws do not depend on the shape
     shape = shapes[int(random.integers(len(shapes)))]
     rises = random.random() < 0.5 or warms
     weights = random.standard_normal(WANDER_TERMS) / (np.arange(WANDER_TERMS) + 0.5)  # standard deviations of `Wander`
@@ -142,7 +142,7 @@ def _draw_nuisance(nuisance: Nuisance, seed: int, oil: Wander) -> tuple[dict[str
     """Draw the values and the drifts of a nuisance, which is a difference between machines.
 
     Returns the values by parameter, and the list of drifts. A value is in SI units, or a factor on the rig's value if
-    `nuisance.scales`. `oil`: course of the oil temperature, which drifts may follow.
+    `nuisance.scales`. `seed`: seed of the machine; `oil`: course of the oil temperature, which drifts may follow.
     """
     values: dict[str, float] = {}
     drifts: list[ParameterDrift] = []

@@ -145,7 +145,8 @@ class Duty:
         for text in self.loads:
             parse_force(text)
 
-    def __repr__(self) -> str:  # seeds of cases are derived from this text: `loads` and `controllers` only if stated
+    def __repr__(self) -> str:
+        # seeds of cases are derived from this text, which has `loads` and `controllers` only where they are stated
         stated_fields = [
             part for part in fields(self) if part.default is MISSING or getattr(self, part.name) != part.default
         ]
@@ -204,7 +205,8 @@ def _convert_to_si(entry: _NuisanceEntry) -> AnyNuisance:
 def _convert_values(entry: _NuisanceEntry, choices: tuple[str, ...], si_unit: str) -> tuple[float | str, ...]:
     """Convert the possible values of a parameter in a profile's entry to SI units; texts are returned unchanged.
 
-    `choices`: texts that the parameter may have, () for a number. Raises InputError for any other value.
+    `choices`: texts that the parameter may have, () for a number; `si_unit`: its SI unit. Raises InputError for any
+    other value.
     """
     values = entry.values or ()
     for value in values:
@@ -220,12 +222,12 @@ def _convert_values(entry: _NuisanceEntry, choices: tuple[str, ...], si_unit: st
 def _parse_drift(entry: _DriftEntry, parameters: tuple[str, ...], si_unit: str) -> DriftRange:
     """Convert the drift in a profile's entry to SI units.
 
-    The size of a relative drift becomes a fraction of the parameter. Raises InputError for a drift that the
-    parameters cannot have.
+    The size of a relative drift becomes a fraction of the parameter. `si_unit`: SI unit of the parameters. Raises
+    InputError for a drift that the parameters cannot have.
     """
     absolute = is_absolute_drift(parameters[0])
     for parameter in parameters:
-        ParameterDrift(parameter, linear_path(0.0, 1.0), absolute)
+        ParameterDrift(parameter, linear_path(0.0, 1.0), absolute)  # raises InputError if it cannot drift
     low, high = (to_si(value, entry.unit, si_unit if absolute else "1", name="drift") for value in entry.size)
     can_fall = entry.oil != 1.0  # with weight 1 the drift follows the oil, which only warms
     if low < 0 or (not absolute and can_fall and high >= 1):
@@ -378,10 +380,10 @@ def _read_profile(path: Path, place: str) -> Profile:
         file = convert_type(_File, tree)
     except ValueError as error:
         raise InputError(f"{error} ({place})") from None
-    head = file.profile
-    base = None if head.extends is None else load_profile(head.extends)
+    table = file.profile
+    base = None if table.extends is None else load_profile(table.extends)
     duty = base.duty if base is not None and file.duty is None else file.duty
     if duty is None:
         raise InputError(f"a profile must have [duty], got none ({place})")
     nuisances = _replace_nuisances(() if base is None else base.nuisances, file.nuisance)
-    return Profile(head.name, head.title, duty, nuisances, place, file.family, head.seeds)
+    return Profile(table.name, table.title, duty, nuisances, place, file.family, table.seeds)

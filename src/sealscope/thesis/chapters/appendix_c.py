@@ -42,6 +42,7 @@ def _chamber_table(sheet: DataSheet, measured: DataSheet | None, chamber: str, i
         (row.number, row.mean_leak_lpm, row.command, row.closed_pct, row.level, *(column[k] for column in columns))
         for k, row in enumerate(APPENDIX_C)
     )
+    # the tail of the id, "-pa" or "-pb", tells the chambers' tables apart
     tail, title = f"-p{chamber[-1].lower()}", f"Appendix C, RMS of the wavelet details of {chamber}"
     return item.table(rows, "", heads, tail=tail, title=title)
 
@@ -52,17 +53,18 @@ def compare_sheets(sheet: DataSheet, measured: DataSheet | None) -> list[tuple[C
     All means are over the tests. The columns are:
 
     - chamber and detail;
-    - geometric mean change of the RMS with the leak [%], i.e. 100 (exp(mean log change) - 1), simulated and measured;
+    - geometric mean change of the RMS with the leak [%], i.e. 100 (exp(mean log change) - 1), simulated;
+    - the same, measured;
     - geometric mean and geometric standard deviation of the simulated over the measured RMS, both without the leak;
     - number of tests in which the simulated and the measured RMS change in the same direction;
     - correlation of the simulated and the measured logarithmic changes.
 
-    Without a measured sheet all columns but the first three are None.
+    `measured`: the measured sheet; if it is None, all columns after the simulated change are None.
     """
     rows: list[tuple[Cell, ...]] = []
     for chamber, name in COLUMNS:
         simulated_change = sheet.log_change(chamber, name)
-        comparison: tuple[Cell, ...] = (None,) * 5  # without a measured sheet
+        comparison: tuple[Cell, ...] = (None,) * 5  # the five columns that need a measured sheet
         if measured is not None:
             measured_change = measured.log_change(chamber, name)
             log_ratio = np.log(sheet.rms[chamber][name][:, 0] / measured.rms[chamber][name][:, 0])

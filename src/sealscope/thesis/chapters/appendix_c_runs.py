@@ -49,6 +49,7 @@ def draw_drifts(number: int, half: float, draw: int = 0) -> tuple[ParameterDrift
     drifts = load_texts("cases.toml")["drifts"].values()
     sizes = [rng.uniform(*drift["shares"]) for drift in drifts]
     changes = rng.choice([-1.0, 1.0], size=len(sizes)) * sizes
+    # two points of a polyline at the same time are a step
     return tuple(
         ParameterDrift(name, polyline_from_table(np.array([half, half]), np.array([0.0, change])))
         for drift, change in zip(drifts, changes, strict=True)
@@ -85,7 +86,7 @@ def build_experiments(kind: Runs, half: float, quick: bool) -> list[tuple[Condit
     runs = []
     for draw, condition in product(range(2 if kind == "drift" and not quick else 1), APPENDIX_C):
         drifts = draw_drifts(condition.number, half, draw) if kind == "drift" else ()
-        seed = _SEEDS[kind] + 100 * draw + condition.number
+        seed = _SEEDS[kind] + 100 * draw + condition.number  # there are fewer than 100 tests, so all seeds differ
         runs.append((condition, leak_test(condition, half, seed, leak=kind == "leak", drifts=drifts)))
     return runs
 
@@ -198,10 +199,11 @@ def runs_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
 
 
 def simulated_sheet(context: Context, runs: Runs) -> tuple[ThesisTable, DataSheet]:
-    """Return the simulated tests of Appendix C as a table and as a data sheet, from a needed item of the reproduction.
+    """Return the simulated tests of Appendix C as a table and as a data sheet.
 
-    `runs`: kind of the tests by what changes in the middle of each: "leak" (a leak begins), "drift" (parameters of the
-    rig step), or "no-leak" (nothing changes).
+    The tests are read from the item `appendix-c-RUNS`, which must be among the `needs` of the context. `runs`: kind of
+    the tests by what changes in the middle of each: "leak" (a leak begins), "drift" (parameters of the rig step), or
+    "no-leak" (nothing changes).
     """
     table = first_table(context, f"appendix-c-{runs}")
     return table, parse_sheet(table)

@@ -70,7 +70,7 @@ class Spectrogram(NamedTuple):
 
 def mother_wavelet() -> WaveletFunctions:
     """Compute the scaling function and the mother wavelet of db8 over time in samples, by the cascade algorithm."""
-    return WaveletFunctions(*discrete_wavelet(WAVELET).wavefun(level=10))
+    return WaveletFunctions(*discrete_wavelet(WAVELET).wavefun(level=10))  # 2^10 values per sample
 
 
 def wavelet_spectrum(omega: Array) -> np.ndarray:
@@ -131,7 +131,8 @@ def continuous_transform(x: Array, rate: float, scales: Array) -> Array:
     for k, a in enumerate(scales):
         # spectrum of the wavelet at scale a, moved so that its middle is at the time 0
         atom = np.sqrt(a) * wavelet_spectrum(a * omega) * np.exp(1j * a * omega * centre)
-        rows[k] = np.fft.irfft(spectrum * np.conj(atom), padded.size)[pad : pad + x.size]  # a correlation
+        correlation = np.fft.irfft(spectrum * np.conj(atom), padded.size)
+        rows[k] = correlation[pad : pad + x.size]  # without the mirrored ends
     return rows
 
 
@@ -166,7 +167,7 @@ def amplitude_spectrum(x: Array, rate: float) -> AmplitudeSpectrum:
     Amplitudes and phases follow from the discrete Fourier transform of eq. (3.2).
     """
     spectrum = np.asarray(np.fft.rfft(x), dtype=np.complex128) * (2.0 / x.size)
-    # a cosine has half of its amplitude at the negative frequency; mean and Nyquist frequency have no such half
+    # 2: half of a cosine's amplitude is at its negative frequency; mean and Nyquist frequency have no such half
     spectrum[0] /= 2.0
     if x.size % 2 == 0:
         spectrum[-1] /= 2.0
@@ -180,9 +181,9 @@ def short_time_spectrum(x: Array, rate: float, window: int, step: int) -> Spectr
     `window`: length of a window [samples]; `step`: distance from the start of one window to the next [samples].
     """
     starts = np.arange(0, x.size - window + 1, step)
-    hann = np.hanning(window + 1)[:-1]
+    hann = np.hanning(window + 1)[:-1]  # periodic: the last value is the first of the next period
     segments = np.lib.stride_tricks.sliding_window_view(x, window)[starts] * hann
-    amplitudes = np.abs(np.fft.rfft(segments, axis=1)).T * 2.0 / hann.sum()
+    amplitudes = np.abs(np.fft.rfft(segments, axis=1)).T * 2.0 / hann.sum()  # 2: half is at the negative frequency
     frequency = np.asarray(np.fft.rfftfreq(window, 1.0 / rate), dtype=np.float64)
     middles = np.asarray((starts + window / 2.0) / rate, dtype=np.float64)
     return Spectrogram(middles, frequency, np.asarray(amplitudes))
@@ -259,7 +260,7 @@ def transform_figure(context: Context, item: Item) -> tuple[Figure, ...]:
     x = np.where(t < 0.5, np.cos(2.0 * np.pi * 100.0 * t), 0.5 * np.sin(2.0 * np.pi * 30.0 * t))
     x[nearest_index(t, 0.75)] += 8.0
     frequency, amplitude, _ = amplitude_spectrum(x, RATE)
-    window = 128
+    window = 128  # [samples]
     times, bins, short_time = short_time_spectrum(x, RATE, window, step=4)
     frequencies = np.geomspace(10.0, 450.0, 64)
     wavelet = np.abs(continuous_transform(x, RATE, scales_for(frequencies)))

@@ -56,7 +56,7 @@ class PrintedTest:
 
     @property
     def candidates(self) -> tuple[Condition, ...]:
-        """The tests of Appendix C that this test can be: those with its command and leak level."""
+        """The tests of Appendix C that can be this test, because they have its command and leak level."""
         return tuple(row for row in APPENDIX_C if (row.command, row.level) == (self.command, self.level))
 
     @property
@@ -70,7 +70,7 @@ class PrintedTest:
     @property
     def omega(self) -> float:
         """Angular frequency [rad/s] of the test's command, such as 4 for `3 sin(4t)`."""
-        return float(self.command.split("(")[1].rstrip(")").removesuffix("t").strip() or 1.0)
+        return float(self.command.split("(")[1].rstrip(")").removesuffix("t").strip() or 1.0)  # 1.0 for "sin(t)"
 
 
 #: The ten tests by section.
@@ -118,7 +118,8 @@ class FigureView:
     def _curve(self, y: Array, label: str, role: Role, t: Array | None = None, start: float = 0.0) -> FigureCurve:
         """Build the curve of `y` over `t` [s] within the figure's interval, from `start` [s] on.
 
-        If `t` is None, `y` is over the times of the recording.
+        If `t` is None, `y` is over the times of the recording. `label`: text of the curve in the legend; `role`: its
+        meaning, which determines the line style.
         """
         t = self.recording.t if t is None else t
         is_drawn = (t >= max(start, self.span[0])) & (t <= self.span[1])
@@ -131,6 +132,7 @@ class FigureView:
         """
         half = self.test.half
         start, stop = self.span
+        # the curve before the leak is drawn as in a figure that ends where the leak opens
         before = replace(self, span=(start, min(stop, half)))._curve(y, "no leak", "no leak", t)
         return [before, self._curve(y, "leak", "leak", t, start=half)]
 

@@ -75,7 +75,7 @@ DUTY = f"position {1e3 * AMPLITUDE} mm sin({OMEGA!r}t)"
 def conductance(lpm: float, rig: Rig) -> float:
     """Compute the leakage conductance [m^3/(s Pa)] of a leak that passes `lpm` [L/min] under a load of 2 kN (`LOAD`).
 
-    The formula is flow / (LOAD / A_A), with the piston's area A_A.
+    The formula is flow / (LOAD / A_A): the load on the piston area A_A gives the pressure difference.
     """
     return lpm * LITRE_PER_MINUTE / (LOAD / rig.cylinder.A_A)
 
@@ -168,7 +168,7 @@ class ControlledRig:
         run = self.run(f"position {' + '.join(terms)}", 14.0)
         is_settled = run.t >= 8.0
         omegas = 2 * np.pi * np.array(frequencies)
-        target = -1j * BANDWIDTH_SPEED / omegas  # complex amplitudes of the sines
+        target = -1j * BANDWIDTH_SPEED / omegas  # complex amplitudes a of Re(a exp(i omega t))
         error = np.abs(sine_fit(run.t[is_settled], run["x"][is_settled], *omegas).amplitudes / target - 1.0)
         limit = math.sqrt(0.5)  # -3 dB
         exceeding = np.flatnonzero(error > limit)
@@ -313,7 +313,7 @@ def load_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     rows = []
     for force in (0.0, 2000.0) if context.quick else (0.0, 500.0, 1000.0, 2000.0):
         further_load = f"{force - LOAD!r} N"  # added to `LOAD`, which acts in every run
-        pairs = (tracking(*loop.run_duty(further_load))[:2] for loop in loops)
+        pairs = (tracking(*loop.run_duty(further_load))[:2] for loop in loops)  # error and energy
         rows.append((force, *itertools.chain.from_iterable(pairs)))
     return (item.table(rows, format_note("load"), heads),)
 

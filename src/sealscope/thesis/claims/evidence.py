@@ -189,10 +189,10 @@ def partial_correlation(x: Array, y: Array, controls: Array) -> float:
 def leave_one_out_r2(columns: Array, y: Array) -> float:
     """Compute the leave-one-out R^2 of a least-squares fit of `y` (n,) by `columns` (n, k).
 
-    With residuals r and leverages h it is ``1 - sum (r_i/(1 - h_i))^2 / sum (y_i - mean y)^2``. Source: Allen,
-    Technometrics 16 (1974) 125-127, doi 10.1080/00401706.1974.10489157.
+    With residuals r and leverages h, R^2 is ``1 - sum (r_i/(1 - h_i))^2 / sum (y_i - mean y)^2``. Source:
+    Allen, Technometrics 16 (1974) 125-127, doi 10.1080/00401706.1974.10489157.
     """
-    hat = columns @ np.linalg.pinv(columns)  # with the leverages on the diagonal
+    hat = columns @ np.linalg.pinv(columns)  # its diagonal has the leverages h
     residuals = (y - hat @ y) / (1.0 - np.diag(hat))
     return float(1.0 - np.sum(residuals**2) / np.sum((y - y.mean()) ** 2))
 
@@ -234,6 +234,7 @@ def classify_without_baseline(sheet: DataSheet, leave_out: Literal["test", "cond
     else:
         groups = [f"{row.command} at {row.closed_pct:g} %" for row in APPENDIX_C]
     regression = make_pipeline(StandardScaler(), LogisticRegression(C=1.0, tol=1e-9))
+    # groups * 2: one entry for each half of a test
     cross_validation: dict[str, Any] = {"groups": groups * 2, "cv": LeaveOneGroupOut(), "method": "decision_function"}
     log_odds = cross_val_predict(regression, columns, is_leaking, **cross_validation)
     return float(np.mean((log_odds > 0) == is_leaking)), auc(log_odds[~is_leaking], log_odds[is_leaking]).value

@@ -64,7 +64,8 @@ def _wavelet_claims() -> Iterator[Claim]:
     text = ", ".join(f"db{order} {100 * fraction:.1f} %" for order, fraction in overlaps.items())
     yield judge_claim("5.7.5", falls, shares=text)
     rate = load_rig(BENCH_RIG).daq.sample_rate
-    operations = 4 * 2 * decomposition_filters("db8")[0].size  # of two filters at each of four levels
+    # operations per sample: one for each coefficient of two filters at each of four levels
+    operations = 4 * 2 * decomposition_filters("db8")[0].size
     _, wait = reach("db8", 4)[-1].tolist()  # number of later samples on which d4 depends
     yield judge_claim(
         "a.3",
@@ -151,7 +152,7 @@ def _throttle_claim(evidence: ClaimEvidence) -> Claim:
     for command in sorted({row.command for row in APPENDIX_C}):
         is_command = np.array([row.command == command for row in APPENDIX_C])
         max_closed = closed_pct[is_command].max()
-        range_open = ranges[:, is_command & (closed_pct == 0.0)].mean(axis=1)  # of p_A and of p_B
+        range_open = ranges[:, is_command & (closed_pct == 0.0)].mean(axis=1)  # [MPa] for p_A, p_B
         range_throttled = ranges[:, is_command & (closed_pct == max_closed)].mean(axis=1)
         rise = range_throttled - range_open
         texts.append(f"{command} {1e3 * rise[0]:+.2f} and {1e3 * rise[1]:+.2f} kPa at {max_closed:g} %")
@@ -167,13 +168,13 @@ def _throttle_claim(evidence: ClaimEvidence) -> Claim:
 def _agreement_claim(evidence: ClaimEvidence) -> Claim:
     """Judge claim 6.1.4: simulation and measurement agree.
 
-    The geometric mean ratio of the leak-free RMS must be within a factor of 1.25 for d1 to d4 of each chamber, and the
-    RMS of d3 of p_A must change with the leak in the same direction in at least 39 of the 41 tests.
+    The geometric mean of simulated over measured leak-free RMS must be from 1/1.25 to 1.25, for d1 to d4 of each
+    chamber. The RMS of d3 of p_A must change with the leak in the same direction in at least 39 of the 41 tests.
     """
     measured, leak = evidence.measured_sheet, evidence.leak_sheet
     if measured is None:
         return judge_claim("6.1.4", [], compared="compared with the sheet only", sheet=NO_SHEET)
-    ratios = {}  # of the RMS without leak, geometric means
+    ratios = {}  # geometric mean ratio of the RMS without the leak, by chamber and detail
     for c, name in itertools.product(CHAMBERS, ("d1", "d2", "d3", "d4")):
         log_ratios = np.log(leak.rms[c][name][:, 0] / measured.rms[c][name][:, 0])
         ratios[f"{c} {name}"] = float(np.exp(np.mean(log_ratios)))

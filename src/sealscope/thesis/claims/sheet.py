@@ -1,8 +1,8 @@
 """Judge the claims of the abstract, chapter 5 and the conclusions on leaks, details and success rates by the sheet.
 
 A function `_test_...` yields the findings on a data sheet: a text, and True or False for each part of the claim. The
-detail d3d4 is the product of the wavelet details d3 and d4. A change is "beyond the noise" if it is larger than noise
-alone causes in 95 % of the tests (`d1_threshold`).
+detail d3d4 is the product of the wavelet details d3 and d4. A change is "beyond the noise" if it is larger than a
+limit that noise alone exceeds in 5 % of the tests (`d1_threshold`).
 """
 
 from __future__ import annotations
@@ -96,8 +96,8 @@ def _rate_claim(rule: Rule, where: str) -> SheetClaim:
         """Test that a rule's success rate is within 1 percentage point of a printed rate, and higher than by chance.
 
         The success rate is the fraction of the tests in which the rule detects the leak. By chance, each of the rule's
-        k details moves as a leak would move it with probability 1/2, which gives a rate of 1/2^k. For a higher rate,
-        the one-sided binomial p-value must be below 0.05/10, as there are ten columns. Yields one finding with two
+        k details moves as a leak would move it with probability 1/2, which gives a rate of 1/2^k. The rate counts as
+        higher if the one-sided binomial p-value is below 0.05/10, as there are ten columns. Yields one finding with two
         results.
         """
         fires = rule.fires(sheet)
@@ -153,8 +153,8 @@ def _test_rates_over_80(sheet: DataSheet) -> Iterator[Finding]:
 def _test_leak_levels(sheet: DataSheet) -> Iterator[Finding]:
     """Test claim 5.6.2: at each level of the leak, d3 of p_A falls beyond the noise in at least 80 % of the tests.
 
-    The levels are "large" to "extra-small". The RMS of the wavelet detail d3 falls beyond the noise if it falls by more
-    than noise alone makes it fall in 95 % of the tests (`d1_threshold`).
+    The levels are "large" to "extra-small". The RMS of the wavelet detail d3 falls beyond the noise if its fall is
+    larger than a limit that noise alone exceeds in 5 % of the tests (`d1_threshold`).
     """
     exceeds = _exceeds_noise(sheet, "p_A", "d3")
     for level in NOMINAL_LPM:
@@ -207,8 +207,8 @@ def _test_both_chambers(sheet: DataSheet) -> Iterator[Finding]:
 def _test_identified_leaks(sheet: DataSheet) -> Iterator[Finding]:
     """Test claim a.1: in each chamber the best wavelet detail reveals the leak in at least 80 % of the tests.
 
-    A detail reveals the leak if its RMS falls in p_A, or rises in p_B, by more than noise alone changes it in 95 % of
-    the tests (`d1_threshold`). The best of d3, d4 and d3d4 is the detail that reveals the leak most often.
+    A detail reveals the leak if its RMS falls in p_A, or rises in p_B, by more than a limit that noise alone exceeds in
+    5 % of the tests (`d1_threshold`). The best of d3, d4 and d3d4 is the detail that reveals the leak most often.
     """
     for chamber in CHAMBERS:
         best = max(SENSITIVE, key=lambda name: int(_exceeds_noise(sheet, chamber, name).sum()))
@@ -304,8 +304,8 @@ def _test_sensitive_details(sheet: DataSheet) -> Iterator[Finding]:
 def _test_product_detail(sheet: DataSheet) -> Iterator[Finding]:
     """Test claim 5.5.2: the product d3d4 has a larger effect size than d3 and than d4, for each chamber.
 
-    The effect size is the mean over the standard deviation, over the tests, of the log change of the RMS with the leak,
-    counted positive as a fall for p_A and as a rise for p_B.
+    The effect size is the mean of the log changes of the RMS with the leak in all tests, divided by their standard
+    deviation. A fall counts as positive for p_A, and a rise for p_B.
     """
     for chamber in CHAMBERS:
         changes = {name: sheet.log_change(chamber, name) * DIRECTION[chamber] for name in SENSITIVE}

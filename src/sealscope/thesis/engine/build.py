@@ -95,8 +95,9 @@ def reproduce(
     `patterns`: selection (`items.select_items`); `folder`: folder of the results; `quick`: True to simulate less;
     `jobs`: number of processes, by default one per core, 1 for this process only; `sheet`: folder of the measured
     data sheet (`sheet.find_sheet`); `items`: the list to select from, by default that of `items.toml`; `publish`:
-    writes the products as files. Results that an earlier call stored from the same inputs are reused. A failed item
-    does not stop the others, and KeyboardInterrupt leaves all finished items stored.
+    writes the products as files; `progress`: is told which items are finished and in work. Results that an earlier call
+    stored from the same inputs are reused. A failed item does not stop the others, and KeyboardInterrupt leaves all
+    finished items stored.
 
     Raises InputError for an unknown item, a bad sheet, or a folder that is damaged, in use or cannot be written.
     """

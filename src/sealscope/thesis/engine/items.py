@@ -93,8 +93,9 @@ def load_items() -> tuple[Item, ...]:
 def _iter_row_items(name: str, chapter: int, row: Mapping[str, Any]) -> Iterator[Item]:
     """Yield the items (figures, tables, claims) that a row of `items.toml` describes.
 
-    A row describes one item, whose id is `name`, the key of the row. If the row has an entry `each`, it describes
-    several items instead: the entry names a function that yields (id, title, inputs) of each.
+    A row describes one item, whose id is `name`, the key of the row. Entries of the row that are no fields of `Item`
+    become its `inputs`. A row with an entry `each` describes several items instead: this entry names a function that
+    yields (id, title, inputs) of each item.
     """
     row_inputs: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in row.items()}
     row_fields: dict[str, Any] = {key: row_inputs.pop(key) for key in row if key in _FIELDS}

@@ -130,9 +130,9 @@ def _encode_picture(folder: Path, name: str) -> str:
 
 
 def format_cell(value: Any) -> str:
-    """Format a table's value for the page: numbers with five significant digits, None and nan as a dash.
+    """Format a table's value for the page: a float with five significant digits, None and nan as a dash.
 
-    Numbers of 1e5 and more have four digits.
+    Floats from 1e5 on have four digits; integers and texts are unchanged.
     """
     if value is None or (isinstance(value, float) and math.isnan(value)):
         return "–"

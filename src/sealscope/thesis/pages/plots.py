@@ -83,7 +83,7 @@ def _render_svg(mpl_figure: MplFigure, figure: Figure) -> bytes:
     from matplotlib.backends.backend_svg import FigureCanvasSVG
 
     out = io.StringIO()
-    mpl_figure.set_dpi(DPI)  # for rasterised lines; an earlier rendering may have changed it
+    mpl_figure.set_dpi(DPI)  # of rasterised lines; an earlier rendering may have changed it
     metadata = {"Title": caption(figure.id, figure.title), "Date": None, "Creator": None}
     FigureCanvasSVG(mpl_figure).print_svg(out, metadata=metadata)
     return out.getvalue().encode()
@@ -136,8 +136,9 @@ def _draw_figure(figure: Figure) -> MplFigure:
     header = _TOP_MARGIN + warning + (_LEGEND_HEIGHT if has_shared_legend else 0.0)
     height = rows * row_height + footer + header
     mpl_figure = MplFigure(figsize=(_WIDTH, height), dpi=DPI, layout="constrained")
-    FigureCanvasAgg(mpl_figure)
+    FigureCanvasAgg(mpl_figure)  # attaches itself to the figure
     engine: Any = mpl_figure.get_layout_engine()
+    # rect: left, bottom, width and height of the area of the panels, as fractions of the figure
     engine.set(rect=(0, footer / height, 1, 1 - (footer + header) / height), h_pad=0.05, w_pad=0.06, hspace=0.03)
     axes = mpl_figure.subplots(rows, columns, squeeze=False)
     have_same_marks = len({panel.marks for panel in figure.panels}) == 1
@@ -146,6 +147,7 @@ def _draw_figure(figure: Figure) -> MplFigure:
             ax.set_axis_off()
             continue
         panel = figure.panels[index]
+        # marks that all panels share have texts in the first row only
         _draw_panel(mpl_figure, ax, panel, label_marks=index < columns or not have_same_marks)
         if not has_shared_legend:
             _add_legend(ax, panel)
@@ -163,7 +165,7 @@ def _draw_figure(figure: Figure) -> MplFigure:
             0.988, 1 - 0.09 / height, UNRESOLVED.upper(), va="top", ha="right", fontsize=8.5, weight="bold",
             color="#5c0f08", bbox=box,
         )  # fmt: skip
-    mpl_figure.draw_without_rendering()
+    mpl_figure.draw_without_rendering()  # computes the layout, which then stays the same in every rendering
     mpl_figure.set_layout_engine("none")
     return mpl_figure
 

@@ -38,7 +38,7 @@ def cycle_length(speed: Array, rate: float) -> float | None:
     cycle = estimate_period(speed, rate)
     if cycle is None:
         spectrum = np.abs(np.fft.rfft((speed - speed.mean()) * np.hanning(speed.size)))
-        n_periods = int(spectrum.argmax())  # in the recording
+        n_periods = int(spectrum.argmax())  # periods in the recording
         if n_periods < MIN_BLOCKS:
             return None
         cycle = speed.size / rate / n_periods
@@ -67,16 +67,17 @@ def oil_loss_tests(signals: Signals, rig: Rig, cycle: float | None, begin: float
     The accumulator is connected to the unloaded side. The volume of oil that the accumulator has delivered follows from
     the pressure of this side by the polytropic law of the gas; the oil that the rod displaces is subtracted if the
     position is recorded. Volume and pressure are averaged over blocks, and the leak's conductance is tested for a step
-    between blocks (`step_test`). `signals`: both pressures and, if recorded, the position; `begin`: time of the first
-    sample [s]; `cycle`: duration of the machine's cycle [s], None if there is no cycle. Blocks are whole multiples of
-    the cycle, so that motion within a cycle averages out; without a cycle they have any length.
+    between blocks (`step_test`). `signals`: both pressures and, if recorded, the position; `rig`: sizes of cylinder
+    and accumulator; `begin`: time of the first sample [s]; `cycle`: duration of the machine's cycle [s], None if
+    there is no cycle. Blocks are whole multiples of the cycle, so that motion within a cycle averages out; without
+    a cycle they have any length.
 
     The result maps "external leak A" and "external leak B" to their tests. A side that cannot be tested is left out.
     The result is empty without an accumulator (`makeup.check_valves` = "absent") or for fewer than `MIN_BLOCKS` blocks.
     """
     if rig.makeup.check_valves == "absent":
         return {}
-    unit_s = 1.0 / signals.rate if cycle is None else cycle
+    unit_s = 1.0 / signals.rate if cycle is None else cycle  # a block is a multiple of this time
     duration = len(signals.time_step) / signals.rate
     block_s = unit_s * max(1, round(duration / (INFERENCE.blocks.coarse * unit_s)))
     edges = np.round(np.arange(int(duration / block_s) + 1) * block_s * signals.rate).astype(int)
@@ -118,15 +119,16 @@ def _estimate_conductance(volume: Array, pressure: Array, block_s: float, begin:
     (K,): mean volume that the accumulator has delivered by each block [m^3]; `pressure` (K,): mean pressure that drives
     the leak in each block [Pa]; `begin`: start of the first block [s].
     """
-    count = len(volume)
-    time = (np.arange(count, dtype=float) + 0.5) * block_s
+    n_blocks = len(volume)
+    time = (np.arange(n_blocks, dtype=float) + 0.5) * block_s
     # volume lost by the middle of each block (rows) with unit conductance in each (columns): half within the block
-    losses = (np.tril(np.ones((count, count)), -1) + 0.5 * np.eye(count)) * pressure * block_s
-    noise = float(np.mean(np.diff(volume, 2) ** 2)) / 6.0  # second differences have 6 times white noise's variance
-    temperature = INFERENCE.level.gas * np.column_stack([time, time**2 / time[-1]])
-    weight = np.linalg.inv(max(noise, np.finfo(float).tiny) * np.eye(count) + temperature @ temperature.T)
+    losses = (np.tril(np.ones((n_blocks, n_blocks)), -1) + 0.5 * np.eye(n_blocks)) * pressure * block_s
+    noise_variance = float(np.mean(np.diff(volume, 2) ** 2)) / 6.0  # a second difference has 6 times the variance
+    # prior standard deviations of the linear and the quadratic change of the volume by the gas temperature
+    gas_volume = INFERENCE.level.gas * np.column_stack([time, time**2 / time[-1]])
+    weight = np.linalg.inv(max(noise_variance, np.finfo(float).tiny) * np.eye(n_blocks) + gas_volume @ gas_volume.T)
     weight -= np.outer(weight.sum(axis=0), weight.sum(axis=1)) / weight.sum()  # eliminates the initial volume
     precision, vector = losses.T @ weight @ losses, losses.T @ weight @ volume
-    healthy_deviation = INFERENCE.healthy.outside  # of the conductance in a healthy machine
+    healthy_deviation = INFERENCE.healthy.outside  # prior of the conductance in a healthy machine
     precision = 0.5 * (precision + precision.T)  # exactly symmetric
     return Information(begin + time, precision, vector, level=healthy_deviation, slope=healthy_deviation)

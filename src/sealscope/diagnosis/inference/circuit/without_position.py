@@ -85,9 +85,9 @@ def circulations(recording: Recording, rig: Rig) -> list[CycleBalance]:
     if not is_known.any() or not np.ptp(flow[is_known]) > 0.0:
         return []
     single_rod = rig.cylinder.single_rod
-    # a constant command means shut valves; else a control loop may hold the piston at any command
+    # behind shut valves the piston is held while the command is constant; a control loop may hold it at any command
     may_hold = is_known & (signals.step("u") == 0.0) if is_locked and "u" in channels else is_known
-    # flow of a piston that creeps behind shut valves; a flow up to this limit counts as a hold
+    # fastest flow of a piston that creeps behind shut valves; a flow up to this limit counts as a hold
     max_creep = _PRIORS.creep * max(rig.cylinder.A_A, rig.cylinder.A_B) if is_locked else 0.0
     is_held = is_known & _find_holds(np.where(may_hold, flow, np.inf), recording.rate, min_limit=max_creep)
     if is_locked and "u" not in channels and not is_held.all():
@@ -117,7 +117,7 @@ def _find_holds(flow: Array, rate: float, min_limit: float = 0.0) -> NDArray[np.
     is_finite = np.isfinite(mean_flow)
     limit = max(_PRIORS.slow * mean_flow[is_finite].max(initial=0.0), min_limit)
     is_moving = ~is_finite | (mean_flow > limit)
-    n_moving = np.convolve(is_moving, np.ones(settling))[: flow.size]  # of the last `settling` samples
+    n_moving = np.convolve(is_moving, np.ones(settling))[: flow.size]  # among the last `settling` samples
     return np.asarray(n_moving == 0)
 
 
@@ -134,7 +134,7 @@ def _build_blocks(
     rows = _integrate_rows([*(term.increments(signals) for term in equation.terms), left], is_used, half_width, rate)
     _shrink_offset(rows.values, [term.name for term in equation.terms])
     if one_sided:
-        # weighted fraction of each row's window in which A has the higher pressure
+        # weighted fraction of each row's window in which A has the higher pressure; the rows are rates, hence `/ rate`
         share_A = _integrate_rows([signals.carried_by_A[1:] / rate], is_used, half_width, rate).values[:, 0]
         rows = rows._replace(whole=rows.whole & (np.minimum(share_A, 1.0 - share_A) < _PRIORS.elsewhere))
     # rows are half of `half_width` apart; a block has the rows of one cycle (`half_width`), or of `MAX_BLOCK_TIME`
@@ -162,9 +162,9 @@ def _integrate_rows(increments: list[Array], is_used: NDArray[np.bool_], half_wi
     """Compute rows of a regression: mean rates of c columns over overlapping triangular windows.
 
     `increments`: an array (n,) for each column, its increments in n sampling intervals; `is_used` (n,): flags of the
-    intervals that may be part of a row; a row with other intervals is flagged as not whole; `half_width`: of a window
-    [s]; `rate`: sampling rate [Hz]. The middles of the windows are half of `half_width` apart. The integral over a
-    triangle is computed as the second difference of the twice integrated increments.
+    intervals that may be part of a row; a row with other intervals is flagged as not whole; `half_width`: half the
+    width of a window [s]; `rate`: sampling rate [Hz]. The middles of the windows are half of `half_width` apart. The
+    integral over a triangle is computed as the second difference of the twice integrated increments.
     """
     half_length, n_samples = half_width * rate, len(is_used)
     centres = np.arange(half_length, n_samples - half_length, 0.5 * half_length)
@@ -179,6 +179,7 @@ def _integrate_rows(increments: list[Array], is_used: NDArray[np.bool_], half_wi
         )
         return np.asarray((before - 2.0 * middle + after) / half_length**2)
 
+    # a window contains (parts of) the intervals `first` to `last` - 1
     n_unused = np.concatenate([[0], np.cumsum(~is_used)])
     first, last = (np.clip(centres + shift, 0, n_samples).astype(int) for shift in (-half_length, half_length + 1.0))
     values = np.column_stack([integrate(np.where(is_used, increment, 0.0)) * rate for increment in increments])

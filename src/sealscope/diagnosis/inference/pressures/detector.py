@@ -55,9 +55,9 @@ class PressureResponse:
         """Report on a recording: tests of the response's parameters for a step, and the leakage.
 
         The leakage is compared with the leakage of the healthy recordings in `baseline`. The report also states how
-        much of the recording is judged: the fraction of samples that do not fill a gap, and the end of the last of
-        these samples. If the leakage cannot be measured or a leak would not show, the report states only the reason
-        (`lack`).
+        much of the recording is judged: the fraction of samples that were recorded and not filled in, and the end of
+        the last of these samples. If the leakage cannot be measured or a leak would not show, the report states only
+        the reason (`lack`).
         """
         leak = self.reading(recording)
         if leak is None:

@@ -61,12 +61,12 @@ class Priors(NamedTuple):
 
     @property
     def normal(self) -> Normal:
-        """Normal prior on the parameters before the first block."""
+        """Normal prior with the mean `centre` and the standard deviations `width`, without the random walk."""
         return Normal(self.centre, np.diag(1.0 / self.variance), self.unit)
 
     @property
     def variance(self) -> Array:
-        """Prior variances (p,) of the parameters before the first block, in squares of `unit`."""
+        """Prior variances (p,) of the parameters, the squares of `width`, in squares of `unit`."""
         return np.asarray((self.width / self.unit) ** 2)
 
     def wander_variance(self, seconds: float) -> Array:
@@ -140,11 +140,11 @@ class Joint:
         """
         theta = np.array([block.theta for block in blocks])
         prior_precision = _prior_precision(len(blocks), priors, block_s)
-        prior_gradient = prior_precision @ ((theta - priors.centre) / priors.unit).ravel()
+        prior_gradient = prior_precision @ ((theta - priors.centre) / priors.unit).ravel()  # at `theta`
         # row and column 0 of a block's Gram matrix belong to the residual, the others to its derivatives
         gram = block_diag(*(block.gram[1:, 1:] for block in blocks))
         gradient = np.concatenate([block.gram[0, 1:] for block in blocks])
-        # of the residual at the parameters about which the blocks are linearised, i.e. with deviations of zero
+        # variance of the residual at the parameters about which the blocks are linearised (deviations of zero)
         variance, _ = _estimate_noise(blocks, np.zeros(theta.size), parameter)
         inflation = 1.0  # white noise at first
         for _ in range(2):  # the fit changes the variance of the noise, which weights the prior
@@ -162,29 +162,31 @@ class Joint:
         random walk, both with the scale `wander` over all blocks. `parameter`: index of the parameter; `time` (K,):
         middles of the blocks [s].
         """
-        indices = slice(parameter, None, self.theta.shape[1])  # of the parameter in all blocks
+        indices = slice(parameter, None, self.theta.shape[1])  # the parameter in all blocks
         unit = self.priors.unit[parameter]
-        # precisions of posterior and prior, of the deviations from `linearised_at` in units of `unit`
+        # posterior and prior precision of the deviations from `linearised_at`, which are in units of `unit`
         posterior = np.linalg.inv(self.covariance[indices, indices])
         prior = self.prior_precision[indices, indices]
         precision = posterior - prior
         linearised_at = self.theta[:, parameter] / unit
         prior_gradient = prior @ (linearised_at - self.priors.centre[parameter] / unit)
-        # the first two addends: likelihood of the deviations; the third changes to the parameter itself
+        # posterior vector minus prior vector gives the likelihood of the deviations (first two terms); the third term
+        # converts it to the likelihood of the parameter itself
         vector = posterior @ self.mean[indices] + prior_gradient + precision @ linearised_at
         precision = 0.5 * (precision + precision.T) / unit**2
         return Information(time, precision, vector / unit, slope=wander, walk=wander)
 
 
 def _prior_precision(n_blocks: int, priors: Priors, block_s: float) -> Array:
-    """Compute the joint prior precision of the parameters in K blocks, each `block_s` [s] long, shape (K p, K p).
+    """Compute the joint prior precision of p parameters in K blocks, each `block_s` [s] long, shape (K p, K p).
 
     K is `n_blocks`. The parameters are in units of `priors.unit`. Each parameter is a random walk from block to block,
-    and its mean over the blocks has the prior standard deviation `priors.width`.
+    and its mean over the blocks has the prior standard deviation `priors.width` (`priors.normal`).
     """
     differences = np.diff(np.eye(n_blocks), axis=0)  # matrix (K - 1, K) of the changes from block to block
     walks = np.kron(differences.T @ differences, np.diag(1.0 / priors.wander_variance(block_s)))
-    mean_weights = np.full((n_blocks, n_blocks), 1.0 / n_blocks**2)  # of the square of the mean over the blocks
+    # the square of the mean of x (K,) over the blocks is x' W x with every entry of W = 1 / K^2
+    mean_weights = np.full((n_blocks, n_blocks), 1.0 / n_blocks**2)
     return np.asarray(walks + np.kron(mean_weights, priors.normal.precision))
 
 
@@ -199,7 +201,7 @@ def _estimate_noise(blocks: Sequence[Block], deviations: Array, parameter: int) 
     directions = [np.append(1.0, -deviation) for deviation in deviations.reshape(len(blocks), -1)]
     pairs = list(zip(blocks, directions, strict=True))
     squares = sum(float(direction @ block.gram @ direction) for block, direction in pairs)
-    variance = max(squares, 1.0) / sum(block.samples for block in blocks)  # never zero
+    variance = max(squares, 1.0) / sum(block.samples for block in blocks)  # never zero, as it is a divisor
     scores = np.concatenate([block.scores @ direction for block, direction in pairs])
     white_variance = variance * sum(float(block.gram[1 + parameter, 1 + parameter]) for block in blocks)
     return variance, max(1.0, float(scores @ scores) / max(white_variance, np.finfo(float).tiny))

@@ -79,7 +79,7 @@ class ResponseLeak:
 
     @property
     def level(self) -> tuple[float, float]:
-        """Mean conductance over the recording and its standard error [m^3/(s Pa)]."""
+        """Conductance over the recording [m^3/(s Pa)], as if it were constant, and its standard error."""
         precision = max(float(self.information.precision.sum()), np.finfo(float).tiny)
         return float(self.information.vector.sum()) / precision, precision**-0.5
 
@@ -100,7 +100,7 @@ class ResponseLeak:
         if self.step is None:
             return Flow(0.0, np.inf)
         size, deviation = self.step.fitted
-        # of the flow over that of a laminar leak, between 1 and the ratio of an orifice
+        # flow over that of a laminar leak: between 1 and `ORIFICE_RATIO`
         mean_ratio, half_range = 0.5 * (ORIFICE_RATIO + 1.0), 0.5 * (ORIFICE_RATIO - 1.0)
         law_deviation = half_range * abs(size) / WITHIN_95
         unit = self.flow_per_conductance
@@ -108,7 +108,7 @@ class ResponseLeak:
 
     @property
     def flow_per_conductance(self) -> float:
-        """Mean flow [m^3/s] that a leak with a conductance of 1 m^3/(s Pa) has at the recording's pressures."""
+        """Mean flow [m^3/s] of a leak with a conductance of 1 m^3/(s Pa), equal to the mean of abs(p_A - p_B)."""
         return float(self.pressure.mean())
 
     @cached_property

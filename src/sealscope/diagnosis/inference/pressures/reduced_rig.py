@@ -163,8 +163,8 @@ def simulate_response(
         Sampling rate [Hz].
     n_substeps : int
         Number of integration steps from sample to sample.
-    sets : array of float, shape (p, lanes)
-        Parameters, a row for each.
+    sets : array of float, shape (13, lanes)
+        Parameters up to the lag of the transducers, a row for each.
     states : array of float, shape (8, lanes)
         p, v, omega, i, I, x (`_rates`), friction and reading at the sample before the first; on return those at the
         last sample.
@@ -179,7 +179,7 @@ def simulate_response(
     steady = _steady_friction(y[1], theta, m)[0]  # friction of steady sliding at the piston's speed y[1]
     for sample in range(command.size - 1):
         rise = command[sample + 1] - command[sample]
-        # added to gain times command: the bias, and the effect of the lead, by which the linear command comes earlier
+        # speed in addition to gain times command: the bias, and the effect of a command that comes earlier by the lead
         lead_speed = theta[GAIN] * theta[LEAD] * (rise * rate) + theta[BIAS]
         for step in range(n_substeps):
             # commanded speeds at the start, in the middle and at the end of the step
@@ -194,9 +194,10 @@ def simulate_response(
             k_3 = _rates(y_2, _advance_friction(friction, steady, y_2[1], 0.5 * h, theta, m)[0], speed_1, theta, m)
             y_3 = _advance(y, h, k_3)
             k_4 = _rates(y_3, _advance_friction(friction, steady, y_3[1], h, theta, m)[0], speed_2, theta, m)
+            # y + h/6 (k_1 + 2 k_2 + 2 k_3 + k_4)
             y = _advance(y, h / 6.0, _advance(_advance(_advance(k_1, 2.0, k_2), 2.0, k_3), 1.0, k_4))
             friction, steady = _advance_friction(friction, steady, y[1], h, theta, m)
-            reading = reading + (y[0] - reading) * (h / (h + theta[LAG]))
+            reading = reading + (y[0] - reading) * (h / (h + theta[LAG]))  # implicit Euler step of the lag
         store(out, sample, reading)
     for row in range(6):
         store(states, row, y[row])
@@ -235,7 +236,10 @@ class Machine(NamedTuple):
 
     @staticmethod
     def from_rig(rig: Rig, rate: float, law: str = STRIBECK) -> Machine:
-        """Make the simulator of a rig for samples at a `rate` [Hz] and a `law` of friction, one of `LAWS`."""
+        """Make the simulator of a rig for samples at a `rate` [Hz] and a `law` of friction, one of `LAWS`.
+
+        The piston has the mean area of both sides. The creep speed `v_th` is that of the law, else that of the rig.
+        """
         numbers = rig_numbers(rig)
         numbers = numbers._replace(A_A=0.5 * (numbers.A_A + numbers.A_B), v_th=_FRICTION[law].creep or numbers.v_th)
         reduced = Reduced(*(getattr(numbers, name) for name in Reduced._fields))
@@ -249,7 +253,7 @@ class Machine(NamedTuple):
         last sample (8, m).
         """
         lanes = np.minimum(np.arange(SINGLE_WIDTH), len(sets) - 1)  # unused lanes repeat the last set
-        theta = np.ascontiguousarray(sets[lanes, : LAG + 1].T, dtype=np.float32)
+        theta = np.ascontiguousarray(sets[lanes, : LAG + 1].T, dtype=np.float32)  # without scale and offset
         ends = np.ascontiguousarray(states[:, lanes], dtype=np.float32)
         out = np.empty((command.size - 1, SINGLE_WIDTH), dtype=np.float32)
         simulate_response(command, self.rate, self.n_substeps, theta, ends, self.numbers, out)
@@ -262,28 +266,30 @@ class Machine(NamedTuple):
 
     def ringing_period(self, stiffness: float) -> float:
         """Compute the period of the pressures' ringing [samples] for a stiffness (bulk modulus) of the oil [Pa]."""
-        m = self.numbers
+        m = self.numbers  # the oil of both chambers is a spring of the stiffness 2 K A^2 / V on the mass
         return float(2.0 * math.pi * self.rate * math.sqrt(m.V * m.M_eq / (2.0 * stiffness)) / m.A_A)
 
     def ringing_stiffnesses(self, dp: Array, total: Array, priors: Priors) -> Array:
         """Find the two stiffnesses of the oil [Pa] that correspond to the strongest ringing of p_A - p_B, shape (2,).
 
         The ringing shows in the spectrum of `dp` (n,), i.e. p_A - p_B [Pa], minus the spectrum of `total` (n,), i.e.
-        p_A + p_B [Pa], which has the same noise and hum but does not ring. `priors`: priors on the parameters. If the
-        spectrum has no line within the prior of the stiffness, both results are the centre of this prior.
+        p_A + p_B [Pa], which has the same noise and hum but does not ring. `priors`: priors on the parameters. If no
+        frequency of the spectrum lies within the prior of the stiffness, both results are the centre of this prior.
         """
         relative_width = priors.width[K_OIL] / priors.centre[K_OIL]
         n_padded = 4 * _SEGMENT  # samples of a segment with zeros, for a finer grid of frequencies
         middle = n_padded / self.ringing_period(priors.centre[K_OIL])  # bin of the ringing at the centre of the prior
-        bins = np.arange(  # of the frequencies that the prior allows
+        # bins from 4 prior deviations of log K below the centre to 2 above; the frequency grows with the root of K
+        bins = np.arange(
             math.ceil(middle * math.exp(-2.0 * relative_width)),
             min(n_padded // 2, int(middle * math.exp(relative_width))),
         )
         if not bins.size:
             return np.full(2, priors.centre[K_OIL])
         segments = sliding_window_view([dp, total], min(_SEGMENT, dp.size), axis=1)[:, :: _SEGMENT // 2]
-        spectra = np.fft.rfft(segments * np.hanning(segments.shape[2] + 1)[:-1], n_padded)
-        powers = np.mean(np.abs(spectra) ** 2, axis=1)  # Welch's method
+        window = np.hanning(segments.shape[2] + 1)[:-1]  # periodic Hann window
+        spectra = np.fft.rfft(segments * window, n_padded)
+        powers = np.mean(np.abs(spectra) ** 2, axis=1)  # Welch's method: mean over half-overlapping segments
         difference_power, total_power = powers
         excess = np.pad((difference_power - total_power)[bins], 1, constant_values=-np.inf)  # so that ends may be peaks
         peaks = np.flatnonzero((excess[1:-1] > excess[:-2]) & (excess[1:-1] >= excess[2:]))

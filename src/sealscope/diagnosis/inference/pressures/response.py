@@ -138,7 +138,7 @@ class Segment:
         # simulated together: theta, theta with each parameter up to SPRING increased by a unit, and the other sets
         simulated = np.concatenate([sets[:1], np.tile(theta, (n_slopes, 1)), sets[1:]])
         simulated[range(1, n_slopes + 1), range(n_slopes)] += self.priors.unit[:n_slopes]
-        states = self.states[:, [*range(n_slopes + 1), *[0] * (n_sets - 1)]]
+        states = self.states[:, [*range(n_slopes + 1), *[0] * (n_sets - 1)]]  # column 0 for the other sets
         responses, ends = self.machine.simulate(self.command, simulated, states)
         n_rows = 1 + len(PARAMETERS)  # residual and derivatives; after these come the residuals of the other sets
         rows = np.empty((n_rows + n_sets - 1, self.dp.size))
@@ -159,7 +159,7 @@ class Segment:
         `priors.unit`. `theta` (p,): all parameters; `response` (n,): simulated p_A - p_B [Pa].
         """
         change = np.asarray(np.gradient(response))
-        change[1:-1] -= np.diff(change, 2) / 6.0  # to fourth order, since the ringing is fast
+        change[1:-1] -= np.diff(change, 2) / 6.0  # accurate to fourth order, since the ringing is fast
         by_lead = theta[SCALE] * self.machine.rate * change  # time derivative of the reading
         decay = math.exp(-1.0 / (self.machine.rate * max(theta[LAG], _MIN)))
         # first-order low pass of -by_lead, as the solution of a bidiagonal system
@@ -214,6 +214,7 @@ class Segment:
         correlates the noise over 2 sqrt(pi) sigma samples.
         """
         count = max(self.n_samples - len(PARAMETERS), 1.0)
+        # a sum of at least 1 Pa^2, since the variance is a divisor elsewhere
         return max(squares, 1.0) / count * max(1.0, 2.0 * math.sqrt(math.pi) * self.smooth)
 
     def is_explained(self, cost: float) -> bool:
@@ -232,7 +233,7 @@ class Segment:
         for s seconds, of which the last may be incomplete. The mains hum is projected out.
         """
         rows = fit.rows - (fit.rows @ self.waves.T) @ self._wave_gram_inverse @ self.waves
-        first = np.arange(0, self.dp.size, round(self.machine.rate))  # sample of each second
+        first = np.arange(0, self.dp.size, round(self.machine.rate))  # index of the first sample of each second
         scores = np.add.reduceat(rows[1 + G] * rows, first, axis=1).T
         return Block(fit.theta, fit.gram, self.n_samples, scores)
 
@@ -302,8 +303,8 @@ class Follower:
     def __init__(self, machine: Machine, priors: Priors, sense: float) -> None:
         self.machine, self.priors, self.sense = machine, priors, sense
         self.theta = priors.centre  # parameters (p,)
-        self.covariance = np.diag(priors.variance)  # of the parameters, in units of `priors.unit`
-        self.variance = math.nan  # of the noise [Pa^2]
+        self.covariance = np.diag(priors.variance)  # covariance of the parameters, in units of `priors.unit`
+        self.variance = math.nan  # variance of the noise [Pa^2]
         self.states = np.zeros((8, SPRING + 2))  # simulated states of all simulated parameter sets, as in `Segment`
         self.last = math.nan  # command at the last sample [V], NaN at the start and after a gap
         self.excess = 0.0  # misfit of the last block of n samples, (chi squared - n) / sqrt(2 n)
@@ -346,6 +347,7 @@ class Follower:
         """
         covariance, states = self.covariance, self.states
         length = round(_FOLLOW.block * recording.rate)
+        # blocks that begin before `stop` lie within the recording
         stop = min(round(_FOLLOW.beginning * recording.rate), len(recording) - length + 1)
         for first in range(0, stop, length):
             self.update(recording.samples(slice(first, first + length)))
@@ -399,8 +401,8 @@ class Follower:
     def _prior(self, block_s: float, jumped: int | None = None) -> Normal:
         """Compute the prior on the parameters in the next block, which is `block_s` [s] long.
 
-        `jumped`: index of a parameter that may have jumped; to its variance the prior variance before the first block
-        is added. None if no parameter has jumped.
+        `jumped`: index of a parameter that may have jumped, whose variance increases by its whole prior variance. None
+        if no parameter has jumped.
         """
         variance = self.priors.wander_variance(block_s)
         if jumped is not None:
@@ -455,7 +457,7 @@ class Follower:
 def fit_response(recording: Recording, rig: Rig) -> Joint | None:
     """Fit the pressure response of a recording that meets its requirements; None if no parameters describe it.
 
-    The result is computed only once for a recording.
+    `rig`: assumed machine, which gives sizes and priors. The result is computed only once for a recording.
     """
 
     def compute_fit(recording: Recording) -> Joint | None:
@@ -481,7 +483,8 @@ def fit_response(recording: Recording, rig: Rig) -> Joint | None:
 def measure_leak(recording: Recording, rig: Rig) -> ResponseLeak | None:
     """Measure the leakage of a recording without position by the response of its pressures.
 
-    Return None if the recording does not meet the requirements, or if no parameters of the response describe it.
+    Return None if the recording does not meet the requirements, or if no parameters of the response describe it. `rig`:
+    assumed machine, which gives sizes and priors.
     """
     joint = fit_response(recording, rig) if find_unmet_requirement(recording, rig) is None else None
     if joint is None:
@@ -504,7 +507,7 @@ def parameter_information(joint: Joint, time: Array, seconds: float) -> dict[str
     conductance G are those of a healthy machine. `joint`: fit of all blocks; `time` (K,): middles of the blocks [s];
     `seconds`: length of the recording [s].
     """
-    growth = math.sqrt(seconds / PRESSURE.blocks.wander)  # of a random walk, relative to its change in `blocks.wander`
+    growth = math.sqrt(seconds / PRESSURE.blocks.wander)  # random walk in the recording over that in `blocks.wander`
     wander = growth * joint.priors.wander
     wander[G] = growth * PRESSURE.conductance.wander
     return {name: joint.information(k, time, float(wander[k])) for k, name in enumerate(PARAMETERS)}

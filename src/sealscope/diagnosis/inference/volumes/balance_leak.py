@@ -108,7 +108,7 @@ class BalanceLeak:
 
     @property
     def flow_per_conductance(self) -> float:
-        """Mean flow [m^3/s] that a leak with a conductance of 1 m^3/(s Pa) has at the recording's pressures."""
+        """Mean flow [m^3/s] of a leak with a conductance of 1 m^3/(s Pa), equal to the mean of abs(p_A - p_B)."""
         return self.balance.mean_pressure()
 
     def _add_law_uncertainty(self, flow: Flow) -> Flow:
@@ -149,7 +149,7 @@ class BalanceLeak:
         hold_rise = held_rise(self.balance.recording_sums, self.healthy)
         if hold_rise is None:
             return None
-        # its error is smaller than the error, or than the value, of the rise from the whole recording
+        # the error of `hold_rise` is smaller than the error or the value of the rise from the whole recording
         is_precise = hold_rise.deviation < max(motion_rise.deviation, motion_rise.value)
         return hold_rise if is_precise or hold_rise.chance < INFERENCE.held_oil.rare else None
 
@@ -185,7 +185,7 @@ class BalanceLeak:
         hold_rise, prior = self._hold_rise, INFERENCE.held_oil
         if hold_rise is None or not hold_rise.chance < prior.rare:
             return flow
-        flows, deviations = np.array([flow, self._hold_flow(hold_rise)]).T  # of the recording, of the holds
+        flows, deviations = np.array([flow, self._hold_flow(hold_rise)]).T  # first of the recording, then of the holds
         return mixture_flow(np.array([1.0 - prior.right, prior.right]), flows, deviations)
 
     @property
@@ -215,10 +215,10 @@ class BalanceLeak:
     def _hold_laws(self) -> _HoldLaws:
         """Fit a leak past the piston to the times in which shut valves hold the load, for each law and piston area.
 
-        The flow is the coefficient times abs(p_A - p_B)^exponent for each exponent of `EXPONENTS`, with each growth of
-        `growth_priors` since the onset, and with each area of `HeldChambers.area_variants`. The weight of a law is the
-        likelihood of its fit times the prior probability of its growth; the sum of the weights for one area is the
-        probability of that area.
+        The flow is the coefficient times abs(p_A - p_B)^exponent for each exponent of `EXPONENTS`, with each relative
+        growth of the coefficient between onset and end (`growth_priors`), and each area of
+        `HeldChambers.area_variants`. For one area the weights of the laws are proportional to the likelihood of the fit
+        times the prior probabilities of exponent and growth, and their sum is the probability of that area.
         """
         chambers = self.balance.chambers
         assert chambers is not None
@@ -229,14 +229,14 @@ class BalanceLeak:
         return _HoldLaws(*(np.concatenate(values) for values in zip(*parts, strict=True)))
 
     def _fit_hold_laws(self, chambers: HeldChambers) -> _HoldLaws:
-        """Fit a leak past the piston for each exponent and growth (`_hold_laws`), with the areas of `chambers`."""
+        """Fit a piston leak for each exponent and growth, with the areas of `chambers`; the weights sum to 1."""
         recording, units = self.balance.recording, list[float]()
         for law, conditions, _, _ in chambers.law_fits:
             after_onset = recording.t >= conditions.onset
             t = recording.t[after_onset]
             difference = (recording["p_A"] - recording["p_B"])[after_onset]
             pressure = np.abs(chambers.pressure_difference(t, difference, conditions.offset))
-            # mean flow for a coefficient of 1
+            # mean flow after the onset for a coefficient of 1
             units.append(float(np.nanmean(pressure**law.exponent * law.growth_factor(t, chambers.end))))
         values, noise_deviations, oil_deviations, _ = np.array([law_fit.fit for law_fit in chambers.law_fits]).T
         log_weights = np.array([law_fit.log_weight for law_fit in chambers.law_fits])
@@ -247,7 +247,7 @@ class BalanceLeak:
     def _rise_laws(self) -> list[LawWeight]:
         """Weigh the laws of a leak's flow, such as laminar, by their fit to the rise over healthy recordings.
 
-        Returns for each law its mean flow if the leak's coefficient rises by 1, and its log weight. A law with an
+        Returns for each law its mean flow for a fitted laminar coefficient of 1, and its log weight. A law with an
         exponent e of `EXPONENTS` lies the fraction f = 2 (1 - e) of the way from laminar to orifice flow:
 
             flow = laminar^(1 - f) orifice^f,    log weight = log prior + f N L,
@@ -261,7 +261,7 @@ class BalanceLeak:
         fit = compare_laws(balance.recording_sums, self.healthy, balance.columns)
         if fit is None:
             return [LawWeight(laminar_flow, 0.0)] * len(EXPONENTS)
-        # the orifice coefficient that fits like a unit laminar rise is 1 / regression
+        # an orifice with the coefficient 1 / `regression` looks like a laminar leak with the coefficient 1
         orifice_flow = balance.mean_of_blocks(balance.blocks.mean_root()) / fit.regression
         log_ratio = INFERENCE.size.readings * fit.log_ratio
         fractions = 2.0 * (1.0 - np.array(EXPONENTS))
@@ -279,8 +279,8 @@ class BalanceLeak:
         """
         balance = self.balance
         limit, size = healthy_leakage(balance.rig), balance.size
-        # behind a servo valve (several balances) its edges leak, too; without a measured flow, the drive's droop under
-        # load looks like leakage
+        # the edges of a servo valve (several balances) leak, too; without a measured flow, a drive that slows down
+        # under load seems to leak
         is_measured = len(balance.columns) == 1 and not balance.equations[0].by_command
         if not (limit > 0.0 and self.rise is None and size.stated and is_measured):
             return None
@@ -293,7 +293,7 @@ class BalanceLeak:
         """95 % upper bound of the leak's mean flow over the recording [m^3/s]; infinite if nothing was tested.
 
         With healthy recordings the bound is on the leakage above that of these recordings; without them, on a leak that
-        begins within the recording. If the times in which shut valves hold the load show the rise (`rise`),
+        begins within the recording. If the rise comes from holds, the times in which shut valves hold the load,
         `_hold_bound` computes the bound. The bound is widened by the uncertainty of the scale of the flows
         (displacement, area or flow meter) and of the leak's law (laminar or orifice).
         """
@@ -314,11 +314,13 @@ class BalanceLeak:
         assert motion_rise is not None and hold_rise is not None and chambers is not None
         piston_probability, fraction_after, fit = chambers.piston_leak
         mean_leak, pressure, laws = fraction_after * fit.value, self.balance.mean_pressure(), self._hold_laws
+        # standard deviations of the flow under each law, over that under the laminar law without growth
         relative_deviations = laws.deviations / max(float(laws.deviations[0]), np.finfo(float).tiny)
-        # mean flow per conductance of a leak past the piston, larger by the uncertainty of its law
+        # mean flow per conductance of a leak past the piston, increased where its law makes the flow less certain
         unit = pressure * max(float(laws.weights @ relative_deviations), 1.0)
+        # the holds show the leak if they are right about it and it did not begin after them
         hold_probability = INFERENCE.held_oil.right * (1.0 - chambers.probability_after_holds)
-        # `hold_rise.value` contains the piston's leak times its probability
+        # `hold_rise.value` contains the piston's leak times its probability; here the leak is either whole or absent
         by_motion = _flow_mixture(motion_rise, motion_rise.value, unit=pressure, weight=1.0 - hold_probability)
         past_piston = _flow_mixture(
             hold_rise,
@@ -357,9 +359,9 @@ class BalanceLeak:
             return LeakRise(total_rise)
         rise_after = self._hold_rise_since(step.onset().value)
         if rise_after is None:
-            mean_rise = step.fitted.size * self._fraction_after(step)  # of the whole recording
+            mean_rise = step.fitted.size * self._fraction_after(step)  # mean over the recording
             return LeakRise(total_rise, motion_rise.log_ratio_within(mean_rise, tail=INFERENCE.scatter.tail))
-        log_deviation: float = INFERENCE.held_oil.agrees  # of the ratio of rise and step
+        log_deviation: float = INFERENCE.held_oil.agrees  # standard deviation of log(rise / step)
         whole_rise = rise_after._replace(may_be_partial=False)  # after the onset the holds show the whole step
         return LeakRise(total_rise, whole_rise.log_ratio(step.fitted.size, log_deviation))
 
@@ -427,7 +429,7 @@ class BalanceLeak:
 
         Behind a servo valve, with a balance for each chamber, the flow is not stated, since the valve's edges leak as
         well. `detectable_flow`: flow [m^3/s], by the assumed sizes, of the smallest leak that would be detected if it
-        began within the recording; None if that was not tested. The result repeats this flow in L/min and as a fraction
+        began within the recording; None if that was not tested. The result states this flow in L/min and as a fraction
         of the pump's flow (`findable_lpm`, `findable_share`).
         """
         balance = self.balance
@@ -498,7 +500,7 @@ class BalanceLeak:
 
 
 def _flow_mixture(rise: Rise, value: float, *, unit: float, weight: float, oil_deviation: float = 0.0) -> Mixture:
-    """Compute the distribution of a leak's mean flow [m^3/s] from the rise of its coefficient, scaled by a weight.
+    """Compute the distribution of a leak's mean flow [m^3/s] from the rise of its coefficient.
 
     The result consists of normal distributions whose weights sum to `weight`, as a part of a larger mixture. `rise`:
     rise over healthy recordings, of which only the distribution of the error is used; `value`: estimate of the rise, a

@@ -126,7 +126,8 @@ class VolumeBalance:
         recorded = self._compute_blocks(recording)
         if recorded is None:
             return None
-        max_odds: float = INFERENCE.rest.alone  # limit for this recording, in which a leak may look like open valves
+        # limits the log odds of this recording alone, since a leak in it can look like open valves
+        max_odds: float = INFERENCE.rest.alone
         odds = np.inf if is_locked else odds + float(np.clip(recorded.odds, -max_odds, max_odds))
         return self._build_balance(recording, recorded.regime(odds))
 
@@ -217,7 +218,7 @@ class VolumeBalance:
         flow, pressure = (float(np.median([summary[name] for summary in summaries])) for name in ("flow", "pressure"))
         typical = healthy[0]._replace(flow=flow, pressure=pressure, start_s=None, held=None)
         first_dated = next((sums for sums in healthy if sums.start_s is not None), typical)
-        later_recording = typical._replace(start_s=_shift_start(first_dated, n_repeats))
+        later_recording = typical._replace(start_s=_shift_start(first_dated, n_repeats))  # after all repetitions
         return rise(later_recording, repetitions, self._columns(channels, shut))
 
     def _shut_log_odds(self, summaries: Sequence[Summary], channels: frozenset[str]) -> float:
@@ -226,6 +227,7 @@ class VolumeBalance:
         The right assumption on the valves makes the estimated leakage scatter less between recordings. For n recordings
         with rests, at least `MIN_FOR_SCATTER`, the log odds are therefore (n - 1) log(scatter if connected / scatter if
         cut off). For fewer recordings they are the sum of the log odds of each, which are limited to +-`rest.alone`.
+        `channels`: names of the recorded channels, which determine the balances.
         """
         with_rests = [summary for summary in summaries if "shut_sums" in summary]
         if len(with_rests) < MIN_FOR_SCATTER:
@@ -293,7 +295,7 @@ class VolumeBalance:
         has_position_balance = bool(equations(self.rig, frozenset(recording.channels)))
         recorded = self._compute_blocks(recording) if has_position_balance else None
         if recorded is None:
-            balances = [self.balance(recording)]  # without a position, or None
+            balances = [self.balance(recording)]  # a balance without a position, or None
         else:
             regimes = [regime for regime in (recorded.open, recorded.shut) if regime is not None]
             balances = [self._build_balance(recording, regime) for regime in regimes]
@@ -311,7 +313,8 @@ class VolumeBalance:
         if leak.step is None and leak.rise is None:
             lack = "p_A and p_B hardly differ, or too few samples are whole: no leak would show"
             return Observed(self.name, lack=lack)
-        # the rows of a block show missing samples, but not without a position, where they also depend on the motion
+        # a block with missing samples has fewer rows; without a position the number also depends on the motion, and the
+        # whole recording counts as judged
         has_position = balance.equations[0].name == CYLINDER or len(balance.columns) > 1
         share = float(rows.mean() / max(rows.max(), 1.0)) if has_position else 1.0
         # end of the last block with rows, over the number of blocks
@@ -335,15 +338,15 @@ def compare_motion(
     """Test whether the piston's motion takes more or less flow for the same speed than in healthy recordings.
 
     Yields one observable, or nothing if there are too few healthy recordings. A change means that the recording is from
-    another machine, or that the scale of a sensor has changed. Load and speed outside of the range of the healthy
-    recordings make the comparison less certain.
+    another machine, or that the scale of a sensor has changed. A load or speed outside of the range of the healthy
+    recordings adds `further_deviation` to the error of the comparison.
     `judged_sums`, `healthy`: summaries of the judged and of the healthy recordings; `roles`: indices of the columns of
     the volume balance by role (leak, motion, left side).
     """
     prior, healthy_sums = INFERENCE.repeats, np.sum([recording.sums[0] for recording in healthy], axis=0)
 
     def estimate(sums: RecordingSums) -> Estimate:
-        """Estimate log(flow per speed of the piston in a recording / the same in the healthy ones), with its error."""
+        """Estimate log(flow per speed of the piston in the recording `sums` / in the healthy ones), with its error."""
         return Estimate(*motion_change(sums.sums[0], healthy_sums, roles))
 
     excess = sum(condition.log_excess for condition in find_unusual_conditions(judged_sums, healthy))
@@ -381,8 +384,9 @@ def _shift_start(recorded: RecordingSums, n_ages: int) -> float | None:
 def _sums_from_summary(summary: Summary, shut: bool = False, locked: bool = False) -> RecordingSums:
     """Restore the Gram matrices, flow, pressure and date of a healthy recording from its summary (`learn`).
 
-    `shut`: true for the Gram matrices under the assumption that valves cut the pump off at rest; `locked`: true to
-    include the leaks while shut valves hold the load, if the summary has them.
+    `shut`: true for the Gram matrices under the assumption that valves cut the pump off at rest, which have separate
+    columns of the pump (added here for a recording without rests); `locked`: true to include the leaks while shut
+    valves hold the load, if the summary has them.
     """
     sums = np.asarray(summary["sums"], dtype=float)
     if shut:

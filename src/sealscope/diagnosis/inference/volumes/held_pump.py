@@ -55,12 +55,12 @@ def estimate_pump_leakage(
     """
     rate, t = recording.rate, 0.5 * (recording.t[1:] + recording.t[:-1])
     difference = recording["p_A"] - recording["p_B"]
-    steps = (pumped * rate, np.diff(recording["x"]) * rate, np.diff(difference) * rate, difference[1:])
-    flow, speed, pressure_rate, pressure = (average_over(AVERAGING_TIME, values, rate) for values in steps)
+    signals = (pumped * rate, np.diff(recording["x"]) * rate, np.diff(difference) * rate, difference[1:])
+    flow, speed, pressure_rate, pressure = (average_over(AVERAGING_TIME, values, rate) for values in signals)
     is_known = np.isfinite(flow) & np.isfinite(speed) & np.isfinite(pressure_rate)
     windows, last_end = [], -np.inf
     for hold in holds:
-        begin = max(last_end, hold.t[0] - INFERENCE.held_oil.before)
+        begin = max(last_end, hold.t[0] - INFERENCE.held_oil.before)  # not within the previous hold
         samples = np.flatnonzero(is_known & (t > begin) & (t < hold.t[0]))
         windows.append(samples[:: max(1, int(rate / MAX_RATE))])
         last_end = hold.t[-1]
@@ -73,7 +73,7 @@ def estimate_pump_leakage(
     # the flow is scaled to a pressure, since the robust fit has a smallest residual in Pa
     conductance = mean_flow / mean_pressure
     values = flow[rows] / conductance
-    design = np.column_stack([pressure[rows], speed[rows], pressure_rate[rows]])
+    design = np.column_stack([pressure[rows], speed[rows], pressure_rate[rows]])  # column 0: leakage
     coefficients, weight = fit_robustly(design, values)
     groups = np.repeat(np.arange(len(windows)), [len(samples) for samples in windows])
     errors = influence_factor(weight) * jackknife_errors(design * weight[:, None], values * weight, [0], groups)

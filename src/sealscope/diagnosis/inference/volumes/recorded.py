@@ -155,7 +155,7 @@ class RecordedBalance:
 
     @cached_property
     def compared_leak(self) -> Information:
-        """Likelihood of the leak's conductance in each of `running_blocks`, as it is compared between recordings.
+        """Likelihood of the leak's conductance in each of `running_blocks`, for comparison with other recordings.
 
         It differs from `leak` if the volume balance has a separate term for the leakage of a pump that holds the load.
         This term is left out here, so that all rests have one common leakage.
@@ -189,15 +189,19 @@ class RecordedBalance:
 
     @cached_property
     def recording_sums(self) -> RecordingSums:
-        """Summary of the recording (Gram matrices, mean flow and pressure) for comparison with other recordings."""
+        """Summary of the recording for comparison with other recordings.
+
+        It has the Gram matrices, the mean flow and pressure, and, if known, the leaks in holds, the leakage of the pump
+        just before holds, and the resistance to the motion.
+        """
         start_s, oil_degC = start_seconds(self.recording), oil_temperature(self.recording)
         sums = RecordingSums.from_blocks(self.blocks, self.columns, start_s, oil_degC)
         if self.is_creep:
-            sums = sums._replace(flow=self.mean_flow)
+            sums = sums._replace(flow=self.mean_flow)  # no pump's flow is known
         hold_leaks = None if self.chambers is None else np.array(self.chambers.leaks)
         pump_leakage = None if self.held_pump_leakage is None else np.array(self.held_pump_leakage)
         fit = fit_difference(self.recording)
-        is_determined = fit is not None and min(fit.friction_error, fit.drop_error) > 0.0
+        is_determined = fit is not None and min(fit.friction_error, fit.drop_error) > 0.0  # 0 is no plausible error
         resistance = np.array(fit) if is_determined else None
         return sums._replace(held=hold_leaks, held_pump=pump_leakage, resistance=resistance)
 
@@ -242,10 +246,10 @@ class RecordedBalance:
         return self.equations[0].left(Signals(dict(self.recording.channels), self.recording.rate, {}))
 
     def _lost_flow(self, sides: CylinderSides) -> Array:
-        """Compute the flow of the pump [m^3/s] that does not move the piston, by magnitude, shape (n - 1,).
+        """Compute the magnitude of the pump's flow [m^3/s] that does not move the piston, shape (n - 1,).
 
         It is positive while the pump holds a load or compresses oil. The area is that of the side with the higher
-        pressure. The flow is averaged over `LOST_FLOW_TIME`.
+        pressure, from `sides`. The flow is averaged over `LOST_FLOW_TIME`.
         """
         recording = self.recording
         is_A_higher = recording["p_A"][1:] > recording["p_B"][1:]
@@ -262,15 +266,15 @@ class RecordedBalance:
         The mean flow is compared with zero and with the typical flow of a pump that holds a load.
         """
         recording = self.recording
-        # time in which the pump's flow may still fall: the first interval, and that by which `extend_rests` extends
+        # time in which the pump's flow may still fall: the first interval, and the longest extension by `extend_rests`
         falling = hold.t[hold.edges[1]] - hold.t[0] + INFERENCE.rest.averaged
         begin, end = np.searchsorted(recording.t, [hold.t[0] + falling, hold.t[-1]])
         flow = self._pumped[begin:end] * recording.rate
         flow = flow[np.isfinite(flow)]
         mean_flow = abs(float(flow.mean()))
-        variance = float(flow.var()) / max(flow.size, 1)  # of the mean
+        variance = float(flow.var()) / max(flow.size, 1)  # variance of the mean flow
         holding_flow = INFERENCE.rest.holding * self.blocks.moving_flow
-        # `holding_flow` is given without an error, so that the difference has the same variance
+        # `holding_flow` counts as exact, so that its difference from `mean_flow` has the same variance
         return rest_log_odds(mean_flow, holding_flow, rest_variance=variance, difference_variance=variance) > 0.0
 
     def _is_loaded(self, hold: LockedHold) -> bool:
@@ -304,14 +308,14 @@ class RecordedBalance:
 
         A hold is a time in which shut valves are supposed to hold the load. With open valves the leakage in holds would
         be the total leakage of pump and piston; with shut valves it is smaller. The two are compared. The total leakage
-        is that just before the holds, at the same pressures, or if this is unknown that of the whole recording. The log
-        odds are limited to +-`rest.most` of `priors.toml`.
+        is measured just before the holds, at the same pressures, or else over the whole recording. The log odds are
+        limited to +-`rest.most` of `priors.toml`.
         """
         if self.chambers is None:
             return None
         hold_leak, pump = self.chambers.total_leak(), self.held_pump_leakage
         if pump is not None:
-            total, total_deviation = pump.value + hold_leak.value, pump.deviation
+            total, total_deviation = pump.value + hold_leak.value, pump.deviation  # pump and piston together
         else:
             conductance = self.conductance
             total, total_deviation = conductance.value, (conductance.high - conductance.low) / (2.0 * WITHIN_95)
@@ -353,7 +357,7 @@ class RecordedBalance:
         fitted = solve(total[np.ix_(nuisance, nuisance)], total[nuisance, roles.left])
         coefficients = dict(zip(nuisance, fitted, strict=True))
         areas, energies = [], []  # for A and B
-        for side in "AB":
+        for side in "AB":  # columns of the motion under a load that this side carries
             motion = [k for k in roles.motion if roles.names[k].endswith(f"{side} carries")]
             squares = np.diag(total)[motion]
             energy = float(squares.sum())
@@ -367,7 +371,7 @@ class RecordedBalance:
             sign = float(np.sign(areas[main]))
             area_A, area_B = (sign * area / self.size.scale for area in (self.rig.cylinder.A_A, self.rig.cylinder.A_B))
             return area_A, area_B, deviation, deviation
-        measured = areas[other] / areas[main] if areas[main] else 0.0
+        measured = areas[other] / areas[main] if areas[main] else 0.0  # 0: no information
         # the side that carries the largest load is more probably the one without a rod
         highest = [float(np.nanquantile(self.recording[name], 1.0 - END_QUANTILE)) for name in ("p_A", "p_B")]
         log_ratio = log_area_ratio(measured, shares[other], is_larger=highest[other] > highest[main])
@@ -421,7 +425,10 @@ class RecordedBalance:
         return self.mean_of_blocks(self.blocks.mean_pressure(self.pressure_offset), since)
 
     def outside_unit_flows(self) -> dict[str, float]:
-        """Compute the mean flow [m^3/s] of an external leak of 1 m^3/(s Pa), for each term of such a leak by name."""
+        """Compute the flow [m^3/s] of an external leak of 1 m^3/(s Pa), for each term of such a leak by its name.
+
+        It is the flow at the root mean square of the pressure that drives the leak, with the pressures as recorded.
+        """
         names, recorded = self.columns[0].names, self.blocks if self.plain is None else self.plain
         return {
             name: recorded.driving_pressure(names, name) * self.size.scale
@@ -449,7 +456,7 @@ class RecordedBalance:
         is_after = self.blocks.time >= since
         if not is_after.any():
             is_after[-1] = True
-        min_weight = 1e-9  # so that the sum of the weights is not zero
+        min_weight = 1e-9  # the sum of the weights must not be zero
         return float(np.average(values[is_after], weights=np.maximum(self.blocks.rows[is_after], min_weight)))
 
     @cached_property
@@ -476,10 +483,10 @@ class RecordedBalance:
         `priors.toml`.
         """
         holding_flow, roles = INFERENCE.rest.holding * self.mean_flow, self.columns[0]
-        # the displaced volume over the integral of p_A - p_B, without the chambers' compliance
-        ratio, ratio_variance = fit_with_robust_covariance(self.blocks.gram[:, 0], [roles.leak], roles.left)
-        flow = float(ratio[0]) * self.mean_pressure()
-        variance = float(ratio_variance[0, 0]) * self.mean_pressure() ** 2
+        # conductance: displaced volume over the integral of p_A - p_B, the chambers' compliance being neglected
+        conductance, conductance_variance = fit_with_robust_covariance(self.blocks.gram[:, 0], [roles.leak], roles.left)
+        flow = float(conductance[0]) * self.mean_pressure()
+        variance = float(conductance_variance[0, 0]) * self.mean_pressure() ** 2
         if not variance > 0.0:
             return 0.0
         max_odds: float = INFERENCE.rest.most
@@ -512,10 +519,11 @@ def log_area_ratio(measured: float, loaded_share: float, *, is_larger: bool) -> 
 
     `measured`: fitted ratio of the areas, without information if it is not positive. Only a fraction w of the motion
     that was attributed to the first side belongs to it, and the rest to the other side, whose area is well known; thus
-    log `measured` = w r. The unknown w is 1 with the probability `held_oil.sides_told` (`priors.toml`). Otherwise log w
-    is uniform between log `loaded_share` and 0. `loaded_share`: fraction of that motion in which the first side surely
-    carries the load. r has a normal prior with the mean `held_oil.sides` if `is_larger`, else -`held_oil.sides`, and
-    the standard deviation `held_oil.sides_deviation`.
+    log `measured` = w r, with the standard error `size.area` (`priors.toml`). The unknown w is 1 with the probability
+    `held_oil.sides_told`. Otherwise log w is uniform between 0 and the logarithm of `loaded_share`, the fraction of
+    that motion in which the first side surely carries the load. r has a normal prior with the standard deviation
+    `held_oil.sides_deviation`. The mean of the prior is `held_oil.sides` if the first side is probably the larger one
+    (`is_larger`), else -`held_oil.sides`.
     """
     prior = INFERENCE.held_oil
     mean, deviation = prior.sides if is_larger else -prior.sides, prior.sides_deviation
@@ -548,7 +556,7 @@ def _flow_scale(balance: RecordedBalance) -> Size:
     has_pressure_unit = not {("p_A", COUNTS), ("p_B", COUNTS)} & balance.units
     states_displacement = rig.states("pump.q_b") and has_flow_unit
     states_areas = rig.states("cylinder.A_A", "cylinder.A_B")
-    if len(balance.columns) > 1 or balance.is_creep:  # behind a servo valve, or of a load that shut valves hold
+    if len(balance.columns) > 1 or balance.is_creep:  # behind a servo valve, or for a load that shut valves hold
         deviation = float(np.hypot(prior.area, prior.creep)) if balance.is_creep else prior.area
         return Size(1.0, deviation, stated=states_areas and has_pressure_unit)
     motion = [k for k in roles.motion if roles.names[k].startswith("motion")]
@@ -595,6 +603,6 @@ def _loaded_area(balance: RecordedBalance, motion: list[int]) -> _Area:
     squares = np.einsum("kii->i", balance.blocks.gram[:, 0])[motion]  # sums over all blocks
     weights = squares / max(float(squares.sum()), np.finfo(float).tiny)
     value, deviation = estimate_weighted_mean(balance.blocks, roles, dict(zip(motion, weights, strict=True)))
-    value, half_width = abs(value), WITHIN_95 * deviation
+    value, half_width = abs(value), WITHIN_95 * deviation  # the coefficients are negative if x is reversed
     assumed = [cylinder.A_A if roles.names[k].endswith("A carries") else cylinder.A_B for k in motion]
     return _Area(value, value - half_width, value + half_width, float(weights @ assumed))

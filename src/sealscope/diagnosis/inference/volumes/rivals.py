@@ -62,8 +62,8 @@ def rival_rises(
     volume_ratio : float
         Measured over assumed ratio of the piston's area to the pump's displacement, by which volumes of air scale.
     unit_flows : mapping of str to float, optional
-        Mean flow [m^3/s] of an external leak with a conductance of 1 m^3/(s Pa), by the name of its term. By default it
-        is the mean of abs(p_A - p_B).
+        Flow [m^3/s] of an external leak with a conductance of 1 m^3/(s Pa), by the name of its term. For a term that is
+        not listed it is the mean of abs(p_A - p_B) in the judged recording.
 
     Returns
     -------
@@ -72,7 +72,7 @@ def rival_rises(
     """
     names = columns[0].names
     hold_rivals = held_rivals(judged, healthy, unit_flows)
-    # a flow meter, with which the balance has no speed loss, is downstream of the pump and does not show its leakage
+    # a balance without a speed loss has a flow meter downstream of the pump, which does not show the pump's leakage
     turning = (TURNING,) if SPEED_LOSS in names else ()
     columns_to_test = [k for k, name in enumerate(names) if name in (AIR, *turning) or name.startswith("external leak")]
     if hold_rivals is not None:
@@ -87,7 +87,7 @@ def rival_rises(
                 Observable(
                     name=TURNING,
                     data=TURNING_DATA,
-                    score=max(pump_rise.score, 0.0) ** 2,
+                    score=max(pump_rise.score, 0.0) ** 2,  # a fall does not count
                     chance=pump_rise.chance,
                     size=pump_rise.value,
                 )
@@ -102,6 +102,7 @@ def rival_rises(
         if names[k] == TURNING:
             turning_columns = [roles.replace_leak(TURNING) for roles in columns]
             level, _ = coefficient_level(healthy_gram, turning_columns)
+            # levels instead of changes, since the oil scales the whole leakage
             values = _without_oil(level + values, predict_thinning([*healthy, judged]))
         *healthy_values, value = values.tolist()
         observable = compare_with_healthy(
@@ -110,7 +111,7 @@ def rival_rises(
             value,
             healthy_values,
             error,
-            above=not is_air,
+            above=not is_air,  # free air may also decrease
             prior_change=INFERENCE.free_air.size * volume_ratio if is_air else np.inf,
         )
         if observable is None:
@@ -120,9 +121,10 @@ def rival_rises(
             # a rise that warmer oil explains does not count
             observable = replace(observable, chance=max(observable.chance, turning_rise.chance))
         else:
-            log_ratio = compare_with_leak(judged, healthy, columns, names[k])  # for one independent residual
+            # rival against a laminar leak, for one independent residual
+            log_ratio = compare_with_leak(judged, healthy, columns, names[k])
             if log_ratio is not None and laws is not None:
-                log_ratio -= max(laws.log_ratio, 0.0)  # of the leak by the better law, laminar or an orifice
+                log_ratio -= max(laws.log_ratio, 0.0)  # if an orifice fits better, the rival is compared with this leak
             log_ratio_to_leak = None if log_ratio is None else INFERENCE.size.readings * log_ratio
             if not is_air:
                 observable = _penalise_size(observable, judged, unit_flows)
@@ -150,14 +152,14 @@ def held_rivals(
     """Test for external leaks of chambers A and B, measured in holds, above those of healthy recordings.
 
     In a hold shut valves hold the load. Return one observable for each chamber that can be compared, or None if the
-    recording `judged` has no holds, or if fewer than `MIN_WITH_HOLDS` healthy recordings have holds. `unit_flows`: mean
-    flow [m^3/s] of an external leak with a conductance of 1 m^3/(s Pa), by its name, as in `rival_rises`.
+    recording `judged` has no holds, or if fewer than `MIN_WITH_HOLDS` healthy recordings have holds. `unit_flows`: flow
+    [m^3/s] of an external leak with a conductance of 1 m^3/(s Pa), by its name, as in `rival_rises`.
     """
     healthy_leaks = [HeldLeaks(*recording.held) for recording in healthy if recording.held is not None]
     if judged.held is None or len(healthy_leaks) < MIN_WITH_HOLDS:
         return None
     judged_leaks = HeldLeaks(*judged.held)
-    # conductance of a leak as large as the pump's mean flow
+    # a leak with this conductance takes the pump's mean flow; a small fraction of it is the smallest error
     max_conductance = judged.flow / judged.pressure if judged.pressure > 0.0 else 0.0
     min_error = INFERENCE.scatter.finest * max_conductance
     observables = list[Observable]()
@@ -187,13 +189,14 @@ def _penalise_size(observable: Observable, judged: RecordingSums, unit_flows: Ma
 def _estimate_change(gram: Array, reference: Array, columns: Sequence[ColumnRoles], tested: int) -> tuple[float, float]:
     """Estimate by how much a coefficient of a recording differs from healthy recordings, with the standard error.
 
-    - `gram`, `reference` (E, m, m): for each equation the Gram matrix of the recording, and the sum of the Gram
-      matrices of the healthy recordings.
+    - `gram`, `reference` (E, m, m): for each of E equations with m columns the Gram matrix of the recording, and the
+      sum of the Gram matrices of the healthy recordings.
     - `columns`: for each equation the indices of its columns by role (leak, motion, left side).
-    - `tested`: index of the column whose coefficient is tested; in the healthy recordings it counts as 0.
+    - `tested`: index of the column whose coefficient is tested; in the healthy recordings this coefficient counts as 0.
 
-    The other coefficients differ from the healthy ones by a normal prior and are eliminated (Schur complement). Without
-    information the change is 0 and the error infinite.
+    The differences of the other coefficients from the healthy ones have normal priors, and are eliminated (Schur
+    complement). Except for the leak, columns without a finite prior deviation are left out. Without information on the
+    tested coefficient the change is 0 and the error infinite.
     """
     precision, moment = 0.0, 0.0
     for e, roles in enumerate(columns):
@@ -201,10 +204,10 @@ def _estimate_change(gram: Array, reference: Array, columns: Sequence[ColumnRole
         free = [k for k in roles.compared if k != tested and (k == leak or np.isfinite(roles.between_deviation[k]))]
         coefficients = solve(reference[e][np.ix_(free, free)], reference[e][free, roles.left])
         residual = gram[e][:, roles.left] - gram[e][:, free] @ coefficients
-        prior = roles.difference_precisions(free, coefficients, coefficients[free.index(leak)])
+        prior_precisions = roles.difference_precisions(free, coefficients, coefficients[free.index(leak)])
         matrix, cross = gram[e][np.ix_(free, free)], gram[e][free, tested]
-        # a coefficient of about 0 has a nearly infinite precision, which is limited
-        regularised = matrix + np.diag(np.minimum(prior, 1e9 * np.diag(matrix)))
+        # prior deviations are fractions of the coefficients: near 0 the precision is nearly infinite, and is limited
+        regularised = matrix + np.diag(np.minimum(prior_precisions, 1e9 * np.diag(matrix)))
         solution = solve(regularised, np.column_stack([cross, residual[free]]))
         precision += float(gram[e][tested, tested] - cross @ solution[:, 0])
         moment += float(residual[tested] - cross @ solution[:, 1])

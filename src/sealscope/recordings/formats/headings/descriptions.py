@@ -113,6 +113,7 @@ def split_pairs(labels: Sequence[Label]) -> list[Label]:
         return list(labels)
     result = []
     for time, value, y_match in zip(times, values, y_matches, strict=True):
+        # the part of the name before the Y, as it is spelled in the heading
         name = value.name if is_unnamed or y_match is None else value.name[: len(y_match["name"])]
         result += [replace(time, name="t", unit=time.unit or "s"), replace(value, name=name)]
     return result

@@ -41,7 +41,7 @@ def stated_rate(remarks: Mapping[str, str]) -> float | None:
         if label.unit is None and (ending := _ENDING.fullmatch(label.name)):  # SamplePeriod_ms
             label = Label(name, ending["name"], ending["unit"])
         is_rate, is_interval = (pattern.fullmatch(label.name) is not None for pattern in _STATED_NAMES)
-        cells = re.split(r"[;,\t]\s*", text.strip())  # one for each channel, all equal
+        cells = re.split(r"[;,\t]\s*", text.strip())  # some loggers repeat it for each channel
         quantity = _QUANTITY.fullmatch(cells[0] if len(set(cells)) == 1 else text.strip())
         if quantity is None or not (is_rate or is_interval):
             continue
@@ -52,7 +52,7 @@ def stated_rate(remarks: Mapping[str, str]) -> float | None:
             in_hertz = parse_unit(unit).powers == parse_unit("Hz").powers  # an interval may be stated as a rate
             value, is_rate = to_si(value, unit, "Hz" if in_hertz else "s"), in_hertz
         if value > 0.0:
-            return float(f"{value if is_rate else 1.0 / value:.12g}")
+            return float(f"{value if is_rate else 1.0 / value:.12g}")  # without rounding errors in the last digits
     return None
 
 
@@ -61,7 +61,7 @@ def scope_start(remarks: Mapping[str, str]) -> np.datetime64 | None:
     for name, entry in remarks.items():
         match = _FILETIME.match(entry) if name.casefold().startswith(("starttime", "start time")) else None
         if match is not None:
-            return np.datetime64(int(match[1]) * 100 - _FROM_1601_TO_1970, "ns")
+            return np.datetime64(int(match[1]) * 100 - _FROM_1601_TO_1970, "ns")  # counted in 100 ns from 1601
     return None
 
 

@@ -46,7 +46,7 @@ class _Guess(NamedTuple):
     @property
     def channel(self) -> str | None:
         """Name of the channel that a column with this meaning contains; None if there is none."""
-        if self.kind == "flow":
+        if self.kind == "flow":  # q_pump is the flow into chamber A
             return "q_pump" if self.side == "A" else None
         return _PRESSURES.get(self.side) if self.kind == "pressure" else _CHANNELS[self.kind]
 
@@ -59,7 +59,7 @@ def proposed_map(labels: Sequence[Label]) -> dict[str, str]:
     contain only the time.
     """
     channel_names = {label.name.casefold() for label in labels} & {name.casefold() for name in CHANNEL_UNITS}
-    head_side = _find_head_side(labels)
+    head_side = _find_head_side(labels)  # the chamber that the word "head" means in these names
     candidates: dict[str, list[tuple[Label, _Guess]]] = {}
     for label in labels:
         guess = None if label.name.casefold() in channel_names else _guess_meaning(label, head_side)
@@ -202,8 +202,8 @@ def _split_words(name: str) -> set[str]:
 
     The result also contains parts of words:
 
-    - both parts of a German compound, such as `kolbenseite` and `druck` of `kolbenseitendruck`, where the last part is
-      a known ending, and the letter that links them is dropped;
+    - both parts of a German compound with a known ending, such as `kolbenseite` and `druck` of `kolbenseitendruck`, the
+      first part also without the letter n or s that links them;
     - both letters of `pa` and `pb`, i.e. `p` and the side;
     - known words of languages without spaces, such as Chinese.
     """
@@ -224,7 +224,7 @@ def _find_head_side(labels: Sequence[Label]) -> str:
     words = {word for label in labels if len(label.name) <= _MAX_NAME for word in _split_words(label.name)}
     if not words & _SIDE["head"]:
         return ""
-    # the letters alone do not name a rod or a cap
+    # a rod is on side B, a cap on side A, and the head then on the other side; the letters alone name neither
     return "A" if words & (_SIDE["B"] - {"b"}) else "B" if words & (_SIDE["A"] - {"a"}) else ""
 
 
@@ -242,7 +242,7 @@ def _guess_meaning(label: Label, head_side: str = "") -> _Guess | None:
     side = head_side if words & _SIDE["head"] and head_side else _find_side(words)
     if unit is not None and same_dimension(unit, "Pa"):
         return None if words & (_KIND["other"] | _KIND["wanted"]) else _Guess("pressure", side, unit)
-    if unit is not None and same_dimension(unit, "K"):  # before `other`, which has oil, too
+    if unit is not None and same_dimension(unit, "K"):  # before `other`, whose words include oil
         is_oil = words & _KIND["oil"] or _is_unnamed_temperature(words)
         return _Guess("oil", "", unit) if is_oil else None
     if words & _MEASURED["spool"]:
@@ -263,7 +263,7 @@ def _guess_meaning(label: Label, head_side: str = "") -> _Guess | None:
         return _Guess("command", side, unit)
     for kind, words_of_kind in _MEASURED.items():
         fits_unit = unit is None or (kind in _UNITS and same_dimension(unit, _UNITS[kind]))
-        if words & words_of_kind and fits_unit and kind != "flow":
+        if words & words_of_kind and fits_unit and kind != "flow":  # a flow must have its unit (above)
             return _Guess(kind, side, unit)
     return None
 
@@ -303,7 +303,7 @@ def suggest_map_entry(label: Label) -> str:
     """
     guess = _guess_meaning(label)
     channel = None if guess is None else guess.channel
-    if guess is not None and guess.kind == "flow":  # of either side
+    if guess is not None and guess.kind == "flow":  # to either side of the cylinder
         channel = "q_pump"
     if channel is None:
         at_valve = {"p_1": "before", "p_2": "behind"}

@@ -81,7 +81,7 @@ def _unpack(path: Path, kind: str, folder: Path, max_bytes: int) -> Path:
     with _open_member(path, kind) as (source, member, size):
         check_unpacked(size, max_bytes, path)
         member_name = Path(member or name).name
-        target = folder / (member_name if member_name.strip(".") else "recording")
+        target = folder / (member_name if member_name.strip(".") else "recording")  # not `.` or `..`
         with target.open("wb") as file:
             while data := source.read(_CHUNK):
                 check_unpacked(file.tell() + len(data), max_bytes, path)

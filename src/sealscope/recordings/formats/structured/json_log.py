@@ -49,7 +49,7 @@ def is_json(head: bytes) -> bool:
     try:
         json.loads(first)
     except json.JSONDecodeError as error:
-        # an array that goes on in the next line fails at its end, a remark such as `[2024-05-31 12:00] started` before
+        # an array that goes on in the next line fails at its end, a remark such as `[2024-05-31 12:00] started` earlier
         return error.pos >= len(first) - 1
     except (ValueError, RecursionError):
         return False

@@ -54,7 +54,7 @@ class _Packet:
         `day_first`: True if the day precedes the month in dates.
         """
         day, time = self.entry("date", index), self.entry("time", index).replace(",", ".")
-        seconds, _, fraction = time.partition(".")
+        seconds, _, fraction = time.partition(".")  # of the fraction 9 digits are used, i.e. nanoseconds
         try:
             return parse_stamps([f"{day} {seconds}.{fraction[:9] or '0'}"], day_first)[0] if day else None
         except ValueError:
@@ -106,17 +106,17 @@ def _iter_packets(lines: Iterator[tuple[int, str]], delimiter: str, decimal: str
     packet. `delimiter`, `decimal`: separators of cells and of decimals; `place`: the file, for messages. Raises
     InputError for a word in place of a number.
     """
-    head: dict[str, list[str]] = {}
+    header: dict[str, list[str]] = {}
     packet: _Packet | None = None
-    in_head = True
+    in_header = True
     for number, line in lines:
         cells = [cell.strip() for cell in line.split(delimiter)]
         if line.startswith(_END_MARK):
-            in_head, packet = False, None
+            in_header, packet = False, None
         elif not any(cells):
             continue
         elif packet is not None and cells[0].casefold() == "channels":
-            head, packet, in_head = {}, None, True
+            header, packet, in_header = {}, None, True
         elif packet is not None:
             names = packet.names
 
@@ -132,15 +132,15 @@ def _iter_packets(lines: Iterator[tuple[int, str]], delimiter: str, decimal: str
             if words:
                 raise InputError(f"a sample must be a number, got {cells[words[0]][:40]!r} {format_place(words[0])}")
             packet.rows.append(values)
-            if len(packet.rows) % 2**16 == 0:  # before a long file fills the memory
+            if len(packet.rows) % 2**16 == 0:  # now and then, before a long file fills the memory
                 check_size(len(packet.rows), len(names))
-        elif in_head:
+        elif in_header:
             texts = cells[1:]
             # if each channel has a column of times, every second cell is empty
             has_time_cells = len(texts) > 2 and texts[2] and not any(texts[1::2])
-            head[cells[0].casefold()] = texts[::2] if has_time_cells else texts
+            header[cells[0].casefold()] = texts[::2] if has_time_cells else texts
         else:
-            packet = _Packet(head, cells[:-1] if cells[-1].casefold() == "comment" else cells)
+            packet = _Packet(header, cells[:-1] if cells[-1].casefold() == "comment" else cells)
             yield packet
 
 

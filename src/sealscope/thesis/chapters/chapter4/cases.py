@@ -193,8 +193,8 @@ def summarise_run(run: SimulatedRun) -> dict[str, float]:
     """Summarise the pressures and flows from pi to 2 pi seconds of a run (`STEADY`) by a few numbers, by name.
 
     In Pa: "range of p_A" (maximum minus minimum) and "peak of p_A" (maximum) of each pressure; "least pressure", the
-    lowest of all; "mean of p_1 - p_A" and "mean of p_2 - p_B", the mean drops at the orifices; "largest drop" of both
-    by magnitude. "flows differ" is rms(Q_A - Q_B) / rms(Q_A). All numbers are nan if the run diverged.
+    lowest of all; "mean of p_1 - p_A" and "mean of p_2 - p_B", the mean drops at the orifices; "largest drop", the
+    largest magnitude of either drop. "flows differ" is rms(Q_A - Q_B) / rms(Q_A). All are nan if the run diverged.
     """
     outputs = {name: steady_output(run, name) for name in (*PRESSURES, "Q_A", "Q_B")}
     drops = {"p_1 - p_A": outputs["p_1"] - outputs["p_A"], "p_2 - p_B": outputs["p_2"] - outputs["p_B"]}
@@ -216,7 +216,8 @@ def piston_drift(run: SimulatedRun) -> float:
     if run.diverged:
         return math.nan
     t, x = run.t, run.outputs["x"]
-    last_period = int((t[-1] + t[1] - t[0]) // PERIOD) - 1  # number of the last whole period, from 0
+    end = t[-1] + t[1] - t[0]  # one sampling interval after the last sample
+    last_period = int(end // PERIOD) - 1  # number of the last whole period, from 0
     means = [float(x[(t >= k * PERIOD) & (t < (k + 1) * PERIOD)].mean()) for k in (0, last_period)]
     return means[1] - means[0]
 

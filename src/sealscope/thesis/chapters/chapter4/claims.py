@@ -227,8 +227,8 @@ def _format_range(values: Iterable[float], unit: str = "kPa", factor: float = 1e
 def _range_text(head: str, values: Callable[[Rows], Iterable[float]]) -> Callable[[list[Rows]], str]:
     """Build a function that formats the smallest and the largest of some numbers [kPa] over several runs.
 
-    The function's argument has, for each interpretation of the throttles' equations, the list of its runs' summaries
-    (`summarise_run`). `head`: text before the numbers; `values`: computes the numbers [Pa] from one of these lists.
+    The built function takes a list of lists: for each interpretation of the throttles' equations, the summaries of some
+    runs (`summarise_run`). `head`: text before the numbers; `values`: computes the numbers [Pa] from one inner list.
     """
     return lambda rows_of_readings: f"{head} {_format_range(v for rows in rows_of_readings for v in values(rows))}"
 
@@ -290,6 +290,7 @@ def _judge_opening(context: Context) -> Iterator[Claim]:
     yield _judge_runs(8, opening, lambda rows: np.abs(peak_and_range_changes(rows)) < min_visible, changes)
     yield _judge_runs(10, opening, lambda rows: np.abs(_changes(rows, "peak")) > min_visible, changes)
     yield _judge_runs(9, opening, lambda rows: [rows[1][flows] < _MAX_FLOW_DIFFERENCE], format_flow_difference)
+    # two tests each: the sign of the mean drop, and whether the drop is visible
     drop = _range_text(p_1, lambda rows: [rows[1][p_1]])
     yield _judge_runs(11, opening, lambda rows: (rows[1][p_1] < 0, rows[1][p_1] < -min_visible), drop)
     drop = _range_text(p_2, lambda rows: [rows[1][p_2]])
@@ -368,14 +369,14 @@ def _judge_drift(context: Context) -> Iterator[Claim]:
     }
 
     def drift_formatter(head: str) -> Callable[[list[list[float]]], str]:
-        """Build a function that formats the piston's drift with orifices minus that without them, at each closing.
+        """Build a function that formats, for each closing, the drift of the piston due to the orifices.
 
-        The text states the smallest and the largest value over the interpretations of the throttles' equations; `head`:
-        text before them.
+        This is the drift with orifices minus the drift without. The text states its smallest and its largest value over
+        the interpretations of the throttles' equations. `head`: text before these values.
         """
 
         def format_drift(rows: list[list[float]]) -> str:
-            """Format the added drift [mm] at each closing, as its smallest and largest value over `rows`.
+            """Format the drift [mm] due to the orifices at each closing, as its smallest and largest value over `rows`.
 
             Each row has the drifts [m] under one interpretation of the equations, one for each closing.
             """
@@ -388,7 +389,7 @@ def _judge_drift(context: Context) -> Iterator[Claim]:
     def differs(row: list[float]) -> Iterator[bool]:
         """Yield for each closing True if the piston's drift differs from the drift without orifices by more than 1 %.
 
-        `row`: the drift [m] at each closing.
+        `row`: the drift [m] at each closing; the 1 % are of the magnitude of the drift without orifices.
         """
         return (abs(with_orifices - drift_without) > min_change for with_orifices in row)
 
@@ -423,7 +424,7 @@ def claims(context: Context, item: Item) -> tuple[ThesisTable | Claim, ...]:
     without_orifices = (_judge_cases_without_orifices, _judge_step_and_gains, _judge_equations_and_tables)
     with_orifices = (_judge_opening, _judge_larger_closings, _judge_drift)
     judgements = [claim for judge in (*without_orifices, *with_orifices) for claim in judge(context)]
-    judgements.sort(key=lambda claim: int(claim.id.rpartition(".")[2]))
+    judgements.sort(key=lambda claim: int(claim.id.rpartition(".")[2]))  # by the number after "4."
     rows: list[tuple[Cell, ...]] = []
     for reading, solver, closed in itertools.product(READINGS, SOLVERS, (0.0, *CLOSINGS)):
         run = context.run(make_experiment(COMMAND, closed, reading, solver))

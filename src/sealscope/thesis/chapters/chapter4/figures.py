@@ -101,12 +101,18 @@ def _axis_label(name: str) -> str:
 
 
 def _line_curve(run: SimulatedRun, name: str, label: str, role: Role) -> FigureCurve:
-    """Build the curve of an output of a run over time, in the figures' unit."""
+    """Build the curve of the output `name` of a run over time, in the figures' unit.
+
+    `label`: text of the curve in the legend; `role`: its meaning, which determines the line style.
+    """
     return FigureCurve(run.t, run.outputs[name] * FIGURE_UNITS[name].scale, label, role)
 
 
 def _marked_curve(run: SimulatedRun, name: str, label: str, role: Role) -> FigureCurve:
-    """Build the curve of an output as about 80 marks, so that another curve with the same values stays visible."""
+    """Build the curve of the output `name` as about 80 marks, so that another curve with the same values stays visible.
+
+    `label`: text of the curve in the legend; `role`: its meaning, which determines the style of the marks.
+    """
     thinned = slice(None, None, max(1, run.t.size // _N_MARKS))
     values = run.outputs[name][thinned] * FIGURE_UNITS[name].scale
     return FigureCurve(run.t[thinned], values, f"{label} (the same)", role, "points")

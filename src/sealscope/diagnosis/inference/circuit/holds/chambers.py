@@ -143,9 +143,9 @@ class HeldChambers:
     def _is_closed(self, hold: LockedHold, p: Array) -> NDArray[np.bool_]:
         """Flag the samples (n,) of a hold in which no check valve refills a chamber.
 
-        The valve is closed while the chamber's pressure exceeds the charge pressure by a margin. `p` (n,): absolute
-        pressure of the chamber in the `hold` [Pa], here averaged over `held_oil.steady` (`priors.toml`) to remove
-        noise.
+        The valve is closed while the chamber's pressure exceeds the charge pressure by a relative and an absolute
+        margin, `held_oil.charge` and `held_oil.resolved` (`priors.toml`). `p` (n,): absolute pressure of the chamber in
+        the `hold` [Pa], here averaged over `held_oil.steady` to remove noise.
         """
         prior = INFERENCE.held_oil
         steady_pressure = average_over(prior.steady, p, 1.0 / float(np.diff(hold.t).mean()))
@@ -167,8 +167,8 @@ class HeldChambers:
         """Compute the fraction of the samples of both sides in all holds in which no check valve refills the chamber.
 
         `refilled`: true for A, and for B, if a check valve refills that side once it is at the charge pressure. While a
-        chamber is refilled, its readings (sample means) fit any leak. They lower the variance of all readings by this
-        fraction.
+        chamber is refilled, its readings (sample means) fit any leak, so that the variance of all readings is too small
+        by this factor.
         """
         share = float(np.concatenate(self._closed_flags(refilled), axis=1).mean())
         return max(share, 1.0 / self.n_readings)  # above 0, since its logarithm is used
@@ -215,15 +215,15 @@ class HeldChambers:
         return UnitLeak([flow_of_side(flow, is_A) for flow in flows], refilled=BOTH)
 
     def _unit_pump_leak(self, is_A: bool) -> UnitLeak:
-        """Compute the flow with a conductance of 1 out of one chamber through open valves and the pump into the other.
+        """Compute the flow from one chamber through open valves and the pump to the other, for a conductance of 1.
 
-        The oil leaves chamber A if `is_A` is True, else B. The other chamber stays at its pressure, since check valves
-        or a shuttle valve connect it to the charge pressure.
+        The oil leaves chamber A if `is_A` is True, else B. No flow counts for the other chamber, since check valves or
+        a shuttle valve keep it at the charge pressure.
         """
         sign = 1.0 if is_A else -1.0
         flows = []
         for hold in self.holds:
-            hold_offset, _ = hold.offset_in_hold(0.0)
+            hold_offset, _ = hold.offset_in_hold(0.0)  # 0: the offset of the recording is not known here
             flow = np.maximum(sign * (hold.p_A - hold.p_B - hold_offset), 0.0)
             flows.append(flow_of_side(flow, is_A))
         return UnitLeak(flows)
@@ -292,7 +292,7 @@ class HeldChambers:
             fit = fit_leaks(self._regressions[leak.refilled], column, self.n_readings)
             # the leak is the only coefficient
             deviation, by_oil = float(fit.by_noise[0, 0]) ** 0.5, float(max(fit.by_oil[0, 0], 0.0)) ** 0.5
-            if not fit.coefficients[0] < 0.0:  # a leak flows from the higher to the lower pressure only
+            if not fit.coefficients[0] < 0.0:  # no leak flows from the lower to the higher pressure
                 value, variance = float(fit.coefficients[0]), fit.variance
         return LeakFit(value, deviation, by_oil, log_likelihood=-0.5 * self.n_readings * float(np.log(variance)))
 
@@ -322,18 +322,19 @@ class HeldChambers:
         return np.asarray(np.log(np.append(from_start, np.full(n_later, (1.0 - from_start) / max(n_later, 1)))))
 
     def _leak_columns(self, leak: UnitLeak, onsets: Array) -> Array:
-        """Compute the volume that a leak with a coefficient of 1 loses from each of o `onsets` to r readings, (r, o).
+        """Compute the volume lost by each of r readings through a leak that begins at each of o `onsets`, (r, o).
 
-        A reading is a mean of samples. The volumes are those that leave each side, relative to their mean over the
-        hold. `leak`: flow of the leak out of both sides in each hold.
+        The leak has a coefficient of 1. A reading is a mean of samples. The volumes are those that leave each side,
+        relative to their mean over the hold. `leak`: flow of the leak out of both sides in each hold.
         """
         columns = []
         for hold, sides in zip(self.holds, leak.flows, strict=True):
             for is_A, flow in zip((True, False), sides, strict=True):
                 increments = 0.5 * (flow[1:] + flow[:-1]) * np.diff(hold.t)
                 volume = np.concatenate([[0.0], np.cumsum(increments)])
-                volume_before = np.interp(onsets, hold.t, volume)
-                # sums over the samples of each reading from the onset on, from their cumulative sums
+                volume_before = np.interp(onsets, hold.t, volume)  # leaked before each onset; does not count
+                # sum over the samples `first` to `last` - 1 of each of k readings, as a difference of cumulative sums;
+                # `first` (k, o) is not before the onset
                 sums = np.concatenate([[0.0], np.cumsum(volume)])
                 last = hold.edges[1:, None]
                 first = np.minimum(np.maximum(hold.edges[:-1, None], np.searchsorted(hold.t, onsets)), last)
@@ -369,9 +370,9 @@ class HeldChambers:
 
     @cached_property
     def piston_fits(self) -> dict[float, PistonFit]:
-        """Most probable onset of a leak past the piston, sensor offset and effect of check valves, by its exponent.
+        """Most probable onset of a leak past the piston, sensor offset and effect of check valves, for several laws.
 
-        The exponents are those of `EXPONENTS`.
+        The keys are the exponents of the laws, `EXPONENTS`.
         """
         return {exponent: self._find_piston_fit(exponent) for exponent in EXPONENTS}
 
@@ -390,7 +391,7 @@ class HeldChambers:
         grid, fits = self._offset_grid, list[tuple[float, PistonFit]]()
         is_never_refilled = self._closed_share(self._refillable_sides) == 1.0
         for refilled in (NEITHER,) if is_never_refilled else (NEITHER, self._refillable_sides):
-            posteriors = [self._find_onset(float(offset), refilled, exponent)[0] for offset in grid]  # without the fits
+            posteriors = [self._find_onset(float(offset), refilled, exponent)[0] for offset in grid]
             best = int(np.argmax(posteriors))
             refined = np.linspace(grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)], N_REFINED)
             fits += [self._find_onset(float(offset), refilled, exponent) for offset in (*refined, grid[best])]
@@ -422,7 +423,7 @@ class HeldChambers:
                 flow * law.growth_factor(hold.t, self.end) for flow, hold in zip(leak.flows, self.holds, strict=True)
             ]
             fit = self._fit_leak(leak._replace(flows=flows), onset)
-            mean_ratio = 1.0 + 0.5 * growth  # mean over initial coefficient, which grows linearly
+            mean_ratio = 1.0 + 0.5 * growth  # mean over initial coefficient, for a linear growth
             fits.append(fit.scale(mean_ratio, fit.log_likelihood))  # the scaling does not change the likelihood
             log_weights.append(fit.log_likelihood + float(np.log(probability)))
         most_probable = fits[int(np.argmax(log_weights))]
@@ -434,7 +435,7 @@ class HeldChambers:
         The mean is over the time after the onset. `conditions`: onset and sensor offset; `law`: law of the leak.
         """
         leak = self._unit_piston_leak(conditions.offset, law=law)
-        flows = [  # out of A, which is the first row
+        flows = [  # row 0 is the flow out of A
             np.abs(sides[0])[hold.t >= conditions.onset] for hold, sides in zip(self.holds, leak.flows, strict=True)
         ]
         after_onset = np.concatenate(flows)
@@ -447,11 +448,11 @@ class HeldChambers:
         the leak's law. Return the log posterior of onset and offset, and the fit with this onset.
         """
         posteriors = self._onset_posteriors(self._unit_piston_leak(offset, refilled, LeakLaw(exponent)))
-        onset = int(posteriors.argmax())
-        log_posterior = float(posteriors[onset]) - 0.5 * self._offset_cost(offset)
-        # readings during a refill lower the variance without any information
+        index = int(posteriors.argmax())
+        log_posterior = float(posteriors[index]) - 0.5 * self._offset_cost(offset)
+        # readings during a refill lower the variance without any information: this is compensated
         log_posterior += 0.5 * self.n_readings * float(np.log(self._closed_share(refilled)))
-        return log_posterior, PistonFit(float(self.onsets[onset]), offset, refilled)
+        return log_posterior, PistonFit(float(self.onsets[index]), offset, refilled)
 
     @cached_property
     def _leak_hypotheses(self) -> list[LeakHypothesis]:
@@ -469,19 +470,19 @@ class HeldChambers:
         best = max(self.law_fits, key=lambda fit: fit.log_weight)
         unit_ratio = self._mean_unit_flow(best.conditions, best.law) / self._mean_unit_flow(best.conditions, LAMINAR)
         log_weights = [fit.log_weight for fit in self.law_fits]
-        # each fit with the index of its onset
-        onset = int(np.abs(self.onsets - best.conditions.onset).argmin())
-        fits = [(best.fit.scale(unit_ratio, float(np.logaddexp.reduce(log_weights))), onset)]
+        # each fit with the index of its onset in `onsets`
+        index = int(np.abs(self.onsets - best.conditions.onset).argmin())
+        fits = [(best.fit.scale(unit_ratio, float(np.logaddexp.reduce(log_weights))), index)]
         for leak in leaks:
-            onset = int(self._onset_posteriors(leak).argmax())
-            fits.append((self._fit_growing_leak(leak, float(self.onsets[onset])), onset))
-        log_posteriors = np.array([fit.log_likelihood + self._onset_log_priors[onset] for fit, onset in fits])
+            index = int(self._onset_posteriors(leak).argmax())
+            fits.append((self._fit_growing_leak(leak, float(self.onsets[index])), index))
+        log_posteriors = np.array([fit.log_likelihood + self._onset_log_priors[index] for fit, index in fits])
         probabilities = np.exp(log_posteriors - log_posteriors.max())
         probabilities /= probabilities.sum()
         fractions_after = (self.end - self.onsets) / max(self.end - self.begin, np.finfo(float).tiny)
         return [
-            LeakHypothesis(float(probability), float(fractions_after[onset]), fit)
-            for probability, (fit, onset) in zip(probabilities, fits, strict=True)
+            LeakHypothesis(float(probability), float(fractions_after[index]), fit)
+            for probability, (fit, index) in zip(probabilities, fits, strict=True)
         ]
 
     def total_leak(self) -> Flow:
@@ -496,8 +497,9 @@ class HeldChambers:
         leaks = [chambers._unit_outside_leak(is_A) for is_A in sides]
         leaks += [chambers._unit_pump_leak(is_A) for is_A in sides]
         hypotheses = chambers._weigh_hypotheses(leaks)
-        means = [h.probability * h.fraction_after * h.fit.value for h in hypotheses]
-        deviations = [h.fraction_after * h.fit.deviation for h in hypotheses]
+        means = [hypothesis.probability * hypothesis.fraction_after * hypothesis.fit.value for hypothesis in hypotheses]
+        deviations = [hypothesis.fraction_after * hypothesis.fit.deviation for hypothesis in hypotheses]
+        # a leak that is estimated as 0 adds no uncertainty
         variance = sum(deviation**2 for mean, deviation in zip(means, deviations, strict=True) if mean > 0.0)
         # without any leak, the deviation is that of a leak past the piston
         return Flow(sum(means), variance**0.5 if any(means) else deviations[0])

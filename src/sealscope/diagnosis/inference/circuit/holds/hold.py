@@ -36,7 +36,7 @@ class LockedHold(NamedTuple):
     edges: NDArray[np.intp]
 
     def mean(self, values: Array) -> Array:
-        """Average samples (..., n) of the hold over the intervals between `edges`, to k readings, shape (..., k)."""
+        """Average `values` (..., n) of n samples over the intervals between `edges`, to k readings, shape (..., k)."""
         sums = np.add.reduceat(values, self.edges[:-1], axis=-1)
         return np.asarray(sums / np.diff(self.edges))
 
@@ -52,7 +52,7 @@ class LockedHold(NamedTuple):
         The first reading of the side with the higher pressure becomes 0 and does not count towards the mean, since the
         valves may still be shutting.
         """
-        first = int(self.carries(is_A))
+        first = int(self.carries(is_A))  # first reading that counts: 1 on the side with the higher pressure, else 0
         centred = np.asarray(readings - readings[first:].mean(axis=0))
         centred[:first] = 0.0
         return centred
@@ -82,12 +82,12 @@ class LockedHold(NamedTuple):
         """Compute p_A - p_B [Pa] at each sample (n,), given the recording's sensor `offset` [Pa] of this difference.
 
         The offset of the hold itself is subtracted (`offset_in_hold`). Once a leak has equalised the pressures, small
-        differences d are errors of the sensors, whose integral over the hold may exceed that of the short flow before.
-        In such holds d is therefore multiplied by d^2 / (d^2 + `held_oil.resolved`^2).
+        differences d are errors of the sensors. Their integral over the hold may exceed the integral of the large but
+        short-lived difference before. In such holds d is therefore multiplied by d^2 / (d^2 + `held_oil.resolved`^2).
         """
         offset_here, cost = self.offset_in_hold(offset)
         difference = np.asarray(self.p_A - self.p_B - offset_here)
-        if cost > 0.0:
+        if cost > 0.0:  # a leak has equalised the pressures
             difference *= difference**2 / (difference**2 + INFERENCE.held_oil.resolved**2)
         return difference
 
@@ -107,13 +107,14 @@ def find_charge_pressure(lower_pressure: Array, rests: NDArray[np.bool_], rate: 
 
     It is the lowest pressure while the pump rests, but at most the median while the pump turns, since a leak may
     equalise the pressures in every rest. If the pump never rests, it is the lowest pressure of the recording. This may
-    be too low, since a moving piston draws oil through lines and check valves, which drop pressure. `lower_pressure`
+    be too low, by the pressure drop of lines and check valves through which a moving piston draws oil. `lower_pressure`
     (n,): the lower of both chamber pressures in each sample [Pa]; `rests` (n - 1,): flags of the sampling intervals in
     which the pump rests; `rate`: sampling rate [Hz].
     """
     steady_pressure = average_over(INFERENCE.held_oil.steady, lower_pressure, rate)
     if not rests.any():
         return float(np.nanquantile(steady_pressure, LOWEST))
+    # the pressure of a sampling interval is that of the sample at its start
     at_rest, turning = steady_pressure[:-1][rests], steady_pressure[:-1][~rests]
     lowest = float(np.nanquantile(at_rest, LOWEST))
     return min(lowest, float(np.nanmedian(turning))) if np.isfinite(turning).any() else lowest
@@ -131,7 +132,7 @@ def extend_rests(rests: NDArray[np.bool_], flow: Array, rate: float) -> NDArray[
     magnitude, extended = np.nan_to_num(np.abs(flow)), rests.copy()
     for first, _ in find_runs(rests).tolist():
         earliest = max(first - window, 0)
-        level = float(np.median(magnitude[max(earliest - window, 0) : earliest + 1]))
+        level = float(np.median(magnitude[max(earliest - window, 0) : earliest + 1]))  # before the flow falls
         is_above_half = magnitude[earliest:first] > 0.5 * level
         n_above = int(np.flatnonzero(is_above_half)[-1]) + 1 if is_above_half.any() else 0
         extended[earliest + n_above : first] = True
@@ -148,8 +149,8 @@ def find_locked_holds(channels: Sequence[Array], rests: NDArray[np.bool_], rate:
     """
     prior, holds = INFERENCE.held_oil, list[LockedHold]()
     decimation = max(1, int(rate / MAX_RATE))  # number of samples that are averaged to one
-    # samples of the first interval, and samples to omit at the end; the end of a rest is uncertain by the time over
-    # which the flow was averaged to find it
+    # samples of the first interval, and samples to omit at the end: those in which the valves open, and those over
+    # which the flow was averaged to find the rest
     settling, opening = (max(1, round(s * rate)) for s in (prior.settles, prior.settles + INFERENCE.rest.averaged))
     for first, n_intervals in find_runs(rests).tolist():
         if n_intervals + 1 < prior.shortest * rate:
@@ -178,4 +179,4 @@ def _reading_edges(n_samples: int, width: float) -> NDArray[np.intp]:
     while edges[-1] + max(round(width), 1) < n_samples:
         edges.append(edges[-1] + max(round(width), 1))
         width *= GROWTH
-    return np.array([*edges[:-1], n_samples])
+    return np.array([*edges[:-1], n_samples])  # the incomplete last interval is joined to the one before

@@ -46,8 +46,8 @@ class UnitLeak(NamedTuple):
     """Flow of a leak with a coefficient of 1 while shut valves hold the load.
 
     `flows`: for each hold of n samples the flow out of A (first row) and out of B, over the coefficient, (2, n), in
-    Pa^e for the exponent e of the law (laminar: 1); `refilled`: true for A, and for B, if a check valve replaces the
-    oil of that side that the piston displaces, once it is at the charge pressure, so that no flow counts there.
+    Pa^e for the exponent e of the law (laminar: 1); `refilled`: true for A, and for B, if a check valve refills that
+    side while it is at the charge pressure. The flow of the side does not count then.
     """
 
     flows: Sequence[Array]
@@ -72,7 +72,7 @@ class HeldLeaks(NamedTuple):
 class PistonFit(NamedTuple):
     """Most probable `onset` of a leak past the piston [s], and sensor `offset` of p_A - p_B [Pa].
 
-    `refilled`: true for A, and for B, if a check valve probably replaces oil of that side at the charge pressure.
+    `refilled`: true for A, and for B, if a check valve probably refills that side while it is at the charge pressure.
     """
 
     onset: float

@@ -81,7 +81,7 @@ class OilRegression(NamedTuple):
         """
         oil, air, volumes = _oil_factors(changes)
         strained, aired = oil * self.strained, air * self.aired
-        dead = strained[:, 1:] + aired[:, 1:]  # by the dead volumes of A and B
+        dead = strained[:, 1:] + aired[:, 1:]  # derivatives by the relative changes of the dead volumes of A and B
         return np.column_stack([strained @ volumes, dead, aired @ volumes])
 
 
@@ -106,7 +106,7 @@ def _oil_deviations() -> Array:
 
 
 def _lowest_changes() -> Array:
-    """Return the lower limits (4,) of the changes of compressibility, dead volumes of A, of B, and air."""
+    """Return the lower limits (4,) of the changes of the oil's properties, in the order of `_oil_factors`."""
     prior = INFERENCE.held_oil
     lowest_dead = prior.least_dead / prior.dead - 1.0
     return np.array([-np.inf, lowest_dead, lowest_dead, -np.inf])
@@ -141,14 +141,14 @@ def build_regression(
         # A grows with the position, and B shrinks
         for index, area, p in ((0, sides.area_A, hold.p_A), (1, -sides.area_B, hold.p_B)):
             stroke_end = sides.low if area > 0.0 else sides.high  # where the chamber is smallest
-            volumes = np.zeros(3)  # in the stroke, and the dead volumes of A and B
+            volumes = np.zeros(3)  # volume in the stroke, dead volumes of A and B
             volumes[0] = abs(area) * abs(float(hold.x.mean()) - stroke_end)
             volumes[1 + index] = abs(area) * prior.dead * stroke
-            increments = -area * np.diff(hold.x, prepend=hold.x[0])
+            increments = -area * np.diff(hold.x, prepend=hold.x[0])  # volumes that the piston displaces
             for columns, values in (
                 (displaced, hold.mean(np.cumsum(increments * is_closed[index]))),
                 (strained, np.outer(hold.mean(p), prior.compressibility * volumes)),
-                (aired, np.outer(hold.mean(1.0 / p), -prior.air * P_ATM * volumes)),  # law of Boyle
+                (aired, np.outer(hold.mean(1.0 / p), -prior.air * P_ATM * volumes)),  # Boyle's law
             ):
                 columns.append(hold.centre(values, is_A=index == 0))
     strained_volumes, aired_volumes = np.vstack(strained), np.vstack(aired)
@@ -172,30 +172,32 @@ def fit_leaks(regression: OilRegression, columns: Array, n_readings: float) -> L
     that reaches its lower limit stays there.
     """
     n_leaks = columns.shape[1]
-    changes = np.zeros(4)  # of the oil's properties
-    left, misfit_variance = regression.leaked(changes), regression.misfit_variance
+    changes = np.zeros(4)  # changes of the oil's properties, at first none
+    leaked, misfit_variance = regression.leaked(changes), regression.misfit_variance
     degrees_of_freedom = max(n_readings - n_leaks, 1.0)
-    variance = max(float(left @ left) / len(left), misfit_variance)
+    variance = max(float(leaked @ leaked) / len(leaked), misfit_variance)
     # precisions of the priors (0 for leaks, which have none), and lower limits of the properties
     precisions = np.append(np.zeros(n_leaks), regression.inflation / _oil_deviations() ** 2)
     lowest = _lowest_changes()
     is_lowest = np.zeros(4, dtype=bool)  # properties that stay at their lower limit
-    for _ in range(MAX_ITERATIONS):  # of a linear fit of the leaks and of corrections of `changes`
+    for _ in range(MAX_ITERATIONS):  # each is a linear fit of the leaks and of corrections of `changes`
         slopes = np.where(is_lowest, 0.0, regression.slopes(changes))
-        left, design = regression.leaked(changes), np.column_stack([columns, slopes])
+        leaked, design = regression.leaked(changes), np.column_stack([columns, slopes])
         scale = np.sqrt((design**2).sum(axis=0))
         scale[~(scale > 0.0)] = 1.0
         scales = np.outer(scale, scale)
-        prior = variance * precisions
-        means = np.append(np.zeros(n_leaks), np.where(is_lowest, 0.0, -changes))  # of the corrections' priors
-        matrix = (design.T @ design + np.diag(prior)) / scales
-        matrix.flat[:: len(scale) + 1] += RIDGE
+        prior_weights = variance * precisions  # weights in a sum of squares of the readings
+        # the prior mean of `changes` is 0, so that of a correction is -`changes`
+        means = np.append(np.zeros(n_leaks), np.where(is_lowest, 0.0, -changes))
+        matrix = (design.T @ design + np.diag(prior_weights)) / scales
+        matrix.flat[:: len(scale) + 1] += RIDGE  # this stride selects the diagonal
         inverse = np.linalg.inv(matrix) / scales
-        solution = inverse @ (design.T @ left + prior * means)
-        residual = left - design @ solution
-        distances = np.append(np.zeros(n_leaks), changes) + solution  # from the mean of the priors
-        cost = float(residual @ residual) + float(prior[n_leaks:] @ distances[n_leaks:] ** 2)
-        previous, variance = variance, cost / len(left) * n_readings / degrees_of_freedom + misfit_variance
+        solution = inverse @ (design.T @ leaked + prior_weights * means)
+        residual = leaked - design @ solution
+        distances = np.append(np.zeros(n_leaks), changes) + solution  # distances from the means of the priors
+        squares = float(residual @ residual) + float(prior_weights[n_leaks:] @ distances[n_leaks:] ** 2)
+        mean_square = squares / len(leaked)
+        previous, variance = variance, mean_square * n_readings / degrees_of_freedom + misfit_variance
         steps = np.clip(solution[n_leaks:], -MAX_STEP, MAX_STEP)
         was_lowest, is_lowest = is_lowest, is_lowest | (changes + steps < lowest)
         changes = np.maximum(changes + steps, lowest)
@@ -216,37 +218,40 @@ def residual_squares(regression: OilRegression, columns: Array, variance: float)
     """Compute the residual sum of squares of the fit of a leak with a coefficient >= 0, for each of o onsets, (o,).
 
     `regression`: regression on the properties of the oil, linearised at their usual values; `columns` (r, o): volume
-    leaked with a coefficient of 1 since each onset, at each reading; `variance`: variance of a reading, by which the
-    priors of the properties count. A property that would fall below its lower limit is at this limit; compressibility
-    and free air are limited to 0.
+    leaked with a coefficient of 1 since each onset, at each reading; `variance`: variance of a reading, which weights
+    the priors on the properties against the readings. A property that would fall below its lower limit is at this
+    limit; compressibility and free air are limited to 0.
     """
     usual = np.zeros(4)
-    left, oil = regression.leaked(usual), regression.slopes(usual)
+    leaked, oil = regression.leaked(usual), regression.slopes(usual)
     products = oil.T @ oil + np.diag(variance * regression.inflation / _oil_deviations() ** 2)
-    scale = np.sqrt(np.diag(products))  # of the properties, which are measured in 1 / scale from here on
+    scale = np.sqrt(np.diag(products))  # from here on the properties are measured in units of 1 / scale
     products /= np.outer(scale, scale)
     oil = oil / scale
-    with_left, with_columns = oil.T @ left, oil.T @ columns  # (4,), (4, o)
+    with_leaked, with_columns = oil.T @ leaked, oil.T @ columns  # (4,), (4, o)
     lowest = scale * np.maximum(_lowest_changes(), -1.0)  # -1: no compressibility or no air in the linear regression
     # The least squares within the limits are the smallest of c = 16 cases: some properties are at their limits, and the
     # others are free and within them.
     is_free = np.array(list(itertools.product((True, False), repeat=4)))  # (c, 4)
     limits = np.where(is_free, 0.0, lowest)
-    rest = with_left - limits @ products  # (c, 4): products with what the limited properties leave
+    # (c, 4): products of `oil` with `leaked` minus the contribution of the properties at their limits
+    remainder = with_leaked - limits @ products
     matrices = np.where(is_free[:, :, None] & is_free[:, None, :], products, np.eye(4))
-    columns_of_rest = np.concatenate(
-        [rest[:, :, None], np.broadcast_to(with_columns, (len(rest), *with_columns.shape))], axis=2
+    right_sides = np.concatenate(
+        [remainder[:, :, None], np.broadcast_to(with_columns, (len(remainder), *with_columns.shape))], axis=2
     )
-    solutions = np.linalg.solve(matrices, np.where(is_free[:, :, None], columns_of_rest, 0.0))
-    # changes of the properties without the leak, and by which they are smaller for a leak with a coefficient of 1
-    by_rest, by_leak = solutions[:, :, 0], solutions[:, :, 1:]  # (c, 4), (c, 4, o)
-    total = left @ left - (limits * (with_left + rest)).sum(axis=1) - (rest * by_rest).sum(axis=1)
-    energy = np.einsum("ro,ro->o", columns, columns) - np.einsum("ko,cko->co", with_columns, by_leak)
-    moment = columns.T @ left - limits @ with_columns - np.einsum("ck,cko->co", rest, by_leak)
-    moment = np.maximum(moment, 0.0)  # (c, o)
+    solutions = np.linalg.solve(matrices, np.where(is_free[:, :, None], right_sides, 0.0))
+    # (c, 4), (c, 4, o): changes of the free properties without a leak, and decrease of these changes for a leak with a
+    # coefficient of 1
+    without_leak, per_leak = solutions[:, :, 0], solutions[:, :, 1:]
+    # sum of squares without a leak; a leak with the coefficient g changes it by -2 g moment + g^2 energy
+    total = leaked @ leaked - (limits * (with_leaked + remainder)).sum(axis=1) - (remainder * without_leak).sum(axis=1)
+    energy = np.einsum("ro,ro->o", columns, columns) - np.einsum("ko,cko->co", with_columns, per_leak)
+    moment = columns.T @ leaked - limits @ with_columns - np.einsum("ck,cko->co", remainder, per_leak)
+    moment = np.maximum(moment, 0.0)  # (c, o); the coefficient of a leak is not negative
     is_informative = energy > RIDGE * np.maximum(energy.max(axis=1, keepdims=True), np.finfo(float).tiny)
     leak = np.where(is_informative, moment / np.where(is_informative, energy, 1.0), 0.0)
-    changes = by_rest[:, :, None] - leak[:, None] * by_leak
+    changes = without_leak[:, :, None] - leak[:, None] * per_leak
     is_within = ((changes >= (1.0 + ROUNDING) * lowest[:, None]) | ~is_free[:, :, None]).all(axis=1)
     squares = np.where(is_within, np.maximum(total[:, None] - leak * moment, 0.0), np.inf)
     return np.asarray(squares.min(axis=0))
