@@ -325,8 +325,9 @@ def to_si(
 ) -> Array | float:
     """Convert `values` (any shape, or one number) in `unit` to doubles in `si_unit`.
 
-    One number is converted exactly and rounded once, an array to within 2 units in the last place. Raises InputError
-    for a unit of another dimension; the message states `name`, the unit, the expected dimension and the file `place`.
+    One number is converted exactly and rounded once, except for units with pi, such as rpm. An array is converted to
+    within 2 units in the last place. Raises InputError for a unit of another dimension; the message states `name`, the
+    unit, the expected dimension and the file `place`.
     """
     scalar = isinstance(values, int | float)
     if unit == si_unit:

@@ -76,6 +76,7 @@ def test_a_leak_as_planned_is_found_in_simulated_holds(rig: Rig, hold: PlannedHo
     assert count_leaks(rig, hold, 0.0, 8) <= 1
 
 
+@pytest.mark.slow
 def test_a_smaller_leak_takes_a_longer_hold(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(held, "_N_DRAWS", 2)
     monkeypatch.setattr(held, "_N_BISECTIONS", 4)
@@ -83,6 +84,9 @@ def test_a_smaller_leak_takes_a_longer_hold(rig: Rig, monkeypatch: pytest.Monkey
     assert hold.duration == SECONDS and hold.conductance <= 1e-14
     smaller = plan_hold(rig, LOAD, FLOW, 0.5 * hold.conductance, false_alarm=ALLOWED)
     assert smaller.duration > hold.duration and smaller.conductance < 0.5 * hold.conductance
+
+
+def test_a_hold_needs_a_load(rig: Rig) -> None:
     with pytest.raises(InputError, match="load > 0 N"):
         plan_hold(rig, 0.0, FLOW)
 

@@ -170,7 +170,7 @@ def test_a_leak_that_equalises_the_pressures_while_the_valves_shut_shows_on_the_
     assert hold.carries(True) and not hold.carries(False)
     assert equal < 0.1 * LOADED
     assert chambers.piston_leak.probability > 0.99
-    without_settling = [hold._replace(edges=hold.edges[1:]) for hold in chambers.holds]
+    without_settling = [replace(hold, edges=hold.edges[1:]) for hold in chambers.holds]
     assert replace(chambers, holds=without_settling).leaks.piston < chambers.leaks.piston
 
 

@@ -171,9 +171,11 @@ def estimate_holding_period(t: Array, values: Array) -> float | None:
     if lengths.size < _PRIORS.runs or np.median(lengths) < 2:
         return None
     median_duration = float(np.median(durations))
-    is_regular = np.abs(durations / median_duration - 1.0) <= _PRIORS.spread
+    is_regular = np.abs(durations - median_duration) <= _PRIORS.spread * median_duration
+    if np.mean(is_regular) < max(_PRIORS.share, 1.0 / durations.size):
+        return None
     period = float(durations[is_regular].mean())
-    return period if period >= _PRIORS.shortest and np.mean(is_regular) >= _PRIORS.share else None
+    return period if period >= _PRIORS.shortest else None
 
 
 def _flag_held(t: Array, values: Array, period: float) -> NDArray[np.bool_]:

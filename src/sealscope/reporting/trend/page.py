@@ -118,7 +118,8 @@ def _draw_trend(trend: Trend, picture: Picture) -> None:
         # another style for a recording with a note, and for one that is not comparable with the first group
         style = "point apart" if point.note else "point" if point.group == 0 else "point other"
         title = f"{point.file}: {point.value:.3g} {trend.unit}"
-        picture.point(style, point.day, point.value, (point.low or 0.0, point.high or 0.0), title)
+        low, high = (point.value if end is None else end for end in (point.low, point.high))
+        picture.point(style, point.day, point.value, (low, high), title)
     for episode in trend.episodes:
         picture.line("course", *np.transpose(_fitted_line(days, episode)))  # days and levels of the vertices
 

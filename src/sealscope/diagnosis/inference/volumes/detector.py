@@ -192,9 +192,9 @@ class VolumeBalance:
         scale = balance.size.scale if balance.size.stated else 0.0
         summary = {name: value for name, value in balance.recording_sums._asdict().items() if value is not None}
         if recorded is not None and recorded.shut is not None:
-            shut_sums = self._build_balance(recording, recorded.shut).recording_sums
+            shut_balance = self._build_balance(recording, recorded.shut)  # supposing that valves hold the load
+            shut_sums, hold_odds = shut_balance.recording_sums, shut_balance.locked_log_odds(balance.conductance)
             summary |= {"shut_sums": shut_sums.sums, "shut_odds": recorded.odds}
-            hold_odds = replace(balance, locked=True).locked_log_odds()  # supposing that valves hold the load
             if shut_sums.held is not None and hold_odds is not None:
                 summary |= {"held": shut_sums.held, "held_odds": hold_odds}
                 if shut_sums.held_pump is not None:

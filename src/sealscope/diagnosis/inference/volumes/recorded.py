@@ -271,8 +271,10 @@ class RecordedBalance:
         begin, end = np.searchsorted(recording.t, [hold.t[0] + falling, hold.t[-1]])
         flow = self._pumped[begin:end] * recording.rate
         flow = flow[np.isfinite(flow)]
+        if not flow.size:
+            return False
         mean_flow = abs(float(flow.mean()))
-        variance = float(flow.var()) / max(flow.size, 1)  # variance of the mean flow
+        variance = float(flow.var()) / flow.size  # variance of the mean flow
         holding_flow = INFERENCE.rest.holding * self.blocks.moving_flow
         # `holding_flow` counts as exact, so that its difference from `mean_flow` has the same variance
         return rest_log_odds(mean_flow, holding_flow, rest_variance=variance, difference_variance=variance) > 0.0
@@ -303,27 +305,25 @@ class RecordedBalance:
         log_load_density = -float(np.log(max(max_load, np.finfo(float).tiny)))
         return np.asarray(log_load_density + 0.5 * offset_costs(pressure) + log_offset_norm)
 
-    def locked_log_odds(self) -> float | None:
+    def locked_log_odds(self, conductance: Interval) -> float | None:
         """Compute the log odds that valves are shut in holds, and not open; None without holds.
 
         A hold is a time in which shut valves are supposed to hold the load. With open valves the leakage in holds would
         be the total leakage of pump and piston; with shut valves it is smaller. The two are compared. The total leakage
-        is measured just before the holds, at the same pressures, or else over the whole recording. The log odds are
-        limited to +-`rest.most` of `priors.toml`.
+        is measured just before the holds, at the same pressures, or else it is the `conductance` [m^3/(s Pa)] over the
+        whole recording, by the balance for open valves. The log odds are limited to +-`rest.most` of `priors.toml`.
         """
         if self.chambers is None:
             return None
         hold_leak, pump = self.chambers.total_leak(), self.held_pump_leakage
-        if pump is not None:
-            total, total_deviation = pump.value + hold_leak.value, pump.deviation  # pump and piston together
-        else:
-            conductance = self.conductance
-            total, total_deviation = conductance.value, (conductance.high - conductance.low) / (2.0 * WITHIN_95)
         variance = hold_leak.deviation**2
+        if pump is not None:  # the total leakage is that of the pump and the leak in holds, whose error then cancels
+            total, difference_variance = pump.value + hold_leak.value, pump.deviation**2
+        else:
+            deviation = (conductance.high - conductance.low) / (2.0 * WITHIN_95)
+            total, difference_variance = conductance.value, variance + deviation**2
         max_odds: float = INFERENCE.rest.most
-        odds = rest_log_odds(
-            hold_leak.value, total, rest_variance=variance, difference_variance=variance + total_deviation**2
-        )
+        odds = rest_log_odds(hold_leak.value, total, rest_variance=variance, difference_variance=difference_variance)
         return float(np.clip(odds, -max_odds, max_odds))
 
     def _cylinder_sides(self) -> CylinderSides | None:

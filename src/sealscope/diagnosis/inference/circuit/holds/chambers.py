@@ -163,6 +163,11 @@ class HeldChambers:
         """
         return [flags | ~np.array(refilled)[:, None] for flags in self._above_charge]
 
+    @cached_property
+    def _is_never_refilled(self) -> bool:
+        """True if both chambers are above the charge pressure in all holds, so that check valves stay closed."""
+        return self._closed_share(BOTH) == 1.0
+
     def _closed_share(self, refilled: tuple[bool, bool]) -> float:
         """Compute the fraction of the samples of both sides in all holds in which no check valve refills the chamber.
 
@@ -329,16 +334,16 @@ class HeldChambers:
         """
         columns = []
         for hold, sides in zip(self.holds, leak.flows, strict=True):
+            steps = np.diff(hold.t)
+            # samples `first` (k, o) to `last` - 1 of each of k readings, which are not before the onset
+            last = hold.edges[1:, None]
+            first = np.minimum(np.maximum(hold.edges[:-1, None], np.searchsorted(hold.t, onsets)), last)
+            counts, sizes = last - first, hold.sizes[:, None]
             for is_A, flow in zip((True, False), sides, strict=True):
-                increments = 0.5 * (flow[1:] + flow[:-1]) * np.diff(hold.t)
-                volume = np.concatenate([[0.0], np.cumsum(increments)])
+                volume = np.concatenate([[0.0], np.cumsum(0.5 * (flow[1:] + flow[:-1]) * steps)])
                 volume_before = np.interp(onsets, hold.t, volume)  # leaked before each onset; does not count
-                # sum over the samples `first` to `last` - 1 of each of k readings, as a difference of cumulative sums;
-                # `first` (k, o) is not before the onset
-                sums = np.concatenate([[0.0], np.cumsum(volume)])
-                last = hold.edges[1:, None]
-                first = np.minimum(np.maximum(hold.edges[:-1, None], np.searchsorted(hold.t, onsets)), last)
-                readings = (sums[last] - sums[first] - (last - first) * volume_before) / np.diff(hold.edges)[:, None]
+                sums = np.concatenate([[0.0], np.cumsum(volume)])  # differences are sums over samples
+                readings = (sums[last] - sums[first] - counts * volume_before) / sizes
                 columns.append(hold.centre(readings, is_A))
         return np.vstack(columns)
 
@@ -365,7 +370,7 @@ class HeldChambers:
         They are a fixed grid, and the recorded p_A - p_B at the end of each hold. If a leak has equalised the pressures
         by then, this difference is the offset.
         """
-        ends = [hold.mean(hold.p_A - hold.p_B)[-1] for hold in self.holds]
+        ends = [hold.mean(hold.difference)[-1] for hold in self.holds]
         return np.unique(np.concatenate([np.append(-OFFSET_GRID, OFFSET_GRID) * INFERENCE.zero.pressure, ends]))
 
     @cached_property
@@ -389,8 +394,7 @@ class HeldChambers:
         leak's law (`LeakLaw`).
         """
         grid, fits = self._offset_grid, list[tuple[float, PistonFit]]()
-        is_never_refilled = self._closed_share(self._refillable_sides) == 1.0
-        for refilled in (NEITHER,) if is_never_refilled else (NEITHER, self._refillable_sides):
+        for refilled in (NEITHER,) if self._is_never_refilled else (NEITHER, self._refillable_sides):
             posteriors = [self._find_onset(float(offset), refilled, exponent)[0] for offset in grid]
             best = int(np.argmax(posteriors))
             refined = np.linspace(grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)], N_REFINED)
@@ -492,7 +496,8 @@ class HeldChambers:
         estimates are weighted by the probabilities of these hypotheses. A check valve that refills a chamber would hide
         the oil that leaves the chamber, so no refilling is assumed.
         """
-        chambers = replace(self, charge=0.0)  # without a charge pressure check valves stay closed
+        # without a charge pressure check valves stay closed
+        chambers = self if self._is_never_refilled else replace(self, charge=0.0)
         sides = (True, False)
         leaks = [chambers._unit_outside_leak(is_A) for is_A in sides]
         leaks += [chambers._unit_pump_leak(is_A) for is_A in sides]

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +23,8 @@ MAX_RATE = 100.0
 LOWEST = 0.02
 
 
-class LockedHold(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class LockedHold:
     """Samples of one hold, in which shut valves hold the load.
 
     `t`: time [s]; `p_A`, `p_B`: absolute pressures [Pa]; `x`: position [m], (n,) each. `edges` (k + 1,): indices of the
@@ -38,13 +41,33 @@ class LockedHold(NamedTuple):
     def mean(self, values: Array) -> Array:
         """Average `values` (..., n) of n samples over the intervals between `edges`, to k readings, shape (..., k)."""
         sums = np.add.reduceat(values, self.edges[:-1], axis=-1)
-        return np.asarray(sums / np.diff(self.edges))
+        return np.asarray(sums / self.sizes)
+
+    @cached_property
+    def sizes(self) -> NDArray[np.intp]:
+        """Number of samples of each reading, shape (k,)."""
+        return np.diff(self.edges)
+
+    @cached_property
+    def difference(self) -> Array:
+        """Recorded p_A - p_B [Pa] at each sample, shape (n,)."""
+        return self.p_A - self.p_B
 
     def carries(self, is_A: bool) -> bool:
         """Return True if the side A (or B, if `is_A` is False) has the higher pressure when the hold begins."""
+        return self._is_A_higher == is_A
+
+    @cached_property
+    def _is_A_higher(self) -> bool:
+        """True if A has the higher pressure in the first interval."""
         settling = slice(self.edges[0], self.edges[1])
-        is_A_higher = float(self.p_A[settling].mean()) > float(self.p_B[settling].mean())
-        return is_A_higher == is_A
+        return float(self.p_A[settling].mean()) > float(self.p_B[settling].mean())
+
+    @cached_property
+    def _last_pressures(self) -> tuple[float, float]:
+        """Mean pressures [Pa] of A and of B in the last interval."""
+        last = slice(self.edges[-2], None)
+        return float(self.p_A[last].mean()), float(self.p_B[last].mean())
 
     def centre(self, readings: Array, is_A: bool) -> Array:
         """Subtract the mean over the hold from `readings` (k, ...) of side A, or of side B if `is_A` is False.
@@ -70,12 +93,11 @@ class LockedHold(NamedTuple):
 
         Returns the offset of the hold, and ((offset of the hold - `offset`) / s)^2.
         """
-        last = slice(self.edges[-2], None)
-        last_A, last_B = float(self.p_A[last].mean()), float(self.p_B[last].mean())
+        last_A, last_B = self._last_pressures
         pressure, difference = max(last_A, last_B), last_A - last_B
         deviation = INFERENCE.held_oil.gain * pressure
         cost = ((difference - offset) / deviation) ** 2
-        is_equalised = -0.5 * cost - np.log(deviation * np.sqrt(2.0 * np.pi)) > -np.log(pressure)
+        is_equalised = -0.5 * cost - math.log(deviation * math.sqrt(2.0 * math.pi)) > -math.log(pressure)
         return (difference, cost) if is_equalised else (offset, 0.0)
 
     def driving_pressure(self, offset: float) -> Array:
@@ -86,7 +108,7 @@ class LockedHold(NamedTuple):
         short-lived difference before. In such holds d is therefore multiplied by d^2 / (d^2 + `held_oil.resolved`^2).
         """
         offset_here, cost = self.offset_in_hold(offset)
-        difference = np.asarray(self.p_A - self.p_B - offset_here)
+        difference = np.asarray(self.difference - offset_here)
         if cost > 0.0:  # a leak has equalised the pressures
             difference *= difference**2 / (difference**2 + INFERENCE.held_oil.resolved**2)
         return difference
@@ -98,7 +120,7 @@ class LockedHold(NamedTuple):
         pressures.
         """
         n_equalising = int(np.searchsorted(self.t, self.t[0] + INFERENCE.held_oil.equalises))  # [samples]
-        difference = self.p_A - self.p_B
+        difference = self.difference
         return float(self.t[np.abs(difference[n_equalising:] - difference[:-n_equalising]).argmax()])
 
 
