@@ -607,8 +607,7 @@ def _find_rest_limits(samples: Mapping[str, Array], rate: float, balance: Equati
     if flow_source(samples) == "q_pump":
         max_flow = max_rest_rate(balance.left(signals), rate, fraction=INFERENCE.rest.moves)
         return RestLimits(pump=max_flow, piston=-math.inf)
-    max_speed = max_rest_rate(signals.step("x"), rate, fraction=INFERENCE.rest.creeps)
-    return RestLimits(pump=max_rest_rate(balance.left(signals), rate), piston=max_speed)
+    return RestLimits(pump=max_rest_rate(balance.left(signals), rate), piston=max_rest_rate(signals.step("x"), rate))
 
 
 def _build_regime(balances: tuple[Equation, ...], compute_blocks: Callable[[float], Blocks]) -> RegimeBlocks:

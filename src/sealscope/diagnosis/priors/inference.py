@@ -330,8 +330,7 @@ class RestPriors(PriorTable):
 
     - `averaged` [s]: time over which the flow is averaged.
     - `least` [s]: shortest rest.
-    - `share`: largest averaged flow of the pump at rest.
-    - `creeps`: largest averaged speed of the piston at rest, over its mean speed in motion.
+    - `share`: largest averaged flow at rest.
     - `holding`: mean flow of a pump that holds a load.
     - `moves`: smallest mean flow of the pump in a block that counts as motion, and smallest flow by a flow meter.
     - `shut`: leakage at rest over that in motion if valves cut the pump off, a standard deviation.
@@ -344,7 +343,6 @@ class RestPriors(PriorTable):
     averaged: float
     least: float
     share: float
-    creeps: float
     holding: float
     moves: float
     shut: float
