@@ -85,8 +85,9 @@ def _at_imex_nodes(a: float, b: float, t: float, h: float) -> tuple[float, float
     The step begins at t [s] and lasts h [s]. At the time s [s] the input is a + b s.
     """
     n = IMEX_NODES  # as fractions of the step
-    first = a + b * (t + n[0] * h), a + b * (t + n[1] * h), a + b * (t + n[2] * h)
-    return first[0], first[1], first[2], a + b * (t + n[3] * h), a + b * (t + n[4] * h), a + b * (t + n[5] * h)
+    at_0, at_1, at_2 = a + b * (t + n[0] * h), a + b * (t + n[1] * h), a + b * (t + n[2] * h)
+    at_3, at_4, at_5 = a + b * (t + n[3] * h), a + b * (t + n[4] * h), a + b * (t + n[5] * h)
+    return at_0, at_1, at_2, at_3, at_4, at_5
 
 
 class RigChoice(NamedTuple):
@@ -264,6 +265,7 @@ def unit_code(functions: Mapping[str, Callable[..., Any]]) -> Mapping[str, str]:
     modules = {}
     for name, function in functions.items():
         text, symbol = plain_code(function, *ARGUMENTS[name])
+        # rename the symbol, quoted or not, wherever arguments in brackets follow
         modules[name] = re.sub(r'"?' + re.escape(symbol) + r'"?(?=\()', f"sealscope_{name}", text)
     return MappingProxyType(modules)
 

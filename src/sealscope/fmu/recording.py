@@ -208,8 +208,8 @@ def _run_unit(
     """Run the FMU with a table of inputs, and return its outputs at the communication points `t` [s].
 
     Returns a structured array with the fields "time" and each variable in `outputs`. `duration` [s]: length of the
-    recording, of which `progress` gets the completed fraction. Raises SimulationFailed if the FMU fails, ends early, or
-    ends with an output that is not finite.
+    recording; `progress`: function called with the task and its completed fraction, None for none. Raises
+    SimulationFailed if the FMU fails, ends early, or ends with an output that is not finite.
     """
     import fmpy
 
@@ -233,7 +233,8 @@ def _run_unit(
             )  # fmt: skip
     except Exception as error:  # from the unit's code, FMPy, or a library for another system
         logged = [line.removeprefix("[ERROR] ") for line in log.getvalue().splitlines() if line.startswith("[")]
+        # [-1:]: the last line that the unit logged, if any
         raise SimulationFailed(f"the unit {path.name} failed: {'; '.join([*logged[-1:], str(error)])}") from error
     if len(rows) < t.size or not all(math.isfinite(rows[name][-1]) for name in outputs):
         raise SimulationFailed(f"the unit {path.name} ended at t = {rows['time'][-1]:.4g} s of {t[-1]:.4g} s")
-    return rows[: t.size]
+    return rows[: t.size]  # without rows after the last communication point

@@ -140,7 +140,7 @@ class SensorChoice(NamedTuple):
 
         Raises InputError if the volume balance of the rig has other terms than `COLUMNS`.
         """
-        (balance,) = live_equations(rig, INPUTS)
+        (balance,) = live_equations(rig, INPUTS)  # these channels allow one balance only
         columns = ColumnRoles(balance)
         if columns.names != COLUMNS[:-1]:
             raise InputError(f"a soft sensor's terms must be {', '.join(COLUMNS[:-1])}, got {', '.join(columns.names)}")
@@ -189,12 +189,13 @@ def memory_layout(choice: SensorChoice) -> np.dtype[Any]:
     - `history`: results of each of the last blocks (`_G` ... `_PRESSURE`)
     - `workspace`: a `Workspace`; `model`: a `Coefficients`
     """
+    # - 1: the response
     lengths, n_slow = _Lengths.from_rate(choice.rate), len(choice.column_order) - choice.n_fast - 1
     max_rows = SUPPORT * lengths.block_strides
     workspace = workspace_shapes(max_rows, SUPPORT, len(choice.column_order), n_slow)
     return record_dtype(
         *_SCALARS,
-        ring=(len(INPUTS), 2 * lengths.half_difference + 3),
+        ring=(len(INPUTS), 2 * lengths.half_difference + 3),  # room for all samples that `_compute_increments` reads
         increments=(_N_COLUMNS,),
         unfinished=(SPAN, _N_COLUMNS),
         rows=(max_rows, _N_COLUMNS),
@@ -207,6 +208,7 @@ def memory_layout(choice: SensorChoice) -> np.dtype[Any]:
         precisions=(LEARNED,),
         history=(WINDOW, 5),
         workspace=record_dtype(**dict(zip(Workspace._fields, workspace, strict=True))),
+        # `_LEAK`, the index of the leak, is also the number of the terms before it
         model=record_dtype(**dict(zip(Coefficients._fields, coefficient_shapes(_LEAK), strict=True))),
     )
 
@@ -226,7 +228,7 @@ def build_functions(choice: SensorChoice) -> dict[str, Callable[..., Any]]:
     n_memory = layout.itemsize // 8  # doubles
     n_inputs, n_results, n_values = len(INPUTS), len(SENSOR_RESULTS), len(VALUES)
     size_error = choice.size_error
-    quantile_order = 0.5 + 0.5 * BOUND_PROBABILITY
+    quantile_order = 0.5 + 0.5 * BOUND_PROBABILITY  # of a two-sided interval
     quantiles = tuple(float(stdtrit(freedom, quantile_order)) for freedom in range(1, WINDOW))  # Student's t
 
     def start(values: Any, inputs: Any, x_0: float, y: Any) -> int:
@@ -241,7 +243,7 @@ def build_functions(choice: SensorChoice) -> dict[str, Callable[..., Any]]:
     def advance(values: Any, inputs: Any, slopes: Any, y: Any, span: float, steps: int) -> int:
         """Add the samples of the next `span` [s] to the sensor's memory `y`.
 
-        The leakage of each block that they complete is estimated. `values`: parameters of the FMU, among them the
+        When the samples complete a block, its leakage is estimated. `values`: parameters of the FMU, among them the
         pump's displacement; `inputs`: measurements at the start of the span; `slopes`: their change per second, taken
         as constant; `steps`: ignored. Returns 0.
         """
@@ -277,7 +279,8 @@ def _build_add_sample(choice: SensorChoice) -> Callable[..., Any]:
     rate = choice.rate
     n_stride, block_strides, half = _Lengths.from_rate(rate)
     n_support, n_block = SPAN * n_stride, n_stride * block_strides
-    # phi = peak (1 - s^2)^4; the first value of `test_function` is at the middle of the first interval
+    # phi = peak (1 - s^2)^4; the first value of `test_function` is in the middle of the first sampling interval, where
+    # s = 1/n_support - 1
     peak = float(test_function(rate)[0, 0]) / (1.0 - (1.0 / n_support - 1.0) ** 2) ** 4
     finish_block = _build_finish_block(choice)
 
@@ -298,20 +301,20 @@ def _build_add_sample(choice: SensorChoice) -> Callable[..., Any]:
         _add_pressure_difference(m, k, n_block, rate)
         stride, k_in_stride = k // n_stride, k % n_stride
         for age in range(SPAN):  # add to the row that began `age` strides ago, weighted by its test function phi(s)
-            row = (stride - age) % SPAN
+            slot = (stride - age) % SPAN  # of this row in `unfinished`
             s = (age * n_stride + k_in_stride + 0.5) * 2.0 / n_support - 1.0  # -1 .. 1 over the row
             phi = peak * (1.0 - s * s) ** 4
             for j in range(_N_COLUMNS):
-                row_sum = 0.0 if age == 0 and k_in_stride == 0 else m.unfinished[row, j]  # a new row begins at 0
-                m.unfinished[row, j] = row_sum + phi * m.increments[j]
-        row = stride - SPAN + 1  # finished at the end of this stride
+                row_sum = 0.0 if age == 0 and k_in_stride == 0 else m.unfinished[slot, j]  # a new row begins at 0
+                m.unfinished[slot, j] = row_sum + phi * m.increments[j]
+        row = stride - SPAN + 1  # number of the row that is finished at the end of this stride
         if k_in_stride < n_stride - 1 or row < 0:
             return
         is_finite, place = True, int(m.n_rows)
         for j in range(_N_COLUMNS):
             m.rows[place, j] = m.unfinished[row % SPAN, j]
             is_finite = is_finite and abs(m.rows[place, j]) < MAX_READING
-        m.n_rows += is_finite
+        m.n_rows += is_finite  # a row with a missing measurement is overwritten by the next
         if row % block_strides == block_strides - 1:
             finish_block(m, m.rows[: int(m.n_rows)], m.ends[: int(m.n_open) + 1], row // block_strides)
 
@@ -348,7 +351,7 @@ def _compute_increments(ring: Any, k: int, half: int, rate: float, displacement:
     slot, next_slot = k % width, (k + 1) % width
     dx, x = ring[_X, next_slot] - ring[_X, slot], 0.5 * (ring[_X, next_slot] + ring[_X, slot])
     # each end of the interval assigns half of its motion to a direction and to the side with the higher pressure,
-    # which carries the load
+    # which carries the load; columns: out and A, out and B, in and A, in and B
     out[_MOTION : _MOTION + 4] = 0.0
     for i in range(k, k + 2):
         is_inward = 0 if ring[_X, (i + half) % width] >= ring[_X, max(i - half, 0) % width] else 1
@@ -356,14 +359,16 @@ def _compute_increments(ring: Any, k: int, half: int, rate: float, displacement:
         out[_MOTION + 2 * is_inward + B_carries] += 0.5 * dx
     for side in (_P_A, _P_B):
         before, after = ring[side, slot], ring[side, next_slot]
-        low, high = max(before + P_ATM, MIN_ABSOLUTE_PRESSURE), max(after + P_ATM, MIN_ABSOLUTE_PRESSURE)
+        absolute_before = max(before + P_ATM, MIN_ABSOLUTE_PRESSURE)
+        absolute_after = max(after + P_ATM, MIN_ABSOLUTE_PRESSURE)
         column = _COMPLIANCE[side]  # then compliance over the stroke, free air and dissolving air of this side
         out[column], out[column + 1] = after - before, x * (after - before)
-        out[column + 2], out[column + 3] = 1.0 / high - 1.0 / low, math.log(high) - math.log(low)
+        out[column + 2] = 1.0 / absolute_after - 1.0 / absolute_before
+        out[column + 3] = math.log(absolute_after) - math.log(absolute_before)
     earlier, later = max(k - 1, 0), k + 1
     velocity_change = ring[_X, (later + 1) % width] - ring[_X, later % width]
     velocity_change -= ring[_X, (earlier + 1) % width] - ring[_X, earlier % width]
-    # change of velocity, for a position that lags the angle or leads it
+    # change of velocity over one interval: this term corrects a position that lags the angle or leads it
     out[_LAG] = rate * velocity_change / (later - earlier)
     out[_BIAS] = 1.0 / rate
     out[_LEAK] = 0.5 * (ring[_P_A, slot] + ring[_P_A, next_slot] - ring[_P_B, slot] - ring[_P_B, next_slot]) / rate
@@ -398,6 +403,7 @@ def _append_conductance(m: Any, size_error: float, n_rows: float, pressure: floa
     """
     model = m.model
     motion = relative_motion(model.block[-1, -1], n_rows, model.numbers)  # [-1, -1]: sum of the squared response
+    # G and the shift are multiplied by the precision, the systematic variance of G by the square of the precision
     precision, weighted_G, weighted_shift, weighted_systematic = estimate_leak(model, n_rows, is_learned=is_learned)
     if not precision > (MIN_REST_PRECISION * m.usual_precision if motion < STANDSTILL else 0.0):
         return
@@ -472,7 +478,7 @@ def _update_with_block(m: Any, size_error: float, b: int, n_rows: float, pressur
         _append_conductance(m, size_error, n_rows, pressure, is_learned=True)
         return
     k = int(m.n_waiting)
-    if k == 0 and not motion_square > 0.0:  # the first motion starts the blocks that are fitted together
+    if k == 0 and not motion_square > 0.0:  # blocks before the first motion are left out
         return
     m.waiting_sizes[k, _BLOCK_ROWS], m.waiting_sizes[k, _BLOCK_PRESSURE] = n_rows, pressure
     for i in range(_N_COLUMNS):
@@ -498,7 +504,7 @@ def _build_finish_block(choice: SensorChoice) -> Callable[..., Any]:
         so the calls for the earlier ones only store the block's end. Each later block is weighted when it ends.
 
         `m`: the sensor's memory; `rows`: rows of the volume balance in the open blocks; `ends`: index past the last row
-        of each open block, of which the last is set here; `block`: number of the newest block in the run, from 0.
+        of each open block, the last to be set here; `block`: number of the newest block in the run, from 0.
         """
         n_rows, n_open, is_first = len(rows), len(ends), m.n_weighted == 0.0
         ends[n_open - 1] = n_rows
@@ -516,11 +522,11 @@ def _build_finish_block(choice: SensorChoice) -> Callable[..., Any]:
             column_order=column_order,
             n_fast=n_fast,
             earlier_sums=m.slow_sums,
-            update_fraction=min(1.0, SUPPORT / m.n_weighted),
+            update_fraction=min(1.0, SUPPORT / m.n_weighted),  # a later block changes the sums less
             workspace=m.workspace,
             gram=m.gram,
         )
-        m.n_open = m.n_rows = 0.0
+        m.n_open = m.n_rows = 0.0  # no block is open any more
         for b in range(n_open):
             block_rows = ends[b] - (ends[b - 1] if b else 0.0)
             slot = (block - n_open + 1 + b) % (SUPPORT + 1)  # of this block in the ring buffer `pressure_sums`
@@ -545,7 +551,7 @@ def _mean(history: Any, newest: int, n: int, column: int) -> float:
 
 @large_law
 def _variance_of_mean(history: Any, newest: int, n: int) -> float:
-    """Compute the variance of the mean conductance of n blocks, the last of which is block `newest`.
+    """Compute the variance of the mean conductance of n >= 2 blocks, the last of which is block `newest`.
 
     The result is the larger of two variances, divided by n: the sample variance of the blocks' estimates, and the mean
     of the variances that the fit gives these estimates. `history` (WINDOW, 5): results of the last blocks, as in
@@ -581,7 +587,7 @@ def _write_results(m: Any, size_error: float, quantiles: Any, out: Any) -> None:
     if n < 2:
         return
     G, pressure = _mean(history, newest, n, _G), _mean(history, newest, n, _PRESSURE)
-    half_width = math.hypot(
+    half_width = math.hypot(  # of random and systematic errors; quantiles[n - 2] has n - 1 degrees of freedom
         quantiles[n - 2] * math.sqrt(_variance_of_mean(history, newest, n)),
         WITHIN_95 * math.sqrt(_mean(history, newest, n, _SYSTEMATIC_VARIANCE)),
     )
@@ -592,10 +598,11 @@ def _write_results(m: Any, size_error: float, quantiles: Any, out: Any) -> None:
         return
     base, pressure = m.base_sum / WINDOW, _mean(history, newest, n, _PRESSURE)
     rise = _mean(history, newest, n, _COMPARABLE_G) - base
+    # of a block in the baseline: the larger of two variances, as in `_variance_of_mean`
     base_variance = max((m.base_square_sum - WINDOW * base**2) / (WINDOW - 1.0), m.base_variance_sum / WINDOW)
     # variance of a healthy machine's random walk from the middle of the baseline to the middle of the last n blocks,
-    # over `base_variance`; the divisor is there because the walk also adds WALK (WINDOW + 1)/6 to that variance, where
-    # the variance of a block's noise is 1
+    # divided by `base_variance`. In units of the variance of a block's noise, the walk adds WALK to its variance in
+    # each block; `base_variance` is 1 for the noise plus WALK (WINDOW + 1)/6 for the walk within the baseline
     walk = WALK * (n_estimated - 0.5 * (n + WINDOW)) / (1.0 + WALK * (WINDOW + 1.0) / 6.0)
     variance = _variance_of_mean(history, newest, n) + base_variance * (1.0 / WINDOW + walk)
     half_width = math.hypot(quantiles[n - 2] * math.sqrt(variance), WITHIN_95 * size_error * rise)

@@ -67,8 +67,8 @@ class _Actuator:
     """The state of one watched actuator in memory.
 
     - `watch`: the leak detector; `judge`: decides on the alarm;
-    - `pending`, `bytes`: number of blocks of samples since the last checkpoint, at which the state was stored in the
-      database, and their total size [bytes]; `n_stored`: number of all blocks of samples so far;
+    - `pending`, `bytes`: number and total size [bytes] of the blocks of samples since the last checkpoint, when the
+      state was stored in the database; `n_stored`: number of all blocks so far;
     - `last`: the detector's last estimate, with flows averaged over the machine's cycles; `judged_s` [s]: end of the
       last stretch of samples that the detector judged;
     - `stored_summary`: the summary that was stored last; `oil_celsius` [deg C]: oil temperature, None if unknown;
@@ -106,7 +106,7 @@ class _Actuator:
         self.pending += 1  # blocks of samples since the last checkpoint
         self.bytes += count_bytes(samples)
         self._update_oil_temperature(samples)
-        for estimate, leak in self.watch.each(samples, follows=follows):
+        for estimate, leak in self.watch.each(samples, follows=follows):  # leak: the one found by then, or None
             self.last = self.watch.with_cycle_means(estimate)
             if estimate.judged or self.judged_s is None or self.judged_s > estimate.t:  # the clock may be set back
                 self.judged_s = estimate.t
@@ -155,10 +155,10 @@ class _Actuator:
                 del self.alarm_samples[0]
 
     def state(self) -> dict[str, Any]:
-        """Convert the state of the actuator that a checkpoint in the database stores to plain values.
+        """Return the actuator's state as plain values, for a checkpoint in the database.
 
-        Stored are the leak detector and the alarm, the last estimate, the oil temperature, the time of the last judged
-        block, and the verdict on the last recording.
+        The state consists of the leak detector and the alarm, the last estimate, the oil temperature, the time of the
+        last judged block, and the verdict on the last recording.
         """
         return save_attributes(self, ("watch", "judge", "last", "oil_celsius", "judged_s", "verdict"))
 
@@ -192,6 +192,7 @@ class _Actuator:
             return state_of("not comparable", self.last.status, since_s=self.judged_s)
         if baseline is None:
             return state_of("learning", since_s=alarm_end_s)
+        # watched since the baseline is known or the last alarm ended, whichever is later
         return state_of("watched", since_s=max(baseline.known_s, alarm_end_s or -math.inf))
 
     def summary(self) -> dict[str, Any]:
@@ -201,11 +202,12 @@ class _Actuator:
         decides (`RecordingVerdict.decides`). Otherwise they come from the detector's last block. Unknown values are
         None. The names are:
 
-        - `blocks`: number of blocks of samples that the detector has seen; `counters`: its counters; `by`: its method;
+        - `blocks`: number of the detector's blocks so far, some seconds each; `counters`: its counters;
+          `by`: what it watches, "volumes" or "pressures";
         - `t`: end of the last block or recording [s since 1970]; `status`: its result in words;
         - `state`: state of the machine by NAMUR NE 107;
-        - `total_lpm`, `leak_lpm` [L/min]: total leakage and the leak, with their 95 % intervals (`_interval_lpm`);
-          `bound_lpm` [L/min]: upper bound of a leak that is not found;
+        - `total_lpm`, `leak_lpm` [L/min]: total leakage and the leak; `total_interval_lpm`, `leak_interval_lpm`: their
+          95 % intervals; `bound_lpm` [L/min]: upper bound of a leak that is not found;
         - `recording`: texts of the last verdict; `why_no_litres`: reason why no L/min are stated, else "";
         - `oil_celsius`: oil temperature [deg C]; `baseline`: version, hours and leakage of the healthy baseline;
         - `alarm`: id of the open alarm; `status_word`: its status word, 0 without an alarm.
@@ -274,6 +276,7 @@ class WatchedActuators:
         self._last_block_clock = dict.fromkeys(self.settings, time.monotonic())  # arrival of the last block of each [s]
         self._keep_s = keep_days * 86_400.0
         self._counters, self._counting = Counter[str](), threading.Lock()
+        # change_number: see `_notify_change`; closed: set to True when open web pages must end
         self._changes, self.change_number, self.closed = itertools.count(1), 0, False
         self.supervisor = Supervisor(outage_reason, self._notify_change)
         self._lock = threading.RLock()
@@ -320,7 +323,7 @@ class WatchedActuators:
             return True
         actuator.load_state(state)
         stored_settings = _parse_settings(stored.settings)
-        for samples, follows, verdict in stored.pending:  # with the settings that they were judged by
+        for samples, follows, verdict in stored.pending:  # judged with the settings of the first time, if readable
             actuator.judge_samples(samples, follows=follows, settings=stored_settings or settings, verdict=verdict)
         actuator.watch.false_alarms_per_1000_h = settings.false_alarms_per_1000_h  # may change without a new baseline
         if actuator.watch.healthy is not None:  # None after a person has marked a repair
@@ -472,7 +475,7 @@ class WatchedActuators:
                 raise InputError(f"the settings must have the actuator {name[:60]!r}, got none")
             actuator, rows = self._actuator(name), StoredRows()
             open_alarm = actuator.judge.alarm
-            t = 0.0 if open_alarm is None else open_alarm.updated_s
+            t = 0.0 if open_alarm is None else open_alarm.updated_s  # without an open alarm, the mark is refused below
             if actuator.last is not None:  # time of the last estimate
                 t = actuator.last.t
             alarm_samples = list(actuator.alarm_samples)

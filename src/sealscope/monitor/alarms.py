@@ -163,6 +163,7 @@ class AlarmJudge:
                 evidence=leak.reason,
                 next_check=state_of(_CONDITIONS[level], leak.cause).action,
                 baseline=baseline,
+                # rarity: the fraction of the allowed false alarms that score as high as this leak
                 by_chance_per_1000_h=settings.false_alarms_per_1000_h * leak.rarity,
             )
             return alarm, "raised"
@@ -254,8 +255,8 @@ class AlarmJudge:
     def _set_alarm(self, alarm: Alarm) -> Alarm:
         """Store a changed alarm as the open alarm, or forget it if it is closed or invalid; return the changed alarm.
 
-        When the cause of an alarm ends, the alarm stays open until a person has seen it. `over_s` is the time of the
-        last change since then, from which the machine counts as watched again.
+        When the cause of an alarm ends, the alarm stays open until a person has seen it. Each change of an alarm that
+        is no longer active sets `over_s`, the time from which the machine counts as watched again.
         """
         if not alarm.active:  # the cause has ended, or the alarm is closed or invalid
             self.over_s = alarm.updated_s

@@ -53,7 +53,7 @@ class MqttLink:
             client.username_pw_set(broker.user, password)
         if broker.tls:
             client.tls_set(ca_certs=None if broker.ca_file is None else str(broker.ca_file))
-        client.reconnect_delay_set(1, 30)
+        client.reconnect_delay_set(1, 30)  # first and longest pause [s]
         client.suppress_exceptions = True  # an error of a callback does not end the connection; paho logs it
         client.enable_logger(_log)
         self.client: Any = client
@@ -76,7 +76,7 @@ class MqttLink:
 
     def check_thread(self) -> None:
         """Close the connection and raise RuntimeError if its thread has ended, as after a malformed packet."""
-        # a private attribute, as paho has no public one; `self` stands for a thread if a later paho lacks it
+        # a private attribute, as paho has no public one; if a later paho lacks it, nothing is checked
         if getattr(self.client, "_thread", self) is None:
             self.close()
             raise RuntimeError("the thread of the connection to the broker has ended")

@@ -224,7 +224,7 @@ class Service:
                     self._store([block], write)
                 return
             self.count(DROPPED)
-            if _is_logged(self.actuators.counters[DROPPED]):
+            if _is_logged(self.actuators.counters[DROPPED]):  # a refused message has no actuator: log its text
                 _log.exception("a block is dropped: %s", str(getattr(blocks[0], "actuator", blocks[0]))[:60])
         else:
             self._is_database_blocked = False
@@ -241,10 +241,10 @@ class Service:
         the database still refuses to store blocks.
         """
         self._lines.deliver()
-        if not self._is_database_blocked:  # else reading works, but writing does not
+        if not self._is_database_blocked:  # otherwise the database can be read, but not written
             self._database.end_outage()
 
 
 def _is_logged(number: int) -> bool:
-    """Return True for the occurrences of a problem to log: the first `_FIRST_LINES`, then those at powers of two."""
+    """Return True if occurrence `number` of a problem is logged: one of the first `_FIRST_LINES`, or a power of two."""
     return number <= _FIRST_LINES or number.bit_count() == 1

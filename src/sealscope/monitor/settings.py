@@ -133,6 +133,7 @@ class ActuatorSettings(WatchSettings):
         watched = load_watched(os.fspath(path))
         if is_machine and watched.machine is None:
             raise ValueError(f"machine must be a file that sealscope commission wrote, got a rig: {rig[:100]}")
+        # a text is "auto": the columns are then found only when a file is read
         columns = {} if isinstance(watched.channel_map, str) else dict(watched.channel_map)
         units = {name: unit for name, column in columns.items() if (unit := _column_unit(name, column))}
         needs_units = units and (values.get("nodes") or values.get("sparkplug"))
@@ -339,6 +340,7 @@ def read_settings(path: Path) -> MonitorSettings:
     """
     values = read_toml(path, "the monitor's settings", os.fspath(path))
     context = {"folder": path.resolve().parent}
+    # an error that concerns all settings has no entry: its message names the "settings"
     return read_model(
         values, MonitorSettings, os.fspath(path), entry_name=lambda entry: entry or "settings", context=context
     )

@@ -171,6 +171,7 @@ class Supervisor:
                 timer.cancel()
 
         def run_until_success() -> None:
+            """Run the part, with `restart` until it succeeds or the monitor stops; then call `on_end`."""
             while not part.attempt(work_with_timer) and restart and not self.stopping.wait(part.pause_s):
                 pass
             on_end()
@@ -185,6 +186,7 @@ class Supervisor:
         part = self.part(name)
 
         def run_steps() -> None:
+            """Run `step` again and again until the monitor stops, and then `last`."""
             while not self.stopping.wait(max(every_s, part.pause_s)):
                 part.attempt(step)
             if last is not None:
@@ -228,7 +230,7 @@ class LimitedLines(logging.Filter):
 
 def describe_error(error: BaseException) -> str:
     """Describe an error in one line, with the innermost line of this package in its traceback."""
-    message = "".join(traceback.format_exception_only(error)[-1:]).strip()
+    message = "".join(traceback.format_exception_only(error)[-1:]).strip()  # the last line has type and text
     place, frame = "", error.__traceback__
     while isinstance(frame, TracebackType):
         file = Path(frame.tb_frame.f_code.co_filename)

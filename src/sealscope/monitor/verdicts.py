@@ -116,11 +116,11 @@ class RecordingVerdict:
         return self.leaks or self.clears or self.mark != ""
 
     def is_rare(self, false_alarms_per_1000_h: float) -> bool:
-        """Return True if leak-free recordings lead to such a verdict seldom enough for it to raise an alarm by itself.
+        """Return True if leak-free recordings get such a verdict so rarely that it may raise an alarm by itself.
 
-        The probability `chance` that a leak-free recording scores as high must not exceed `false_alarms_per_1000_h`
-        times the length of the recording in units of 1000 h; this limit is at least `rarest` of `priors.toml`, the
-        smallest probability that can be known. Returns True if `chance` is None.
+        `chance`, the probability that a leak-free recording scores as high, must not exceed
+        `false_alarms_per_1000_h` times the length of the recording in units of 1000 h. The limit is never below
+        `rarest` of `priors.toml`, the smallest probability that can be known. Returns True if `chance` is None.
         """
         allowed_chance = false_alarms_per_1000_h * (self.end_s - self.start_s) / 3.6e6  # [s] in 1000 h
         return self.chance is None or self.chance <= max(_FALSE_ALARM.rarest, allowed_chance)

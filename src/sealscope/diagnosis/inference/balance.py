@@ -109,10 +109,10 @@ class BlockStream:
         self._finds_rests = any(MOVING_BIAS in columns.names for columns in self.columns)  # a term that is 0 at rest
         if self._finds_rests:
             self._margin += round(AVERAGING_TIME * rate) + round(MIN_REST * rate)
-        self._rest_limits: RestLimits | None = None  # from the first samples on
+        self._rest_limits: RestLimits | None = None  # known after the first samples
         self._weighting, self._n_first = Weighting(self.columns), n_first
-        self._absolute_offsets: dict[str, float] | None = None  # from gauge to absolute pressure [Pa], by channel
-        self._left_signs: tuple[float, ...] = ()  # of each left side, from the first blocks on
+        self._absolute_offsets: dict[str, float] | None = None  # absolute minus gauge pressure [Pa] by channel
+        self._left_signs: tuple[float, ...] = ()  # sign of each balance's left side, known after the first blocks
         self.restart(start)
 
     def restart(self, begin: float) -> None:
@@ -122,9 +122,9 @@ class BlockStream:
         """
         self._begin = begin
         self._pieces: list[Mapping[str, Array]] = []  # joined only when they complete a block
-        self._first = 0  # index since `begin` of the first stored sample
+        self._first = 0  # index of the first stored sample, counted from `begin`
         self._end = 0  # index past the last stored sample
-        self._n_closed = 0  # blocks since `begin`
+        self._n_closed = 0  # number of blocks computed since `begin`
 
     def push(self, samples: Mapping[str, Array], last: bool = False) -> Blocks | None:
         """Add samples of the stream and return the blocks that they complete; None if they complete none.
@@ -138,10 +138,10 @@ class BlockStream:
             self._pieces.append(samples)
             self._end += len(next(iter(samples.values())))
         length = self._strides_per_block * self._stride
-        # number of samples after a block that its last rows extend over, and that its speeds and rests depend on
+        # number of samples needed after a block: its last rows extend over them, its speeds and rests depend on them
         tail = (SPAN - 1) * self._stride + 1 + (0 if last else self._margin)
         n_complete = max(0, (self._end - tail) // length)
-        is_waiting = not (last or self._weighting.has_blocks)  # for the first `n_first` blocks
+        is_waiting = not (last or self._weighting.has_blocks)  # until the first `n_first` blocks are complete
         min_blocks = (self._n_first or 1) if is_waiting else 1
         if n_complete <= self._n_closed or (self._n_closed == 0 and n_complete < min_blocks):
             return None
@@ -154,7 +154,7 @@ class BlockStream:
         groups = zip([self._n_closed, *group_ends[:-1]], group_ends, strict=True)
         blocks = Blocks.join([self._build_blocks(joined, first, end) for first, end in groups])
         self._n_closed = n_complete
-        first_stored = max(0, n_complete * length - self._margin)
+        first_stored = max(0, n_complete * length - self._margin)  # later blocks need these samples
         self._pieces = [{name: values[first_stored - self._first :].copy() for name, values in joined.items()}]
         self._first = first_stored
         return blocks
@@ -221,15 +221,15 @@ class BlockStream:
             pressure, left = values[:, columns.leak], balance.flow_sign * values[:, columns.left]
             motion = values[:, [k for k in columns.motion if columns.names[k].startswith("motion")]].sum(axis=1)
             leak_z = _leak_z_score(values.T @ values, columns, len(values))
-            odds = _sign_log_odds(leak_z, other_cause=INFERENCE.sense.leak)
+            log_odds = _sign_log_odds(leak_z, other_cause=INFERENCE.sense.leak)
             if (flow := np.abs(left)).any():
                 constant_load = np.average(pressure, weights=flow)
                 work_z = _z_score((pressure - constant_load) * left)
-                odds += _sign_log_odds(work_z, other_cause=INFERENCE.sense.work)
+                log_odds += _sign_log_odds(work_z, other_cause=INFERENCE.sense.work)
             motion_z = _z_score(motion * left)
             if motion_z > 0.0:  # else either x or the flow may be reversed
-                odds += _sign_log_odds(motion_z, other_cause=INFERENCE.sense.sides)
-            signs.append(-1.0 if odds < 0.0 else 1.0)
+                log_odds += _sign_log_odds(motion_z, other_cause=INFERENCE.sense.sides)
+            signs.append(-1.0 if log_odds < 0.0 else 1.0)
         return tuple(signs)
 
     def _build_blocks(self, samples: Mapping[str, Array], first: int, end: int) -> Blocks:
@@ -239,25 +239,26 @@ class BlockStream:
         weighted together: one robust fit to all of them determines the weights. The first call also estimates the
         signs of the left sides, for all blocks of the stream. `on_samples` is called with the samples of each block.
         """
-        length = self._strides_per_block * self._stride  # of a block [samples]
-        n_first_samples = (self._n_first or end) * length  # of the first blocks; of all without `_n_first`
+        length = self._strides_per_block * self._stride  # samples in a block
+        n_first_samples = (self._n_first or end) * length  # samples in the first blocks; in all without `_n_first`
         self._estimate_stream_constants(samples, n_first_samples)
         if self._on_samples is not None:
             for k in range(first * length, end * length, length):
                 block = slice(k - self._first, k - self._first + length)
                 self._on_samples(self._begin + k / self._rate, {name: samples[name][block] for name in samples})
-        step = max(1, BATCH_SAMPLES // length)  # [blocks]
-        batches = [self._compute_rows(samples, k, min(k + step, end)) for k in range(first, end, step)]
+        size = max(1, BATCH_SAMPLES // length)  # blocks in a batch, whose rows are computed together
+        batches = [self._compute_rows(samples, k, min(k + size, end)) for k in range(first, end, size)]
         weights = np.concatenate([batch.weights for batch in batches])
         is_counted = weights > 0.0  # rows without missing samples
-        root_weights = np.sqrt(weights[is_counted])[:, None]  # products of two rows then have the weight
+        root_weights = np.sqrt(weights[is_counted])[:, None]  # a product of two entries of a row has its weight
         rows_by_balance = zip(*(batch.rows for batch in batches), strict=True)
         rows = [np.concatenate(parts)[is_counted] * root_weights for parts in rows_by_balance]
         self._left_signs = self._left_signs or self._flow_signs(rows)
         for equation_rows, columns, sign in zip(rows, self.columns, self._left_signs, strict=True):
             equation_rows[:, columns.left] *= sign
-        block_ends = np.cumsum(is_counted.reshape(-1, self._strides_per_block).sum(axis=1))  # [counted rows]
-        stride = self._stride / self._rate  # [s]
+        # index past the last counted row of each block
+        block_ends = np.cumsum(is_counted.reshape(-1, self._strides_per_block).sum(axis=1))
+        stride = self._stride / self._rate  # distance of two rows [s]
         first_rows = np.arange(first, end, dtype=float) * self._strides_per_block
         start = self._begin + (first_rows + 0.5 * SPAN) * stride  # middle of each block's first test function
         return Blocks(
@@ -292,11 +293,11 @@ class BlockStream:
         each block the result also contains the mean magnitude of the first balance's left side as a flow [m^3/s], and
         the means of equal parts of the sorted samples of p_A - p_B [Pa].
         """
-        length = self._strides_per_block * self._stride  # of a block [samples]
+        length = self._strides_per_block * self._stride  # samples in a block
         # range of the samples of the blocks; the test functions of the last rows extend beyond the last block
         start, stop = first * length, end * length + (SPAN - 1) * self._stride + 1
         begin = max(self._first, start - self._margin)
-        piece = {  # with margins
+        piece = {  # samples of the range, and margins on either side
             name: values[begin - self._first : stop + self._margin - self._first] for name, values in samples.items()
         }
         signals = Signals(
@@ -306,7 +307,7 @@ class BlockStream:
             offset=self._offset,
             rest_limits=self._rest_limits,
         )
-        without_margins = slice(start - begin, stop - 1 - begin)  # of the increments, one fewer than samples
+        without_margins = slice(start - begin, stop - 1 - begin)  # selects increments, one fewer than samples
         is_whole = np.ones((end - first) * self._strides_per_block, dtype=bool)
         lefts = [balance.left(signals) for balance in self._balances]
         rows = []
@@ -315,9 +316,9 @@ class BlockStream:
             weak_rows = weak_form_rows([column[without_margins] for column in columns], self._rate)
             is_whole &= weak_rows.whole
             rows.append(weak_rows.values)
-        in_blocks = slice(start - begin, start - begin + (end - first) * length)
+        in_blocks = slice(start - begin, start - begin + (end - first) * length)  # ends with the last block
         pressure = (piece["p_A"] - piece["p_B"])[in_blocks].reshape(-1, length)
-        flow = np.abs(lefts[0][in_blocks].reshape(-1, length)) * self._rate
+        flow = np.abs(lefts[0][in_blocks].reshape(-1, length)) * self._rate  # volume per interval times rate [m^3/s]
         is_known = np.isfinite(flow)
         mean_flow = np.where(is_known, flow, 0.0).sum(axis=1) / np.maximum(is_known.sum(axis=1), 1)
         pressures = np.array([sorted_part_means(block, self._rate) for block in pressure])
@@ -330,10 +331,10 @@ class BlockStream:
 class _BlockRows(NamedTuple):
     """Rows of the regression of each volume balance in K blocks, and their weights.
 
-    `rows`: for each balance an array (r, m), one row for each test function of the weak form. `weights` (r,): 1 without
-    holes (long gaps of missing samples), a fraction next to a hole, and 0 with a missing sample. `flow` (K,): mean
-    magnitude of the first balance's left side [m^3/s]; `pressures` (K, p): means of p equal parts of the sorted samples
-    of p_A - p_B [Pa].
+    `rows`: for each balance an array (r, m) of m columns (its terms and left side), with one row for each test function
+    of the weak form. `weights` (r,): 1 without holes (long gaps of missing samples), a fraction next to a hole, and 0
+    with a missing sample. `flow` (K,): mean magnitude of the first balance's left side [m^3/s]; `pressures` (K, p):
+    means of p equal parts of the sorted samples of p_A - p_B [Pa].
     """
 
     rows: tuple[Array, ...]
@@ -346,7 +347,7 @@ def _z_score(products: Array) -> float:
     """Compute the z score of the sum of `products` (r,) under the hypothesis that their mean is zero.
 
     A row of the regression has one product of two factors: the flow on the left side of the balance, and a quantity
-    that on average has the same sign if the sensors are wired correctly, such as the motion of the piston. Then
+    that on average has the same sign if the sensors are wired correctly, such as the motion of the piston. The score is
 
         z = sum(products) / sqrt(OVERLAP sum(products^2)).
 
@@ -359,8 +360,8 @@ def _z_score(products: Array) -> float:
 def _sign_log_odds(z: float, other_cause: float) -> float:
     """Compute the log odds that a flow has the correct sign, from the z score `z` of one symptom of correct wiring.
 
-    With the standard normal distribution Phi and c = `other_cause`, the probability that something other than the sign
-    causes the score,
+    c = `other_cause` is the probability that something other than the sign causes the score; both signs are then
+    equally probable. With the standard normal distribution Phi,
 
         log odds = log((Phi(z) + c/2) / (Phi(-z) + c/2)).
 

@@ -181,16 +181,17 @@ class Blocks:
     def driving_pressure(self, names: Sequence[str], term: str) -> float:
         """Estimate the root mean square of the pressure that drives a term [Pa], such as p_B for a leak out of side B.
 
-        `names`: names of the columns, in the order of `gram`. With the sums of squares s^2 of the columns of the term
-        and of the leak, over the equations that contain the term, and the root mean square rms(p_A - p_B),
+        `names`: names of the columns, in the order of `gram`. s_term^2 and s_leak^2 are the sums of squares of the
+        columns of the term and of the leak, over the equations that contain the term, and rms is a root mean square:
 
             pressure = rms(p_A - p_B) s_term / s_leak.
         """
-        squares = np.einsum("keii->ei", self.gram)  # of each column, by equation
-        squares = squares[squares[:, names.index(term)] > 0.0].sum(axis=0)
+        squares = np.einsum("keii->ei", self.gram)  # (E, m): sum of squares of each column in each equation
+        squares = squares[squares[:, names.index(term)] > 0.0].sum(axis=0)  # equations that contain the term
         ratio = squares[names.index(term)] / max(squares[names.index(LEAK)], np.finfo(float).tiny)
-        mean_squares = ((self.pressures - self.zero[:, None]) ** 2).mean(axis=1)  # of p_A - p_B, in each block
-        return float(np.sqrt(np.average(mean_squares, weights=np.maximum(self.rows, 1e-9)) * ratio))
+        mean_squares = ((self.pressures - self.zero[:, None]) ** 2).mean(axis=1)  # mean of (p_A - p_B)^2 in each block
+        weights = np.maximum(self.rows, 1e-9)  # positive, so that the mean over the blocks exists
+        return float(np.sqrt(np.average(mean_squares, weights=weights) * ratio))
 
     @classmethod
     def join(cls, parts: Sequence[Blocks]) -> Blocks:
@@ -201,7 +202,7 @@ class Blocks:
 class ColumnRoles:
     """Indices of the columns of one equation's Gram matrices by role, and the priors on their coefficients.
 
-    A column belongs to a term of the volume balance or to its left side. Indices of columns:
+    The m columns are the m - 1 terms of the volume balance and, last, its left side. Indices of columns:
 
     - `left`: left side; `leak`: laminar leak, or the term that is tested in its place; `bias`: flow offset, or None;
     - `nuisance`: terms whose coefficients are unknown in any machine;
@@ -216,7 +217,7 @@ class ColumnRoles:
     - `drift_rate`: drift, relative to the coefficient [1/min];
     - `between_deviation`: relative difference between recordings, infinite without a prior, 0 for a flow offset that
       repeats in all recordings;
-    - `level_deviation`: constant part of the coefficient, in the coefficient's unit.
+    - `level_deviation`: constant part of the coefficient, in the coefficient's unit, infinite without a prior.
 
     `names` and `drivers` (m - 1,): names and drivers of the terms (`Term`); `healthy_conductance` [m^3/(s Pa)]:
     standard deviation of a healthy machine's leak.
@@ -227,7 +228,8 @@ class ColumnRoles:
         self.left = len(self.names)
         self.nuisance = tuple(k for k, term in enumerate(equation.terms) if term.nuisance)
         self.compared = tuple(k for k, term in enumerate(equation.terms) if term.nuisance or term.compared)
-        is_shut = HOLDING in self.names and MOVING_BIAS not in self.names  # made by `terms.shut_at_rest`
+        # true for a balance that `terms.shut_at_rest` made
+        is_shut = HOLDING in self.names and MOVING_BIAS not in self.names
         self.hold_leak = self.names.index(HOLDING) if is_shut else None
         self.leak = self.names.index(LEAK)
         drift_priors = vars(INFERENCE.drift)
@@ -240,9 +242,10 @@ class ColumnRoles:
         )
         self.motion = tuple(k for k in self.nuisance if equation.terms[k].drift in ("motion", "edge"))
         self.fast = tuple(k for k in self.nuisance if equation.terms[k].drift in UNSTEADY)
-        # without HOLDING: one leakage for all rests, since separate ones would follow outliers
-        states = [self.names.index(name) for name in (TURNING, MOVING_BIAS)] if MOVING_BIAS in self.names else []
-        self.slow = (*(k for k in self.nuisance if k not in self.fast), *states)
+        # columns that are zero at rest; HOLDING is left out, since separate leakages of holds and other rests would
+        # follow outliers
+        in_motion = [self.names.index(name) for name in (TURNING, MOVING_BIAS)] if MOVING_BIAS in self.names else []
+        self.slow = (*(k for k in self.nuisance if k not in self.fast), *in_motion)
         self.bias = self.names.index(BIAS) if BIAS in self.names else None
         # a flow offset repeats in all recordings, unless its term stands for an external leak (drift "outside") or,
         # if valves shut at rest, for losses of the pump in motion
@@ -256,19 +259,20 @@ class ColumnRoles:
 
         The differences are those of one recording from the other recordings. `indices` (c,): indices of the columns of
         the coefficients; `coefficients` (c,): coefficients in the other recordings; `leak_coefficient`: the leak's
-        coefficient in the other recordings [m^3/(s Pa)]. The prior deviations are relative to the coefficients. An
-        exception is a flow offset that repeats: it differs only by the leak's flow at the pressure `zero.pressure`
-        (`priors.toml`), the standard deviation of a sensor offset of p_A - p_B.
+        coefficient in the other recordings [m^3/(s Pa)]. The prior deviations are relative to the coefficients:
+        `between_deviation`, for the leak `between.pump` of `priors.toml`. An exception is a flow offset that repeats:
+        it differs only by the leak's flow at the pressure `zero.pressure`, the standard deviation of a sensor offset of
+        p_A - p_B. A deviation of 0 gives an infinite precision.
         """
         is_leak = np.array(indices) == self.names.index(LEAK)
         deviations = np.abs(coefficients) * np.where(is_leak, INFERENCE.between.pump, self.between_deviation[indices])
-        repeats = (np.array(indices) == self.bias) & (self.between_deviation[indices] == 0.0)  # flow offset
+        repeats = (np.array(indices) == self.bias) & (self.between_deviation[indices] == 0.0)
         deviations[repeats] = abs(leak_coefficient) * INFERENCE.zero.pressure
         with np.errstate(divide="ignore", over="ignore"):
             return np.asarray(1.0 / deviations**2)
 
     def with_free_zero(self) -> ColumnRoles:
-        """Return a copy of these column roles with a flow offset that may differ freely between recordings."""
+        """Return a copy of these roles whose flow offset (zero of the flow) may differ freely between recordings."""
         roles = copy(self)
         if self.bias is not None:
             roles.between_deviation = self.between_deviation.copy()
@@ -371,7 +375,7 @@ def solve(matrix: Array, right: Array) -> Array:
     matrix are about zero.
     """
     scale = np.sqrt(np.maximum(matrix.diagonal(), 0.0))
-    scale[~(scale > 0.0)] = 1.0
+    scale[~(scale > 0.0)] = 1.0  # a column of zeros stays as it is
     column = scale[:, None]
     scaled = matrix / column / scale
     scaled.flat[:: len(scale) + 1] += RIDGE  # this stride selects the diagonal
@@ -526,13 +530,16 @@ def _fit_nuisance(normal: _NormalEquations, prior: _Prior, n_polynomials: int, n
     min_variance = 1e-14 * normal.left_square / n_rows  # rounding errors of the sums
     variance = max(left_square / n_rows, min_variance)
     for _ in range(MAX_ITERATIONS):
+        # prior of each coefficient: its mean, and its precision times the variance of a row; rows that overlap are
+        # correlated, as if their variance were OVERLAP times as large
         precision, mean = np.zeros((2, len(prior.drift), n_polynomials))
         with np.errstate(divide="ignore", over="ignore"):
+            # infinite for a deviation of 0: the drift is relative to the coefficient, which may be 0
             precision[:, 0] = OVERLAP * variance / prior.level**2
             precision[:, 1:] = (OVERLAP * variance / prior.drift**2)[:, None]
-        if prior.offset > 0.0:
+        if prior.offset > 0.0:  # the last coefficient is the error of the sensor offset (`_Prior`)
             precision[-1, 0], mean[-1, 0] = OVERLAP * variance / prior.offset**2, -prior.current_offset
-        # the drift is relative, so that a zero coefficient has an infinite precision
+        # limited to a precision that is enough to fix a coefficient
         prior_precision = np.minimum(precision.ravel(), 1e9 * np.diag(normal.gram))
         prior_moment = prior_precision * mean.ravel()
         coefficients = solve(gram + np.diag(prior_precision), moment + prior_moment)
@@ -547,7 +554,7 @@ class _EquationFit(NamedTuple):
     """Fit of one equation: sensor offset of p_A - p_B and nuisance coefficients.
 
     `offset`: the fitted offset [Pa], relative to the one already removed; `normal`: normal equations after subtracting
-    it; `nuisance`: coefficients, the last of which is the remaining error of the offset.
+    this offset; `nuisance`: coefficients, the last of which is the remaining error of the offset.
     """
 
     normal: _NormalEquations
@@ -558,8 +565,8 @@ class _EquationFit(NamedTuple):
 def _fit_equation(gram: Array, blocks: Blocks, roles: ColumnRoles, test: int, nuisance: list[int]) -> _EquationFit:
     """Fit the nuisance coefficients of one equation and the sensor offset z of p_A - p_B, by Gauss-Newton steps.
 
-    The tested coefficient g is free in each block. The leakage is g (p_A - p_B - z) = g (p_A - p_B) - g z: where g
-    differs between blocks, so does the constant flow -g z, which shows z. z is small, since a first estimate of the
+    The tested coefficient g is free in each block. The leakage is g (p_A - p_B - z) = g (p_A - p_B) - g z. A change of
+    g between blocks also changes the constant flow -g z, and so reveals z. z is small, since a first estimate of the
     offset is already removed from the Gram matrices (`pressure_offset.remove_pressure_offset`).
 
     `gram` (K, m, m): Gram matrices of the equation in K blocks; `roles`: indices of its columns by role (leak, motion,
@@ -570,9 +577,10 @@ def _fit_equation(gram: Array, blocks: Blocks, roles: ColumnRoles, test: int, nu
     total = gram.sum(axis=0)
     constants = solve(total[np.ix_(nuisance, nuisance)], total[nuisance, roles.left])  # without drifts
     magnitudes = np.minimum(np.abs(constants), roles.level_deviation[nuisance])  # at most the prior deviation
-    # standard deviations of the drifts over the recording; the offset does not drift
+    # standard deviations of the drifts over the recording; the last one is the offset's, which does not drift
     drift = np.append(magnitudes * roles.drift_rate[nuisance] * minutes, 0.0)
     offset_deviation = roles.offset_deviation(test, blocks)
+    # inf: the level of the offset has the prior deviation `offset_deviation` instead
     prior = _Prior(np.append(roles.level_deviation[nuisance], np.inf), drift, offset_deviation)
     nuisance_and_offset = [*nuisance, gram.shape[1]]  # `_shift_offset` appends the offset's column
     offset, coefficients = 0.0, np.zeros(len(blocks))  # z, and g in each block
@@ -618,11 +626,11 @@ def _eliminate_nuisance(
     `test`: index of the tested column; `nuisance`: indices of the columns to eliminate. With the residual variance s^2
     of a row, the results are the Schur complements
 
-        precision = (N - C (G + P)^-1 C') / s^2,    vector = (n - C (G + P)^-1 (m + P mu)) / s^2.
+        precision = (N - C (G + P)^-1 C') / s^2,    vector = (n - C (G + P)^-1 (b + P mu)) / s^2.
 
     N is the diagonal matrix of the tested column's sums of squares, n its products with the left side, and C its
-    products with the nuisance columns. G is the Gram matrix of the nuisance columns, m their products with the left
-    side, P their prior precision and mu their prior mean.
+    products with the nuisance columns. G is the Gram matrix of the nuisance columns and b their products with the left
+    side. P / s^2 is the prior precision of the nuisance coefficients, and mu their prior mean.
     """
     normal, fit, _ = _fit_equation(gram, blocks, roles, test, nuisance)
     right_sides = np.column_stack([normal.coupling.T, normal.moment + fit.prior_moment])
@@ -649,7 +657,7 @@ def offset_cost(offset: float) -> float:
 
 
 def offset_costs(offsets: Array) -> Array:
-    """Compute `offset_cost` for an array of sensor offsets [Pa]."""
+    """Compute `offset_cost`, the lower of the costs by a narrow and by a wide prior, for an array of offsets [Pa]."""
     usual, far, odds = INFERENCE.zero.pressure, INFERENCE.zero.far, INFERENCE.zero.odds
     return np.asarray(np.minimum((offsets / usual) ** 2, (offsets / far) ** 2 + 2.0 * np.log(far / usual / odds)))
 
@@ -681,33 +689,36 @@ class LeakAndBias(NamedTuple):
 
 
 def estimate_leak_and_bias(blocks: Blocks, roles: ColumnRoles) -> LeakAndBias:
-    """Compute the joint likelihood of leak coefficient and flow offset in each block, for the first equation.
+    """Compute the joint likelihood of leak coefficient and flow offset (bias) in K blocks, for the first equation.
 
-    `roles`: indices of the equation's columns by role (leak, motion, left side); they must include the flow offset
-    (`roles.bias`). All other coefficients are eliminated.
+    All other coefficients are eliminated. Returns the precision (2 K, 2 K) and the information vector (2 K,), leaks
+    first, and the mean pressure difference (K,) in each block (`LeakAndBias`). `roles`: indices of the equation's
+    columns by role (leak, motion, left side); they must include the flow offset (`roles.bias`).
     """
     leak, bias = roles.leak, roles.bias
     assert bias is not None
     gram = blocks.gram[:, 0].copy()
     bias_energy = gram[:, bias, bias]
     has_bias = bias_energy > RIDGE * bias_energy.max()  # false if the flow offset's column is zero, as at rest
-    pressure = np.where(has_bias, gram[:, leak, bias], 0.0) / np.where(has_bias, bias_energy, 1.0)
+    # mean of p_A - p_B in each block: the leak's column is (p_A - p_B) dt, that of the flow offset is dt
+    mean_pressure = np.where(has_bias, gram[:, leak, bias], 0.0) / np.where(has_bias, bias_energy, 1.0)
     fit = _fit_equation(gram, blocks, roles, leak, _nuisance_columns(roles))
-    # subtract from the leak's column its mean in the block, so that leak and bias are uncorrelated there
-    gram[:, leak] -= pressure[:, None] * gram[:, bias]
-    gram[:, :, leak] -= pressure[:, None] * gram[:, :, bias]
+    # subtract this mean from the leak's column, so that leak and flow offset are uncorrelated in the block
+    gram[:, leak] -= mean_pressure[:, None] * gram[:, bias]
+    gram[:, :, leak] -= mean_pressure[:, None] * gram[:, :, bias]
     nuisance = [k for k in roles.nuisance if k not in (leak, bias)]
     position = _nuisance_columns(roles).index(bias)
     polynomials, _ = _drift_polynomials(blocks)
-    prior = fit.nuisance.prior_precision.reshape(-1, polynomials.shape[1])[:-1]  # without the offset's error
-    prior = np.delete(prior, position, axis=0).ravel()
+    # prior precisions of the fit, a row for each nuisance column; the last row is the sensor offset's, not used here
+    prior = fit.nuisance.prior_precision.reshape(-1, polynomials.shape[1])[:-1]
+    prior = np.delete(prior, position, axis=0).ravel()  # without the flow offset, which is estimated here
     leaks, biases = (_build_normal_equations(gram, polynomials, nuisance, k, roles.left) for k in (leak, bias))
     coupling = np.vstack([leaks.coupling, biases.coupling])
     solution = solve(leaks.gram + np.diag(prior), np.column_stack([coupling.T, leaks.moment]))
     precision = np.diag(np.concatenate([leaks.energy, biases.energy])) - coupling @ solution[:, :-1]
     vector = np.concatenate([leaks.tested_moment, biases.tested_moment]) - coupling @ solution[:, -1]
     variance = fit.nuisance.variance
-    return LeakAndBias(0.5 * (precision + precision.T) / variance, vector / variance, pressure)
+    return LeakAndBias(0.5 * (precision + precision.T) / variance, vector / variance, mean_pressure)
 
 
 def estimate_weighted_mean(blocks: Blocks, roles: ColumnRoles, weights: Mapping[int, float]) -> tuple[float, float]:

@@ -170,12 +170,13 @@ def compare_estimates(
     ratios = np.exp(np.linspace(-np.log(MAX_RATIO), np.log(max_ratio), NODES))
     inflations = np.geomspace(1.0, prior.inflation, INFLATIONS) if prior.inflation > 1.0 else np.ones(1)
     ratios, inflations = (grid.ravel() for grid in np.meshgrid(ratios, inflations))
-    scatter = prior.deviation * ratios  # at each point of the joint grid
+    scatter = prior.deviation * ratios  # scatter s at each point of the joint grid
     weights = 1.0 / (scatter[:, None] ** 2 + (inflations[:, None] * errors) ** 2)  # (grid points, n)
     precision = weights.sum(axis=1)
     means = weights @ values / precision
     squares = (weights * (values - means[:, None]) ** 2).sum(axis=1)
-    # the prior density of log s is s^-m exp(-m s_0^2 / (2 s^2)); for the other factors see the module
+    # the prior density of log s is s^-m exp(-m s_0^2 / (2 s^2)), where m is `prior.recordings` and s / s_0 the ratio;
+    # for the other factors see the module
     log_posterior = -prior.recordings * (np.log(ratios) + 0.5 / ratios**2)
     log_posterior += 0.5 * (np.log(weights).sum(axis=1) - np.log(precision) - squares)
     posterior = np.exp(log_posterior - log_posterior.max())

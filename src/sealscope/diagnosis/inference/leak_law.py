@@ -49,7 +49,7 @@ def apparent_conductances(blocks: Blocks, columns: Sequence[ColumnRoles]) -> dic
     these matrices by role (leak, motion, left side).
     """
     leak, orifice = columns[0].leak, columns[0].names.index(ORIFICE)
-    gram = blocks.gram.sum(axis=1)
+    gram = blocks.gram.sum(axis=1)  # sum over the equations
     energy = np.maximum(gram[:, leak, leak], _TINY)
     orifice_slope = np.maximum(gram[:, orifice, leak] / energy, _TINY)  # r
     return {exponent: orifice_slope ** (2.0 * (1.0 - exponent)) for exponent in EXPONENTS}
@@ -85,7 +85,7 @@ def find_leak_step(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Informa
     `columns`: for each equation the indices of the columns of these matrices by role (leak, motion, left side); `leak`:
     likelihood of the leak's coefficient in the K blocks. Return None if too few blocks have information.
     """
-    weights = np.maximum(leak.precision.sum(axis=0), 0.0)
+    weights = np.maximum(leak.precision.sum(axis=0), 0.0)  # information of each block
     shapes = apparent_conductances(blocks, columns)
     tests = []
     for exponent, prior in zip(EXPONENTS, law_priors(), strict=True):
@@ -121,7 +121,8 @@ def estimate_step_flow(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Inf
 
     This mean over time is computed for each combination of a law (exponent of |p_A - p_B|, `EXPONENTS`), a growth
     (fraction by which the leak increases from the onset to the end) and an onset. The result is the mean over these
-    combinations, weighted by their probabilities, and the standard deviation of their mixture.
+    combinations, weighted by their likelihood and the prior probability of the growth (laws and onsets have equal
+    ones), and the standard deviation of their mixture.
 
     `blocks`: the K blocks, with the pressures and the Gram matrices of the volume balance; `columns`: for each equation
     the indices of the columns of these matrices by role (leak, motion, left side); `leak`: likelihood of the leak's

@@ -42,7 +42,7 @@ class Observable:
         Twice the log odds of this description over the alternative ones, from sources other than the score, such as a
         prior on its size.
     log_ratio_to_leak : float, optional
-        Log likelihood ratio of this description of a difference from healthy recordings to its description by a leak.
+        Log likelihood ratio of two explanations of a difference from healthy recordings: this change, and a leak.
     """
 
     name: str

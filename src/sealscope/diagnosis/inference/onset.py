@@ -201,7 +201,7 @@ class StepTest:
 
         The score is twice the logarithm of a likelihood ratio. The result is limited to the range from 0 to 10 000.
         """
-        max_score = 1e4  # upper end of the search, with a probability of practically zero
+        max_score = 1e4  # upper end of the search; such a score has practically no probability
         if self.law.chance(0.0) <= chance:
             return 0.0
         if not chance > self.law.chance(max_score):
@@ -247,6 +247,7 @@ class History(NamedTuple):
 
     def relative_to(self, before: NDArray[np.bool_]) -> History:
         """Return the history minus its mean over the blocks flagged in `before` (K,); unchanged if there are none."""
+        # subtracts the mean over the flagged blocks from the coefficient in each block
         transform = np.eye(len(before)) - before / max(int(np.count_nonzero(before)), 1)
         return History(transform @ self.mean, transform @ self.covariance @ transform.T)
 
@@ -364,6 +365,7 @@ def step_sizes(information: Information, onsets: NDArray[np.intp], shape: Array,
     n = len(whitened.z)
     steps = whitened.transform @ whitened.step_shapes(whitened.positions[onsets], shape, growth)
     fit = _fit_steps(whitened.z, steps, whitened.eigen)
+    # log likelihood (walk, onset) with the best size of the step and the best variance of the noise
     likelihoods = (
         0.5 * np.log(fit.weight).sum(axis=1)[:, None]
         + whitened.walk_log_priors[:, None]
@@ -412,7 +414,7 @@ def _residual_squares(total: Array, moments: Array, energies: Array) -> Array:
 
     There is one result for each of w assumed variances of the coefficient's random walk and each of o onsets. A step
     down does not reduce the sum. `total` (w,): sum of squares before the fit; `moments` and `energies` (w, o): products
-    of the steps with the whitened values and with themselves.
+    of the steps with the whitened values and with themselves. The result is kept above rounding errors.
     """
     return np.asarray(np.maximum(total[:, None] - np.maximum(moments, 0.0) ** 2 / energies, 1e-12 * total[:, None]))
 
@@ -459,7 +461,7 @@ def step_shapes(count: int, positions: Array, growth: float = 0.0) -> Array:
     step after the onset. From the onset on the step grows linearly from 1 to 1 + `growth` at the end of the last
     block.
     """
-    end_since_onset = np.arange(count)[:, None] + 1.0 - positions  # of each block
+    end_since_onset = np.arange(count)[:, None] + 1.0 - positions  # end of each block minus onset, (K, o)
     steps, middle_since_onset = np.clip(end_since_onset, 0.0, 1.0), end_since_onset - 0.5
     grown_fraction = np.clip(middle_since_onset / np.maximum(count - positions, 1.0), 0.0, 1.0)
     return np.asarray(steps * (1.0 + growth * grown_fraction))
@@ -541,7 +543,7 @@ def _build_whitening(precision: Array, slope: float, walk: float) -> _Whitening 
     if count < MIN_BLOCKS or np.count_nonzero(is_informative) < MIN_BLOCKS:
         return None
     root = np.sqrt(values[is_informative])
-    design = (vectors[:, is_informative] * root).T  # from the coefficient in all blocks to z
+    design = (vectors[:, is_informative] * root).T  # matrix from the coefficient in all blocks to z
     index = np.arange(count)
     fixed = design @ np.column_stack([np.ones(count), (index - index.mean()) / count])  # level and slope
     if np.isfinite(slope):  # the prior on the slope is one more estimate
@@ -550,7 +552,8 @@ def _build_whitening(precision: Array, slope: float, walk: float) -> _Whitening 
     # the columns of the orthogonal matrix after the first two are orthogonal to level and slope
     complement = np.linalg.qr(fixed, mode="complete")[0][:, 2:].T
     transform = complement @ design
-    covariance = transform @ (np.minimum.outer(index, index) + 1.0) @ transform.T  # of the walk: min(k, l)
+    # covariance of a walk with steps of variance 1, which is min(k, l) for blocks k and l counted from 1
+    covariance = transform @ (np.minimum.outer(index, index) + 1.0) @ transform.T
     # scale of the walk's variance at which walk and noise change z equally on average
     unit = len(complement) / max(float(np.trace(covariance)), np.finfo(float).tiny)
     eigen, basis = np.linalg.eigh(unit * covariance)
@@ -601,6 +604,7 @@ def _onset_times(time: Array, positions: Array) -> Array:
 
     `time` (K,): middles of the blocks [s].
     """
+    # edges of the blocks: half way between their middles, extrapolated at both ends
     first_edge, last_edge = 1.5 * time[0] - 0.5 * time[1], 1.5 * time[-1] - 0.5 * time[-2]
     edges = np.concatenate([[first_edge], 0.5 * (time[1:] + time[:-1]), [last_edge]])
     return np.asarray(np.interp(positions, np.arange(len(edges)), edges))
@@ -609,8 +613,8 @@ def _onset_times(time: Array, positions: Array) -> Array:
 def _test_step_up(whitened: _Whitened, steps: Array, fits: _StepFits) -> StepTest:
     """Test whitened values of a coefficient for a step up at any of o onsets, by the likelihood ratio to no step.
 
-    `steps` (n, o): whitened unit steps; `fits`: their fits to the values z, or to -z to test for a step down. Both
-    likelihoods are maximised over the variances of walk and noise, with the prior on the walk.
+    `steps` (n, o): whitened unit steps; `fits`: their fits to the values z for each of w walks, or to -z to test for a
+    step down. Both likelihoods are maximised over the variances of walk and noise, with the prior on the walk.
     """
     n, walk_log_priors, unit = len(whitened.z), whitened.walk_log_priors, whitened.unit
     weight, total, moments, energies, residual_squares = fits
@@ -632,6 +636,7 @@ def _test_step_up(whitened: _Whitened, steps: Array, fits: _StepFits) -> StepTes
     noise = float(residual_squares[walk, best]) / n
     size_at_best, error_at_best = moments[walk, best] / energies[walk, best], np.sqrt(noise / energies[walk, best])
     size = moments[walk_without_step] / energies[walk_without_step]
+    # residual squares of a step up or down at each onset
     squares = total[walk_without_step] - moments[walk_without_step] ** 2 / energies[walk_without_step]
     return StepTest(
         score=score,

@@ -71,15 +71,15 @@ def remove_pressure_offset(blocks: Blocks, columns: Sequence[ColumnRoles]) -> Bl
 def _find_relative_offset(leak_steps: Array, flow_offset_steps: Array, residuals: Array) -> float:
     """Find the most probable sensor offset of p_A - p_B, in units of its usual standard deviation.
 
-    `residuals` (n,): whitened residuals. Column k of `leak_steps` and `flow_offset_steps`, (n, K) each: change of the
-    residuals by a unit step, from block k on, of the leak's coefficient and of the constant flow. With
-    S = leak_steps - offset flow_offset_steps, and a leak that steps up by `size` in block k,
+    `residuals` (n,): whitened residuals. Column k of `leak_steps` (n, K) is the change of the residuals by a unit step
+    of the leak's coefficient from block k on; `flow_offset_steps` (n, K): the same for a step of the constant flow.
+    With S = leak_steps - offset flow_offset_steps, and a leak that steps up by `size` in block k,
 
         residuals = size S[:, k] + noise,    cov noise = kappa (I + q S S'),
 
     where q S S' is the random walk of the leak's coefficient. The likelihood is maximised over size > 0, k, kappa and
-    q; `offset_cost` states the prior on the offset. The search is over asinh of the offset, which is linear
-    near zero and logarithmic for large offsets.
+    q; `offset_cost` states the prior on the offset. The search is over asinh of the offset, which is linear near zero
+    and logarithmic for large offsets.
     """
     usual, far = INFERENCE.zero.pressure, INFERENCE.zero.far  # standard deviations of the prior [Pa]
     # only walks up to the best one without an offset: else offset and walk describe changes that no leak explains
@@ -98,17 +98,21 @@ def _find_relative_offset(leak_steps: Array, flow_offset_steps: Array, residuals
         return independent_fraction * float(_walk_likelihoods(steps, residuals, walks).max())
 
     def cost(position: float) -> float:
-        """Compute minus the log posterior density of a sensor offset, up to a constant; `position`: its asinh."""
+        """Compute minus the log posterior density of a sensor offset, up to a constant.
+
+        `position`: asinh of the relative offset. The log prior density is -1/2 times `offset_cost`.
+        """
         return 0.5 * offset_cost(usual * float(np.sinh(position))) - log_likelihood(position)
 
     positions = np.arcsinh(3.0 * far / usual) * np.linspace(-1.0, 1.0, N_GRID)
-    # search about the maxima of prior and likelihood: a far offset has a high likelihood and a low prior
-    starts = {N_GRID // 2, int(np.argmax([log_likelihood(position) for position in positions]))}  # indices of positions
+    # indices of the positions to search about: offset 0, where the prior has its maximum, and the maximum of the
+    # likelihood, since a far offset may have a high likelihood and a low prior
+    starts = {N_GRID // 2, int(np.argmax([log_likelihood(position) for position in positions]))}
     minima = []
     for start in starts:
         low, high = positions[max(start - 1, 0)], positions[min(start + 1, N_GRID - 1)]  # neighbours on the grid
         minima.append(find_minimum(cost, low, high, tolerance=1e-3))
-    position, _ = min(minima, key=lambda minimum: minimum[1])  # by the cost
+    position, _ = min(minima, key=lambda minimum: minimum[1])  # position of the lowest cost
     return float(np.sinh(position))
 
 
@@ -127,30 +131,30 @@ class _WhitenedSteps(NamedTuple):
 def _whiten_steps(blocks: Blocks, roles: ColumnRoles) -> _WhitenedSteps | None:
     """Convert the estimates of leak and constant flow in K blocks to residuals with independent unit noise.
 
-    The result also contains the changes of these residuals by unit steps of leak and constant flow. `roles`: indices of
-    the columns of the first equation by role (leak, motion, left side). Return None if the blocks have too little
-    information.
+    The result also contains the changes of these residuals by unit steps of leak and constant flow (the flow offset).
+    `roles`: indices of the columns of the first equation by role (leak, motion, left side). Return None if the blocks
+    have too little information.
 
-    The 2 K estimates (K leaks, K constant flows) have the inverse covariance P. With a root R of it, P = R' R, the
+    The 2 K estimates (K leaks, K constant flows) have the inverse covariance P. With R such that P = R' R, the
     residuals are R times the estimates. Slow changes are then projected out: level and slope of the leak, and a
-    quadratic drift of the constant flow (F and B of the module).
+    quadratic drift of the constant flow.
     """
     count = len(blocks)
-    # the constant flow is that at the mean pressure difference, to which a leak g adds g times this pressure
+    # the constant flow is stated at each block's mean pressure difference `pressure`; a leak g adds g `pressure` to it
     precision, vector, pressure = estimate_leak_and_bias(blocks, roles)
-    energies = np.diag(precision).reshape(2, count)  # of leak and constant flow; zero in some blocks at rest
+    energies = np.diag(precision).reshape(2, count)  # rows: leak and constant flow; zero in some blocks at rest
     floors = np.maximum(np.finfo(float).eps * energies.max(axis=1), np.finfo(float).tiny)
     scale = np.sqrt(np.maximum(energies, floors[:, None])).ravel()
     eigenvalues, eigenvectors = np.linalg.eigh(precision / np.outer(scale, scale))
     is_informative = eigenvalues > RANK_TOLERANCE * max(float(eigenvalues[-1]), 0.0)
-    position = np.linspace(-1.0, 1.0, count)  # of each block in the recording
+    position = np.linspace(-1.0, 1.0, count)  # from the first block to the last
     trend, drift = (np.polynomial.legendre.legvander(position, degree) for degree in (1, 2))
     trend_and_drift = np.block([[trend, np.zeros_like(drift)], [pressure[:, None] * trend, drift]])
     # `MIN_BLOCKS` already includes level and slope, two of the columns of trend and drift
     if np.count_nonzero(is_informative) < trend_and_drift.shape[1] + MIN_BLOCKS - 2:
         return None
     root_eigenvalues = np.sqrt(eigenvalues[is_informative])
-    whitening = (eigenvectors[:, is_informative] * root_eigenvalues).T * scale  # R, of the informative directions
+    whitening = (eigenvectors[:, is_informative] * root_eigenvalues).T * scale  # R, informative directions only
     slow_changes = whitening @ trend_and_drift
     slow_changes /= np.maximum(np.linalg.norm(slow_changes, axis=0), np.finfo(float).tiny)
     complement = np.linalg.qr(slow_changes, mode="complete")[0][:, slow_changes.shape[1] :].T  # orthogonal to these
@@ -175,13 +179,14 @@ def _walk_likelihoods(steps: Array, residuals: Array, walks: Array) -> Array:
     eigen, basis = eigen[is_informative], basis[:, is_informative]
     n = len(residuals)
     walks = walks * n / max(float(eigen.sum()), np.finfo(float).tiny)
-    variances = 1.0 + walks[:, None] * eigen  # of the residuals along the eigenvectors, over the noise's variance
-    directions = steps @ (basis / np.sqrt(eigen))
+    variances = 1.0 + walks[:, None] * eigen  # variance of the residuals along each eigenvector, over kappa
+    directions = steps @ (basis / np.sqrt(eigen))  # orthonormal
     in_span = directions.T @ residuals
     off_span = residuals - directions @ in_span
     total = float(off_span @ off_span) + (in_span**2 / variances).sum(axis=1)
     # products of a step from each block on, (w, K), with the residuals and with itself
     moments = (np.sqrt(eigen) * in_span / variances) @ basis.T
     energies = np.maximum((eigen / variances) @ (basis**2).T, np.finfo(float).tiny)
+    # 1e-9: lower limit against rounding errors
     residual_squares = np.maximum(total - (np.maximum(moments, 0.0) ** 2 / energies).max(axis=1), 1e-9 * total)
     return np.asarray(-0.5 * np.log(variances).sum(axis=1) - 0.5 * n * np.log(residual_squares))

@@ -45,10 +45,10 @@ def apply_regime(blocks: Blocks, roles: ColumnRoles, shut: bool, *, has_holds: b
 
     - Open valves: these columns are dropped from the Gram matrices.
     - Shut valves: the flow offset in motion replaces the flow offset of all times (`terms.shut_at_rest`). The column
-      for the leakage of a pump that holds the load remains only with `has_holds` (some hold lasts for seconds), and
-      only if the pump is off at other times. Else it is set to zero. If it is certain that valves are shut at rest
-      (`is_certain`), and there are no such holds, it is first added to the column of the pump that moves the piston,
-      since a press that builds up its pressure is connected to its pump.
+      `HOLDING`, of a pump that holds the load, remains only if some hold lasts for seconds (`has_holds`) and the pump
+      is off at other times. Else it is set to zero. Before that, if no hold lasts for seconds but the pump is off at
+      times, and it is certain that valves are shut at rest (`is_certain`), this column is added to `TURNING`, of a pump
+      that moves the piston: a press that builds up its pressure is connected to its pump.
     """
     names = (*roles.names, "left")
     if not shut:
@@ -85,15 +85,15 @@ def add_pump_columns(gram: Array, names: Sequence[str]) -> Array:
 def has_rests(blocks: Blocks, roles: ColumnRoles) -> bool:
     """Return True if the pump or the piston rests in any block.
 
-    More than the fraction `NEGLIGIBLE` of the sum of squares of p_A - p_B must then come from rests. `roles`: indices
-    of the columns of `blocks` by role; they include the leakage of a pump that moves or holds the piston, and the flow
+    Rests must contribute more than the fraction `NEGLIGIBLE` of the sum of squares of p_A - p_B. `roles`: indices of
+    the columns of `blocks` by role; they include the leakage of a pump that moves or holds the piston, and the flow
     offset in motion (`terms.with_rests`).
     """
     return _rest_share(blocks, roles, TURNING) > NEGLIGIBLE
 
 
 def _is_always_on(blocks: Blocks, roles: ColumnRoles) -> bool:
-    """Return True if the pump always moves the piston or holds the load. `roles`: as for `has_rests`."""
+    """Return True if the pump always moves the piston or holds the load; `roles`: indices of the columns by role."""
     return _rest_share(blocks, roles, TURNING, HOLDING) < NEGLIGIBLE
 
 
@@ -121,7 +121,7 @@ def shut_odds(blocks: Blocks, roles: ColumnRoles) -> float:
         return 0.0
     turning, holding, moving_bias = (roles.names.index(name) for name in (TURNING, HOLDING, MOVING_BIAS))
     columns = [*roles.nuisance, turning, holding, moving_bias]
-    grams = blocks.gram[:, 0]  # of the pump's volume balance in each block
+    grams = blocks.gram[:, 0]  # Gram matrices (K, m, m) of the pump's volume balance, the only equation
     coefficients, covariance = fit_with_robust_covariance(grams, columns, roles.left)
     # at rest the leakage is the leak's coefficient; in motion the coefficient of the turning pump is added
     rest, extra = columns.index(roles.leak), columns.index(turning)

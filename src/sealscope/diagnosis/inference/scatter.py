@@ -168,9 +168,9 @@ class Rise(NamedTuple):
     def log_ratio(self, rise: float, log_deviation: float = 0.0) -> float:
         """Compute the log likelihood ratio of a true rise of the leak's coefficient by `rise` to no rise.
 
-        `rise` is in the unit of the estimate `value`, with which both hypotheses are compared. `log_deviation`:
-        standard deviation of the logarithm of the true rise about log(`rise`); 0 if the true rise is known to be
-        `rise`. If it is known and `may_be_partial`, the estimate may contain any fraction of the rise.
+        Both hypotheses are compared with the estimate `value`; `rise` is in its unit. `log_deviation`: standard
+        deviation of the logarithm of the true rise about log(`rise`); 0 if the true rise is known to be `rise`. If the
+        true rise is known and `may_be_partial`, `value` may contain any fraction of it.
         """
         if log_deviation > 0.0 and rise > 0.0:
             return self._log_ratio_lognormal(rise, log_deviation)
@@ -210,9 +210,10 @@ class Rise(NamedTuple):
             [rise * np.exp(log_deviation * grid_deviations), self.value + self.deviation * grid_deviations]
         )
         grid = np.unique(grid[grid > TINY])
-        prior = -0.5 * (np.log(grid / rise) / log_deviation) ** 2 - np.log(grid * log_deviation * np.sqrt(2.0 * np.pi))
+        z = np.log(grid / rise) / log_deviation
+        log_prior = -0.5 * z**2 - np.log(grid * log_deviation * np.sqrt(2.0 * np.pi))
         log_densities = [self._log_density(self.value - true_rise) for true_rise in grid]
-        log_integrand = prior + log_densities - self._log_density(self.value)
+        log_integrand = log_prior + log_densities - self._log_density(self.value)
         log_max = float(log_integrand.max())
         return log_max + float(np.log(max(np.trapezoid(np.exp(log_integrand - log_max), grid), TINY)))
 
@@ -296,10 +297,10 @@ class RecordingSums(NamedTuple):
     ) -> RecordingSums:
         """Summarise a recording from its `blocks`: sum of the Gram matrices, mean flow and mean pressure.
 
-        The sum is divided by the residual variance of a row. Unshared coefficients are eliminated. The means are
-        weighted by the numbers of rows. `columns`: for each equation the indices of its columns by role (leak, motion,
-        left side); `start_s`: date [s since 1970] and `oil_degC`: oil temperature, None if unknown, are stored as they
-        are.
+        The sum is divided by the residual variance of a row; coefficients that recordings do not share are eliminated.
+        The means are weighted by the numbers of rows. `columns`: for each equation the indices of its columns by role
+        (leak, motion, left side); `start_s`, `oil_degC`: date [s since 1970] and oil temperature, None if unknown,
+        which are stored as they are.
         """
         weights = np.maximum(blocks.rows, 1e-9)  # positive, so that the means exist
         flow = float(np.average(blocks.flow, weights=weights))
@@ -325,7 +326,7 @@ def rise(judged: RecordingSums, baseline: Sequence[RecordingSums], columns: Sequ
     """
     healthy_sums = np.sum([recording.sums for recording in baseline], axis=0)
     count, prior = len(baseline), INFERENCE.scatter
-    # factors on the prior standard deviations; `prior.between` is one standard deviation of these factors
+    # factors on the prior standard deviations; log(`prior.between`) is the standard deviation of their logarithm
     widths = prior.between ** np.linspace(-MAX_SCALE, MAX_SCALE, SCALES)
     rises, rise_errors = np.zeros((SCALES, count)), np.zeros((SCALES, count))
     if count > 1:  # rises of each healthy recording over the others, scaled to its rise over the mean of all
@@ -338,8 +339,8 @@ def rise(judged: RecordingSums, baseline: Sequence[RecordingSums], columns: Sequ
         )
     values, error = _estimate_leak_excess(judged.sums, healthy_sums, columns, widths)
     level, level_error = coefficient_level(healthy_sums, columns)
-    # error of a rise for each width: a fraction of the typical standard error, and at least the fraction `prior.finest`
-    # of the pump's mean flow, as a conductance
+    # error of a rise for each width: a fraction of the typical standard error, at least the fraction `prior.finest` of
+    # the pump's mean flow, as a conductance, and never 0 (1 / MAX_READING)
     errors = prior.estimate * np.median(np.column_stack([error, rise_errors]), axis=1)
     errors = np.maximum(errors, max(prior.finest * _conductance_of_flow(judged), 1.0 / MAX_READING))
     return _compare_levels(judged, baseline, _Estimates(values, rises, errors, level, level_error))
@@ -372,6 +373,7 @@ def held_pump_rise(judged: RecordingSums, baseline: Sequence[RecordingSums]) -> 
     if judged.held_pump is None or len(baseline) < MIN_WITH_HOLDS:
         return None
     leakages = np.array([r.held_pump for r in (*baseline, judged) if r.held_pump is not None])
+    # the relative deviation between sessions, times the mean leakage of the healthy recordings
     session_deviation = INFERENCE.held_oil.pump_session * abs(float(leakages[:-1, 0].mean()))
     return _compare_held(judged, baseline, leakages, session_deviation=session_deviation)
 
@@ -384,7 +386,7 @@ def _compare_held(judged: RecordingSums, baseline: Sequence[RecordingSums], leak
     """
     *healthy_leaks, leak = leaks[:, 0]
     level = float(np.mean(healthy_leaks))
-    min_error = max(INFERENCE.scatter.finest * _conductance_of_flow(judged), 1.0 / MAX_READING)
+    min_error = max(INFERENCE.scatter.finest * _conductance_of_flow(judged), 1.0 / MAX_READING)  # above 0
     error = np.maximum(np.median(leaks[:, 1]), min_error)
     estimates = _Estimates(
         values=np.array([leak - level]),
@@ -426,7 +428,7 @@ def _compare_levels(judged: RecordingSums, baseline: Sequence[RecordingSums], es
     coefficients; there is one row if no such prior is used.
 
     The sum of healthy mean and rise is the leak coefficient a of a recording. Leak coefficients are compared as z =
-    asinh(a / 2 c), which is logarithmic for large a (`_LevelScale`). From z the predicted effect of the oil is
+    asinh(a / (2 c)), which is logarithmic for large a (`_LevelScale`). From z the predicted effect of the oil is
     subtracted. The rest is normal about an unknown mean, with an unknown standard deviation sigma of single recordings;
     sessions, oil and unusual conditions add covariances (see the module).
     """
@@ -436,26 +438,28 @@ def _compare_levels(judged: RecordingSums, baseline: Sequence[RecordingSums], es
     if session_deviation is None:
         session_deviation = prior.session * conductance_of_flow
     # log width of the prior in each row, in standard deviations; estimates from holds have no such prior
-    exponents = np.linspace(-MAX_SCALE, MAX_SCALE, SCALES) if len(values) == SCALES else np.zeros(len(values))
+    log_widths = np.linspace(-MAX_SCALE, MAX_SCALE, SCALES) if len(values) == SCALES else np.zeros(len(values))
     recordings = [*baseline, judged]
     oils = _oil_hypotheses(recordings)
     # scatter that the oil does not explain: warmer oil is thinner and leaks more
     oil_factor = np.exp(oils[0].thinning[:-1])
     unexplained = rises - level * (oil_factor - oil_factor.mean())
     scatter = float(np.median(unexplained.std(axis=1)))
+    # c, below which z is linear in a: the largest of the errors, the scatter and a tenth of the level
     scale = _LevelScale(level, max(level_error, float(np.median(errors)), scatter, 0.1 * level, min_crossover))
     steepness = scale.slope(level)  # dz/da at the healthy mean
     relative_slope = steepness * level  # change of z for a relative change of a
     log_condition_excess = sum(condition.log_excess for condition in find_unusual_conditions(judged, baseline))
     pause = 3600.0 * INFERENCE.oil.shift  # from hours to seconds
     sessions = number_sessions([recording.start_s for recording in recordings], pause)
-    # grid of sigma in z, for each row of the estimates: from the standard error to the largest plausible scatter
+    # grid of sigma in z, for each row of the estimates: from the standard error to the largest plausible scatter, at
+    # least to ten standard errors
     max_scatter = min(steepness * prior.largest * conductance_of_flow, prior.relative)
     max_sigma = np.maximum(max_scatter, 10.0 * steepness * errors)
     sigma = np.geomspace(steepness * errors, max_sigma, NODES, axis=1)
     judged_z, healthy_z = scale.transform(values), scale.transform(rises)
-    # log Jacobian of z, plus log prior of the width
-    estimate_logarithms = np.log(scale.slope(level + rises)).sum(axis=1) - 0.5 * exponents**2
+    # log Jacobian of z, plus log prior of the width, for each row
+    log_priors = np.log(scale.slope(level + rises)).sum(axis=1) - 0.5 * log_widths**2
     predictions = []
     for oil in oils:
         thinned = level * np.exp(oil.thinning)  # predicted levels
@@ -469,7 +473,7 @@ def _compare_levels(judged: RecordingSums, baseline: Sequence[RecordingSums], es
         )
         shifts = scale.transform(thinned - level) - scale.transform(np.zeros(1))  # effect of the oil on z
         predicted = Population(*candidates).predict(
-            judged_z - shifts[-1], healthy_z - shifts[:-1], sigma, estimate_logarithms + oil.log_probability
+            judged_z - shifts[-1], healthy_z - shifts[:-1], sigma, log_priors + oil.log_probability
         )
         predictions.append(scale.to_levels(predicted, judged_z))
     all_oils = Mixture(*(np.concatenate(parts, axis=1) for parts in zip(*predictions, strict=True)))
@@ -487,7 +491,7 @@ def _candidate_covariances(
 ) -> tuple[Array, Array]:
     """Build the candidate covariances of transformed leak coefficients z between recordings, with log priors.
 
-    z = asinh(a / 2 c) of a leak coefficient a (`_LevelScale`) is logarithmic for large coefficients.
+    z = asinh(a / (2 c)) of a leak coefficient a (`_LevelScale`) is logarithmic for large coefficients.
 
     Parameters
     ----------
@@ -524,7 +528,8 @@ def _candidate_covariances(
     covariances += np.diag(relative_slopes**2 * oil.variances)
     covariances[:, -1, -1] += condition_deviation**2
     if oil_deviation > 0.0 and sessions[-1] not in sessions[:-1]:
-        # two cases: the oil in the judged recording's session is like the oil in the healthy sessions, or unlike it
+        # two cases: the oil in the judged recording's session is like the oil in the healthy sessions, or unlike it;
+        # unlike oil adds the variance of a difference between two sessions
         unlike = INFERENCE.scatter.unlike
         log_priors = (np.log([[1.0 - unlike], [unlike]]) + log_priors).ravel()
         covariances = np.tile(covariances, (2, 1, 1))
@@ -533,7 +538,7 @@ def _candidate_covariances(
 
 
 class _LevelScale(NamedTuple):
-    """Transform z = asinh(a / 2 c) of a leak coefficient a: logarithmic for a far above c, linear for a far below c.
+    """Transform z = asinh(a / (2 c)) of a leak coefficient a: logarithmic for a far above c, linear far below c.
 
     `level`: mean coefficient of the healthy recordings; `crossover`: c. Both are in the unit of the coefficient.
     """
@@ -542,16 +547,16 @@ class _LevelScale(NamedTuple):
     crossover: float
 
     def transform(self, excess: Array) -> Array:
-        """Compute z = asinh(a / 2 c) of leak coefficients a = `level` + `excess`, of any shape.
+        """Compute z = asinh(a / (2 c)) of leak coefficients a = `level` + `excess`, of any shape, with c = `crossover`.
 
         `level` is the mean coefficient of the healthy recordings.
         """
         return np.asarray(np.arcsinh((self.level + excess) / (2.0 * self.crossover)))
 
     def slope(self, level: Any) -> Any:
-        """Compute the derivative dz/da of the transform z = asinh(a / 2 c) at leak coefficients a = `level`.
+        """Compute dz/da = 1 / sqrt(a^2 + (2 c)^2) of z = asinh(a / (2 c)) at leak coefficients a = `level`.
 
-        `level`: a number or an array; the result has the same shape.
+        c is the `crossover`. `level`: a number or an array; the result has the same shape.
         """
         return 1.0 / np.hypot(level, 2.0 * self.crossover)
 
@@ -561,14 +566,14 @@ class _LevelScale(NamedTuple):
         `predicted`: mixture of normal distributions of z, shape (s, g, nodes) as from `Population.predict`, whose
         weights are logarithms and whose centres are relative to `transformed` (s,), the z of the judged recording. Each
         normal distribution is split into `PARTS` narrower ones, along a new last axis, within which the coefficient is
-        nearly linear in z.
+        nearly linear in z. Their mixture has the mean and the variance of the original distribution.
         """
         x, part_weights = np.polynomial.hermite_e.hermegauss(PARTS)  # centres of the parts [standard deviations]
         centres, deviations = predicted.centres + transformed[:, None, None], predicted.deviations[..., None]
         z = np.clip(centres[..., None] + np.sqrt(1.0 - PART_WIDTH**2) * deviations * x, -MAX_Z, MAX_Z)
         return Mixture(
             predicted.weights[..., None] + np.log(part_weights / part_weights.sum()),
-            2.0 * self.crossover * np.cosh(z) * PART_WIDTH * deviations,
+            2.0 * self.crossover * np.cosh(z) * PART_WIDTH * deviations,  # da/dz times the deviation of a part
             2.0 * self.crossover * np.sinh(z) - self.level,
         )
 
@@ -666,7 +671,8 @@ class Population:
         self._sample = np.unique(np.linspace(0, n - 1, min(n, MAX_RECORDINGS)).astype(int))
         healthy = candidates[:, self._sample[:, None], self._sample]
         eigen, basis = np.linalg.eigh(healthy)
-        # the other quantities are stored along these eigenvectors; axes (g, 1, n): 1 for the grid of sigma
+        # the other quantities are stored along these eigenvectors; axes (g, 1, n): 1 for the grid of sigma; `_cross`:
+        # covariance of each healthy value with the judged one; `_ones`: change of the values with their mean
         self._eigen, self._basis = np.maximum(eigen, 0.0)[:, None], basis
         self._cross = np.einsum("gij,gi->gj", basis, candidates[:, self._sample, n])[:, None]
         self._ones = basis.sum(axis=1)[:, None]
@@ -787,7 +793,7 @@ class _Oil(NamedTuple):
 
 
 def predict_thinning(recordings: Sequence[RecordingSums]) -> Array:
-    """Predict how much thinner oil raised the logarithm of the leakage of each recording (n + 1,), the judged one last.
+    """Predict by how much thin oil raised the log leakage of each recording (n + 1,), the judged one last.
 
     The predictions are relative to the mean over the n healthy recordings. They are all 0 if nothing shows the oil's
     viscosity.
@@ -819,19 +825,19 @@ def _oil_hypotheses(recordings: Sequence[RecordingSums]) -> list[_Oil]:
 def _oils_by_drop(recordings: Sequence[RecordingSums], unknown_deviation: float) -> list[_Oil]:
     """List the hypotheses by which the viscous drop of the motion shows the oil of `recordings`, the judged one last.
 
-    What resists the motion is known well at the top speed v, as friction + drop v. Its two parts are known less well,
-    since friction varies with speed and load. There are two hypotheses:
+    The resistance to the motion at the top speed v, friction + drop v, is known well. Friction and viscous drop are
+    known less well, since friction varies with speed and load. There are two hypotheses:
 
-    - Friction was what it is in the healthy recordings, and drop = (resistance at v - healthy friction) / v.
     - Friction changed, as if seals wore, and the drop is the fitted one.
+    - Friction was what it is in the healthy recordings, and drop = (resistance at v - healthy friction) / v.
 
-    Their probabilities follow from the judged friction and from the healthy drops: with an unknown scatter of the oil
-    between n days, their density goes with S^(-(n - 1) / 2), where S is the sum of the squares of the logarithms about
-    their mean and of the relative errors. Splitting the resistance wrongly makes the drops scatter more.
+    Their probabilities follow from the judged friction and from the n healthy drops. Splitting the resistance wrongly
+    makes these drops scatter more. With an unknown scatter, their density is proportional to S^(-(n - 1) / 2), where S
+    is the sum of the squares of their logarithms about the mean and of their relative errors.
 
-    A drop below its standard error is replaced by this error. A recording without a drop has the mean one, with the
-    error of unknown oil, whose logarithm has the standard deviation `unknown_deviation`. The list is empty if the
-    judged recording or all healthy ones have no drop.
+    A drop below its standard error is replaced by this error. A recording without a drop gets the mean drop, and the
+    error of unknown oil: `unknown_deviation`, the standard deviation of the logarithm of the leakage. The list is empty
+    if the judged recording or all healthy ones have no drop.
     """
     prior, no_fit = INFERENCE.oil, np.full(len(Resistance._fields), np.nan)
     friction, friction_error, drop, drop_error, speed = np.array(
@@ -845,9 +851,10 @@ def _oils_by_drop(recordings: Sequence[RecordingSums], unknown_deviation: float)
     friction, drop = sign * friction, sign * drop
     usual_friction, top_speed = (float(np.median(values[healthy])) for values in (friction, speed))
     drops, log_densities = [drop], np.zeros(1)
-    if min(usual_friction, friction[-1]) > 0.0:
+    if min(usual_friction, friction[-1]) > 0.0:  # else their ratio has no logarithm
         drops.append(drop + (friction - usual_friction) / top_speed)
         change = float(np.log(friction[-1] / usual_friction))
+        # prior deviations of this change under the two hypotheses: friction changed, or did not
         deviations = np.array([prior.friction_changes, prior.friction_session])
         log_densities = -0.5 * (change / deviations) ** 2 - np.log(deviations)
     shown_drops = np.maximum(drops, drop_error)  # (hypotheses, n + 1)
@@ -873,8 +880,9 @@ def coefficient_level(gram: Array, columns: Sequence[ColumnRoles]) -> tuple[floa
     """Estimate the leak coefficient, at least 0, and its standard error from the Gram matrices `gram` (E, m, m).
 
     `columns`: for each equation the indices of its columns by role (leak, motion, left side). The coefficients of the
-    other terms (nuisances) are eliminated from each equation by the Schur complement, and the equations are added up.
-    Both results are 0 if the matrices have no information on the leak.
+    other terms (nuisances) are eliminated from each equation by the Schur complement, and the equations are added up;
+    those that recordings do not share are already eliminated from `gram` (`eliminate_unshared`). Both results are 0 if
+    the matrices have no information on the leak.
     """
     precision, moment = 0.0, 0.0
     for e, roles in enumerate(columns):
@@ -910,6 +918,7 @@ def motion_change(judged: Array, healthy: Array, roles: ColumnRoles) -> tuple[fl
     # limited to a precision that is enough to fix a coefficient
     prior = np.where(is_free, 0.0, np.minimum(precision, 1e9 * np.diag(gram)))
     weights = np.where(np.isin(fitted, motion), np.diag(gram), 0.0)
+    # second right side: gives the variance of the weighted sum of the coefficients
     right_sides = np.column_stack([judged[fitted, roles.left] + prior * reference, weights])
     coefficients, error_weights = solve(gram + np.diag(prior), right_sides).T
     # means of the motion coefficients, times the sum of the weights, which cancels in both results
@@ -1021,7 +1030,8 @@ def compare_with_leak(
     reference = np.sum([recording.sums for recording in baseline], axis=0)
     residual_squares = []
     for is_rival in (False, True):
-        energy = moment = square_without = 0.0  # square of the tested column, its product with the residual, ...
+        # sums over the equations: square of the tested column, its product with the residual, square of the residual
+        energy = moment = square_without = 0.0
         for e, roles in enumerate(columns):
             gram = judged.sums[e]
             tested = roles.names.index(rival) if is_rival else roles.leak
@@ -1035,7 +1045,8 @@ def compare_with_leak(
             return None
         can_be_negative = is_rival and rival == AIR  # there may be less air, but oil only leaves
         gain = (moment if can_be_negative else max(moment, 0.0)) ** 2 / energy  # decrease of the residual square
-        residual_squares.append(max(square_without - gain, 1e-9 * abs(square_without) + TINY))
+        min_square = 1e-9 * abs(square_without) + TINY  # above rounding errors
+        residual_squares.append(max(square_without - gain, min_square))
     with_leak, with_rival = residual_squares
     return float(-0.5 * np.log(with_rival / with_leak))
 
@@ -1066,7 +1077,7 @@ def _residual_products(gram: Array, reference: Array, roles: ColumnRoles, *, has
     coefficients[compared] = -solve(reference[np.ix_(compared, compared)], reference[compared, roles.left])
     nuisance = [k for k in compared if has_leak or k != roles.leak]
     prior = roles.difference_precisions(nuisance, coefficients[nuisance], coefficients[roles.names.index(LEAK)])
-    coefficients[roles.left] = 1.0
+    coefficients[roles.left] = 1.0  # residual = left side - sum of the fitted terms
     products = gram @ coefficients
     products[roles.left] = coefficients @ products  # the residual's sum of squares
     # limited, as the prior on a coefficient of zero has an infinite precision

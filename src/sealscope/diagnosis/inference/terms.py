@@ -120,7 +120,7 @@ class Signals:
 
     @cached_property
     def speed(self) -> Array:
-        """Speed of the piston [m/s] at each sample, by a central difference of the position (constant at the ends)."""
+        """Speed of the piston [m/s] at each sample, by a central difference of x, held constant beyond the ends."""
         half_width = max(1, round(HALF_DIFFERENCE * self.rate))  # [samples]
         x = self._channels["x"]
         padded = np.concatenate([x[:1].repeat(half_width), x, x[-1:].repeat(half_width)])
@@ -209,7 +209,7 @@ def _extend_flags(starts: NDArray[np.bool_], length: int) -> NDArray[np.bool_]:
 
     The result has the shape (n + length - 1,).
     """
-    changes = np.zeros(len(starts) + length, dtype=int)  # of the number of runs that cover a sample
+    changes = np.zeros(len(starts) + length, dtype=int)  # +1 where a run begins, -1 past its end
     changes[: len(starts)] += starts
     changes[length:] -= starts
     return np.cumsum(changes)[:-1] > 0
@@ -424,7 +424,7 @@ def _external_leak_term(side: str, weight: float = 1.0) -> Term:
     """Make the term of an external leak from one side of the cylinder: its increments are `weight` max(p, 0) dt [Pa s].
 
     p is the gauge pressure of the `side`, "A" or "B", and dt the sampling interval. `weight`: factor of this flow in
-    the volume balance, 1 or 0 for a leak from A, -1 or 0 for a leak from B.
+    the volume balance, 1 for a leak from A, -1 for a leak from B, and 0 in a balance of the other chamber alone.
     """
     p = f"p_{side}"
 
@@ -528,9 +528,9 @@ def _chamber_equation(side: str, rig: Rig) -> Equation:
     """Make the volume balance of one chamber, `side` "A" or "B", of a cylinder behind a servo valve.
 
     The volume displaced by the piston equals the flow over the valve's edges, less compression and leakage. An overlap
-    of the edges (dead band) reduces the flow in both directions of motion. So does a leak, if p_A - p_B changes its
-    sign with the direction of motion, as friction does. Only the prior on a healthy piston separates a leak from an
-    overlap and from a change of friction.
+    of the edges (dead band) reduces the flow in both directions of motion. So does a leak, if friction makes p_A - p_B
+    change its sign with the direction of motion. Only the prior on a healthy piston separates a leak from an overlap
+    and from a change of friction.
     """
     is_A = side == "A"
     area = rig.cylinder.A_A if is_A else rig.cylinder.A_B

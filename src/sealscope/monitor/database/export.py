@@ -22,7 +22,7 @@ _LABELS = {"valid": "leak", "repaired": "leak", "invalid": "healthy"}
 
 
 def export_labels(store: MonitorStore, folder: Path) -> tuple[int, int]:
-    """Write all alarms and estimates of a monitor to `alarms.csv` and `estimates.csv`; return the rows of each.
+    """Write all alarms and estimates of a monitor to `alarms.csv` and `estimates.csv`; return how many of each.
 
     `store`: database of the monitor; `folder`: folder of the two files. The estimates from the start of an alarm's
     onset interval until its last mark are labelled: `leak` if the mark is `repaired` or `valid`, `healthy` if it is
@@ -32,7 +32,7 @@ def export_labels(store: MonitorStore, folder: Path) -> tuple[int, int]:
     rows = []
     # by actuator: start and stop [s] of an interval, and the columns `label` and `alarm` of the estimates in it
     intervals = defaultdict[str, list[tuple[float, float, dict[str, str]]]](list)
-    # in order of time, so that the label of the latest alarm is the last
+    # in order of time, at equal times in order of number: the label of the latest alarm is the last
     for alarm in sorted(reversed(store.alarms()), key=lambda alarm: float(alarm["raised_s"])):
         history = events[alarm["id"]]
         last_mark = next((event for event in reversed(history) if event["event"] in _LABELS), None)

@@ -59,7 +59,7 @@ class StoredRows:
     def add_estimates(self, actuator: str, estimates: Iterable[BlockEstimate], oil_celsius: float | None) -> None:
         """Add the leakage estimates of blocks of samples, each with the oil temperature [deg C], None if unknown.
 
-        `actuator`: name of the actuator from which the samples are.
+        `actuator`: name of the actuator of these blocks.
         """
         for estimate in estimates:
             total_ends = estimate.total_interval_lpm or (None, None)
@@ -248,7 +248,7 @@ class MonitorStore:
             delete_pending = tables.pending.delete().where(tables.pending.c.actuator == actuator)
             connection.execute(delete_pending, [{"name": name} for name in rows.actuators])
         if rows.events and self.engine.dialect.name == "postgresql":
-            # commit events in the order of their numbers: outputs never read an event with a smaller number later
+            # events are committed in the order of their numbers: otherwise an output could miss a smaller number
             connection.execute(sa.text("lock table events in exclusive mode"))
         for table in (tables.estimates, tables.pending, tables.events):
             if new_rows := getattr(rows, table.name):
@@ -381,8 +381,9 @@ class MonitorStore:
         if seconds is not None:
             newest = select(columns.t).where(is_chosen).order_by(columns.number.desc()).limit(1).scalar_subquery()
             is_chosen &= columns.t.between(newest - seconds, newest)
-        n_averaged = max(1, -(-self._value(select(func.count()).where(is_chosen)) // max_rows))  # rounded up
-        group = columns.number - columns.number % n_averaged  # running number with which the group of a row begins
+        n_estimates = self._value(select(func.count()).where(is_chosen))
+        n_averaged = max(1, -(-n_estimates // max_rows))  # estimates per row, rounded up
+        group = columns.number - columns.number % n_averaged  # first running number in the group of an estimate
         query = select(*(func.avg(columns[name]).label(name) for name in ("t", *tables.FIGURES)))
         return [dict(row._mapping) for row in self._rows(query.where(is_chosen).group_by(group).order_by(group))]
 
@@ -454,6 +455,7 @@ def _unpack_samples(data: bytes) -> StoredSamples:
     """Unpack a block of samples from the bytes in which the database stores it (`_pack_samples`)."""
     line, _, numbers = data.partition(b"\n")
     header = json.loads(line)
+    # a row of the times, then a row for each channel
     t, *channels = np.frombuffer(numbers, dtype="<f8").reshape(1 + len(header["units"]), -1)
     samples = Recording(t, dict(zip(header["units"], channels, strict=True)), header["units"], header["rate"])
     verdict = header.get("verdict")

@@ -40,7 +40,7 @@ class EventLines:
         self._store.deliver("lines", self._write_line)
 
     def _write_line(self, event: dict[str, Any]) -> bool:
-        """Write an event as one line of JSON, unless its alarm is shelved, and return True.
+        """Write an event as one line of JSON if it is to be announced (`is_announced`), and return True.
 
         Raises PartAway if the stream refuses the line or a part of it; the next call with the same event writes the
         rest. The line is not buffered, because a buffer would keep lines that a full disk refuses.
@@ -58,7 +58,7 @@ class EventLines:
                 self._stream.write(self._unwritten.decode())
                 return True
             self._stream.flush()
-            while self._unwritten:
+            while self._unwritten:  # `os.write` returns how many bytes it has written
                 self._unwritten = self._unwritten[os.write(file, self._unwritten) :]
         except (OSError, ValueError) as error:
             raise PartAway(getattr(error, "strerror", None) or error) from None
@@ -85,7 +85,7 @@ class Webhook:
     def from_settings(cls, actuators: WatchedActuators, table: WebhookSettings, settings: MonitorSettings) -> Self:
         """Build the output from its `table` of the settings; raise InputError if the token cannot be read.
 
-        `actuators`: provide the database with the events.
+        `actuators`: source of the events (their `store`).
         """
         token = read_secret(table.token_file, "webhook.token_file")
         return cls(actuators.store, table.url, token, table.timeout_s)
@@ -99,7 +99,7 @@ class Webhook:
         self._store.deliver("webhook", self._send_post)
 
     def _send_post(self, event: dict[str, Any]) -> bool:
-        """Post an alarm event unless its alarm is shelved; return True, or raise PartAway if it is not confirmed."""
+        """Post an event if it is to be announced (`is_announced`); return True, or raise PartAway if not confirmed."""
         if not is_announced(event):
             return True
         try:
@@ -115,7 +115,7 @@ class Webhook:
     async def _post(self, event: dict[str, Any]) -> None:
         """Send one event in a request; raise OSError if the status of the answer is not 200 to 299."""
         headers = {**self._headers, "Idempotency-Key": str(event["number"])}
-        client = httpx.AsyncClient(timeout=None)
+        client = httpx.AsyncClient(timeout=None)  # `asyncio.timeout` limits the whole request instead
         async with (
             asyncio.timeout(self._timeout),
             client,

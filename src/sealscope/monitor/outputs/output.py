@@ -41,7 +41,7 @@ class Output(Protocol):
     def from_settings(cls, actuators: WatchedActuators, table: Any, settings: MonitorSettings) -> Self:
         """Build the output from its `table` of the `settings`; raise InputError if a secret cannot be read.
 
-        `actuators`: provide the database with the events, and the summaries.
+        `actuators`: source of the events (their `store`) and of the summaries.
         """
 
     def deliver(self) -> None:

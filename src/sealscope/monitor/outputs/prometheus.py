@@ -54,7 +54,7 @@ def format_metrics(
     families: dict[str, Any] = {}
 
     def add(name: str, text: str, value: float | None, **labels: str) -> None:
-        """Add a value with its labels to the metric `name`, unless it is None. `text`: help text of the metric."""
+        """Add `value` with its labels to the metric `name`; do nothing for None. `text`: help text of the metric."""
         if value is not None:
             kind = CounterMetricFamily if name.endswith("_total") else GaugeMetricFamily
             families.setdefault(name, kind(name, text, labels=[*labels])).add_metric([*labels.values()], float(value))
@@ -73,8 +73,8 @@ def format_metrics(
             add("sealscope_passed_over_total", text, count, actuator=actuator, reason=reason)
     for reason, count in counters.items():
         add("sealscope_dropped_blocks_total", "Messages dropped by reason", count, reason=reason)
-    for part, outage_total in (parts or {}).items():
-        for (name, text), value in zip(_PART_METRICS.items(), outage_total, strict=True):
+    for part, part_values in (parts or {}).items():
+        for (name, text), value in zip(_PART_METRICS.items(), part_values, strict=True):
             add(name, text, value, part=part)
     for (name, text), value in zip(_QUEUE_METRICS.items(), queue_load or QueueLoad(), strict=True):
         add(name, text, value)

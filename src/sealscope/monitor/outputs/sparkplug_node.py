@@ -67,7 +67,7 @@ class SparkplugNode:
     def from_settings(cls, actuators: WatchedActuators, table: SparkplugSettings, settings: MonitorSettings) -> Self:
         """Build the node from its `table` of the settings; raise InputError if the password cannot be read.
 
-        `actuators`: provide the database with the events, the summaries, and the counters of dropped messages.
+        `actuators`: source of the events (their `store`) and the summaries, and counter of dropped messages.
         """
         broker = settings.mqtt
         assert broker is not None  # `MonitorSettings` refuses Sparkplug without a broker
@@ -120,13 +120,14 @@ class SparkplugNode:
         return spb.topic_of(self._settings.group, kind, self._settings.node, device)
 
     def _birth_number_metric(self) -> spb.SparkplugMetric:
+        """Build the metric bdSeq, the number that assigns a death message to its birth message."""
         return spb.SparkplugMetric(spb.BIRTH_SEQUENCE, self._birth_number, spb.INT64)
 
     def _death_message(self) -> tuple[str, bytes]:
         """Build topic and payload of the node's death message, which is the last will of the next connection.
 
-        The broker publishes this message when the connection is lost. Its number bdSeq, one more than that of the last
-        birth message, becomes the number of this connection and its birth message.
+        The broker publishes this message when that connection is lost. The death and birth messages of a connection
+        have the same number bdSeq (0 to 255), one more than that of the last birth message.
         """
         self._birth_number = (self._last_birth_number + 1) % 256
         payload = spb.SparkplugPayload(_milliseconds(None), (self._birth_number_metric(),))

@@ -52,7 +52,8 @@ class Admission:
         if n_failures < _FREE_ATTEMPTS:
             return 0.0
         doublings = min(n_failures - _FREE_ATTEMPTS, 30)  # limited, so that the power does not overflow
-        return max(0.0, last + min(_FIRST_PAUSE_S * 2.0**doublings, _MAX_PAUSE_S) - self._now())
+        pause = min(_FIRST_PAUSE_S * 2.0**doublings, _MAX_PAUSE_S)
+        return max(0.0, last + pause - self._now())
 
     def admits(self, address: str, token: str, *, session: bool = False) -> bool:
         """Return True if a token is right; count a wrong token for the client's IP `address`, and return False.
@@ -73,7 +74,7 @@ class Admission:
 
 
 def _network(address: str) -> str:
-    """Return the /64 network of an IPv6 address, any other address unchanged."""
+    """Return the /64 network of an IPv6 address, all of which one client may use; leave other addresses unchanged."""
     try:
         ip_address = ipaddress.ip_address(address)
     except ValueError:

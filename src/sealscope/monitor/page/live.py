@@ -191,6 +191,7 @@ def _envelope(t: Array, series: dict[str, Array]) -> dict[str, list[float | None
     for name, values in series.items():
         bins = values[first:].reshape(n_bins, bin_size)
         ends = np.stack([bins.min(axis=1), bins.max(axis=1)], axis=1)
+        # the minimum occurs before the maximum
         is_rising = (bins.argmin(axis=1) < bins.argmax(axis=1))[:, None]
         curves[name] = _round_to_json(np.where(is_rising, ends, ends[:, ::-1]).ravel())
     return curves
@@ -208,6 +209,7 @@ def _detail_curves(t: Array, signal: Array | None, pressure: str, detail_form: s
     missing_indices = np.flatnonzero(~np.isfinite(samples))
     first = missing_indices[-1] + 1 if missing_indices.size else 0
     samples = samples[first:]
+    # needs: one window of samples whose details do not depend on padding at the ends of the signal
     header: dict[str, Any] = {"of": pressure, "drawn": detail_form, "needs": min_samples() + WINDOW_SIZE - 1}
     if samples.size < header["needs"]:
         return {**header, "t": [], "has": int(samples.size)}
@@ -218,11 +220,11 @@ def _detail_curves(t: Array, signal: Array | None, pressure: str, detail_form: s
     except InputError:  # numbers overflow
         return {**header, "t": [], "has": 0}
     if detail_form == "details":
-        inside = transform.inside()
+        inside = transform.inside()  # without the samples that depend on padding
         series = {f"d{level}": row[inside] for level, row in enumerate(transform.values, 1)}
         return {**header, **_envelope(t[inside], series)}
     rows = {f"d{level}": _round_to_json(row, 4) for level, row in enumerate(windows.rms, 1)}
-    return {**header, "t": _round_to_json(t[windows.ends - 1], 4), **rows}
+    return {**header, "t": _round_to_json(t[windows.ends - 1], 4), **rows}  # at the last sample of each window
 
 
 def _motion_curves(t: Array, channels: dict[str, Array], rate: float) -> dict[str, Any]:

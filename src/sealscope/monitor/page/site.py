@@ -127,8 +127,8 @@ class _Pages:
         """Answer with the summaries of all actuators, most urgent first, and the state of the monitor, as JSON."""
         rows = rank_actuators(self._actuators.summaries(), self._store.alarms(open_only=True))
         rows = [{**row, "by_files": row["name"] in self._by_files} for row in rows]
-        budget = self._actuators.false_alarms_per_1000_h
-        return JSONResponse({"actuators": rows, **self._counters_and_outages(), "false_alarms_per_1000_h": budget})
+        limit = self._actuators.false_alarms_per_1000_h
+        return JSONResponse({"actuators": rows, **self._counters_and_outages(), "false_alarms_per_1000_h": limit})
 
     def actuator(self, request: Request) -> Response:
         """Answer with the summary, history, events and alarms of one actuator, as JSON.
@@ -148,7 +148,7 @@ class _Pages:
             "by_files": name in self._by_files,
             "course": self._store.history(name, seconds=seconds),
             "events": self._store.last_events(name),
-            "limit_lpm": settings.error_lpm or settings.warning_lpm or None,
+            "limit_lpm": settings.error_lpm or settings.warning_lpm or None,  # None instead of a limit of 0
             "alarms": self._store.alarms(actuator=name)[:50],
         }
         return JSONResponse(details)
@@ -198,10 +198,11 @@ class _Pages:
         return _EventStream(self._events(request, name, pressure, detail_form), self._remove_listener)
 
     def _remove_listener(self) -> None:
+        """Count one listener less; called at the end of an event stream."""
         self._n_listeners -= 1
 
     async def _events(self, request: Request, name: str, pressure: str, detail_form: str) -> AsyncIterator[str]:
-        """Yield the server-sent events that `changes` describes, as text, until the client or the monitor ends.
+        """Yield the server-sent events of `changes`, as text, until the client disconnects or the monitor ends.
 
         `name`: actuator whose curves are sent, "" for no curves; `pressure`: pressure whose wavelet details are drawn;
         `detail_form`: "rms" or "details". If too many actuators are viewed already, an event "live" states this error
@@ -230,6 +231,7 @@ class _Pages:
         return Response(self._render_metrics(self._actuators.summaries()), media_type=CONTENT_TYPE)
 
     def _render_metrics(self, summaries: Mapping[str, Mapping[str, Any]]) -> str:
+        """Format the metrics for Prometheus. `summaries`: summary of each actuator, {} in a database outage."""
         totals, load = self._supervisor.outage_totals(), self._queue_load()
         return format_metrics(summaries, self._actuators.counters, totals, load)
 
@@ -307,6 +309,7 @@ class _EventStream(StreamingResponse):
         self._on_end = on_end
 
     async def __call__(self, *connection: Any) -> None:
+        """Send the response to the client, and then call `on_end`; called by starlette."""
         try:
             await super().__call__(*connection)
         finally:
@@ -318,6 +321,7 @@ def _read_packaged(name: str) -> str:
 
 
 def _make_refusal(error: str, status: int, headers: dict[str, str] | None = None) -> JSONResponse:
+    """Build the answer that refuses a request, with the reason `error` and an HTTP status."""
     return JSONResponse({"error": error}, status, headers)
 
 
@@ -332,6 +336,7 @@ def _format_event(kind: str, values: Mapping[str, Any]) -> str:
 
 
 def _client_address(request: Request) -> str:
+    """Return the IP address of the client that sent a request, "" if it is unknown."""
     return "" if request.client is None else request.client.host
 
 

@@ -175,7 +175,7 @@ class _Connection:
         """Queue a received message; called by the library paho, whose connection would time out if this call waited.
 
         If the queue is full, a message of QoS 0 is dropped. A message of QoS 1 is left unacknowledged, and so are all
-        later ones of this connection; the broker sends them again over the next connection. Both are counted.
+        later ones of QoS 1 on this connection; the broker sends them again over the next. All of these are counted.
         """
         queue_entry, size = (self._connection, message), len(message.payload)
         if message.qos == 0:

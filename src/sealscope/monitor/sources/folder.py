@@ -80,9 +80,9 @@ class WatchedFolder:
         self.settle_s, self._is_stored = settle_s, is_stored
         watched = load_watched(settings.rig)
         self._rig, self._channel_map, self._rate = settings.rig, settings.map or watched.channel_map, settings.rate
-        # None keeps the machine's limit in its own unit: a limit of creep is compared with the creep
+        # None: the limit in the machine's file is used, in its own unit (a limit of creep is compared with the creep)
         self._limit_lpm = None if settings.error_lpm == watched.limit_lpm else settings.error_lpm
-        self._newest_s = self._end_s = newest_s
+        self._newest_s = self._end_s = newest_s  # start and end of the newest recording [s since 1970]
         # by identity of the file: time at which it was first found [s], and time of its first sample [s since 1970]
         self._first_found: dict[str, float] = {}
         self._starts: dict[str, float] = {}
@@ -101,7 +101,7 @@ class WatchedFolder:
         """
         files = sorted(self._files())  # by the time of their last change
         self._first_found = {file.identity: self._first_found.get(file.identity, time.monotonic()) for file in files}
-        self._submitted &= self._first_found.keys()
+        self._submitted &= self._first_found.keys()  # forget the files that are gone
         self._unreadable &= self._first_found.keys()
         self._read_ahead.clear()
         self._starts = {identity: start for identity, start in self._starts.items() if identity in self._first_found}

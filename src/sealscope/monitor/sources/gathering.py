@@ -83,8 +83,8 @@ class ValueGatherer:
         `t` [s]: time of the first sample, rounded to the sampling interval; the others follow at the sampling rate. NaN
         is an unknown value. Values without a finite time, and too many values at once, are dropped. If the time jumps
         forward by more than `_AHEAD_S`, the blocks continue after the pause with each channel's last value. If it jumps
-        back by more than `_AHEAD_S`, all earlier values are discarded. Only the first value of a channel may be so old:
-        the channel then counts as constant since the time of this value.
+        back by more than `_AHEAD_S`, all earlier values are discarded. But if the first value of a channel is so old,
+        nothing is discarded: the channel counts as constant since the time of this value.
         """
         # a double resolves the number of a sample up to 2^52
         if not math.isfinite(t) or abs(t * self.rate) > 2**52 or not 0 < len(values) <= MAX_SAMPLES:
@@ -151,14 +151,14 @@ class ValueGatherer:
                 return []
             # start at the first index at which every channel has a value
             first_indices = [min(channel.values) for channel in channels if channel.previous is None]
-            if not first_indices:
+            if not first_indices:  # each channel has a value from before: start at the first new value
                 first_indices = [min(min(channel.values) for channel in channels if channel.values)]
             self._start = max(first_indices)
-        newest = [channel.newest for channel in channels if channel.arrival >= self._now() - SILENT_S]
-        if not newest or None in newest:  # all channels are silent, or one has no value on the time axis
+        newest_indices = [channel.newest for channel in channels if channel.arrival >= self._now() - SILENT_S]
+        if not newest_indices or None in newest_indices:  # all are silent, or one has no value on the time axis
             return []
         blocks: list[Recording] = []
-        known_stop = min(index for index in newest if index is not None) + 1
+        known_stop = min(index for index in newest_indices if index is not None) + 1
         while known_stop - self._start >= self._length:
             stop = self._start + self._length
             samples = {name: channel.pop_values(self._start, stop) for name, channel in self._channels.items()}

@@ -86,7 +86,7 @@ def check_json_keys(values: Any, payload: bytes, n_colons: int) -> None:
     `values`: the decoded message; `payload`: its bytes; `n_colons`: number of colons that `check_json` counted. Each
     pair has a colon outside texts; if a key is repeated, `values` has fewer pairs than there are such colons.
     """
-    if _count_shallow_pairs(values) != n_colons:  # a quick test: unequal, too, if a text contains a colon
+    if _count_shallow_pairs(values) != n_colons:  # a quick test, which a colon within a text also fails
         unquoted = payload.replace(b"\\\\", b"").replace(b'\\"', b"").split(b'"')[::2]  # the parts outside texts
         check_keys(values, sum(part.count(b":") for part in unquoted))
 
@@ -94,7 +94,7 @@ def check_json_keys(values: Any, payload: bytes, n_colons: int) -> None:
 def check_keys(values: Any, n_pairs: int) -> None:
     """Check that no mapping of a message repeats a key; raise MessageLimit otherwise.
 
-    `values`: the decoded message; `n_pairs`: number of pairs in its bytes, which is larger if a key is repeated.
+    `values`: the decoded message, which has fewer pairs if a key is repeated; `n_pairs`: number of pairs in its bytes.
     """
     if _count_shallow_pairs(values) == n_pairs:  # a quick test
         return
@@ -246,7 +246,7 @@ def _scan_items(data: Any) -> tuple[int, int, int]:
             if number > (MAX_SAMPLES if major == _LIST else MAX_PAIRS):
                 return (_LONG_LIST if major == _LIST else _PAIRS), start, n_pairs
             depth += 1
-            n_left[depth] = number if major == _LIST or has_unknown_length else 2 * number
-            role[depth], n_items[depth] = major - _LIST, 0
+            n_left[depth] = number if major == _LIST or has_unknown_length else 2 * number  # a pair is two items
+            role[depth], n_items[depth] = major - _LIST, 0  # 0 in a list, 1 at the first key of a mapping
         elif major == _SIMPLE and not (20 <= info <= 22 or 25 <= info <= 27):  # false, true, null, floats
             return _VALUE, start, n_pairs

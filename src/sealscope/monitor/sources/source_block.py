@@ -213,6 +213,7 @@ def _parse_identity(value: Any) -> str:
     if value is None:
         return ""
     if isinstance(value, bool) or not isinstance(value, (str, int)):
+        # NO_CLOCK also stands for an invalid identity
         raise RefusedMessage(NO_CLOCK, f"id must be a text or a whole number, got {type(value).__name__}")
     if isinstance(value, int) and value.bit_length() > 64:
         raise RefusedMessage(NO_CLOCK, "a whole number as id must have at most 64 bits")
@@ -264,7 +265,10 @@ def _parse_mapping(payload: bytes) -> Mapping[str, Any]:
 
 
 def _parse_number(values: Mapping[str, Any], name: str) -> float:
-    """Read the entry `name` of a message as a finite number; raise RefusedMessage if it is anything else."""
+    """Read the time "t" or the sampling rate "rate" of a message as a finite number.
+
+    `values`: all entries of the message; `name`: "t" or "rate". Raises RefusedMessage if the entry is anything else.
+    """
     value = values.get(name)
     try:
         number = math.nan if isinstance(value, bool) or not isinstance(value, (int, float)) else float(value)

@@ -255,8 +255,8 @@ class SparkplugHost:
     ) -> Recording | None:
         """Build a recording in SI units from the samples in a message's metrics; return None if there are none.
 
-        `birth`: the birth of the actuator; `sent_ms` [ms since 1970]: time of sending, which metrics without a time
-        get. A single value of a slow channel, such as the oil temperature, is not a sample: `birth` stores it, and all
+        `birth`: the birth of the actuator; `sent_ms` [ms since 1970]: time of sending, used for metrics without a
+        time. A single value of a slow channel, such as the oil temperature, is not a sample: `birth` stores it, and all
         recordings repeat it until the next value. Raises RefusedMessage if the samples cannot be used.
         """
         channel_of = {name: channel for channel, name in birth.names.items() if channel != _RATE}
@@ -296,14 +296,17 @@ class SparkplugHost:
     def _sample_times(self, actuator: str, t: float, size: int, rate: float) -> Array:
         """Compute the times [s] of `size` samples at `rate` [Hz], the first at or near its stated time `t` [s].
 
-        `t` is in whole milliseconds. The expected start is one sampling interval after the previous sample of the
-        actuator. If `t` is within 3 ms of the expected start, the times begin at the expected start. If the rounding of
-        `t` cannot explain their difference, the times are shifted towards `t`, by at most `_MAX_SHIFT` samples.
+        `t` is truncated or rounded to whole milliseconds. The expected start is one sampling interval after the
+        previous sample of the actuator. If `t` is within 3 ms of it, the times begin at the expected start. If the
+        rounding of `t` cannot explain their difference, the times are shifted towards `t`, by at most `_MAX_SHIFT`
+        samples.
         """
         start, expected_start = t, self._next_starts.get(actuator, math.nan)
         if abs(expected_start - t) < 3.0 * _LATE_S:  # else samples are missing, or the clock was set
-            shift = min(max(expected_start, t - _EARLY_S), t + _LATE_S) - expected_start
-            start = expected_start + min(max(shift, -_MAX_SHIFT / rate), _MAX_SHIFT / rate)
+            # the true time nearest to the expected start that rounding or truncation may turn into `t`
+            possible_start = min(max(expected_start, t - _EARLY_S), t + _LATE_S)
+            shift, max_shift = possible_start - expected_start, _MAX_SHIFT / rate
+            start = expected_start + min(max(shift, -max_shift), max_shift)
         self._next_starts[actuator] = start + size / rate
         return np.asarray(start + np.arange(size) / rate)
 

@@ -95,7 +95,7 @@ def estimate_low_drifts(recording: Recording) -> LowDrifts | None:
     drifts = list[float]()
     for p, low in zip(pressures, lowest, strict=True):
         is_low = is_known & np.isfinite(p) & (p < low + prior.near)
-        is_at_charge = low < min(lowest) + prior.near and is_low.mean() > prior.share  # else fit no samples
+        is_at_charge = low < min(lowest) + prior.near and is_low.mean() > prior.share  # else fit no samples: NaN
         drifts += _fit_drift(recording.t, p, regressors, np.flatnonzero(is_low & is_at_charge))
     return LowDrifts(*drifts) if np.isfinite(drifts).any() else None
 
@@ -130,7 +130,8 @@ class ChargeTrend(NamedTuple):
         f = float(np.clip((onset - self.begin) / max(self.end - self.begin, TINY), 0.0, 1.0))
         expected = self.pressure * abs(flow) / volumes * (1.0 - f) ** 2 * (1.0 + 2.0 * f)
         deviation = float(np.hypot(self.error, CHANGES.charge.scatter))
-        # a fall by another cause has a wide, even density, here multiplied by the deviation as the normal densities are
+        # a fall by another cause has the probability `unlike` and the uniform density 1 / `zero_drift.size`; it is
+        # multiplied by the deviation, by which the normal densities below are not divided
         other_cause = CHANGES.charge.unlike * deviation / CHANGES.zero_drift.size
         with_loss = float(weights @ np.exp(-0.5 * ((self.fall - expected) / deviation) ** 2)) + other_cause
         without_loss = float(np.exp(-0.5 * (self.fall / deviation) ** 2)) + other_cause
@@ -158,7 +159,7 @@ def estimate_charge_trend(recording: Recording) -> ChargeTrend | None:
 
 
 def _regressors(recording: Recording, flow_channel: str) -> Array:
-    """Compute the quantities (n, 2 or 3) that also change the charge pressure: flow of the pump, and position.
+    """Compute the quantities (n, 2 or 3) that change the charge pressure besides a drift: pump flow and position.
 
     The first two columns are the positive and the negative part of the flow, relative to its largest magnitude. The
     third column, if the position is recorded, is the position [m] minus its mean. All are averaged over
@@ -177,9 +178,10 @@ def _regressors(recording: Recording, flow_channel: str) -> Array:
 def _fit_drift(t: Array, pressure: Array, regressors: Array, rows: NDArray[np.intp]) -> tuple[float, float]:
     """Estimate the drift [Pa/s] of the lower envelope of a pressure, and the standard error of the drift.
 
-    `t` [s] and `pressure` [Pa], (n,): the samples; `regressors` (n, k): pump flow and position, which are fitted
-    together with the drift; `rows`: indices of the samples to fit, which are thinned out if they are many. Both results
-    are NaN for fewer than `MIN_SAMPLES` samples.
+    The envelope is a robust fit in which samples above it count less than those below. `t` [s] and `pressure` [Pa],
+    (n,): the samples; `regressors` (n, k): pump flow and position, which are fitted together with the drift; `rows`:
+    indices of the samples to fit, which are thinned out if they are many. Both results are NaN for fewer than
+    `MIN_SAMPLES` samples.
     """
     rows = rows[:: max(1, len(rows) // MAX_SAMPLES)]
     if len(rows) < MIN_SAMPLES:
@@ -198,7 +200,7 @@ def _fit_drift(t: Array, pressure: Array, regressors: Array, rows: NDArray[np.in
         scale = WEIGHT_SCALE * float(np.median(below) if below.size else 0.0) + MIN_SCALE
         # 1/hypot is the root of a Cauchy weight; samples above the envelope count less
         weight = np.where(residual > 0.0, ABOVE, 1.0) / np.hypot(1.0, residual / scale)
-    slope = 0  # column of the time
+    slope = 0  # index of the column of the time, whose coefficient is the drift
     parts = equal_parts(len(rows))
     (jackknife_error,) = jackknife_errors(design * weight[:, None], values * weight, [slope], parts)
     error = np.hypot(jackknife_error, _envelope_error(time, residual))
@@ -208,8 +210,9 @@ def _fit_drift(t: Array, pressure: Array, regressors: Array, rows: NDArray[np.in
 def _envelope_error(time: Array, residual: Array) -> float:
     """Compute the standard error [Pa/s] of a lower envelope's slope from its scatter between n parts of a recording.
 
-    A part that lies off the envelope as a whole gets low weights in the robust fit, whose own standard error therefore
-    does not show it. With the quantile r_k (`BEGIN`) of the residuals in part k, and the mean time t_k of the part,
+    A part that lies off the envelope as a whole gets low weights in the robust fit. The standard error of that fit
+    therefore misses such a scatter. With the quantile r_k (`BEGIN`) of the residuals in part k, and the mean time t_k
+    of the part,
 
         error^2 = (sum (r_k - mean of r)^2 / (n - 2)) / sum (t_k - mean of t)^2.
     """
@@ -238,7 +241,7 @@ def compare_low_drifts(judged: LowDrifts, healthy: Sequence[LowDrifts]) -> Itera
         change = compare_estimates(LOW.format(side), DRIFT, drift, known[side], scatter)
         if change is not None:
             yield _with_size_prior(change, CHANGES.zero_drift)
-    # variance of each side's drift, including the variance between the healthy recordings
+    # variance of each side's drift, including the variance between the healthy recordings (0 if there are none)
     healthy_var = {side: float(np.var([drift.value for drift in known[side]] or [0.0])) for side in drifts}
     variances = {side: prior.scatter**2 + drift.deviation**2 + healthy_var[side] for side, drift in drifts.items()}
     falls = [mean for other in healthy if (mean := _mean_fall(other, variances)) is not None]

@@ -43,7 +43,8 @@ def duty_tests(recording: Recording) -> list[StepTest]:
     """
     length, cycle = len(recording) // BLOCKS, find_cycle(recording)
     if "x" in recording and cycle is not None:
-        # whole cycles; without a position the motion is that of the drive, which a leak changes within a cycle
+        # blocks of whole cycles; not without a position, as the motion is then the drive's, which a leak changes within
+        # a cycle
         cycle_samples = cycle * recording.rate
         length = round(max(1, math.ceil(length / cycle_samples)) * cycle_samples)
     time, blocks = _split_blocks(recording, length)
@@ -159,7 +160,8 @@ def sensor_features(blocks: Mapping[str, Array], rate: float) -> Iterator[tuple[
     """
     p_A, p_B = blocks["p_A"], blocks["p_B"]
     if channel := next((name for name in ("omega", "u", "theta", "x") if name in blocks), None):
-        # friction puts p_A - p_B in phase with the flow into A (1); with exchanged or reversed sensors it is -1
+        # friction puts p_A - p_B in phase with the flow into A, so that their correlation is near 1; with exchanged or
+        # reversed sensors it is near -1
         flow = blocks[channel] if channel in ("omega", "u") else np.gradient(blocks[channel], axis=1)
         difference = p_A - p_B - np.nanmean(p_A - p_B)
         covariance, pressure_variance, flow_variance = (
@@ -189,7 +191,7 @@ def _log_hum(blocks: Array, frequency: float) -> Array:
     halves = blocks[:, : 2 * length].reshape(-1, 2, length)
     halves = halves - halves.mean(axis=2, keepdims=True)
     distances = np.array([0.0, *_NEIGHBOURS, *np.negative(_NEIGHBOURS)])  # [bins], from the line
-    cycles = np.outer(np.arange(length), frequency + distances / length)
+    cycles = np.outer(np.arange(length), frequency + distances / length)  # (samples, bins); bin 0 is the line
     fourier = np.hanning(length)[:, None] * np.exp(-2j * np.pi * cycles)
     log_power = np.log((np.abs(halves @ fourier) ** 2).mean(axis=1))
     return np.asarray(log_power[:, 0] - log_power[:, 1:].mean(axis=1))
@@ -224,5 +226,6 @@ def feature_step_test(time: Array, values: Array) -> StepTest | None:
     if len(values) < MIN_BLOCKS or not np.isfinite(values).all() or not np.ptp(values) > 0.0:
         return None
     drift = _PRIORS.wander  # prior scale of a healthy machine's slow change, linear or as a random walk
-    precision = np.eye(len(values))  # independent errors of equal variance, which the test estimates
+    # independent errors of equal variance, which the test estimates; precision times values are the values
+    precision = np.eye(len(values))
     return two_sided_step_test(Information(time, precision, vector=values, slope=drift, walk=drift))

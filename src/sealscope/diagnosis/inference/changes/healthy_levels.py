@@ -78,7 +78,9 @@ class HealthyLevels:
     def compare(self, recording: Recording, baseline: Sequence[Healthy]) -> Iterator[Observable]:
         """Compare friction, drifts and spectra of a recording with those of healthy ones; yield one test for each.
 
-        Quantities that the recording or too many of the healthy recordings (`baseline`) lack are left out.
+        There are two kinds of drifts: of the pressures' lowest readings (`_low_drifts`), and of the pressures in motion
+        (`_compare_drifts`). Quantities that the recording or too many of the healthy recordings (`baseline`) lack are
+        left out.
         """
         judged = self.learn(recording)
         if judged is None:
@@ -121,7 +123,7 @@ def _compare_friction(judged: Summary, healthy: Sequence[Summary]) -> Observable
     ]
     if not choices:
         return None
-    _, judged_log, healthy_logs = min(choices, key=lambda choice: choice[0])  # with the smallest scatter
+    _, judged_log, healthy_logs = min(choices, key=lambda choice: choice[0])  # choice with the smallest scatter
     if judged_log is None:
         return None
     scatter = PriorScatter(deviation=prior.friction_scatter, recordings=prior.recordings)
@@ -136,9 +138,10 @@ def _log_frictions(
     `key`, `error_key`: keys of friction and standard error [Pa] in the summaries `judged` and `healthy`. The usual sign
     of the friction depends on the motion's channel; the sum of friction / error over the healthy recordings has this
     sign. As friction resists the motion, healthy frictions of the other sign show that the errors are too small. All
-    errors are therefore multiplied by the upper quartile of abs(friction) / error, taken as 0 for the usual sign, if
-    the quartile exceeds 1. A friction is usable if it has the usual sign and exceeds its error. The result for the
-    judged recording is None if its friction is not usable; healthy frictions that are not usable are left out.
+    errors are therefore multiplied by the upper quartile of a ratio over the healthy recordings, but at least by 1. The
+    ratio is 0 for a friction of the usual sign, and abs(friction) / error for one of the other sign. A friction is
+    usable if it has the usual sign and exceeds its error. The result for the judged recording is None if its friction
+    is not usable; healthy frictions that are not usable are left out.
     """
     known = [summary for summary in healthy if {key, error_key} <= set(summary)]
     if not known or not {key, error_key} <= set(judged):
@@ -169,7 +172,7 @@ def _compare_drifts(judged: Summary, healthy: Sequence[Summary]) -> Iterator[Obs
     healthy_drifts = [drifts for summary in healthy if (drifts := _drifts(summary)) is not None]
     prior = CHANGES.healthy
     scatter = PriorScatter(prior.drift, recordings=prior.drift_recordings, inflation=prior.drift_inflation)
-    tests = [  # of the drifts of p_A, p_B and p_A - p_B
+    tests = [  # tests of the drifts of p_A, p_B and p_A - p_B
         compare_estimates(name, DRIFT, judged_drifts[k], [drifts[k] for drifts in healthy_drifts], scatter)
         for k, name in enumerate(DRIFTS)
     ]
@@ -178,7 +181,7 @@ def _compare_drifts(judged: Summary, healthy: Sequence[Summary]) -> Iterator[Obs
 
 
 def _drifts(summary: Summary) -> tuple[Estimate, Estimate, Estimate] | None:
-    """Read the drifts of p_A, p_B and p_A - p_B in motion from a recording's summary [Pa]; None if it has none."""
+    """Read the drifts [Pa] of p_A, p_B and p_A - p_B in motion from a recording's summary; None if it has none."""
     if not set(summary) >= DRIFT_KEYS:
         return None
     drift_A, drift_B = (
@@ -237,6 +240,6 @@ def _estimate_drift(motion: Motion, pressure: Array) -> Estimate:
     """
     values = pressure[motion.rows]
     coefficients, weight = fit_robustly(motion.design, values)
-    # TIME is the column of the time over the recording's duration
+    # TIME is the column of the time over the duration: its coefficient is the drift over the whole recording
     (error,) = jackknife_errors(motion.design * weight[:, None], values * weight, [TIME], motion.strokes)
     return Estimate(float(coefficients[TIME]), influence_factor(weight) * float(error))

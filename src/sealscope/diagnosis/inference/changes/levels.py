@@ -134,7 +134,7 @@ def estimate_levels(recording: Recording) -> PressureLevels | None:
         return None
     means = np.array([recording["p_A"].mean(), recording["p_B"].mean()])
     rows = pressure_level_rows(recording.channels, recording.rate, means)
-    lengths = [len(recording) // count for count in _PRIORS.blocks]  # of a block [samples], from the shortest on
+    lengths = [len(recording) // count for count in _PRIORS.blocks]  # block lengths [samples], the shortest first
     cycle = find_cycle(recording)
     if cycle is not None:  # try blocks of whole cycles first
         cycle_samples = cycle * recording.rate
@@ -158,9 +158,9 @@ def pressure_level_rows(
     """Build the rows (n, m) of the fit of pressure levels: 1, sign of the speed, motion (`motion_columns`), p_A, p_B.
 
     The rows of samples at rest or without a known motion are zero. If no motion is recorded, the rows are 1, p_A, p_B.
-    `channels`: samples by channel name; `rate`: sampling rate [Hz]; `means` (2,) [Pa]: subtracted from the pressures;
-    `max_speed`: highest speed, by default the `top_speed` of `channels`. A sample is at rest below the fraction
-    `levels.slowest` (`priors.toml`) of this speed.
+    `channels`: samples by channel name; `rate`: sampling rate [Hz]; `means` (2,) [Pa]: subtracted from the pressures,
+    which limits rounding errors; `max_speed`: highest speed, by default the `top_speed` of `channels`. A sample is at
+    rest below the fraction `levels.slowest` (`priors.toml`) of this speed.
     """
     motion = motion_columns(channels, rate)
     pressures = np.column_stack([channels["p_A"], channels["p_B"]]) - means
@@ -241,8 +241,9 @@ def pattern_tests(time: Array, values: Array) -> tuple[LevelChange, ...]:
 def _whitening_matrix(values: Array) -> Array:
     """Compute the matrix (c, 4) that transforms pressure levels to c numbers with independent errors of equal variance.
 
-    The matrix is S^(-1/2), with the covariance S of the differences between neighbouring blocks. `values` (K, 4): the
-    four levels in each of K blocks (`PressureLevels`), of which c vary at all.
+    The matrix W is a root of the inverse of S, W' W = S^-1, where S is the covariance of the differences between
+    neighbouring blocks. `values` (K, 4): the four levels in each of K blocks (`PressureLevels`), of which c vary at
+    all.
     """
     varying = np.flatnonzero(np.ptp(values, axis=0) > 0.0)  # half differences are constant without a motion
     differences = np.diff(values[:, varying], axis=0)

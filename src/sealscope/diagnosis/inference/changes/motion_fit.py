@@ -85,7 +85,7 @@ def select_motion(recording: Recording) -> Motion | None:
     acceleration = average_over(AVERAGING_TIME, rate * np.gradient(speed), rate)
     is_known = np.isfinite(speed) & np.isfinite(acceleration) & np.isfinite(values)
     is_known &= np.isfinite(recording["p_A"]) & np.isfinite(recording["p_B"])
-    increments = np.diff(values) if is_position else values / rate  # of the position
+    increments = np.diff(values) if is_position else values / rate  # changes of the position between samples
     slowest = max_rest_rate(increments, rate, fraction=CHANGES.healthy.slowest)
     rows = np.flatnonzero(is_known & (np.abs(speed) > slowest))
     if len(rows) < MIN_ROWS:
@@ -204,7 +204,7 @@ def jackknife_errors(design: Array, values: Array, columns: Sequence[int], group
     normalised = design / scale
     matrices = np.array([normalised[part].T @ normalised[part] for part in parts])
     moments = np.array([normalised[part].T @ values[part] for part in parts])
-    # the last problem has all rows
+    # normal equations without each of the groups in turn, and last those of all rows
     matrices = np.concatenate([matrices.sum(axis=0) - matrices, matrices.sum(axis=0)[None]])
     moments = np.concatenate([moments.sum(axis=0) - moments, moments.sum(axis=0)[None]])
     eigenvalues, vectors = np.linalg.eigh(matrices)
@@ -257,7 +257,8 @@ def _fit_difference(recording: Recording, without_slow_changes: bool) -> Resista
     if motion is None:
         return None
     difference = recording["p_A"][motion.rows] - recording["p_B"][motion.rows]
-    design = np.delete(motion.design, TIME, axis=1)  # columns: sign of the speed (DIRECTION), SPEED, ...
+    # columns without the time: sign of the speed (DIRECTION), speed over `top_speed` (SPEED), ...
+    design = np.delete(motion.design, TIME, axis=1)
     if without_slow_changes:
         design, difference = remove_slow_changes(motion, design, difference, recording.t)
     coefficients, weight = fit_robustly(design, difference)

@@ -86,7 +86,7 @@ def compute_octaves(recording: Recording, pair: tuple[str, str] = CHAMBERS) -> O
     priors = CHANGES.octaves
     if not set(pair) <= set(recording.channels):
         return None
-    length = round(priors.seconds * recording.rate)  # of a window [samples]
+    length = round(priors.seconds * recording.rate)  # samples in a window
     highest = min(priors.highest, priors.share * recording.rate)
     n_octaves = int(np.log2(max(highest / priors.lowest, 1.0)))
     if n_octaves < MIN_OCTAVES or len(recording) < length:

@@ -147,10 +147,10 @@ def _step_hypotheses(
 ) -> Iterator[_Hypothesis]:
     """Yield the steps to test: of each term's coefficient, of leaks under other laws, and of the motion's scale.
 
-    `centred`: Gram matrices of the columns in blocks of the recording, without the sensor offset of p_A - p_B, for
-    laminar leaks; `recorded`: the same with the pressures as recorded; `terms`: the balance's terms; `columns`: for
-    each equation the indices of its columns by role (leak, motion, left side); `has_accumulator`: True if the
-    accumulator's volume shows external leaks.
+    `centred`: blocks of the recording without the sensor offset of p_A - p_B, for the tests of laminar leaks;
+    `recorded`: the same blocks with the pressures as recorded, for all other tests; `terms`: the balance's terms;
+    `columns`: for each equation the indices of its columns by role (leak, motion, left side); `has_accumulator`: True
+    if the accumulator's volume shows external leaks.
     """
     first = columns[0]
     for index, term in enumerate(terms):
@@ -158,10 +158,10 @@ def _step_hypotheses(
             blocks = centred if term.name in (LEAK, PUMP) else recorded
             signs = (1.0,) if term.cause in _ONE_WAY and term.name != BIAS else (1.0, -1.0)
             yield _Hypothesis(_observable_name(term), signs, information(blocks, columns, index))
-    # from blocks with the offset of p_A - p_B, since an offset has the same effect as another law
+    # pressures as recorded: the removed offset was estimated for a laminar leak, and may be the effect of another law
     leak = information(recorded, columns, first.leak)
     for exponent, shape in apparent_conductances(recorded, columns).items():
-        if exponent < 1.0:
+        if exponent < 1.0:  # 1 is the laminar leak, tested above
             yield _Hypothesis(f"{LEAK} of exponent {exponent:g}", (1.0,), leak, shape)
     scale = first.names.index(ORIFICE)  # the column of the orifice, no longer needed, takes the motion's volume
     yield _Hypothesis(SCALE, (1.0, -1.0), information(_with_fitted_motion(recorded, columns, scale), columns, scale))
@@ -210,7 +210,7 @@ def _accumulator_support(balance_test: StepTest, accumulator_test: StepTest) -> 
     onset = balance_test.onsets[balance_test.best]
     nearest = int(np.abs(accumulator_test.onsets - onset).argmin())
     sizes = np.array([accumulator_test.size[nearest], balance_test.fitted.size])
-    measured, expected = sizes / accumulator_test.deviation[nearest]  # in standard errors
+    measured, expected = sizes / accumulator_test.deviation[nearest]  # a/s and b/s
     return float(measured**2 - (measured - expected) ** 2)
 
 
@@ -226,7 +226,7 @@ def _with_fitted_motion(blocks: Blocks, columns: Sequence[ColumnRoles], index: i
         nuisance, motion = list(roles.nuisance), list(roles.motion)
         coefficients = np.zeros(len(total))
         coefficients[nuisance] = solve(total[np.ix_(nuisance, nuisance)], total[nuisance, roles.left])
-        transform = np.eye(len(total))  # from the old columns to the new ones
+        transform = np.eye(len(total))  # matrix from the old columns to the new ones
         transform[:, index] = 0.0
         transform[motion, index] = coefficients[motion]
         gram[:, equation] = transform.T @ gram[:, equation] @ transform

@@ -43,7 +43,7 @@ def sorted_part_means(pressure: Array, rate: float) -> Array:
         noise_gain = math.comb(2 * _ORDER, _ORDER)  # variance of a difference of white noise of variance 1
         # not by BLAS (@), whose rounding depends on the number of threads
         noise_variance = float((differences**2).sum()) / max(len(differences), 1) / noise_gain
-        variance = np.nansum(deviation**2, axis=(1, 2), keepdims=True) / (n_pieces * (piece - 1))  # in each stride
+        variance = np.nansum(deviation**2, axis=(1, 2), keepdims=True) / (n_pieces * (piece - 1))  # one per stride
         min_variance = max(noise_variance, np.finfo(float).tiny)
         deviation *= np.sqrt(1.0 - noise_variance / np.maximum(variance, min_variance))
     values = (mean + deviation).ravel()

@@ -87,7 +87,7 @@ def eliminate(matrix: Any, count: int) -> None:
 @law
 def median(values: Any, n: int) -> float:
     """Compute the median of the first n values, by quickselect, which reorders them."""
-    k, low, high = (n - 1) // 2, 0, n - 1
+    k, low, high = (n - 1) // 2, 0, n - 1  # k: index of the middle value, the lower one of two
     while low < high:
         pivot, i, j = values[k], low, high
         while i <= j:
@@ -148,7 +148,7 @@ def _reweigh(values: Any, ends: Any, column_order: Any, workspace: Any) -> bool:
     (r, m): rows; `ends`: index past the last row of each block; `column_order`: indices of the fitted columns, the left
     side last; `workspace`: a `Workspace` with the fit, whose weights and residuals are replaced.
     """
-    count, left, block = len(values), len(column_order) - 1, 0
+    count, left, block = len(values), len(column_order) - 1, 0  # left: position of the left side in `column_order`
     for r in range(count):
         while r >= ends[block]:  # find the block of row r
             block += 1

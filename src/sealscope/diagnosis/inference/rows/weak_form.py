@@ -126,6 +126,7 @@ def weights_near_holes(holes: Array, rate: float) -> Array:
     Holes are long gaps of missing samples that were filled in. `holes` (n,): 1 for a sample in a hole, else 0;
     `rate`: sampling rate [Hz]. The weights (r,) are between 0 and 1; a weight below `MIN_WEIGHT` is replaced by 0.
     """
-    hole_time = np.maximum(holes[1:], holes[:-1]) / rate  # of each interval that touches a hole [s]
+    # length [s] of each sampling interval that touches a hole, else 0: its integral is the fraction in holes
+    hole_time = np.maximum(holes[1:], holes[:-1]) / rate
     weights = 1.0 - weak_form_rows([hole_time], rate).values[:, 0]
     return np.where(weights < MIN_WEIGHT, 0.0, np.minimum(weights, 1.0))
