@@ -360,7 +360,7 @@ class Weighting:
         blocks and the sums over earlier blocks, which this object stores, are updated.
         """
         self._count += len(ends)
-        update_fraction = min(1.0, SUPPORT / self._count)  # a mean at first, then exponential forgetting
+        update_fraction = min(1.0, SUPPORT / self._count)  # the last fifth of all blocks counts most
         grams = []
         for equation_rows, columns, earlier_sums in zip(values, self._columns, self._earlier_sums, strict=True):
             fast, slow = np.array(columns.fast), np.array([*columns.slow, columns.left])
@@ -543,7 +543,7 @@ def _fit_nuisance(normal: _NormalEquations, prior: _Prior, n_polynomials: int, n
         prior_precision = np.minimum(precision.ravel(), 1e9 * np.diag(normal.gram))
         prior_moment = prior_precision * mean.ravel()
         coefficients = solve(gram + np.diag(prior_precision), moment + prior_moment)
-        previous, variance = variance, max(left_square - float(moment @ coefficients), min_variance) / n_rows
+        previous, variance = variance, max((left_square - float(moment @ coefficients)) / n_rows, min_variance)
         if abs(variance - previous) <= TOLERANCE * previous:
             break
     row_variance = max(OVERLAP * variance, np.finfo(float).tiny)
