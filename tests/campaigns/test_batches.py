@@ -110,7 +110,8 @@ def test_with_noise_the_scores_are_of_the_same_law(plan_with):
         assert not np.any(one == other)  # other noise of the same law
 
 
-@pytest.mark.parametrize("machines", [{}, pytest.param({"profile": "bench"}, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("machines", [{}, {"profile": "bench"}])
 def test_a_row_is_the_same_in_any_batch(plan_with, monkeypatch, machines):
     plan = plan_with(duration="4 s", onset="2 s", **machines)
     cases = list_cases(plan)[::6]
@@ -160,6 +161,7 @@ def test_rows_of_both_ways_are_not_mixed(plan_with, finished_tiny, finished_in_b
     assert ways == ["in batches", "run by run"]
 
 
+@pytest.mark.slow
 def test_a_case_that_fails_costs_no_other(plan_with):
     plan = plan_with([{"count": 5}, {"leak": "0.015 L/min", "count": 5}, {"leak": "30 L/min", "count": 2}])
     cases = [case for case in list_cases(plan) if case.use == "judge"]
@@ -190,6 +192,7 @@ def test_a_cell_that_cannot_be_run_costs_no_other(text):
             assert "vacuum" in rows[case.id].error
 
 
+@pytest.mark.slow
 def test_a_leak_that_asks_for_a_shorter_step_gets_it(plan_with):
     plan = plan_with([{"leak": "0.55 L/min", "count": 1}], detectors=["sign rule: d3 of p_A fell"])
     case = list_cases(plan)[-1]

@@ -67,6 +67,7 @@ def test_no_more_processes_than_two_a_core(call, tiny, tmp_path, monkeypatch):
     assert err.startswith("sealscope: --jobs 30: 4 processes are started, two a core\n")
 
 
+@pytest.mark.slow
 def test_in_batches_it_says_so_and_goes_on(call, tiny, tmp_path):
     folder = tmp_path / "mine"
     status, out, err = call("campaign", "run", tiny, "-o", folder, "--batch", "-j", "2")

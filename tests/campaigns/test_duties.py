@@ -47,6 +47,7 @@ def plan_of(folder, text):
     return load_plan(path)
 
 
+@pytest.mark.slow
 def test_a_machine_follows_its_target_under_its_load(tmp_path):
     plan = plan_of(tmp_path, PLAN)
     pi, flat = (case_experiment(plan, case) for case in list_cases(plan))

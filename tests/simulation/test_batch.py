@@ -175,7 +175,8 @@ def test_oil_boils_side_by_side_as_it_does_by_itself(check_rig, rms_of):
     np.testing.assert_allclose(simulate_batch([one], bounds=bounds).rms[0], rms_of(alone.recording, bounds), rtol=1e-6)
 
 
-@pytest.mark.parametrize("volumes", ["fixed", pytest.param("position", marks=pytest.mark.slow)])  # of throttled rigs
+@pytest.mark.slow
+@pytest.mark.parametrize("volumes", ["fixed", "position"])  # of throttled rigs
 def test_neither_order_nor_number_nor_threads_change_a_run(check_rig, volumes):
     experiments = [
         Experiment.of(
