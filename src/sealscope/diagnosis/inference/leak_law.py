@@ -4,7 +4,7 @@ The law of a leak is the exponent e of its flow c |p_A - p_B|^e. Such a leak, in
 changes the conductance of block k by c r_k. Here r_k is the regression coefficient of |p_A - p_B|^e on the pressure
 difference within the block. A step test with a size proportional to r_k in each block thus covers every law, and the
 healthy laminar leakage does not enter. A seal that continues to wear leaks more towards the end: the step grows by a
-fraction of its size. The flow of a step is a mixture over laws, growths and onsets, each weighted by its likelihood, and
+fraction of its size. The flow of a step is a mixture over laws, growths and onsets, weighted by their likelihood, and
 growths by their prior, too.
 
 A rise g, i.e. the conductance above that of the healthy recordings, is the regression coefficient of the leak's flow on
