@@ -1018,7 +1018,7 @@ def compare_with_leak(
 
         -log(residual sum of squares with the rival / the same with the leak) / 2.
 
-    A recording counts as `size.readings` independent residuals (`priors.toml`). While the rival (for example an
+    The caller multiplies it by the number of independent residuals of a recording. While the rival (for example an
     external leak) is fitted, the leak may differ as it does between healthy recordings. A negative coefficient is not
     fitted, except that of free air, of which there may be less. `columns`: for each equation the indices of its columns
     by role (leak, motion, left side).
@@ -1035,12 +1035,13 @@ def compare_with_leak(
         for e, roles in enumerate(columns):
             gram = judged.sums[e]
             tested = roles.names.index(rival) if is_rival else roles.leak
-            residual, nuisance, prior = _residual_products(gram, reference[e], roles, has_leak=is_rival)
+            # `products`: of the residual with each column, and last with itself
+            products, nuisance, prior = _residual_products(gram, reference[e], roles, has_leak=is_rival)
             regularised = gram[np.ix_(nuisance, nuisance)] + np.diag(prior)
-            solved = solve(regularised, np.column_stack([gram[nuisance, tested], residual[nuisance]]))
+            solved = solve(regularised, np.column_stack([gram[nuisance, tested], products[nuisance]]))
             energy += float(gram[tested, tested] - gram[tested, nuisance] @ solved[:, 0])
-            moment += float(residual[tested] - gram[tested, nuisance] @ solved[:, 1])
-            square_without += float(residual[-1] - residual[nuisance] @ solved[:, 1])
+            moment += float(products[tested] - gram[tested, nuisance] @ solved[:, 1])
+            square_without += float(products[-1] - products[nuisance] @ solved[:, 1])
         if not energy > 0.0:
             return None
         can_be_negative = is_rival and rival == AIR  # there may be less air, but oil only leaves

@@ -307,7 +307,7 @@ class BaselineLearning:
             self.squares += difference * (mean - self.mean)
 
     def freeze(self, version: int, end: float, hours: float, *, states_lpm: bool) -> WatchBaseline:
-        """Compute the baseline from the sums over blocks, which must contain at least `GROUP` blocks.
+        """Compute the baseline from the sums so far; at least `GROUP` blocks must have been added.
 
         `version`: 1 for the first baseline, increased by one after each repair; `end`: end of the last block [s];
         `hours`: operating time over which the baseline was learned [h]. With `states_lpm`, the baseline also states its
@@ -315,7 +315,9 @@ class BaselineLearning:
         """
         assert self.duty_low and self.duty_high and self.low is not None and self.high is not None
         level = self.total / self.blocks
-        lpm = level * self.flow / self.blocks if states_lpm else None
+        mean_flow = self.flow / self.blocks  # [L/min] at a level of 1
+        lpm = level * mean_flow if states_lpm else None
+        # standard deviation between the `count` groups of blocks
         deviation = math.sqrt(self.squares / (self.count - 1)) if self.count > 1 else 0.0
         healthy = HealthyLevel(level, self.low, self.high, deviation, known_s=end, count=self.count)
         return WatchBaseline(

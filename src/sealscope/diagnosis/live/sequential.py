@@ -171,8 +171,8 @@ class StepDetector:
         There is one onset for each of `PARTS`, the fractions of the block in which the leak is open. Every
         `_SELECT_EVERY` blocks, old onsets are thinned out.
         """
-        # with a small probability the variance of the coefficient's random walk changes; then all `WALKS` are equally
-        # likely
+        # at each block the variance of the coefficient's random walk changes with a small probability; after a change
+        # all `WALKS` are equally likely
         log_prior = np.logaddexp(np.log1p(-_PRIORS.changes) + self._log_weights, np.log(_PRIORS.changes / len(WALKS)))
         # the likelihood of n innovations e with variances S and the sum T of e^2 / S is T^(-n/2) times the product of
         # S^(-1/2). T begins with its value before the onset; the log likelihood before the onset is subtracted from the
@@ -180,6 +180,7 @@ class StepDetector:
         sums = np.zeros((_N_ROWS, len(WALKS), len(PARTS)))
         sums[_T] = self._squares
         sums[_LOG_PRIOR] = log_prior + 0.5 * (self._count * np.log(self._squares) + self._log_variances)
+        # number of innovations so far, number of the block, onset [s], and beginning of the block [s]
         onsets = np.array([[self._count, self._blocks, end - part * (end - begin), begin] for part in PARTS])
         self._sums = np.concatenate([self._sums, sums], axis=2)
         self._onsets = np.concatenate([self._onsets, onsets])
@@ -200,7 +201,7 @@ class StepDetector:
             return -np.inf
         # for each walk and onset the sums of f e / S, f^2 / S and e^2 / S: e is the error of a prediction, S its
         # variance, and f the response of e to a unit step (`take`)
-        a, b, T = self._sums[_A : _T + 1]
+        a, b, T = self._sums[[_A, _B, _T]]
         # fraction of T that a step of the best size explains, less than 1 so that its logarithm is finite
         explained = np.minimum(np.maximum(a, 0.0) ** 2 / (b * T), 1.0 - 1e-15)
         max_log_ratio = -0.5 * float(np.min(self._onsets[:, _N] * np.log1p(-explained)))
@@ -223,7 +224,8 @@ class StepDetector:
         """Compute the log likelihood ratios (v, q, j) of a rise of the coefficient to no step.
 
         v is the prior variance of the step's size (`SIZES`), q the variance of the random walk in a block (`WALKS`),
-        and j the onset. With the number n of innovations and their sums a, b and T (`take`),
+        and j the onset. Of n innovations e, errors of predictions with the variance S that answer a unit step by f, the
+        sums are a = sum f e / S, b = sum f^2 / S and T = sum e^2 / S (`take`):
 
             R = (1 + v b)^(-1/2) (1 - max(a, 0)^2 / ((b + 1/v) T))^(-n/2).
         """

@@ -80,11 +80,12 @@ class SignalWindow:
         speed = 0.0 if motion is None else top_speed(motion)
         max_speed = max(speed, float(self._rows[:, _SPEED].max(initial=0.0)) if self._rows.size else 0.0)
         fraction_moving = 1.0 if motion is None else float(time_in_motion(motion[None, :, 0], max_speed, rate)[0])
-        columns = pressure_level_rows(channels, rate, self._means, max_speed)  # rows of the mean pressures' fit
+        # design matrix of the regression of the mean pressures on the motion
+        design = pressure_level_rows(channels, rate, self._means, max_speed)
         single_block = {name: values[None] for name, values in channels.items()}  # arrays (1, n) of one block
         values = {**dict(log_amplitudes(single_block)), **dict(sensor_features(single_block, rate))}
         features = [float(values[name][0]) if name in values else np.nan for name in FEATURES]
-        n_samples, gram = len(channels["p_A"]), columns.T @ columns
+        n_samples, gram = len(channels["p_A"]), design.T @ design
         row = np.array([begin, begin + n_samples / rate, n_samples, speed, fraction_moving, *features, *gram.ravel()])
         # keep the last `WINDOW` blocks, but none with other channels
         stored = self._rows[1 - WINDOW :] if self._rows.shape[1:] == row.shape else np.empty((0, len(row)))

@@ -146,7 +146,7 @@ class Watch:
 
     @property
     def learned_with(self) -> tuple[Rig, Mapping[str, bool], float]:
-        """Settings of the learning: the rig, for each method whether L/min are stated, and the time to learn [h]."""
+        """Rig, whether L/min are stated (for each method), and time to learn [h], as the baseline is learned with."""
         return self._rig, self._litres, self.learn_hours
 
     @property
@@ -530,10 +530,11 @@ class Watch:
         return self._compared[is_after] if is_after.any() else self._compared[-1:]
 
     def with_cycle_means(self, estimate: BlockEstimate) -> BlockEstimate:
-        """Replace the flows in the last block's estimate by means over more blocks, and so over cycles of the machine.
+        """Replace the flows in the last block's estimate by means over more blocks, which cover cycles of the machine.
 
-        The means are over the blocks since the tests restarted, as they do after a pause or a change of duty. After an
-        alarm, the means are over the blocks since the onset of the leak. At most the last `RECENT` blocks are used.
+        The means are over the blocks since the tests last restarted, after a pause or a change of duty. After an alarm,
+        they are over the blocks since the onset of the leak. At most the last `RECENT` blocks are used. An estimate of
+        a block that was not judged is returned unchanged.
         """
         estimator = self._estimator
         if estimator is None or not (estimate.judged and len(self._compared)):

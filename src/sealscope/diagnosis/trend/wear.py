@@ -368,17 +368,20 @@ def score_changes(levels: Levels, n_healthy: int = 1, *, falls: bool = False, ma
     R [days] is a sum over all possible changes. Each term is the likelihood ratio of the change to no change, times the
     time between the recordings before and after the beginning of the change [days], at most `wait` (`priors.toml`). The
     first `n_healthy` recordings are assumed unchanged. With `falls` the test is for a downward step instead. With
-    `may_grow`, an even growth since the first recording does not count as a change.
+    `may_grow`, an even growth since the first recording does not count as a change. Returns log R of the recordings up
+    to each recording, and where the most probable change begins.
     """
     if falls:
         levels = replace(levels, value=-levels.value)
     n, changes = len(levels), _Changes.enumerate(levels, n_healthy, steps_only=falls)
-    # sums over the grid of tau and r: prior times likelihood with each change, and without a change
+    # sums of prior times likelihood with each change, and without a change, over a grid of the unknown scatter between
+    # recordings and of its correlated part
     log_terms, log_null = np.full((n, changes.begin.size), -np.inf), np.full(n, -np.inf)
     if not changes.begin.size:  # no change can begin: R = 0
         return ChangeScores(log_null, np.zeros(n, dtype=np.int64))
     for node in _evaluate_grid(levels, changes.profiles, may_grow=may_grow):
         log_null = np.logaddexp(log_null, node.log_null)
+        # a change of the size d has the likelihood ratio exp(b d - a d^2 / 2)
         a, b = node.a[:, changes.profile_index], node.b[:, changes.profile_index]
         log_terms = np.logaddexp(log_terms, node.log_null[:, None] + _log_mean_ratio(a, b, changes.scale * node.tau))
     # weighted likelihood ratio w_j LR_j(n) of each change; changes that begin after recording n do not count yet

@@ -57,7 +57,7 @@ class SparkplugNode:
         self._client = self._link.client
         self._client.on_connect = self._on_connect
         self._client.on_message = self._on_message
-        self._last_birth_number = self._birth_number = 0  # bdSeq of the last birth, and of this connection
+        self._sent_birth_number = self._connection_birth_number = 0  # bdSeq of the last birth, and of this connection
         self._seq = 255  # sequence number of the last message; the next is 0
         self._birth_due = threading.Event()
         self._sent_values: dict[str, dict[str, Any]] = {}  # by actuator and metric
@@ -81,7 +81,7 @@ class SparkplugNode:
         While there is no connection, nothing is sent.
         """
         if not self._link.is_open:
-            self._last_birth_number = self._store.position(_BIRTHS)
+            self._sent_birth_number = self._store.position(_BIRTHS)
             self._link.open(clean_start=True)
         self._link.check_thread()
         if not self._client.is_connected():
@@ -93,7 +93,7 @@ class SparkplugNode:
             except BaseException:
                 self._birth_due.set()
                 raise
-        if self._last_birth_number != self._birth_number:  # the birth of this connection is still due
+        if self._sent_birth_number != self._connection_birth_number:  # hosts ignore data before this connection's birth
             return
         self._store.deliver(_NAME, self._send_event)
         if time.monotonic() >= self._next_update:
@@ -121,7 +121,7 @@ class SparkplugNode:
 
     def _birth_number_metric(self) -> spb.SparkplugMetric:
         """Build the metric bdSeq, the number that assigns a death message to its birth message."""
-        return spb.SparkplugMetric(spb.BIRTH_SEQUENCE, self._birth_number, spb.INT64)
+        return spb.SparkplugMetric(spb.BIRTH_SEQUENCE, self._connection_birth_number, spb.INT64)
 
     def _death_message(self) -> tuple[str, bytes]:
         """Build topic and payload of the node's death message, which is the last will of the next connection.
@@ -129,7 +129,7 @@ class SparkplugNode:
         The broker publishes this message when that connection is lost. The death and birth messages of a connection
         have the same number bdSeq (0 to 255), one more than that of the last birth message.
         """
-        self._birth_number = (self._last_birth_number + 1) % 256
+        self._connection_birth_number = (self._sent_birth_number + 1) % 256
         payload = spb.SparkplugPayload(_milliseconds(None), (self._birth_number_metric(),))
         return self._topic("NDEATH"), spb.encode_payload(payload)
 
@@ -176,8 +176,8 @@ class SparkplugNode:
 
     def _send_births(self) -> None:
         """Send the birth messages of the node and of all devices, with the present values of all metrics."""
-        self._store.write_position(_BIRTHS, self._birth_number)
-        self._last_birth_number = self._birth_number
+        self._store.write_position(_BIRTHS, self._connection_birth_number)
+        self._sent_birth_number = self._connection_birth_number
         summaries = self._summaries()
         # alarms are read latest first: reversed, the latest of each actuator replaces the others
         latest = {alarm["actuator"]: alarm for alarm in reversed(self._store.alarms())}

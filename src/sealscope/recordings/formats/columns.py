@@ -289,9 +289,9 @@ def _apply_map(choice: ColumnMap, columns: Mapping[str, str]) -> None:
 
 
 def _apply_names(choice: ColumnMap) -> None:
-    """Add the channels and the time that are found by the names of columns to `choice`.
+    """Complete `choice` with the channels and the time column that the names of columns show.
 
-    Channels and a time that a map has already set stay as they are.
+    Channels and a time column that are already set, by the user's map, stay as they are.
     """
     labels = choice.labels
     for channel in CHANNEL_UNITS:
@@ -300,7 +300,8 @@ def _apply_names(choice: ColumnMap) -> None:
         column = _find_column(labels, channel, f"channel {channel}")
         column = _find_embedded_name(labels, channel) if column is None else column
         if column is not None and column != choice.time and column not in choice.channel_of:
-            unit, note = _choose_unit(channel, _find_unit(labels[column], channel), f"column {labels[column].whole}")
+            found_unit = _find_unit(labels[column], channel)
+            unit, note = _choose_unit(channel, found_unit, f"column {labels[column].whole}")
             choice.channels[channel] = Formula({column: 1.0}, 0.0, unit)
             if labels[column].name != channel:
                 choice.names[channel] = labels[column].whole
@@ -390,9 +391,10 @@ def _date_columns(choice: ColumnMap) -> list[int]:
 
 
 def _note_unused(choice: ColumnMap, used: Container[int | None]) -> None:
-    """Add a note on unused columns to `choice`, and list those with measured quantities, and with temperatures.
+    """Add a note on unused columns to `choice`, with a map by which some of them could be read.
 
-    `used`: numbers of the used columns. The note proposes a map by which some of the unused columns could be read.
+    Set `choice.unused` to those that contain measured quantities, and, if no column is T_oil,
+    `choice.unused_temperatures` to those that contain temperatures. `used`: numbers of the used columns.
     """
     unused = [label for i, label in enumerate(choice.labels) if i not in used and label.whole]
     choice.unused = tuple(label.whole for label in unused if is_measured(label))

@@ -177,13 +177,13 @@ def _detect_dialect(body: Sequence[str]) -> tuple[str, str, int]:
 def _split_heading(line: str, delimiter: str, width: int = 0) -> list[str]:
     """Split the heading line of a log into the names of columns.
 
-    If the delimiter is a blank, a unit in brackets stays with its name. The line is then split at wider spaces only, if
-    this gives `width` names, the number of columns, and splitting at all blanks does not.
+    If the delimiter is a blank, names end at each blank, but a unit in brackets stays with its name. If that does not
+    give one name for each of the `width` columns, and splitting at wider spaces does, names may contain single blanks.
     """
     if delimiter == " ":
         names = _SPACED_LABEL.findall(line)
         names_with_blanks = re.split(r"\s{2,}|\t", line.strip())
-        return names_with_blanks if len(names_with_blanks) == width != len(names) else names
+        return names_with_blanks if len(names) != width and len(names_with_blanks) == width else names
     return [cell.strip() for cell in split_cells(line, delimiter)]
 
 

@@ -398,10 +398,10 @@ def _convert_numbers(values: Array, unit: str | None, name: str, state: TimeStat
 def _convert_without_unit(values: Array, finite: Array, name: str, state: TimeState) -> _Seconds:
     """Convert a time column of numbers (n,) without a unit to seconds.
 
-    Returns (times (n,) [s], provenance of the start, lines for the history). `finite` (m,): the finite `values` of this
-    part of the log. Size and steps of the finite values of its first part show if all are days or seconds, and since
-    when. `name`: the column in messages; `state`: state of the column after the previous part, which is updated. Raises
-    InputError if the numbers count rows.
+    Returns (times (n,) [s], provenance of the start, lines for the history). A log may be read in parts. The size and
+    the steps of the finite values of the first part tell for the whole log whether the numbers are days or seconds, and
+    from which date they count. `finite` (m,): the finite `values` of this part; `name`: name of the column in messages;
+    `state`: state of the column after the previous part, which is updated. Raises InputError if the numbers count rows.
     """
     first = float(finite[0])
     is_first_part = state.head is None

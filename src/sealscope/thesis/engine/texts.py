@@ -29,13 +29,13 @@ def judge_claim(id: str, tests: Iterable[bool | None], kind: str = "", /, **valu
     """Judge the claim `id` by the tests of its parts (`claim_verdict`), and fill `values` into its texts.
 
     `tests`: results, None for a test that cannot be made. The texts are in `claims.toml` under `id`, or under `kind`
-    for claims that share texts. Three of the `values`, if given, replace a whole text: `sheet` (finding on the thesis's
-    data sheet), `simulation` (finding by simulation) and `why` (reason for the verdict). The others fill the
+    for claims that share texts. Three of the `values`, if given, replace a whole text: `sheet` (what the thesis's data
+    show), `simulation` (what a simulation shows) and `why` (reason for the verdict). The others fill the
     placeholders of the same name.
     """
     claims = load_texts("claims.toml")
     templates = dict(claims[kind or id])
-    # a claim without a text on the sheet gets the text of its chapter, by the prefix of its id
+    # a claim without a text `sheet` of its own gets that of its chapter, found by the prefix of its id
     templates.setdefault("sheet", next(text for prefix, text in claims["sheet"].items() if id.startswith(prefix)))
     replaced = {name: values[name] for name in ("sheet", "simulation", "why") if name in values}
     texts = {name: template.format(**values) for name, template in templates.items() if name not in replaced}

@@ -154,9 +154,9 @@ def sensor_features(blocks: Mapping[str, Array], rate: float) -> Iterator[tuple[
     """Yield the name and the values (K,) of each feature of the pressures that only a change of a sensor shifts.
 
     The features are the correlation of p_A - p_B with the flow, the noise of both pressures, the difference of their
-    noise, and the hum at the frequencies of the mains. The first word of a name is the kind of data that events list
-    (`Observable.data`), such as "noise". All names are in `SENSOR_FEATURES`. `blocks`: samples (K, length) by channel
-    name, including p_A and p_B, NaN where missing; `rate`: sampling rate [Hz].
+    noise, and the hum at the frequencies of the mains. The first word of a name, such as "noise", is its kind of data
+    (`Observable.data`). All names are in `SENSOR_FEATURES`. `blocks`: samples (K, length) of K blocks by channel name,
+    including p_A and p_B, NaN where missing; `rate`: sampling rate [Hz].
     """
     p_A, p_B = blocks["p_A"], blocks["p_B"]
     if channel := next((name for name in ("omega", "u", "theta", "x") if name in blocks), None):
@@ -176,7 +176,7 @@ def sensor_features(blocks: Mapping[str, Array], rate: float) -> Iterator[tuple[
     yield "noise of p_A beside that of p_B", noise_A - noise_B
     bin_width = rate / (p_A.shape[1] // 2)  # [Hz], of the spectra of half a block
     for hertz in _PRIORS.mains:
-        # the sampling rate must resolve the line and the neighbouring bins
+        # line and neighbouring bins must be below the highest frequency that counts, a fraction of the sampling rate
         if hertz + _NEIGHBOURS[-1] * bin_width < _PRIORS.highest * rate:
             yield f"hum of {hertz:g} Hz", _log_hum(p_A + p_B, hertz / rate)
 

@@ -65,9 +65,9 @@ def volume_observables(
 ) -> tuple[Observable, ...]:
     """Test the coefficients of a volume balance for a step up or down, or only up for leaks; highest score first.
 
-    A leak is also tested for flows proportional to a power of p_A - p_B below 1, and the motion of the piston for a
-    change of its scale by one factor. The `advantage` of an observable comes from the prior on its size, the sensor
-    offset, and the oil that the accumulator lost.
+    A leak is tested as a laminar flow, and as a flow proportional to a power of p_A - p_B below 1. The coefficients of
+    the motion are tested together, for a change of their common scale. The result has one observable for each test. Its
+    `advantage` comes from the prior on its size, the sensor offset, and the oil that the accumulator lost.
 
     - `blocks`: Gram matrices of the columns in blocks of the recording, without the sensor offset of p_A - p_B, for the
       tests of laminar leaks; `plain`: the same with the pressures as recorded, for all other tests.
@@ -91,6 +91,7 @@ def volume_observables(
             advantage = -leak_disadvantage
         else:
             advantage = -_size_penalty(name, step.fitted.size, recorded, columns[0].names, volume_ratio, flow_scale)
+        # a leak whose oil a check valve makes up has a name of its own, which ends with MADE_UP
         if (accumulator_test := oil_loss.get(name.removesuffix(MADE_UP))) is not None:
             advantage += _accumulator_support(step, accumulator_test)
         elif charge is not None and (name == OUTSIDE or name.startswith("external leak")):

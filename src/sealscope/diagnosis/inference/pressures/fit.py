@@ -61,8 +61,8 @@ class Priors(NamedTuple):
 
     @property
     def normal(self) -> Normal:
-        """Normal prior with the mean `centre` and the standard deviations `width`, without the random walk."""
-        return Normal(self.centre, np.diag(1.0 / self.variance), self.unit)
+        """Normal prior of the parameters' means over the recording: mean `centre`, standard deviations `width`."""
+        return Normal(self.centre, np.diag(1.0 / self.variance), self.unit)  # mean, precision, unit
 
     @property
     def variance(self) -> Array:

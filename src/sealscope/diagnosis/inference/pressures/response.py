@@ -120,10 +120,10 @@ class Segment:
         The residual is recorded minus simulated p_A - p_B, without its mean and the mains hum. The result (m,) is
         infinite for a set whose simulation diverges.
         """
-        states = self.states[:, np.zeros(len(sets), dtype=int)]  # column 0, once for each set
+        states = self.states[:, np.zeros(len(sets), dtype=int)]  # each set starts from the state in column 0
         simulated, _ = self.machine.simulate(self.command, sets, states)
-        residual, _, amplitudes = self._project_on_waves(self.dp - sets[:, SCALE, None] * simulated)
-        squares = self.dp.size * np.var(residual - amplitudes @ self.waves, axis=1)
+        difference, _, amplitudes = self._project_on_waves(self.dp - sets[:, SCALE, None] * simulated)
+        squares = self.dp.size * np.var(difference - amplitudes @ self.waves, axis=1)  # without the hum
         return np.asarray(np.nan_to_num(squares, nan=np.inf))
 
     def linearise(self, sets: Array) -> Linearisation:

@@ -157,7 +157,8 @@ class VolumeBalance:
     def _build_balance(self, recording: Recording, regime: RegimeBlocks) -> RecordedBalance:
         """Build the volume balance of a recording from its blocks.
 
-        `regime`: the blocks for one assumption on the valves while the pump rests, open or shut.
+        `regime`: the blocks for one assumption on the valves while the pump rests, open or shut. Shut valves hold the
+        load (`locked`), so that the holds measure leaks.
         """
         offset = float(regime.blocks.zero[0])  # sensor offset that was removed from p_A - p_B [Pa]
         oil_loss = compute_once(
@@ -268,7 +269,9 @@ class VolumeBalance:
     def observe(self, recording: Recording, baseline: Sequence[Healthy] = ()) -> Observed:
         """Report on a recording: tests of each term of the volume balance for a step, and the leakage.
 
-        The leakage is compared with that of the healthy recordings in `baseline` that have the same terms.
+        The leakage is compared with that of the healthy recordings in `baseline` that have the same terms. Without a
+        recorded flow of the pump, the creep of a load that valves hold shows the leakage. If neither can be judged, the
+        report says what is missing.
         """
         summaries = healthy_summaries(self, baseline)
         is_locked = _are_valves_shut(summaries)
@@ -280,7 +283,8 @@ class VolumeBalance:
         if balance is None or not self._is_held_by_valves(balance, summaries):
             return Observed(self.name, lack=_NO_CREEP.format(self.rig.circuit.needed_channels))
         balance = replace(balance, locked=is_locked)
-        # summaries list the terms without those of a pump that valves cut off at rest
+        # summaries do not list the leakage of a pump that turns or holds the load, which has terms of its own if valves
+        # cut the pump off at rest
         names = [name for name in balance.columns[0].names if name not in (TURNING, HOLDING)]
         comparable = [summary for summary in summaries if summary["terms"] == names]
         healthy = [_sums_from_summary(summary, balance.shut, balance.locked) for summary in comparable]

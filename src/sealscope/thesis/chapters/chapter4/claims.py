@@ -387,16 +387,16 @@ def _judge_drift(context: Context) -> Iterator[Claim]:
         return format_drift
 
     def differs(row: list[float]) -> Iterator[bool]:
-        """Yield for each closing True if the piston's drift differs from the drift without orifices by more than 1 %.
+        """Yield for each closing whether the drift differs from that without orifices by over `min_change`.
 
-        `row`: the drift [m] at each closing; the 1 % are of the magnitude of the drift without orifices.
+        `row`: the drift [m] at each closing.
         """
         return (abs(with_orifices - drift_without) > min_change for with_orifices in row)
 
     def grows(row: list[float]) -> Iterator[bool]:
-        """Yield for each closing but the first True if the piston drifts more than at the next smaller closing.
+        """Yield for each closing except the first whether the piston drifts more than at the closing before.
 
-        The magnitude must grow by more than 1 % of the drift without orifices. `row`: the drift [m] at each closing.
+        The magnitude must grow by more than `min_change`. `row`: the drift [m] at each closing.
         """
         return (abs(later) - abs(earlier) > min_change for earlier, later in itertools.pairwise(row))
 

@@ -262,9 +262,10 @@ def closing_figure(context: Context, item: Item) -> tuple[Figure, ...]:
 def volume_figure(context: Context, item: Item) -> tuple[Figure, ...]:
     """Draw how the pressures depend on the line volumes V_1 = V_2, which the thesis does not give.
 
-    The panels show the range of p_1, the range of p_A, and the mean of p_1 - p_A, for one command and closing.
+    The panels show the range of p_1, the range of p_A, and the mean of p_1 - p_A, for one command and throttles that
+    are closed by 25 %.
     """
-    command, closed = "3 sin(4t)", 25.0
+    command, closed = "3 sin(4t)", 25.0  # closed [%]
     volumes = _QUICK_VOLUMES if context.quick else _VOLUMES
     sweep = {volume: run_both_solvers(context, command, closed, Reading(V_line_cm3=volume)) for volume in volumes}
     measures: dict[str, Callable[[SimulatedRun], float]] = {

@@ -100,9 +100,13 @@ def _oil_factors(changes: Array) -> tuple[float, float, Array]:
 
 
 def _oil_deviations() -> Array:
-    """Return prior standard deviations (4,) of the changes of the oil's properties, in the order of `_oil_factors`."""
+    """Return prior standard deviations (4,) of the relative changes of the oil's properties.
+
+    They are those of the compressibility, the dead volumes of A and of B, and the free air, as in `_oil_factors`.
+    """
     prior = INFERENCE.held_oil
-    return np.array([prior.deviation, prior.dead_deviation, prior.dead_deviation, prior.air_deviation])
+    dead_volume_deviation = prior.dead_deviation
+    return np.array([prior.deviation, dead_volume_deviation, dead_volume_deviation, prior.air_deviation])
 
 
 def _lowest_changes() -> Array:
@@ -219,8 +223,8 @@ def residual_squares(regression: OilRegression, columns: Array, variance: float)
 
     `regression`: regression on the properties of the oil, linearised at their usual values; `columns` (r, o): volume
     leaked with a coefficient of 1 since each onset, at each reading; `variance`: variance of a reading, which weights
-    the priors on the properties against the readings. A property that would fall below its lower limit is at this
-    limit; compressibility and free air are limited to 0.
+    the priors on the properties against the readings. The properties are changes relative to their usual values, each
+    with a lower limit, which is -1 (nothing left) for compressibility and free air.
     """
     usual = np.zeros(4)
     leaked, oil = regression.leaked(usual), regression.slopes(usual)
@@ -229,7 +233,7 @@ def residual_squares(regression: OilRegression, columns: Array, variance: float)
     products /= np.outer(scale, scale)
     oil = oil / scale
     with_leaked, with_columns = oil.T @ leaked, oil.T @ columns  # (4,), (4, o)
-    lowest = scale * np.maximum(_lowest_changes(), -1.0)  # -1: no compressibility or no air in the linear regression
+    lowest = scale * np.maximum(_lowest_changes(), -1.0)  # -1: nothing left
     # The least squares within the limits are the smallest of c = 16 cases: some properties are at their limits, and the
     # others are free and within them.
     is_free = np.array(list(itertools.product((True, False), repeat=4)))  # (c, 4)
