@@ -229,6 +229,7 @@ def test_a_locked_hold_measures_the_seal_alone(leak: float) -> None:
     assert own.chambers.leaks.piston == pytest.approx(leak, rel=0.35, abs=2e-15)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("leak", few([2e-14, 0.0], 1))
 def test_the_bound_is_the_holds_where_they_know_better(leak: float) -> None:
     healthy = [learnt_sums(summary, shut=True, locked=True) for summary in summaries()]

@@ -204,6 +204,7 @@ def test_a_temperature_that_is_not_read_is_named_when_a_machine_is_commissioned(
     assert read.healthy[0].about["oil_degC"] == 41.5
 
 
+@pytest.mark.slow
 def test_files_of_one_name_in_several_folders_are_told_apart(healthy, tmp_path):
     for day, recording in enumerate((*healthy, ss.simulate(command="3 sin(4t)", duration="20 s", seed=4)), start=1):
         place = tmp_path / f"day{day}"
