@@ -13,6 +13,7 @@ from sealscope.diagnosis.inference.scatter import Rise
 from sealscope.diagnosis.inference.terms import AVERAGING_TIME, TURNING, find_rests
 from sealscope.diagnosis.inference.volumes.balance_leak import BalanceLeak
 from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
+from sealscope.diagnosis.inference.volumes.detector import _sign_log_odds as sign_log_odds
 from sealscope.diagnosis.inference.volumes.detector import _sums_from_summary as learnt_sums
 from sealscope.diagnosis.inference.volumes.recorded import RecordedBalance
 from sealscope.diagnosis.priors.inference import INFERENCE
@@ -248,6 +249,31 @@ def test_a_rise_that_began_within_the_recording_is_dated_by_the_holds() -> None:
         onset = BalanceLeak(VolumeBalance.name, judged, healthy).rise_onset
         assert (onset is None) == (since == 0.0)
         assert onset is None or onset.low <= since <= onset.high
+
+
+def test_healthy_recordings_tell_the_sign_of_the_flow() -> None:
+    """A recording that may have either sign takes that of the healthy ones; one that is sure of its own keeps it."""
+    recorded = recorded_blocks(press(3, shut=True), RIG)
+    assert recorded is not None
+    unsure = recorded._replace(sign_log_odds=(-0.3,))
+    for one in (recorded, unsure):  # neither has been reversed yet
+        assert one.with_sign_prior(np.zeros(1)) is one
+    assert recorded.with_sign_prior(np.array([-5.0])) is recorded
+    mirrored = unsure.with_sign_prior(np.array([5.0]))
+    e, left = 0, recorded.open.columns[0].left
+    before, after = recorded.open.blocks.gram[:, e], mirrored.open.blocks.gram[:, e]
+    np.testing.assert_array_equal(after[:, left, left], before[:, left, left])
+    np.testing.assert_array_equal(after[:, left, :left], -before[:, left, :left])
+    np.testing.assert_array_equal(after[:, :left, :left], before[:, :left, :left])
+    assert mirrored.shut is not None and not np.array_equal(mirrored.shut.blocks.gram, recorded.shut.blocks.gram)
+
+
+def test_the_healthy_sign_counts_no_more_than_a_sensor_that_was_rewired() -> None:
+    rewired = INFERENCE.sense.rewired
+    summaries = [{"sign_log_odds": np.array([12.0])}] * 9
+    assert sign_log_odds(summaries) == pytest.approx(np.log((1.0 - rewired) / rewired))
+    assert sign_log_odds([{}]) == 0.0
+    assert sign_log_odds([*summaries, {"sign_log_odds": np.array([1.0, 1.0])}]) == 0.0
 
 
 def test_means_of_neighbouring_samples_do_not_hide_the_noise_of_a_resting_pump() -> None:

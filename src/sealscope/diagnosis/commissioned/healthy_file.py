@@ -212,6 +212,7 @@ _BALANCE = table_type(
     shut_odds=(_Number, None),
     held_odds=(_Number, None),
     creep_odds=(_Number, None),
+    sign_log_odds=(_Array, None),
     flow=_Magnitude,
     pressure=_Magnitude,
     start_s=(_Time, None),

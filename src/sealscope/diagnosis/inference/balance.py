@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import replace
 from functools import cache, partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -85,6 +86,8 @@ class BlockStream:
         Time of the first sample [s].
     offset : float
         Sensor offset [Pa] that is subtracted from p_A - p_B.
+    left_signs : tuple of float
+        Sign of each balance's left side, 1 or -1; empty to estimate them from the first blocks.
     on_samples : callable, optional
         Called with the start time [s] and the samples of each block before the block is computed.
     """
@@ -97,6 +100,7 @@ class BlockStream:
         n_first: int | None = SUPPORT,
         start: float = 0.0,
         offset: float = 0.0,
+        left_signs: tuple[float, ...] = (),
         on_samples: Callable[[float, Mapping[str, Array]], None] | None = None,
     ) -> None:
         self._on_samples = on_samples
@@ -112,7 +116,8 @@ class BlockStream:
         self._rest_limits: RestLimits | None = None  # known after the first samples
         self._weighting, self._n_first = Weighting(self.columns), n_first
         self._absolute_offsets: dict[str, float] | None = None  # absolute minus gauge pressure [Pa] by channel
-        self._left_signs: tuple[float, ...] = ()  # sign of each balance's left side, known after the first blocks
+        self._left_signs = left_signs  # sign of each balance's left side, known after the first blocks
+        self.sign_log_odds: tuple[float, ...] = ()  # log odds that recorded signs are right, from the first blocks
         self.restart(start)
 
     def restart(self, begin: float) -> None:
@@ -200,8 +205,8 @@ class BlockStream:
         self._left_signs = tuple(float(sign) for sign in require_part(state, "signs", Sequence))
         self._weighting.load_state(require_part(state, "weighting", Mapping))
 
-    def _flow_signs(self, rows: Sequence[Array]) -> tuple[float, ...]:
-        """Estimate the sign of the recorded flow in each volume balance: 1 if it is right, -1 if a sensor is reversed.
+    def _flow_sign_log_odds(self, rows: Sequence[Array]) -> tuple[float, ...]:
+        """Compute for each volume balance the log odds that the recorded flow has the right sign, and is not reversed.
 
         `rows`: for each balance the rows (r, m) of its regression, one for each test function of the weak form.
 
@@ -216,7 +221,7 @@ class BlockStream:
         Each symptom has a z score, with the probability Phi(z) of a correct sign, except for a fraction of machines in
         which something else causes the score (`_sign_log_odds`).
         """
-        signs = []
+        odds_by_balance = []
         for balance, columns, values in zip(self._balances, self.columns, rows, strict=True):
             pressure, left = values[:, columns.leak], balance.flow_sign * values[:, columns.left]
             motion = values[:, [k for k in columns.motion if columns.names[k].startswith("motion")]].sum(axis=1)
@@ -229,8 +234,8 @@ class BlockStream:
             motion_z = _z_score(motion * left)
             if motion_z > 0.0:  # else either x or the flow may be reversed
                 log_odds += _sign_log_odds(motion_z, other_cause=INFERENCE.sense.sides)
-            signs.append(-1.0 if log_odds < 0.0 else 1.0)
-        return tuple(signs)
+            odds_by_balance.append(log_odds)
+        return tuple(odds_by_balance)
 
     def _build_blocks(self, samples: Mapping[str, Array], first: int, end: int) -> Blocks:
         """Compute the blocks with the indices `first` to `end` - 1 from `samples`, arrays by channel name.
@@ -253,7 +258,9 @@ class BlockStream:
         root_weights = np.sqrt(weights[is_counted])[:, None]  # a product of two entries of a row has its weight
         rows_by_balance = zip(*(batch.rows for batch in batches), strict=True)
         rows = [np.concatenate(parts)[is_counted] * root_weights for parts in rows_by_balance]
-        self._left_signs = self._left_signs or self._flow_signs(rows)
+        if not self._left_signs:
+            self.sign_log_odds = self._flow_sign_log_odds(rows)
+            self._left_signs = tuple(-1.0 if log_odds < 0.0 else 1.0 for log_odds in self.sign_log_odds)
         for equation_rows, columns, sign in zip(rows, self.columns, self._left_signs, strict=True):
             equation_rows[:, columns.left] *= sign
         # index past the last counted row of each block
@@ -365,7 +372,7 @@ def _sign_log_odds(z: float, other_cause: float) -> float:
 
         log odds = log((Phi(z) + c/2) / (Phi(-z) + c/2)).
 
-    `BlockStream._flow_signs` lists the three symptoms.
+    `BlockStream._flow_sign_log_odds` lists the three symptoms.
     """
     from scipy.special import ndtr
 
@@ -510,17 +517,40 @@ class RegimeBlocks(NamedTuple):
     columns: tuple[ColumnRoles, ...]
     shut: bool = False
 
+    def reverse_flow(self, is_reversed: Sequence[bool]) -> RegimeBlocks:
+        """Reverse the sign of the left side, a recorded flow, in each balance that is flagged in `is_reversed` (E,)."""
+        signs = np.ones((len(self.columns), self.blocks.gram.shape[-1]))
+        for e, roles in enumerate(self.columns):
+            signs[e, roles.left] = -1.0 if is_reversed[e] else 1.0
+        factors = signs[:, :, None] * signs[:, None, :]  # of products of two columns
+        blocks, plain = (replace(series, gram=series.gram * factors) for series in (self.blocks, self.plain))
+        return self._replace(blocks=blocks, plain=plain)
+
 
 class RecordedBlocks(NamedTuple):
     """Blocks of a recording under both assumptions on the valves while the pump rests (`regimes`).
 
     `open`: the pump stays connected to the cylinder; `shut`: valves cut it off, None if the machine never rests or the
-    balance does not allow this case; `odds`: log odds that valves cut it off.
+    balance does not allow this case; `odds`: log odds that valves cut it off. `sign_log_odds` (E,): log odds of each
+    balance that the recorded flow has the right sign; the blocks have the more probable sign.
     """
 
     open: RegimeBlocks
     shut: RegimeBlocks | None
     odds: float
+    sign_log_odds: tuple[float, ...]
+
+    def with_sign_prior(self, log_odds: Array) -> RecordedBlocks:
+        """Reverse each recorded flow whose sign is wrong by this recording and prior evidence together.
+
+        `log_odds` (E,): log odds of each balance, from other recordings, that the recorded flow has the right sign.
+        """
+        is_right = np.array(self.sign_log_odds) >= 0.0
+        is_reversed = ((np.array(self.sign_log_odds) + log_odds >= 0.0) != is_right).tolist()
+        if not any(is_reversed):
+            return self
+        shut = None if self.shut is None else self.shut.reverse_flow(is_reversed)
+        return self._replace(open=self.open.reverse_flow(is_reversed), shut=shut)
 
     def regime(self, odds: float) -> RegimeBlocks:
         """Return the blocks for the more probable state of the valves at rest: shut if `odds` > 0, else open.
@@ -553,15 +583,20 @@ def recorded_blocks(recording: Recording, rig: Rig) -> RecordedBlocks | None:
     start = float(recording.t[0])
     block_s = min(MAX_BLOCK_TIME, max(MIN_BLOCK_TIME, recording.duration / _BLOCKS.blocks))  # length of a block
 
-    @cache
-    def compute_blocks(offset: float) -> Blocks | None:
-        """Compute the blocks after subtracting `offset` [Pa] from p_A - p_B; None if no block is complete."""
-        stream = BlockStream(stream_balances, recording.rate, block_s, n_first=None, start=start, offset=offset)
-        return stream.push(samples, last=True)
-
-    recorded = compute_blocks(0.0)
+    make_stream = partial(BlockStream, stream_balances, recording.rate, block_s, n_first=None, start=start)
+    stream = make_stream()
+    recorded = stream.push(samples, last=True)
     if recorded is None:
         return None
+    signs = tuple(-1.0 if log_odds < 0.0 else 1.0 for log_odds in stream.sign_log_odds)
+
+    @cache
+    def compute_blocks(offset: float) -> Blocks:
+        """Compute the blocks after subtracting `offset` [Pa] from p_A - p_B."""
+        blocks = make_stream(offset=offset, left_signs=signs).push(samples, last=True) if offset else recorded
+        assert blocks is not None  # as many samples as for `recorded`
+        return blocks
+
     columns = ColumnRoles(stream_balances[0])
 
     odds = shut_odds(recorded, columns) if may_shut else 0.0
@@ -573,17 +608,16 @@ def recorded_blocks(recording: Recording, rig: Rig) -> RecordedBlocks | None:
         `shut`: true if valves cut the pump off from the cylinder while it rests, false if they do not.
         """
         blocks = compute_blocks(offset)
-        assert blocks is not None  # as many samples as for `recorded`
         if not may_shut:
             return blocks
         return apply_regime(blocks, columns, shut, has_holds=has_holds, is_certain=odds > INFERENCE.rest.locked)
 
     open_regime = _build_regime(balances, partial(compute_regime_blocks, shut=False))
     if not may_shut or not has_rests(recorded, columns):
-        return RecordedBlocks(open_regime, shut=None, odds=0.0)
+        return RecordedBlocks(open_regime, shut=None, odds=0.0, sign_log_odds=stream.sign_log_odds)
     shut_balances = tuple(shut_at_rest(balance) for balance in balances)
     shut_regime = _build_regime(shut_balances, partial(compute_regime_blocks, shut=True))._replace(shut=True)
-    return RecordedBlocks(open_regime, shut_regime, odds)
+    return RecordedBlocks(open_regime, shut_regime, odds, stream.sign_log_odds)
 
 
 def _longest_hold(samples: Mapping[str, Array], rate: float, balance: Equation) -> float:

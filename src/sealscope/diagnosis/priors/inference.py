@@ -197,11 +197,13 @@ class SensePriors(PriorTable):
     - `work`: the load gives back more work than it takes.
     - `leak`: offsets of sensors, compressed oil and losses of the pump look like a negative leak.
     - `sides`: the sides A and B are exchanged in the log.
+    - `rewired`: a recording has another sign than the healthy recordings before it.
     """
 
     work: float
     leak: float
     sides: float
+    rewired: float
 
 
 class HeldOilPriors(PriorTable):

@@ -47,7 +47,7 @@ from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.diagnosis.verdict.evidence import VOLUME_BALANCE
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.channels import flow_source
-from sealscope.recordings.recording import Recording, compute_once
+from sealscope.recordings.recording import Array, Recording, compute_once
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
@@ -115,17 +115,26 @@ class VolumeBalance:
                 return f"{name} is constant or missing"
         return None
 
-    def balance(self, recording: Recording, odds: float = 0.0, *, is_locked: bool = False) -> RecordedBalance | None:
+    def balance(
+        self,
+        recording: Recording,
+        odds: float = 0.0,
+        *,
+        is_locked: bool = False,
+        sign_log_odds: Array | float = 0.0,
+    ) -> RecordedBalance | None:
         """Set up the volume balance of a recording; None if its channels or its length allow none.
 
         `odds`: log odds, from healthy recordings, that valves cut the pump off from the cylinder while the pump rests;
-        `is_locked`: true if valves certainly cut the pump off, whatever this recording shows.
+        `is_locked`: true if valves certainly cut the pump off, whatever this recording shows; `sign_log_odds` (E,):
+        log odds of each balance, from healthy recordings, that the recorded flow has the right sign.
         """
         if not equations(self.rig, frozenset(recording.channels)):
             return self._balance_without_position(recording)
         recorded = self._compute_blocks(recording)
         if recorded is None:
             return None
+        recorded = recorded.with_sign_prior(np.asarray(sign_log_odds))
         # limits the log odds of this recording alone, since a leak in it can look like open valves
         max_odds: float = INFERENCE.rest.alone
         odds = np.inf if is_locked else odds + float(np.clip(recorded.odds, -max_odds, max_odds))
@@ -183,6 +192,7 @@ class VolumeBalance:
           odds that they do, from the leakage at rest;
         - `held`, `held_odds`, if it holds a load at rest: leaks while shut valves hold the load, and log odds that the
           valves are shut, from these leaks; `held_pump`, if known: leakage of the pump just before;
+        - `sign_log_odds`, with a position: log odds of each balance that the recorded flow has the right sign;
         - `creep_odds`, if no pump's flow is recorded (`is_creep`): log odds that the load creeps by leakage.
         """
         has_position_balance = bool(equations(self.rig, frozenset(recording.channels)))
@@ -192,6 +202,8 @@ class VolumeBalance:
             return None
         scale = balance.size.scale if balance.size.stated else 0.0
         summary = {name: value for name, value in balance.recording_sums._asdict().items() if value is not None}
+        if recorded is not None:
+            summary["sign_log_odds"] = np.array(recorded.sign_log_odds)
         if recorded is not None and recorded.shut is not None:
             shut_balance = self._build_balance(recording, recorded.shut)  # supposing that valves hold the load
             shut_sums, hold_odds = shut_balance.recording_sums, shut_balance.locked_log_odds(balance.conductance)
@@ -276,7 +288,7 @@ class VolumeBalance:
         summaries = healthy_summaries(self, baseline)
         is_locked = _are_valves_shut(summaries)
         odds = self._shut_log_odds(summaries, frozenset(recording.channels))
-        balance = self.balance(recording, odds, is_locked=is_locked)
+        balance = self.balance(recording, odds, is_locked=is_locked, sign_log_odds=_sign_log_odds(summaries))
         has_flow, has_position = flow_source(recording.channels) is not None, "x" in recording
         if balance is None and (has_flow or not has_position):
             return Observed(self.name, lack=_NO_BALANCE[has_position].format(recording.duration))
@@ -364,6 +376,20 @@ def compare_motion(
     )
     if observable is not None:
         yield observable
+
+
+def _sign_log_odds(summaries: Sequence[Summary]) -> Array | float:
+    """Compute the log odds, from summaries of healthy recordings, that the recorded flow has the right sign.
+
+    The result (E,) is for each of E balances; 0 if the summaries do not agree on E. It is limited since the sensor may
+    have been reversed since then (`sense.rewired` of `priors.toml`).
+    """
+    log_odds = [summary["sign_log_odds"] for summary in summaries if "sign_log_odds" in summary]
+    if len({len(values) for values in log_odds}) != 1:
+        return 0.0
+    rewired: float = INFERENCE.sense.rewired
+    limit = float(np.log((1.0 - rewired) / rewired))
+    return np.asarray(np.clip(np.sum(log_odds, axis=0), -limit, limit))
 
 
 def _are_valves_shut(summaries: Sequence[Summary]) -> bool:
