@@ -13,7 +13,7 @@ from sealscope.diagnosis.inference.scatter import Rise
 from sealscope.diagnosis.inference.terms import AVERAGING_TIME, TURNING, find_rests
 from sealscope.diagnosis.inference.volumes.balance_leak import BalanceLeak
 from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
-from sealscope.diagnosis.inference.volumes.detector import _sign_log_odds as sign_log_odds
+from sealscope.diagnosis.inference.volumes.detector import _healthy_sign_log_odds as healthy_sign_log_odds
 from sealscope.diagnosis.inference.volumes.detector import _sums_from_summary as learnt_sums
 from sealscope.diagnosis.inference.volumes.recorded import RecordedBalance
 from sealscope.diagnosis.priors.inference import INFERENCE
@@ -271,9 +271,10 @@ def test_healthy_recordings_tell_the_sign_of_the_flow() -> None:
 def test_the_healthy_sign_counts_no_more_than_a_sensor_that_was_rewired() -> None:
     rewired = INFERENCE.sense.rewired
     summaries = [{"sign_log_odds": np.array([12.0])}] * 9
-    assert sign_log_odds(summaries) == pytest.approx(np.log((1.0 - rewired) / rewired))
-    assert sign_log_odds([{}]) == 0.0
-    assert sign_log_odds([*summaries, {"sign_log_odds": np.array([1.0, 1.0])}]) == 0.0
+    assert healthy_sign_log_odds(summaries, 1) == pytest.approx(np.log((1.0 - rewired) / rewired))
+    assert healthy_sign_log_odds([{}], 1) == 0.0
+    other_channels = {"sign_log_odds": np.array([-1.0, 2.0])}
+    np.testing.assert_array_equal(healthy_sign_log_odds([*summaries, other_channels], 2), [-1.0, 2.0])
 
 
 def test_means_of_neighbouring_samples_do_not_hide_the_noise_of_a_resting_pump() -> None:

@@ -116,7 +116,7 @@ class BlockStream:
         self._rest_limits: RestLimits | None = None  # known after the first samples
         self._weighting, self._n_first = Weighting(self.columns), n_first
         self._absolute_offsets: dict[str, float] | None = None  # absolute minus gauge pressure [Pa] by channel
-        self._left_signs = left_signs  # sign of each balance's left side, known after the first blocks
+        self.left_signs = left_signs  # sign of each balance's left side, known after the first blocks
         self.sign_log_odds: tuple[float, ...] = ()  # log odds that recorded signs are right, from the first blocks
         self.restart(start)
 
@@ -183,7 +183,7 @@ class BlockStream:
             "first": self._first,
             "done": self._n_closed,
             "zeros": self._absolute_offsets,
-            "signs": list(self._left_signs),
+            "signs": list(self.left_signs),
             "weighting": self._weighting.state(),
         }
 
@@ -202,11 +202,11 @@ class BlockStream:
         if absolute_offsets is not None:
             absolute_offsets = {name: float(offset) for name, offset in absolute_offsets.items()}
         self._absolute_offsets = absolute_offsets
-        self._left_signs = tuple(float(sign) for sign in require_part(state, "signs", Sequence))
+        self.left_signs = tuple(float(sign) for sign in require_part(state, "signs", Sequence))
         self._weighting.load_state(require_part(state, "weighting", Mapping))
 
     def _flow_sign_log_odds(self, rows: Sequence[Array]) -> tuple[float, ...]:
-        """Compute for each volume balance the log odds that the recorded flow has the right sign, and is not reversed.
+        """Compute for each volume balance the log odds that the recorded flow has the right sign.
 
         `rows`: for each balance the rows (r, m) of its regression, one for each test function of the weak form.
 
@@ -258,10 +258,10 @@ class BlockStream:
         root_weights = np.sqrt(weights[is_counted])[:, None]  # a product of two entries of a row has its weight
         rows_by_balance = zip(*(batch.rows for batch in batches), strict=True)
         rows = [np.concatenate(parts)[is_counted] * root_weights for parts in rows_by_balance]
-        if not self._left_signs:
+        if not self.left_signs:
             self.sign_log_odds = self._flow_sign_log_odds(rows)
-            self._left_signs = tuple(-1.0 if log_odds < 0.0 else 1.0 for log_odds in self.sign_log_odds)
-        for equation_rows, columns, sign in zip(rows, self.columns, self._left_signs, strict=True):
+            self.left_signs = tuple(-1.0 if log_odds < 0.0 else 1.0 for log_odds in self.sign_log_odds)
+        for equation_rows, columns, sign in zip(rows, self.columns, self.left_signs, strict=True):
             equation_rows[:, columns.left] *= sign
         # index past the last counted row of each block
         block_ends = np.cumsum(is_counted.reshape(-1, self._strides_per_block).sum(axis=1))
@@ -588,12 +588,13 @@ def recorded_blocks(recording: Recording, rig: Rig) -> RecordedBlocks | None:
     recorded = stream.push(samples, last=True)
     if recorded is None:
         return None
-    signs = tuple(-1.0 if log_odds < 0.0 else 1.0 for log_odds in stream.sign_log_odds)
 
     @cache
     def compute_blocks(offset: float) -> Blocks:
         """Compute the blocks after subtracting `offset` [Pa] from p_A - p_B."""
-        blocks = make_stream(offset=offset, left_signs=signs).push(samples, last=True) if offset else recorded
+        if not offset:
+            return recorded
+        blocks = make_stream(offset=offset, left_signs=stream.left_signs).push(samples, last=True)
         assert blocks is not None  # as many samples as for `recorded`
         return blocks
 

@@ -172,7 +172,7 @@ def estimate_holding_period(t: Array, values: Array) -> float | None:
         return None
     median_duration = float(np.median(durations))
     is_regular = np.abs(durations - median_duration) <= _PRIORS.spread * median_duration
-    if np.mean(is_regular) < max(_PRIORS.share, 1.0 / durations.size):
+    if np.mean(is_regular) < _PRIORS.share:
         return None
     period = float(durations[is_regular].mean())
     return period if period >= _PRIORS.shortest else None

@@ -287,8 +287,10 @@ class VolumeBalance:
         """
         summaries = healthy_summaries(self, baseline)
         is_locked = _are_valves_shut(summaries)
-        odds = self._shut_log_odds(summaries, frozenset(recording.channels))
-        balance = self.balance(recording, odds, is_locked=is_locked, sign_log_odds=_sign_log_odds(summaries))
+        channels = frozenset(recording.channels)
+        odds = self._shut_log_odds(summaries, channels)
+        sign_log_odds = _healthy_sign_log_odds(summaries, len(equations(self.rig, channels)))
+        balance = self.balance(recording, odds, is_locked=is_locked, sign_log_odds=sign_log_odds)
         has_flow, has_position = flow_source(recording.channels) is not None, "x" in recording
         if balance is None and (has_flow or not has_position):
             return Observed(self.name, lack=_NO_BALANCE[has_position].format(recording.duration))
@@ -378,18 +380,17 @@ def compare_motion(
         yield observable
 
 
-def _sign_log_odds(summaries: Sequence[Summary]) -> Array | float:
-    """Compute the log odds, from summaries of healthy recordings, that the recorded flow has the right sign.
+def _healthy_sign_log_odds(summaries: Sequence[Summary], n_balances: int) -> Array:
+    """Compute the log odds of each volume balance, from healthy recordings, that the recorded flow has the right sign.
 
-    The result (E,) is for each of E balances; 0 if the summaries do not agree on E. It is limited since the sensor may
-    have been reversed since then (`sense.rewired` of `priors.toml`).
+    The log odds in the `summaries` with as many balances are added, to an array (n_balances,). The sums are limited,
+    since the sensor may have been reversed since then (`sense.rewired` of `priors.toml`).
     """
-    log_odds = [summary["sign_log_odds"] for summary in summaries if "sign_log_odds" in summary]
-    if len({len(values) for values in log_odds}) != 1:
-        return 0.0
+    recorded = (summary.get("sign_log_odds", ()) for summary in summaries)
+    total = sum((values for values in recorded if len(values) == n_balances), start=np.zeros(n_balances))
     rewired: float = INFERENCE.sense.rewired
     limit = float(np.log((1.0 - rewired) / rewired))
-    return np.asarray(np.clip(np.sum(log_odds, axis=0), -limit, limit))
+    return np.clip(total, -limit, limit)
 
 
 def _are_valves_shut(summaries: Sequence[Summary]) -> bool:

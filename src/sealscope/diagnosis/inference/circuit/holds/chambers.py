@@ -163,11 +163,6 @@ class HeldChambers:
         """
         return [flags | ~np.array(refilled)[:, None] for flags in self._above_charge]
 
-    @cached_property
-    def _is_never_refilled(self) -> bool:
-        """True if both chambers are above the charge pressure in all holds, so that check valves stay closed."""
-        return self._closed_share(BOTH) == 1.0
-
     def _closed_share(self, refilled: tuple[bool, bool]) -> float:
         """Compute the fraction of the samples of both sides in all holds in which no check valve refills the chamber.
 
@@ -394,7 +389,8 @@ class HeldChambers:
         leak's law (`LeakLaw`).
         """
         grid, fits = self._offset_grid, list[tuple[float, PistonFit]]()
-        for refilled in (NEITHER,) if self._is_never_refilled else (NEITHER, self._refillable_sides):
+        is_never_refilled = self._closed_share(self._refillable_sides) == 1.0
+        for refilled in (NEITHER,) if is_never_refilled else (NEITHER, self._refillable_sides):
             posteriors = [self._find_onset(float(offset), refilled, exponent)[0] for offset in grid]
             best = int(np.argmax(posteriors))
             refined = np.linspace(grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)], N_REFINED)
@@ -497,7 +493,7 @@ class HeldChambers:
         the oil that leaves the chamber, so no refilling is assumed.
         """
         # without a charge pressure check valves stay closed
-        chambers = self if self._is_never_refilled else replace(self, charge=0.0)
+        chambers = self if self._closed_share(BOTH) == 1.0 else replace(self, charge=0.0)
         sides = (True, False)
         leaks = [chambers._unit_outside_leak(is_A) for is_A in sides]
         leaks += [chambers._unit_pump_leak(is_A) for is_A in sides]
