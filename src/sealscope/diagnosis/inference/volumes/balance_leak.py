@@ -241,7 +241,8 @@ class BalanceLeak:
         values, noise_deviations, oil_deviations, _ = np.array([law_fit.fit for law_fit in chambers.law_fits]).T
         log_weights = np.array([law_fit.log_weight for law_fit in chambers.law_fits])
         weights = np.exp(log_weights - log_weights.max())
-        deviations = np.hypot(noise_deviations, oil_deviations)
+        begin_errors = np.array([chambers.begin_error(conditions, law) for law, conditions, _, _ in chambers.law_fits])
+        deviations = np.sqrt(noise_deviations**2 + oil_deviations**2 + (begin_errors * values) ** 2)
         return _HoldLaws(weights / weights.sum(), np.array(units), values * units, deviations * units)
 
     def _rise_laws(self) -> list[LawWeight]:
