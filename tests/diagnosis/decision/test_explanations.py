@@ -139,6 +139,18 @@ def test_what_an_event_disturbs_speaks_for_it_only_where_it_shows_itself() -> No
     assert together.probability > 100.0 * apart.probability
 
 
+def test_air_that_shows_itself_also_explains_the_ringing_and_the_charge_pressure() -> None:
+    """Oil with air rings at another pitch, and raises the pressure of a closed circuit."""
+    side_effects = [
+        observable("details: rise of d4 of p_A", 1e-16),
+        observable("noise of details: rise of d4 of p_A", 1e-16),
+        observable("levels: what feeds both chambers", 1e-10),
+    ]
+    best = explain([observable("volumes: free air", 1e-16), *side_effects])[0]
+    assert [event.name for event in best.events] == ["air"]
+    assert not explain(side_effects)[0].has("air")
+
+
 def test_rivals_of_the_same_data_are_not_added_up() -> None:
     """Two descriptions of one residual are one: a second one as good adds nothing to the first."""
     twice = [LEAK, observable("volumes: leak through an orifice", LEAK.chance)]
