@@ -25,6 +25,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -35,6 +36,10 @@ from sealscope.recordings.recording import Array
 
 #: Fraction of the sum of squares of p_A - p_B below which a state of the machine does not occur, but for rounding.
 NEGLIGIBLE = 1e-6
+#: How the names of the terms of the chambers' compliance begin (`terms`).
+COMPLIANCES = ("compliance", "free air", "dissolving air")
+#: Least number of blocks with motion, and without, from which the leakage of either state is estimated by itself.
+MIN_STATE_BLOCKS = 2
 
 
 def apply_regime(blocks: Blocks, roles: ColumnRoles, shut: bool, *, has_holds: bool, is_certain: bool) -> Blocks:
@@ -113,25 +118,78 @@ def shut_odds(blocks: Blocks, roles: ColumnRoles) -> float:
 
     The leakage at rest is compared with zero and with the leakage in motion (`rest_log_odds`). Positive log odds mean
     that valves cut the pump off. The log odds are limited to +-`rest.most` of `priors.toml`, and are 0 if the recording
-    says nothing about the valves. `roles`: indices of the columns of `blocks` by role. The columns must include
-    `TURNING` and `HOLDING`, the additional leakage while the pump moves the piston and while it holds the load, and
-    `MOVING_BIAS`, the additional flow offset in motion (`terms.with_rests`).
+    says nothing about the valves, for example since the pump never rests for long. `roles`: indices of the columns of
+    `blocks` by role. The columns must include `TURNING` and `HOLDING`, the additional leakage while the pump moves the
+    piston and while it holds the load, and `MOVING_BIAS`, the additional flow offset in motion (`terms.with_rests`).
     """
-    if _is_always_on(blocks, roles) or len(blocks) < 2:
+    estimate = _estimate_leakage_by_state(blocks, roles)
+    if estimate is None or not (estimate.rest_variance > 0.0 and estimate.difference_variance > 0.0):
         return 0.0
-    turning, holding, moving_bias = (roles.names.index(name) for name in (TURNING, HOLDING, MOVING_BIAS))
-    columns = [*roles.nuisance, turning, holding, moving_bias]
-    grams = blocks.gram[:, 0]  # Gram matrices (K, m, m) of the pump's volume balance, the only equation
-    coefficients, covariance = fit_with_robust_covariance(grams, columns, roles.left)
-    # at rest the leakage is the leak's coefficient; in motion the coefficient of the turning pump is added
-    rest, extra = columns.index(roles.leak), columns.index(turning)
-    rest_leak, motion_leak = coefficients[rest], coefficients[rest] + coefficients[extra]
-    rest_variance, difference_variance = float(covariance[rest, rest]), float(covariance[extra, extra])
-    if not (rest_variance > 0.0 and difference_variance > 0.0):
-        return 0.0
-    odds = rest_log_odds(rest_leak, motion_leak, rest_variance=rest_variance, difference_variance=difference_variance)
+    odds = rest_log_odds(
+        estimate.rest,
+        estimate.motion,
+        rest_variance=estimate.rest_variance,
+        difference_variance=estimate.difference_variance,
+    )
     max_odds: float = INFERENCE.rest.most
     return float(np.clip(odds, -max_odds, max_odds))
+
+
+class _LeakageByState(NamedTuple):
+    """Leakage conductances at `rest` and in `motion` [m^3/(s Pa)].
+
+    `rest_variance`, `difference_variance`: variances of the errors of `rest` and of `motion` - `rest`.
+    """
+
+    rest: float
+    motion: float
+    rest_variance: float
+    difference_variance: float
+
+
+def _estimate_leakage_by_state(blocks: Blocks, roles: ColumnRoles) -> _LeakageByState | None:
+    """Estimate the leakage in motion from blocks with motion, and that at rest from the other blocks, given the former.
+
+    Leakage at rest lets the pressures relax, and the rate shows only its ratio to the compliance. A regression over all
+    blocks could therefore make both zero at rest. Thus the compliances, and all coefficients but the leakage and the
+    flow offset, are those in motion. With the columns X of leakage and flow offset at rest, the left side y, the other
+    columns Z and their coefficients b in motion, the leakage r at rest is the first of
+
+        (X'X)^-1 X'(y - Z b),    variance = White's variance + J cov(b) J' + sum (J_c b_c)^2,
+
+    where J = d r/db is the first row of -(X'X)^-1 X'Z. The last term is a relative error of 1 of each compliance c:
+    those of low pressures and of high ones differ by the air in the oil. Pressures that stay the same at rest, or a
+    pump that makes good the leakage, have no such error. Return None if fewer than `MIN_STATE_BLOCKS` blocks lie in
+    either state.
+    """
+    gram, left = blocks.gram[:, 0], roles.left
+    turning, holding, moving_bias = (roles.names.index(name) for name in (TURNING, HOLDING, MOVING_BIAS))
+    energies = np.diagonal(gram, axis1=1, axis2=2)
+    is_rest = energies[:, turning] + energies[:, holding] <= NEGLIGIBLE * energies[:, roles.leak]
+    if min(np.count_nonzero(is_rest), np.count_nonzero(~is_rest)) < MIN_STATE_BLOCKS:
+        return None
+    columns = [*roles.nuisance, turning, holding, moving_bias]
+    coefficients, covariance = fit_with_robust_covariance(gram[~is_rest], columns, left)
+    # in motion the leakage is the sum of the leak's coefficient and that of the turning pump
+    in_motion = [columns.index(roles.leak), columns.index(turning)]
+    own = [roles.leak] if roles.bias is None else [roles.leak, roles.bias]  # columns whose coefficients rests have
+    shared = [k for k, column in enumerate(columns) if column not in (*own, turning, holding, moving_bias)]
+    shared_columns = [columns[k] for k in shared]
+    # the left side without what the shared columns explain
+    residual = np.eye(left + 1)
+    residual[shared_columns, left] = -coefficients[shared]
+    rest_gram = residual.T @ gram[is_rest] @ residual
+    rest, rest_covariance = fit_with_robust_covariance(rest_gram, own, left)
+    total = rest_gram.sum(axis=0)
+    sensitivity = -solve(total[np.ix_(own, own)], total[np.ix_(own, shared_columns)])[0]  # of r to b
+    is_compliance = np.array([roles.names[column].startswith(COMPLIANCES) for column in shared_columns])
+    by_compliance = sensitivity * coefficients[shared] * is_compliance
+    rest_variance = float(rest_covariance[0, 0] + by_compliance @ by_compliance)
+    rest_variance += float(sensitivity @ covariance[np.ix_(shared, shared)] @ sensitivity)
+    motion_variance = float(covariance[np.ix_(in_motion, in_motion)].sum())
+    common = float(sensitivity @ covariance[np.ix_(shared, in_motion)].sum(axis=1))
+    motion = float(coefficients[in_motion].sum())
+    return _LeakageByState(float(rest[0]), motion, rest_variance, rest_variance + motion_variance - 2.0 * common)
 
 
 def rest_log_odds(rest: float, motion: float, *, rest_variance: float, difference_variance: float) -> float:

@@ -237,23 +237,24 @@ class VolumeBalance:
     def _shut_log_odds(self, summaries: Sequence[Summary], channels: frozenset[str]) -> float:
         """Compute the log odds that valves cut the pump off at rest, from summaries of healthy recordings (`learn`).
 
-        The right assumption on the valves makes the estimated leakage scatter less between recordings. For n recordings
-        with rests, at least `MIN_FOR_SCATTER`, the log odds are therefore (n - 1) log(scatter if connected / scatter if
-        cut off). For fewer recordings they are the sum of the log odds of each, which are limited to +-`rest.alone`.
-        `channels`: names of the recorded channels, which determine the balances.
+        The prior log odds are `rest.valves` (`priors.toml`). The leakage at rest and in motion of each recording adds
+        its log odds (`regimes.shut_odds`), limited to +-`rest.alone`. The right assumption on the valves also makes the
+        estimated leakage scatter less between recordings: n recordings with rests, at least `MIN_FOR_SCATTER`, add
+        (n - 1) log(scatter if connected / scatter if cut off). `channels`: names of the recorded channels, which
+        determine the balances.
         """
         with_rests = [summary for summary in summaries if "shut_sums" in summary]
+        max_odds: float = INFERENCE.rest.alone
+        odds_by_rests = np.clip([summary.get("shut_odds", 0.0) for summary in with_rests], -max_odds, max_odds)
+        odds = float(INFERENCE.rest.valves + np.sum(odds_by_rests))
         if len(with_rests) < MIN_FOR_SCATTER:
-            max_odds: float = INFERENCE.rest.alone
-            return float(
-                np.sum(np.clip([summary.get("shut_odds", 0.0) for summary in with_rests], -max_odds, max_odds))
-            )
+            return odds
         scatter = []
         for shut in (False, True):
             sums = [_sums_from_summary(summary, shut) for summary in with_rests]
             values = leak_deviations_from_mean(sums, self._columns(channels, shut))
             scatter.append(max(float(values.std(ddof=1)), np.finfo(float).tiny))
-        return (len(with_rests) - 1) * float(np.log(scatter[0] / scatter[1]))
+        return odds + (len(with_rests) - 1) * float(np.log(scatter[0] / scatter[1]))
 
     def _is_held_by_valves(self, balance: RecordedBalance, summaries: Sequence[Summary]) -> bool:
         """Return True unless a control loop may hold the load in a volume balance without a pump (`terms.locked`).
