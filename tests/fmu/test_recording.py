@@ -192,12 +192,12 @@ def test_what_a_unit_cannot_do_is_one_line(plant, tmp_path):
             ss.record_fmu(path, ss.Experiment.of(**{"duration": 1.0, "command": "2 sin(3t)"} | options), map=map)
         return str(caught.value)
 
-    assert "a unit's leak must be a conductance" in refused(leak="0.01 L/min")
+    assert "an FMU's leak must be a conductance" in refused(leak="0.01 L/min")
     assert "the experiment needs the input F (load against +x" in refused(load="1 kN")
-    assert "a unit must have the outputs p_A and p_B, got cap.pressure" in refused(map={"u": "drive.voltage"})
+    assert "an FMU must have the outputs p_A and p_B, got cap.pressure" in refused(map={"u": "drive.voltage"})
     assert "has no variable 'drive.volts'; did you mean drive.voltage?" in refused(map={"u": "drive.volts"})
-    assert "of faults and drifts a unit can have those of sensors only" in refused(fault="friction +20 %")
-    assert "a unit must have a command, not a target" in refused(
+    assert "of faults and drifts an FMU can have those of sensors only" in refused(fault="friction +20 %")
+    assert "an FMU must have a command, not a target" in refused(
         command="position 50 mm sin(2t)", rig="thesis-closed-loop"
     )
     assert "the unit plant.fmu failed" in refused(SimulationFailed, command="step 9.9 at 0.5 s")

@@ -90,7 +90,7 @@ def record_fmu(
     measured = {channel: names[channel] for channel in _MEASURED_NAMES if channel in names}
     if not {"p_A", "p_B"} <= set(measured):
         raise InputError(
-            f"a unit must have the outputs p_A and p_B, got {', '.join(sorted(variables)[:12])} ({path}); name them "
+            f"an FMU must have the outputs p_A and p_B, got {', '.join(sorted(variables)[:12])} ({path}); name them "
             "with --map p_A=NAME"
         )
     rate = experiment.rate
@@ -128,14 +128,14 @@ def _check_experiment(experiment: Experiment) -> None:
     An FMU cannot take a target of the position, a fault or drift of the machine, or a leak stated as a flow.
     """
     if experiment.target is not None:
-        raise InputError(f"a unit must have a command, not a target, got {experiment.command}")
+        raise InputError(f"an FMU must have a command, not a target, got {experiment.command}")
     if experiment.effects():
-        raise InputError("of faults and drifts a unit can have those of sensors only: the machine is its own")
+        raise InputError("of faults and drifts an FMU can have those of sensors only: the machine is its own")
     for leak in experiment.leaks:
         if leak.coefficient is None:
             raise InputError(
-                f"a unit's leak must be a conductance, 'G = 6e-13 from 20 s' or 'C = 2e-10', got {leak}: its flow "
-                "follows from the unit"
+                f"an FMU's leak must be a conductance, 'G = 6e-13 from 20 s' or 'C = 2e-10', got {leak}: its flow "
+                "follows from the FMU"
             )
 
 
@@ -144,7 +144,7 @@ def _read_description(path: Path) -> Any:
     try:
         import fmpy
     except ImportError:
-        raise InputError("running a unit needs FMPy: pip install 'sealscope[fmu]'") from None
+        raise InputError("running an FMU needs FMPy: pip install 'sealscope[fmu]'") from None
     try:
         return fmpy.read_model_description(str(path))
     except Exception as error:  # from the archive, its XML or FMPy's checks
@@ -184,7 +184,7 @@ def _build_input_table(
     # in each step, the inputs are needed at one time only, its middle
     u, G, C = (values[:, 0] for values in RunInputs(experiment, experiment.leaks).at_nodes(t, np.array([half_step])))
     if experiment.load is not None and experiment.load.tables() is not None:
-        raise InputError(f"a unit takes its load over time, got one over position or velocity ({experiment.load})")
+        raise InputError(f"an FMU needs a load over time, got one over position or velocity ({experiment.load})")
     load = np.zeros(t.size) if experiment.load is None else np.asarray(experiment.load.value_at(t + half_step))
     inputs = {"u": u, "G": G, "C": C, "F": load}
     columns: dict[str, Array] = {}

@@ -81,7 +81,8 @@ def profile_key(name: str) -> str:
     The hash does not depend on the path of the profile's file.
     """
     profile = load_profile(name)
-    # seeds of cases derive from the name; `seeds` replaces it in a renamed profile that must draw the same cases
+    # the seeds of cases depend on this hash, and so on the profile's name; a renamed profile that must draw the same
+    # cases as before states its former name in `seeds`
     return digest(repr(replace(profile, name=profile.seeds or profile.name, place="")))
 
 

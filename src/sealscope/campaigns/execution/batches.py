@@ -62,8 +62,9 @@ def check_plan(plan: SimulatedPlan, cases: Sequence[CampaignCase]) -> None:
     - all detectors are scorers, which need only the RMS of wavelet details before and after the onset
     - no recordings are kept, and both sides of the onset have usable samples (`scored_bounds`)
     - each leak has a single law, and no sensor has a fault
-    - no factor changes the sampling rate, and the runs can be simulated side by side (`refuse_unbatchable`); only the
-      first case of each combination of levels is tested for this, unless its experiment cannot be built
+    - no factor changes the sampling rate, and the runs can be simulated side by side (`refuse_unbatchable`); for this,
+      only the first case of each combination of levels is tested, and skipped if its experiment cannot be built: its
+      row will state the error
     """
 
     def refusal(rule: str) -> InputError:

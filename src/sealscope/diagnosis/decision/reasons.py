@@ -172,9 +172,10 @@ def _against_text(ringing: Ringing | None) -> str:
 def _rivals_text(case: Case, alarm: LeakTest) -> str:
     """Describe the most probable explanation other than a leak, and how to tell this explanation from a leak.
 
-    `alarm`: test that raised the alarm. Of several events the first is described. Of a change of the operating point
-    only the time is stated: the onset of the step that looks like a leak. The stated probability is that of all
-    explanations without a leak. The text is "" if the time is unknown, or if there is no such explanation.
+    `alarm`: test that raised the alarm. If the explanation has several events, the first one is described. If that
+    event is a change of the operating point, the text states only its time: the onset of the step that looks like a
+    leak. The stated probability is that of all explanations without a leak. The text is "" if that time is unknown, or
+    if there is no explanation without a leak.
     """
     leak_probability = case.leak_probability(alarm)
     best = next((explanation for explanation in case.explanations if not explanation.has(*LEAK_EVENTS)), None)

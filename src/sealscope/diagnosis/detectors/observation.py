@@ -143,8 +143,8 @@ def _compute_surprisals(recording: Recording, rig: Rig) -> Mapping[str, float]:
     """Compute the surprisals -log(p-value) of changes within a recording, as `healthy_surprisals` returns them.
 
     Changes of the signals (duty, noise, hum, mean pressures) and of the volume balance are tested. Changes of the
-    pressure response are tested, too, if there is no balance, or if the recording has no channel of the flow: then
-    valves or a control loop may hold the load. `rig` is the assumed machine.
+    pressure response are tested, too, if the balance may be of no use: if there is none, or if no flow is recorded,
+    since a control loop may then hold the load by replacing the leakage. `rig` is the assumed machine.
     """
     surprisals = _max_surprisals(observe_signals(recording))
     balance = VolumeBalance(rig)

@@ -162,8 +162,9 @@ def estimate_rise_flow(
 ) -> Flow:
     """Estimate the mean flow [m^3/s] of a leak after its onset, from the leakage above that of healthy recordings.
 
-    The most probable law gives the value; the other laws contribute to its standard deviation. The value is a mean over
-    the possible onsets.
+    For an onset and a law the flow is the mean rise times the law's flow per rise, divided by the fraction of the
+    recording's information after the onset. The result is the mean of these flows over the onsets, under the most
+    probable law; its standard error includes the differences to the other laws.
 
     Parameters
     ----------
@@ -174,7 +175,7 @@ def estimate_rise_flow(
     value, deviation : float
         Mean rise of the coefficient over the whole recording, and its standard deviation [m^3/(s Pa)].
     laws : sequence of LawWeight
-        Weight of each law of `EXPONENTS`.
+        For each law of `EXPONENTS` its log probability, and the mean flow for a rise of 1.
     max_flow : float
         Mean flow of the pump [m^3/s]; onsets and laws with a larger leak are excluded.
 

@@ -444,8 +444,8 @@ class _Whitened(NamedTuple):
         """Compute the change of the coefficient in each of K blocks by a unit step at each of o onsets, shape (K, o).
 
         `positions` (o,): onsets, counted in blocks from the start; `shape`: factor on the step in each block of the
-        recording, by default 1; `growth`: relative growth of the step from its onset to the end. A prior on the level,
-        which counts as the first of the K blocks, has no entry in `shape`.
+        recording, by default 1; `growth`: relative growth of the step from its onset to the end. If the
+        coefficient has a prior on its level, this prior is the first of the K blocks, without an entry in `shape`.
         """
         count = self.transform.shape[1]
         steps = step_shapes(count, positions, growth)
@@ -522,10 +522,10 @@ def _whiten_blocks(information: Information) -> _Whitened | None:
 
 @lru_cache(maxsize=16)
 def _unit_whitening(count: int, slope: float, walk: float) -> _Whitening | None:
-    """Build the matrices that whiten `count` blocks with independent estimates of variance 1; None if too few.
+    """Build the matrices of `_build_whitening` for `count` independent estimates of variance 1; None if too few.
 
-    `slope`, `walk`: scales of the priors on the linear change and on the random walk over all blocks, in units of the
-    standard deviation 1 of an estimate (`Information`). The result is cached, since many tests share it.
+    This frequent case is cached. The matrices eliminate level and slope. `slope`, `walk`: scales of the priors on the
+    linear change and on the random walk over all blocks, relative to the standard deviation of an estimate.
     """
     return _build_whitening(np.eye(count), slope, walk)
 

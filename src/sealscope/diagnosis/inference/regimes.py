@@ -172,16 +172,20 @@ def _estimate_leakage_by_state(blocks: Blocks, roles: ColumnRoles) -> _LeakageBy
     coefficients, covariance = fit_with_robust_covariance(gram[~is_rest], columns, left)
     # in motion the leakage is the sum of the leak's coefficient and that of the turning pump
     in_motion = [columns.index(roles.leak), columns.index(turning)]
-    own = [roles.leak] if roles.bias is None else [roles.leak, roles.bias]  # columns whose coefficients rests have
-    shared = [k for k, column in enumerate(columns) if column not in (*own, turning, holding, moving_bias)]
+    rest_columns = (
+        [roles.leak] if roles.bias is None else [roles.leak, roles.bias]
+    )  # columns whose coefficients rests have
+    shared = [k for k, column in enumerate(columns) if column not in (*rest_columns, turning, holding, moving_bias)]
     shared_columns = [columns[k] for k in shared]
     # the left side without what the shared columns explain
     residual = np.eye(left + 1)
     residual[shared_columns, left] = -coefficients[shared]
     rest_gram = residual.T @ gram[is_rest] @ residual
-    rest, rest_covariance = fit_with_robust_covariance(rest_gram, own, left)
+    rest, rest_covariance = fit_with_robust_covariance(rest_gram, rest_columns, left)
     total = rest_gram.sum(axis=0)
-    sensitivity = -solve(total[np.ix_(own, own)], total[np.ix_(own, shared_columns)])[0]  # of r to b
+    sensitivity = -solve(total[np.ix_(rest_columns, rest_columns)], total[np.ix_(rest_columns, shared_columns)])[
+        0
+    ]  # of r to b
     is_compliance = np.array([roles.names[column].startswith(COMPLIANCES) for column in shared_columns])
     by_compliance = sensitivity * coefficients[shared] * is_compliance
     rest_variance = float(rest_covariance[0, 0] + by_compliance @ by_compliance)

@@ -600,9 +600,9 @@ def circulation(rig: Rig, channels: frozenset[str]) -> Equation | None:
 def locked(rig: Rig, channels: frozenset[str]) -> Equation | None:
     """Return the volume balance of a load that is held by shut valves; None if circuit or channels do not suffice.
 
-    The piston moves only as far as oil leaks from the loaded side. The left side of the balance is minus the volume
-    that the loaded side of the piston displaces; x is assumed to grow as A fills. Leaks of seal, valve and line cannot
-    be separated.
+    The piston moves only as far as oil leaks from the loaded side. The left side of the balance is the volume that must
+    have leaked from A to B for that motion: -dx times the piston's area on the loaded side, where x grows as A fills.
+    Leaks of seal, valve and line cannot be separated.
 
     The balance needs the position and both pressures. If a command or the pump's flow is recorded, the circuit must
     have valves that hold the load, and the command must be recorded: it is constant while they are shut. If neither is
@@ -619,8 +619,8 @@ def locked(rig: Rig, channels: frozenset[str]) -> Equation | None:
         """Return the side, "A" or "B", that on average carries the load."""
         return "A" if np.nanmean(s["p_A"] * areas["A"] - s["p_B"] * areas["B"]) > 0.0 else "B"
 
-    def displaced_volume(s: Signals) -> Array:
-        """Compute minus the displaced volume [m^3] of the loaded side, shape (n - 1,)."""
+    def leaked_volume(s: Signals) -> Array:
+        """Compute the volume [m^3] that has leaked from A to B in each interval, shape (n - 1,)."""
         return -areas[loaded_side(s)] * s.step("x")
 
     compliance = Term(
@@ -631,7 +631,7 @@ def locked(rig: Rig, channels: frozenset[str]) -> Equation | None:
         drift="compliance",
         needs=_PRESSURES,
     )
-    return Equation(LOCKED, displaced_volume, (compliance, *_STANDSTILL_LEAKS))
+    return Equation(LOCKED, leaked_volume, (compliance, *_STANDSTILL_LEAKS))
 
 
 def pump_volume(rig: Rig, channels: frozenset[str]) -> Callable[[Signals], Array] | None:

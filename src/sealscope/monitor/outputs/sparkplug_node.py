@@ -65,9 +65,10 @@ class SparkplugNode:
 
     @classmethod
     def from_settings(cls, actuators: WatchedActuators, table: SparkplugSettings, settings: MonitorSettings) -> Self:
-        """Build the node from its `table` of the settings; raise InputError if the password cannot be read.
+        """Build the node from a monitor's `settings`, whose table for Sparkplug is `table`.
 
-        `actuators`: source of the events (their `store`) and the summaries, and counter of dropped messages.
+        `actuators`: the watched actuators, with their database (`store`), the `summaries` to publish and the function
+        `count`, which counts dropped messages. Raises InputError if the broker's password cannot be read.
         """
         broker = settings.mqtt
         assert broker is not None  # `MonitorSettings` refuses Sparkplug without a broker

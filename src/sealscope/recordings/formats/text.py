@@ -543,9 +543,9 @@ class _Log:
     ) -> tuple[NDArray[np.datetime64], list[int]]:
         """Parse cells of the time column to time stamps (n,); also return the indices of the words.
 
-        A word is a text without digits that is not a stamp. Words and missing cells become NaT. The first date such as
-        05/06/2024 sets `day_first`. `format_place`: function from the index of a cell to its place, for messages.
-        Raises InputError for a cell with digits that is not a stamp.
+        A word is a text without digits that is not a stamp. Words and missing cells become NaT. At the first ambiguous
+        date, such as 05/06/2024, the log's dates decide `day_first`. `format_place`: function from the index of a cell
+        to its place, for messages. Raises InputError for a cell with digits that is not a stamp.
         """
         texts = ["" if cell.strip().lower() in MISSING else cell for cell in cells]
         if self.day_first is None and ambiguous_dates(texts):

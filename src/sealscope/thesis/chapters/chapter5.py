@@ -61,9 +61,9 @@ class PrintedTest:
 
     @property
     def condition(self) -> Condition:
-        """The test of Appendix C for which this test of chapter 5 is taken; the thesis does not name it.
+        """The test of Appendix C that this test of chapter 5 probably is; the thesis does not say.
 
-        The candidate is taken whose mean leak is nearest to the nominal leak of the test's level (section 5.1).
+        It is the one of the `candidates` whose mean leak is nearest to the nominal leak of the level (section 5.1).
         """
         return min(self.candidates, key=lambda row: abs(row.mean_leak_lpm - NOMINAL_LPM[self.level]))
 

@@ -245,7 +245,7 @@ def _noise_limit_texts(evidence: ClaimEvidence, sheet: DataSheet) -> dict[str, A
 
 
 def _trend_test(chamber: str) -> SheetTest:
-    """Build the function that tests whether the changes of a chamber's wavelet details grow with the mean leak.
+    """Build the function that tests if a chamber's wavelet details follow the mean leak in the claimed direction.
 
     The function tests claim 5.5.3 for p_A or 5.5.4 for p_B on a data sheet. `chamber`: "p_A" or "p_B".
     """

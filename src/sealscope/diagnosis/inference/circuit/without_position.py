@@ -59,7 +59,7 @@ class CycleBalance(NamedTuple):
     oil_loss: Mapping[str, StepTest]
 
 
-def circulations(recording: Recording, rig: Rig) -> list[CycleBalance]:
+def cycle_balances(recording: Recording, rig: Rig) -> list[CycleBalance]:
     """Compute the volume balances of a recording without position or without flow, over whole cycles and over holds.
 
     A hold is a time in which the piston is held at standstill. A recording with a position but without flow gives only

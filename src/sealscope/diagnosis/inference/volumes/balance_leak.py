@@ -76,10 +76,12 @@ class BalanceLeak:
     def cause(self) -> Cause:
         """Cause of a leak, such as "piston leak", or "piston or pump leak" if the balance cannot separate them.
 
-        It is "internal or external leak" if only the creep of a held load is known, which valves and lines may cause as
-        well. It is "piston leak" behind a servo valve. It is also "piston leak" if the leakage is measured while shut
-        valves hold the load, and either valves cut the pump off at rest or the leakage is too high for a healthy
-        machine.
+        - "internal or external leak" if only the creep of a held load is known: leaking valves and lines cause it, too.
+        - "piston leak" if a servo valve drives the cylinder.
+        - "piston leak" also if holds measure the leakage, i.e. times in which shut valves separate the pump from the
+          loaded cylinder. The balance must assume such valves at every rest, or the leakage in the holds must be too
+          high for a healthy machine.
+        - "piston or pump leak" otherwise.
         """
         if self.balance.is_creep:
             return "internal or external leak"
@@ -215,10 +217,10 @@ class BalanceLeak:
     def _hold_laws(self) -> _HoldLaws:
         """Fit a leak past the piston to the times in which shut valves hold the load, for each law and piston area.
 
-        The flow is the coefficient times abs(p_A - p_B)^exponent for each exponent of `EXPONENTS`, with each relative
-        growth of the coefficient between onset and end (`growth_priors`), and each area of
-        `HeldChambers.area_variants`. For one area the weights of the laws are proportional to the likelihood of the fit
-        times the prior probabilities of exponent and growth, and their sum is the probability of that area.
+        A law is an exponent of `EXPONENTS` and a relative growth of the coefficient between onset and end
+        (`growth_priors`); the flow is the coefficient times abs(p_A - p_B)^exponent. Each law is fitted with each area
+        of `HeldChambers.area_variants`. The weights of the laws with one area are proportional to the likelihood of the
+        fit times the prior probabilities of exponent and growth, and their sum is the probability of that area.
         """
         chambers = self.balance.chambers
         assert chambers is not None

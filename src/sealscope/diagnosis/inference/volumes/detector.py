@@ -18,7 +18,7 @@ from sealscope.diagnosis.inference.balance import (
 )
 from sealscope.diagnosis.inference.blocks import ColumnRoles
 from sealscope.diagnosis.inference.circuit.store import recorded_oil_loss_tests
-from sealscope.diagnosis.inference.circuit.without_position import circulations
+from sealscope.diagnosis.inference.circuit.without_position import cycle_balances
 from sealscope.diagnosis.inference.differences import Estimate, PriorScatter, compare_estimates
 from sealscope.diagnosis.inference.observable import Observable, Observed
 from sealscope.diagnosis.inference.regimes import add_pump_columns
@@ -146,12 +146,12 @@ class VolumeBalance:
         A balance of a load that shut valves hold is always usable. Any other balance is usable only if the pump
         compensates the leakage (`compensates_leakage`). Return None if no balance is usable.
         """
-        cycle_balances = compute_once(
-            recording, (self.name, self.rig), lambda samples: circulations(samples, self.rig), READ
+        balances = compute_once(
+            recording, (self.name, self.rig), lambda samples: cycle_balances(samples, self.rig), READ
         )
         candidates = (
             RecordedBalance(cycle.blocks, (cycle.equation,), (cycle.columns,), self.rig, recording, cycle.oil_loss)
-            for cycle in cycle_balances
+            for cycle in balances
         )
         usable = (candidate for candidate in candidates if candidate.is_creep or compensates_leakage(candidate))
         return min(usable, key=lambda candidate: BalanceLeak(self.name, candidate).bound_flow, default=None)
@@ -397,8 +397,9 @@ def _healthy_sign_log_odds(summaries: Sequence[Summary], n_balances: int) -> Arr
 def _are_valves_shut(summaries: Sequence[Summary]) -> bool:
     """Return True if the healthy recordings show that valves cut the pump off at rest.
 
-    The mean of the log odds in their summaries must exceed `rest.locked` of `priors.toml`, either of "shut_odds" (from
-    all rests) or of "held_odds" (only from rests in which a load is held). Odds that no summary has show nothing.
+    A summary may state the log odds that they do so, by all rests ("shut_odds") and by those rests alone in which a
+    load is held ("held_odds"). The mean of one of the two over the summaries that state it must exceed `rest.locked` of
+    `priors.toml`.
     """
     log_odds = ([summary[key] for summary in summaries if key in summary] for key in ("shut_odds", "held_odds"))
     return any(bool(odds) and float(np.mean(odds)) > INFERENCE.rest.locked for odds in log_odds)
