@@ -172,9 +172,8 @@ def _estimate_leakage_by_state(blocks: Blocks, roles: ColumnRoles) -> _LeakageBy
     coefficients, covariance = fit_with_robust_covariance(gram[~is_rest], columns, left)
     # in motion the leakage is the sum of the leak's coefficient and that of the turning pump
     in_motion = [columns.index(roles.leak), columns.index(turning)]
-    rest_columns = (
-        [roles.leak] if roles.bias is None else [roles.leak, roles.bias]
-    )  # columns whose coefficients rests have
+    # leakage and flow offset, which are fitted to the rests alone
+    rest_columns = [column for column in (roles.leak, roles.bias) if column is not None]
     shared = [k for k, column in enumerate(columns) if column not in (*rest_columns, turning, holding, moving_bias)]
     shared_columns = [columns[k] for k in shared]
     # the left side without what the shared columns explain
@@ -183,9 +182,8 @@ def _estimate_leakage_by_state(blocks: Blocks, roles: ColumnRoles) -> _LeakageBy
     rest_gram = residual.T @ gram[is_rest] @ residual
     rest, rest_covariance = fit_with_robust_covariance(rest_gram, rest_columns, left)
     total = rest_gram.sum(axis=0)
-    sensitivity = -solve(total[np.ix_(rest_columns, rest_columns)], total[np.ix_(rest_columns, shared_columns)])[
-        0
-    ]  # of r to b
+    normal, coupling = total[np.ix_(rest_columns, rest_columns)], total[np.ix_(rest_columns, shared_columns)]
+    sensitivity = -solve(normal, coupling)[0]  # derivatives of the leakage at rest by the shared coefficients
     is_compliance = np.array([roles.names[column].startswith(COMPLIANCES) for column in shared_columns])
     by_compliance = sensitivity * coefficients[shared] * is_compliance
     rest_variance = float(rest_covariance[0, 0] + by_compliance @ by_compliance)
