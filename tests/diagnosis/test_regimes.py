@@ -250,6 +250,20 @@ def test_a_hold_behind_valves_tells_a_leak_from_a_pump_that_differs_from_day_to_
         assert evidence.cause == ("piston leak" if leak else None)
 
 
+@pytest.mark.slow
+def test_a_hold_before_the_onset_does_not_hide_the_rise_of_the_whole_recording() -> None:
+    """The drive is off for 20 s, its valves shut; the leak begins later, while the pump holds the load."""
+    pumps = (4e-13, 4.2e-13, 4.1e-13, 3.9e-13, 4e-13)
+    healthy = [press(seed, shut=False, start=20.0, pump=pump, servo=True) for seed, pump in enumerate(pumps)]
+    chances = []
+    for leak in (0.0, 2e-13):
+        judged = press(7, shut=False, start=20.0, pump=4.05e-13, servo=True, leak=leak, since=60.0)
+        measured = VolumeBalance(RIG).observe(judged, healthy).leak
+        assert measured is not None and measured.rise is not None
+        chances.append(measured.rise.chance)
+    assert chances[0] > 0.1 and chances[1] < 0.01
+
+
 def test_holds_without_a_load_or_with_a_pump_that_makes_good_a_leakage_measure_none() -> None:
     """Equal pressures show no leak, and a pump that turns slower than its noise keeps up a load."""
     loaded = balance(0, odds=10.0)

@@ -282,6 +282,16 @@ def test_chance_threshold_and_interval_agree() -> None:
     assert (low, high) == (pytest.approx(0.0, abs=1e-9), pytest.approx(6.0))
 
 
+@pytest.mark.parametrize("share", [0.05, 0.5])
+def test_a_rise_with_a_share_of_the_false_alarms_needs_a_higher_score(share: float) -> None:
+    rise = Rise(2.0, 1.0, 5.0)
+    shared = rise.share_alarms(share)
+    assert shared.chance == pytest.approx(min(rise.chance / share, 1.0))
+    assert shared.threshold(0.01) == pytest.approx(rise.threshold(0.01 * share))
+    at_threshold = shared._replace(value=shared.threshold(0.01))
+    assert at_threshold.chance == pytest.approx(0.01)
+
+
 @pytest.mark.parametrize("scale", [0.0, 1e-200, 1.0, 1e150])
 def test_recordings_of_any_size_have_a_rise_and_a_threshold(scale: float) -> None:
     random = np.random.default_rng(6)

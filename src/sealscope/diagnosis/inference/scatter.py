@@ -116,7 +116,8 @@ class Rise(NamedTuple):
     `value`: the estimate, and `deviation`: its standard deviation, both in the unit of the coefficient (of a laminar
     leak m^3/(s Pa)). In a healthy recording `value` has the distribution `mixture`. If `mixture` is None, `value` over
     `deviation` has Student's t distribution with `degrees_of_freedom`. `may_be_partial`: the leak may have begun within
-    the recording, whose mean then contains only a part of the rise.
+    the recording, whose mean then contains only a part of the rise. `share`: fraction of the allowed false alarms that
+    is left to this rise, by which its p-value is divided (`share_alarms`).
     """
 
     value: float
@@ -124,6 +125,14 @@ class Rise(NamedTuple):
     degrees_of_freedom: float
     mixture: Mixture | None = None
     may_be_partial: bool = False
+    share: float = 1.0
+
+    def share_alarms(self, share: float) -> Rise:
+        """Return this rise with its p-value divided by `share`, for use beside another rise of which the best counts.
+
+        `share`: fraction of the false-alarm probability of both that this rise may use.
+        """
+        return self._replace(share=share)
 
     def widen(self, variance: float) -> Rise:
         """Return the rise with an additional independent error of the given variance, in the square of its unit.
@@ -143,27 +152,30 @@ class Rise(NamedTuple):
 
     @property
     def chance(self) -> float:
-        """Probability that a healthy recording has a higher score (a one-sided p-value).
+        """Probability that a healthy recording has a higher score (a one-sided p-value), over `share`, at most 1.
 
         The score is the estimated rise over its standard deviation.
         """
         from scipy.special import ndtr, stdtr
 
         if self.mixture is None:
-            return min(float(stdtr(self.degrees_of_freedom, -self.score)), 1.0)
-        weights, deviations, centres = self.mixture
-        return min(float(weights @ ndtr((centres - self.score * self.deviation) / deviations)), 1.0)
+            chance = float(stdtr(self.degrees_of_freedom, -self.score))
+        else:
+            weights, deviations, centres = self.mixture
+            chance = float(weights @ ndtr((centres - self.score * self.deviation) / deviations))
+        return min(chance / max(self.share, TINY), 1.0)
 
     def threshold(self, chance: float) -> float:
-        """Compute the score that a healthy recording exceeds with the probability `chance`, between 0 and 1.
+        """Compute the score whose p-value (`chance`) is the argument `chance`, between 0 and 1.
 
         The score is the estimated rise of the leakage over its standard deviation.
         """
         from scipy.special import stdtrit
 
+        probability = 1.0 - chance * self.share
         if self.mixture is None:
-            return float(stdtrit(self.degrees_of_freedom, 1.0 - chance))
-        return self.mixture.quantile(1.0 - chance) / self.deviation
+            return float(stdtrit(self.degrees_of_freedom, probability))
+        return self.mixture.quantile(probability) / self.deviation
 
     def log_ratio(self, rise: float, log_deviation: float = 0.0) -> float:
         """Compute the log likelihood ratio of a true rise of the leak's coefficient by `rise` to no rise.

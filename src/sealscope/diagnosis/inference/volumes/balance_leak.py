@@ -85,8 +85,8 @@ class BalanceLeak:
         """
         if self.balance.is_creep:
             return "internal or external leak"
-        hold_rise = self._hold_rise
-        in_holds = hold_rise is not None and (self.balance.shut or hold_rise.chance < INFERENCE.held_oil.rare)
+        rise = self.rise if self.rise is self._rises.get(True) else None  # in holds
+        in_holds = rise is not None and (self.balance.shut or rise.chance < INFERENCE.held_oil.rare)
         has_servo_valve = len(self.balance.columns) > 1  # one balance for each chamber
         return "piston leak" if has_servo_valve or in_holds else "piston or pump leak"
 
@@ -126,10 +126,27 @@ class BalanceLeak:
     def rise(self) -> Rise | None:
         """Amount by which the mean leakage [m^3/(s Pa)] exceeds that of healthy recordings; None without these.
 
-        It is measured in holds, i.e. while shut valves hold the load, if these are precise enough or show a leak, else
-        over the whole recording.
+        Of `_rises`, measured over the whole recording and while shut valves hold the load, the one with the smallest
+        p-value counts.
         """
-        return self._motion_rise if self._hold_rise is None else self._hold_rise
+        return min(self._rises.values(), key=lambda rise: rise.chance, default=None)
+
+    @cached_property
+    def _rises(self) -> dict[bool, Rise]:
+        """Rises of the leakage over healthy recordings, with their shares of the false alarms; empty without these.
+
+        The key False is for the rise over the whole recording, True for that in holds, i.e. while shut valves hold the
+        load (`_hold_rise`). Holds do not show a leak that begins after them. With the prior probability s of such a
+        leak, the rise over the whole recording may use the fraction s of the false alarms, that in holds the rest
+        (weighted Bonferroni correction).
+        """
+        motion_rise, hold_rise, chambers = self._motion_rise, self._hold_rise, self.balance.chambers
+        if motion_rise is None:
+            return {}
+        if hold_rise is None or chambers is None:
+            return {False: motion_rise}
+        share = chambers.probability_after_holds
+        return {False: motion_rise.share_alarms(share), True: hold_rise.share_alarms(1.0 - share)}
 
     @cached_property
     def _motion_rise(self) -> Rise | None:
