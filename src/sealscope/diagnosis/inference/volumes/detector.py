@@ -118,14 +118,14 @@ class VolumeBalance:
     def balance(
         self,
         recording: Recording,
-        odds: float = 0.0,
+        odds: float = INFERENCE.rest.valves,
         *,
         is_locked: bool = False,
         sign_log_odds: Array | float = 0.0,
     ) -> RecordedBalance | None:
         """Set up the volume balance of a recording; None if its channels or its length allow none.
 
-        `odds`: log odds, from healthy recordings, that valves cut the pump off from the cylinder while the pump rests;
+        `odds`: log odds, prior and from healthy recordings, that valves cut a resting pump off from the cylinder;
         `is_locked`: true if valves certainly cut the pump off, whatever this recording shows; `sign_log_odds` (E,):
         log odds of each balance, from healthy recordings, that the recorded flow has the right sign.
         """
