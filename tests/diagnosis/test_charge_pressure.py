@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -85,6 +87,20 @@ def test_a_healthy_recording_shows_no_drift_and_a_rise_is_no_loss_of_oil() -> No
     rising = {change.name: change for change in compare_low_drifts(drifts(record(fall=-500.0, seed=24)), HEALTHY)}
     assert rising[FALL].chance > 0.5
     assert rising["drift of low p_A"].chance < 1e-4
+
+
+@pytest.mark.parametrize("enclosed", [-1e5, 2e5])
+def test_a_pressure_enclosed_before_the_pump_first_turns_is_no_drift(enclosed: float) -> None:
+    """A logger that starts early records what shut valves hold, which is not the charge pressure."""
+    recording = record()
+    rests = recording.t < 20.0
+    channels = dict(recording.channels)
+    channels["omega"] = np.where(rests, 0.0, channels["omega"])
+    channels["x"] = np.where(rests, 0.0, channels["x"])
+    early = {**channels, "p_A": np.where(rests, 8e5 + enclosed, channels["p_A"])}
+    expected, estimated = (drifts(replace(recording, channels=values)).estimate("A") for values in (channels, early))
+    assert expected is not None and estimated is not None
+    assert estimated.value == pytest.approx(expected.value, abs=1.0)
 
 
 def test_missing_samples_cost_nothing_but_themselves() -> None:

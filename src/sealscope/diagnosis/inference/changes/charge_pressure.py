@@ -23,6 +23,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from sealscope.diagnosis.inference.balance import max_rest_rate
 from sealscope.diagnosis.inference.changes.motion_fit import (
     GROUPS,
     equal_parts,
@@ -32,6 +33,7 @@ from sealscope.diagnosis.inference.changes.motion_fit import (
 )
 from sealscope.diagnosis.inference.differences import Estimate, PriorScatter, compare_estimates, size_penalty
 from sealscope.diagnosis.inference.observable import Observable
+from sealscope.diagnosis.inference.terms import find_rests
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.diagnosis.priors.inference import StepSize
 from sealscope.recordings.channels import flow_source
@@ -80,24 +82,37 @@ class LowDrifts(NamedTuple):
 def estimate_low_drifts(recording: Recording) -> LowDrifts | None:
     """Estimate the drifts [Pa/s] of the lowest pressures of both chambers.
 
-    In a closed circuit a chamber that carries no load is at the charge pressure. The drift of a chamber is unknown if
-    its lowest pressure is by `charge.near` (`priors.toml`) or more above the other chamber's, or if at most the
-    fraction `charge.share` of its samples lies within `charge.near` of the lowest pressure. Return None if neither
-    drift is known, without both pressures, or without the pump's angle or speed.
+    In a closed circuit a chamber that carries no load is at the charge pressure. Samples before the pump first turns do
+    not count, as shut valves may enclose any pressure until then. The drift of a chamber is unknown if its lowest
+    pressure is by `charge.near` (`priors.toml`) or more above the other chamber's, or if at most the fraction
+    `charge.share` of its samples lies within `charge.near` of the lowest pressure. Return None if neither drift is
+    known, without both pressures, or without the pump's angle or speed.
     """
     flow_channel = flow_source(recording.channels)
     if len(recording) < MIN_SAMPLES or flow_channel not in PUMP or not {"p_A", "p_B"} <= set(recording.channels):
         return None
     prior, regressors = CHANGES.charge, _regressors(recording, flow_channel)
-    is_known = np.isfinite(regressors).all(axis=1)
+    has_turned = np.arange(len(recording)) >= _first_turn(recording[flow_channel], flow_channel, recording.rate)
+    is_known = np.isfinite(regressors).all(axis=1) & has_turned
     pressures = [average_over(prior.seconds, recording[name], recording.rate) for name in ("p_A", "p_B")]
-    lowest = [float(np.nanquantile(p, LOWEST)) for p in pressures]
+    lowest = [float(np.nanquantile(p[is_known], LOWEST)) if is_known.any() else np.nan for p in pressures]
     drifts = list[float]()
     for p, low in zip(pressures, lowest, strict=True):
         is_low = is_known & np.isfinite(p) & (p < low + prior.near)
         is_at_charge = low < min(lowest) + prior.near and is_low.mean() > prior.share  # else fit no samples: NaN
         drifts += _fit_drift(recording.t, p, regressors, np.flatnonzero(is_low & is_at_charge))
     return LowDrifts(*drifts) if np.isfinite(drifts).any() else None
+
+
+def _first_turn(drive: Array, flow_channel: str, rate: float) -> int:
+    """Find the index of the first sample at which the pump turns; 0 if it always rests.
+
+    `drive` (n,): the pump's angle, or its speed, as `flow_channel` "theta" or "omega" tells; `rate`: sampling rate
+    [Hz].
+    """
+    turned = np.diff(drive) if flow_channel == "theta" else drive[1:] / rate
+    is_turning = ~find_rests(turned, rate, max_rest_rate(turned, rate))
+    return int(np.argmax(is_turning))
 
 
 class ChargeTrend(NamedTuple):
