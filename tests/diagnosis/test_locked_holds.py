@@ -135,12 +135,12 @@ def test_a_large_leak_that_equalises_the_pressures_at_once_is_found() -> None:
 
 @pytest.mark.parametrize("exponent", [1.0, 0.5])
 def test_the_faster_a_leak_equalises_the_pressures_the_less_its_size_is_known(exponent: float) -> None:
-    """The relative error is that of a begin some tenth of a second off, over the time in which the leak flows."""
+    """The relative error is that of a start some tenth of a second off, over the time in which the leak flows."""
     errors = []
     for size in (0.01, 1.0, 100.0):
         chambers = held_press(piston=size * SEAL, exponent=exponent)
         law = LeakLaw(exponent)
-        errors.append(chambers.begin_error(chambers.piston_fits[exponent], law))
+        errors.append(chambers.start_error(chambers.piston_fits[exponent], law))
     held_s = HELD[1] - HELD[0]
     assert errors[0] == pytest.approx(INFERENCE.held_oil.settles / held_s / len(chambers.holds) ** 0.5, rel=0.2)
     assert errors[0] < errors[1] < errors[2]

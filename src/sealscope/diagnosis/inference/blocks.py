@@ -207,7 +207,7 @@ class ColumnRoles:
     - `left`: left side; `leak`: laminar leak, or the term that is tested in its place; `bias`: flow offset, or None;
     - `nuisance`: terms whose coefficients are unknown in any machine;
     - `compared`: the nuisance terms, and those that are fitted only to compare recordings;
-    - `motion`: motion of the piston, or flow of the valve's edges;
+    - `motion`: motion of the piston, or flow of the valve's edges; `compliance`: the chambers' oil and its air;
     - `hold_leak`: leakage of a pump that holds the load (`terms.HOLDING`), which a comparison of recordings leaves out,
       or None;
     - `fast`, `slow`: terms whose coefficients are free in each block, or common to all, while rows are weighted.
@@ -241,6 +241,7 @@ class ColumnRoles:
             [INFERENCE.level.outside if term.drift == "outside" else np.inf for term in equation.terms]
         )
         self.motion = tuple(k for k in self.nuisance if equation.terms[k].drift in ("motion", "edge"))
+        self.compliance = tuple(k for k in self.nuisance if equation.terms[k].drift in ("compliance", "air"))
         self.fast = tuple(k for k in self.nuisance if equation.terms[k].drift in UNSTEADY)
         # columns that are zero at rest; HOLDING is left out, since separate leakages of holds and other rests would
         # follow outliers

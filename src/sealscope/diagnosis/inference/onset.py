@@ -444,8 +444,8 @@ class _Whitened(NamedTuple):
         """Compute the change of the coefficient in each of K blocks by a unit step at each of o onsets, shape (K, o).
 
         `positions` (o,): onsets, counted in blocks from the start; `shape`: factor on the step in each block of the
-        recording, by default 1; `growth`: relative growth of the step from its onset to the end. If the
-        coefficient has a prior on its level, this prior is the first of the K blocks, without an entry in `shape`.
+        recording, by default 1; `growth`: relative growth of the step from its onset to the end. If the coefficient
+        has a prior on its level, this prior is the first of the K blocks, without an entry in `shape`.
         """
         count = self.transform.shape[1]
         steps = step_shapes(count, positions, growth)

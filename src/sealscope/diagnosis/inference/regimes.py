@@ -8,9 +8,9 @@ like a leak that ends. Between recordings one coefficient is compared for all re
 piston's leak only in such holds. If a flow meter measures the flow to the cylinder, only its flow tells motion from
 rest. Both balances select from the same columns, so one set of Gram matrices serves both.
 
-Let g be the leakage coefficient (of p_A - p_B) in motion and r the coefficient at rest; their covariance allows for
-errors that differ from block to block. With open valves r scatters about g; with shut valves and a healthy piston,
-about zero:
+Let g be the leakage coefficient (of p_A - p_B) in motion and r the coefficient at rest, given the compliances in
+motion; their covariance allows for errors that differ from block to block. With open valves r scatters about g; with
+shut valves and a healthy piston, about zero:
 
     log odds = log N(r; 0, V_r + (s g)^2) - log N(r - g; 0, V_(r - g) + (w g)^2),
 
@@ -36,8 +36,6 @@ from sealscope.recordings.recording import Array
 
 #: Fraction of the sum of squares of p_A - p_B below which a state of the machine does not occur, but for rounding.
 NEGLIGIBLE = 1e-6
-#: How the names of the terms of the chambers' compliance begin (`terms`).
-COMPLIANCES = ("compliance", "free air", "dissolving air")
 #: Least number of blocks with motion, and without, from which the leakage of either state is estimated by itself.
 MIN_STATE_BLOCKS = 2
 
@@ -155,12 +153,12 @@ def _estimate_leakage_by_state(blocks: Blocks, roles: ColumnRoles) -> _LeakageBy
     flow offset, are those in motion. With the columns X of leakage and flow offset at rest, the left side y, the other
     columns Z and their coefficients b in motion, the leakage r at rest is the first of
 
-        (X'X)^-1 X'(y - Z b),    variance = White's variance + J cov(b) J' + sum (J_c b_c)^2,
+        (X'X)^-1 X'(y - Z b),    variance = White's variance + J cov(b) J' + k^2 sum (J_c b_c)^2,
 
-    where J = d r/db is the first row of -(X'X)^-1 X'Z. The last term is a relative error of 1 of each compliance c:
-    those of low pressures and of high ones differ by the air in the oil. Pressures that stay the same at rest, or a
-    pump that makes good the leakage, have no such error. Return None if fewer than `MIN_STATE_BLOCKS` blocks lie in
-    either state.
+    where J = d r/db is the first row of -(X'X)^-1 X'Z. The last term is a relative error k = `rest.compliance`
+    (`priors.toml`) of each compliance c: those of low pressures and of high ones differ by the air in the oil.
+    Pressures that stay the same at rest, or a pump that makes good the leakage, have no such error. Return None if
+    fewer than `MIN_STATE_BLOCKS` blocks lie in either state.
     """
     gram, left = blocks.gram[:, 0], roles.left
     turning, holding, moving_bias = (roles.names.index(name) for name in (TURNING, HOLDING, MOVING_BIAS))
@@ -184,9 +182,8 @@ def _estimate_leakage_by_state(blocks: Blocks, roles: ColumnRoles) -> _LeakageBy
     total = rest_gram.sum(axis=0)
     normal, coupling = total[np.ix_(rest_columns, rest_columns)], total[np.ix_(rest_columns, shared_columns)]
     sensitivity = -solve(normal, coupling)[0]  # derivatives of the leakage at rest by the shared coefficients
-    is_compliance = np.array([roles.names[column].startswith(COMPLIANCES) for column in shared_columns])
-    by_compliance = sensitivity * coefficients[shared] * is_compliance
-    rest_variance = float(rest_covariance[0, 0] + by_compliance @ by_compliance)
+    by_compliance = (sensitivity * coefficients[shared])[np.isin(shared_columns, roles.compliance)]
+    rest_variance = float(rest_covariance[0, 0] + INFERENCE.rest.compliance**2 * (by_compliance @ by_compliance))
     rest_variance += float(sensitivity @ covariance[np.ix_(shared, shared)] @ sensitivity)
     motion_variance = float(covariance[np.ix_(in_motion, in_motion)].sum())
     common = float(sensitivity @ covariance[np.ix_(shared, in_motion)].sum(axis=1))

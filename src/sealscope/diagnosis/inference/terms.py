@@ -601,8 +601,8 @@ def locked(rig: Rig, channels: frozenset[str]) -> Equation | None:
     """Return the volume balance of a load that is held by shut valves; None if circuit or channels do not suffice.
 
     The piston moves only as far as oil leaks from the loaded side. The left side of the balance is the volume that must
-    have leaked from A to B for that motion: -dx times the piston's area on the loaded side, where x grows as A fills.
-    Leaks of seal, valve and line cannot be separated.
+    have leaked from A to B for that motion: -dx times the piston's area on the loaded side, where x is assumed to grow
+    as A fills. Leaks of seal, valve and line cannot be separated.
 
     The balance needs the position and both pressures. If a command or the pump's flow is recorded, the circuit must
     have valves that hold the load, and the command must be recorded: it is constant while they are shut. If neither is

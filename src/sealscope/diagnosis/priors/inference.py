@@ -337,6 +337,7 @@ class RestPriors(PriorTable):
     - `moves`: smallest mean flow of the pump in a block that counts as motion, and smallest flow by a flow meter.
     - `shut`: leakage at rest over that in motion if valves cut the pump off, a standard deviation.
     - `open`: relative difference of the leakage at rest and in motion if no valve shuts, a standard deviation.
+    - `compliance`: relative error of a compliance at rest that is fitted in motion, a standard deviation.
     - `valves`: log odds, before any recording, that valves cut the pump off.
     - `most`: limit of the log odds, from a healthy recording, that valves cut the pump off.
     - `alone`: the same limit for a judged recording.
@@ -350,6 +351,7 @@ class RestPriors(PriorTable):
     moves: float
     shut: float
     open: float
+    compliance: float
     valves: float
     most: float
     alone: float

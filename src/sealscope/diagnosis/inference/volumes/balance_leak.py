@@ -85,8 +85,9 @@ class BalanceLeak:
         """
         if self.balance.is_creep:
             return "internal or external leak"
-        rise = self.rise if self.rise is self._rises.get(True) else None  # in holds
-        in_holds = rise is not None and (self.balance.shut or rise.chance < INFERENCE.held_oil.rare)
+        hold_rise = self._rises.get(True)
+        is_clear = self.balance.shut or (hold_rise is not None and hold_rise.chance < INFERENCE.held_oil.rare)
+        in_holds = hold_rise is not None and self.rise is hold_rise and is_clear
         has_servo_valve = len(self.balance.columns) > 1  # one balance for each chamber
         return "piston leak" if has_servo_valve or in_holds else "piston or pump leak"
 
@@ -127,7 +128,7 @@ class BalanceLeak:
         """Amount by which the mean leakage [m^3/(s Pa)] exceeds that of healthy recordings; None without these.
 
         Of `_rises`, measured over the whole recording and while shut valves hold the load, the one with the smallest
-        p-value counts.
+        p-value counts, that in holds if both are equal.
         """
         return min(self._rises.values(), key=lambda rise: rise.chance, default=None)
 
@@ -146,7 +147,7 @@ class BalanceLeak:
         if hold_rise is None or chambers is None:
             return {False: motion_rise}
         share = chambers.probability_after_holds
-        return {False: motion_rise.share_alarms(share), True: hold_rise.share_alarms(1.0 - share)}
+        return {True: hold_rise.share_alarms(1.0 - share), False: motion_rise.share_alarms(share)}
 
     @cached_property
     def _motion_rise(self) -> Rise | None:
@@ -260,8 +261,8 @@ class BalanceLeak:
         values, noise_deviations, oil_deviations, _ = np.array([law_fit.fit for law_fit in chambers.law_fits]).T
         log_weights = np.array([law_fit.log_weight for law_fit in chambers.law_fits])
         weights = np.exp(log_weights - log_weights.max())
-        begin_errors = np.array([chambers.begin_error(conditions, law) for law, conditions, _, _ in chambers.law_fits])
-        deviations = np.sqrt(noise_deviations**2 + oil_deviations**2 + (begin_errors * values) ** 2)
+        start_errors = np.array([chambers.start_error(conditions, law) for law, conditions, _, _ in chambers.law_fits])
+        deviations = np.sqrt(noise_deviations**2 + oil_deviations**2 + (start_errors * values) ** 2)
         return _HoldLaws(weights / weights.sum(), np.array(units), values * units, deviations * units)
 
     def _rise_laws(self) -> list[LawWeight]:

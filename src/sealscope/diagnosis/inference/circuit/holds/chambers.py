@@ -249,24 +249,27 @@ class HeldChambers:
         fit = self._fit_leak(unit_leak, conditions.onset)
         return fit._replace(log_likelihood=fit.log_likelihood - 0.5 * self._offset_cost(conditions.offset))
 
-    def begin_error(self, conditions: PistonFit, law: LeakLaw) -> float:
-        """Estimate the relative standard error of a piston leak's coefficient by the uncertain begin of each hold.
+    def start_error(self, conditions: PistonFit, law: LeakLaw) -> float:
+        """Estimate the relative standard error of a piston leak's coefficient by the uncertain start of each hold.
 
-        The coefficient is the volume that has left a chamber over the time integral of the unit flow u. A hold begins
-        when its valves are shut, which is known to within s = `held_oil.settles` (`priors.toml`). A large leak
-        equalises the pressures within about that time, so that the integral is uncertain. With the unit flow u_0 at the
-        begin of each hold, the error is s sqrt(sum u_0^2) / sum of the integrals, summed over the holds. Holds after
-        the onset count; that of a leak within a hold does not matter. `conditions`: onset and sensor offset; `law`: law
-        of the leak.
+        The coefficient is the volume that has left a chamber, divided by the time integral of the flow u of a leak with
+        a coefficient of 1. A hold starts when its valves are shut. This time is known to within s = `held_oil.settles`
+        (`priors.toml`), and a large leak equalises the pressures about as fast. With the flow u_0 at the start of each
+        hold, the error is
+
+            s sqrt(sum of u_0^2) / (sum of the integrals of u), summed over the holds.
+
+        Only the time after the onset counts, so that a leak which begins within a hold has no such error there.
+        `conditions`: onset and sensor offset; `law`: law of the leak.
         """
-        begins, integrals = [0.0], [0.0]
+        start_flows, integrals = [0.0], [0.0]
         for hold in self.holds:
             is_after = hold.t >= conditions.onset
             unit_flow = np.where(is_after, np.abs(hold.driving_pressure(conditions.offset)) ** law.exponent, 0.0)
-            begins.append(float(unit_flow[: hold.edges[1]].max()))
+            start_flows.append(float(unit_flow[: hold.edges[1]].max()))
             integrals.append(float(np.trapezoid(unit_flow, hold.t)))
         time_error: float = INFERENCE.held_oil.settles
-        return time_error * float(np.linalg.norm(begins)) / max(sum(integrals), float(np.finfo(float).tiny))
+        return time_error * float(np.linalg.norm(start_flows)) / max(sum(integrals), float(np.finfo(float).tiny))
 
     def _offset_cost(self, offset: float) -> float:
         """Compute -2 log of the prior density of a sensor offset [Pa] and of the holds' deviations from this offset."""
