@@ -13,7 +13,8 @@ from sealscope.campaigns.smallest import DetectableLeak, PlannedDuty, RecordingP
 from sealscope.diagnosis.inference.circuit.holds.chambers import HeldChambers
 from sealscope.diagnosis.inference.circuit.holds.hold import MAX_RATE, find_locked_holds
 from sealscope.diagnosis.inference.circuit.holds.oil import CylinderSides
-from sealscope.diagnosis.inference.scatter import RecordingSums, held_rise
+from sealscope.diagnosis.inference.comparison.levels import held_rise
+from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
 from sealscope.errors import InputError
 from sealscope.parameters import Rig, load_rig
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sealscope.diagnosis.inference.balance import max_rest_rate, recorded_blocks
-from sealscope.diagnosis.inference.scatter import Rise
+from sealscope.diagnosis.inference.comparison.rise import Rise
 from sealscope.diagnosis.inference.terms import AVERAGING_TIME, TURNING, find_rests
 from sealscope.diagnosis.inference.volumes.balance_leak import BalanceLeak
 from sealscope.diagnosis.inference.volumes.detector import VolumeBalance

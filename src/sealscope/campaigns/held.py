@@ -24,7 +24,8 @@ import numpy as np
 from sealscope.diagnosis.inference.circuit.holds.chambers import HeldChambers
 from sealscope.diagnosis.inference.circuit.holds.hold import MAX_RATE, find_locked_holds
 from sealscope.diagnosis.inference.circuit.holds.oil import CylinderSides
-from sealscope.diagnosis.inference.scatter import RecordingSums, held_rise
+from sealscope.diagnosis.inference.comparison.levels import held_rise
+from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
 from sealscope.diagnosis.priors.decision import DECISION
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.errors import InputError

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from sealscope.diagnosis.inference.comparison.rise import Rise
 from sealscope.diagnosis.inference.observable import Flow, LeakRise, Observable
 from sealscope.diagnosis.inference.onset import Information, Interval, StepTest, step_test
-from sealscope.diagnosis.inference.scatter import Rise
 from sealscope.diagnosis.verdict.evidence import Cause, TotalLeakage
 
 #: Flow of the pump, and of a step of one [m^3/s]; L/min of 1 m^3/s.

@@ -13,9 +13,9 @@ import pytest
 from sealscope.diagnosis.decision.case import AGAINST, LEVEL, WITHIN, Case
 from sealscope.diagnosis.decision.decide import decide
 from sealscope.diagnosis.decision.null import HealthyNull
+from sealscope.diagnosis.inference.comparison.rise import Rise
 from sealscope.diagnosis.inference.observable import Observable, Observed
 from sealscope.diagnosis.inference.onset import Interval
-from sealscope.diagnosis.inference.scatter import Rise
 from sealscope.diagnosis.verdict.evidence import Evidence
 
 from .cases import DRIVING, LITRES, MeasuredLeak, observable, step
@@ -197,7 +197,7 @@ NAMES = {
     "decision/reasons.py",
     "inference/balance.py",
     "inference/blocks.py",
-    "inference/scatter.py",
+    "inference/comparison/coefficients.py",
     "inference/terms.py",
     "live/explanation.py",
     "live/watch.py",

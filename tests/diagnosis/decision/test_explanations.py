@@ -18,8 +18,8 @@ from sealscope.diagnosis.decision.explanations import (
     probability_of,
 )
 from sealscope.diagnosis.decision.null import HealthyNull
+from sealscope.diagnosis.inference.comparison.rise import Rise
 from sealscope.diagnosis.inference.observable import LeakRise, Observed
-from sealscope.diagnosis.inference.scatter import Rise
 from sealscope.diagnosis.priors.decision import DECISION
 from sealscope.diagnosis.verdict.states import state_of
 

@@ -25,7 +25,7 @@ from sealscope.diagnosis.healthy import SummarisedRecording, Summary
 from sealscope.diagnosis.inference.changes.pressure_bands import MIN_OCTAVES, PAIRS, Octaves
 from sealscope.diagnosis.inference.changes.signals import SIGNALS
 from sealscope.diagnosis.inference.circuit.holds.leaks import HeldLeaks
-from sealscope.diagnosis.inference.scatter import Resistance
+from sealscope.diagnosis.inference.comparison.recording_sums import Resistance
 from sealscope.diagnosis.inference.terms import LEAK
 from sealscope.diagnosis.rms_change.blocks import DUTY
 from sealscope.diagnosis.verdict.evidence import PRESSURE_RESPONSE, RMS_CHANGE, VOLUME_BALANCE
@@ -135,7 +135,7 @@ def _check_sums(summary: Any) -> Any:
     inequality. The other arrays of the summary are checked, too: `shut_sums` (1, m + 2, m + 2) are the sums for a pump
     that valves cut off at rest, which needs two more columns; `held` are the leaks while valves hold the load;
     `held_pump` are the pump's leakage just before these times and its standard deviation; and `resistance` is what
-    resists the motion (`scatter.Resistance`).
+    resists the motion (`recording_sums.Resistance`).
     """
     size = len(summary.terms) + 1
     if summary.sums.ndim != 3 or not len(summary.sums) or summary.sums.shape[1:] != (size, size):

@@ -19,8 +19,8 @@ from sealscope.diagnosis.decision.explanations import (
     probability_of,
 )
 from sealscope.diagnosis.decision.null import HealthyNull, null_key
+from sealscope.diagnosis.inference.comparison.rise import RISE
 from sealscope.diagnosis.inference.observable import LeakMeasure, Observable, Observed
-from sealscope.diagnosis.inference.scatter import RISE
 from sealscope.diagnosis.priors.decision import DECISION
 from sealscope.diagnosis.verdict.evidence import AGAINST, WITHIN
 from sealscope.diagnosis.verdict.states import joint_causes

@@ -27,8 +27,8 @@ import numpy as np
 
 from sealscope.diagnosis.decision.events import Event, load_events
 from sealscope.diagnosis.inference.changes.volumes import VOLUMES
+from sealscope.diagnosis.inference.comparison.rise import RISE
 from sealscope.diagnosis.inference.observable import LeakRise, Observable
-from sealscope.diagnosis.inference.scatter import RISE
 from sealscope.diagnosis.priors.decision import DECISION
 
 #: Largest number of events in an explanation.

@@ -13,8 +13,8 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from sealscope.diagnosis.inference.comparison.rise import Rise
 from sealscope.diagnosis.inference.onset import Interval, StepTest
-from sealscope.diagnosis.inference.scatter import Rise
 from sealscope.diagnosis.verdict.evidence import Cause, LeakCourse, RelativeLeak, TotalLeakage
 
 

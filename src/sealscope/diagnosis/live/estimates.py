@@ -10,10 +10,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from sealscope.diagnosis.inference.comparison.rise import Rise
 from sealscope.diagnosis.inference.observable import Flow
 from sealscope.diagnosis.inference.onset import WITHIN_95
 from sealscope.diagnosis.inference.onset import Interval as Onset
-from sealscope.diagnosis.inference.scatter import Rise
 from sealscope.diagnosis.live.rise import LEVEL, LiveRise
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.diagnosis.priors.live import LIVE

@@ -2,7 +2,7 @@
 
 The thesis compares the RMS of d1 to d4 and of d3*d4 before and after (its ch. 5 and Appendix C). It states a leak if
 the RMS has decreased (p_A) or increased (p_B). Here d2 to d4 of all chambers are tested for a step of either sign
-within the recording (`inference.onset`), or for a rise or fall against leak-free recordings (`inference.scatter`).
+within the recording (`inference.onset`), or for a rise or fall against leak-free recordings (`inference.comparison`).
 """
 
 from __future__ import annotations

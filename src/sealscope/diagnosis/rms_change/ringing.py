@@ -16,8 +16,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from sealscope.diagnosis.inference.comparison.population import Population, number_sessions
+from sealscope.diagnosis.inference.comparison.rise import Rise
 from sealscope.diagnosis.inference.onset import Information
-from sealscope.diagnosis.inference.scatter import Population, Rise, number_sessions
 from sealscope.diagnosis.priors.rms_change import RMS_PRIORS
 from sealscope.diagnosis.rms_change.blocks import DUTY, RmsBlocks
 from sealscope.recordings.recording import Array

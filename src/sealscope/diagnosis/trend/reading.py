@@ -14,10 +14,10 @@ import numpy as np
 from sealscope.diagnosis.detectors.detector import unusable_reason
 from sealscope.diagnosis.healthy import Summary
 from sealscope.diagnosis.inference.blocks import ColumnRoles
+from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
 from sealscope.diagnosis.inference.onset import WITHIN_95
 from sealscope.diagnosis.inference.pressures.detector import PressureResponse
 from sealscope.diagnosis.inference.pressures.leak import conductance_scale_error
-from sealscope.diagnosis.inference.scatter import RecordingSums
 from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
 from sealscope.diagnosis.inference.volumes.recorded import RecordedBalance
 from sealscope.diagnosis.inspection import inspect_recording

@@ -17,10 +17,11 @@ import numpy as np
 
 from sealscope.diagnosis.decision.decide import decide
 from sealscope.diagnosis.decision.null import HealthyNull
+from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
+from sealscope.diagnosis.inference.comparison.rise import Rise
 from sealscope.diagnosis.inference.leak_law import EXPONENTS, law_priors, mixture_flow
 from sealscope.diagnosis.inference.observable import Flow, LeakRise, Observable, Observed, Remark, Ringing
 from sealscope.diagnosis.inference.onset import WITHIN_95, Interval
-from sealscope.diagnosis.inference.scatter import RecordingSums, Rise
 from sealscope.diagnosis.inference.volumes.rivals import rival_rises
 from sealscope.diagnosis.rms_change.detector import DETAILS, compare_summaries
 from sealscope.diagnosis.trend.reading import TrendPoint

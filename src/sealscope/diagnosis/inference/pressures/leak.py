@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sealscope.diagnosis.inference.comparison.rise import Rise, student_rise
 from sealscope.diagnosis.inference.observable import Flow, LeakRise, Remark
 from sealscope.diagnosis.inference.onset import WITHIN_95, Information, Interval, StepTest, fit_history, step_test
-from sealscope.diagnosis.inference.scatter import Rise, student_rise
 from sealscope.diagnosis.priors.pressures import PRESSURE
 from sealscope.diagnosis.verdict.evidence import PRESSURE_RESPONSE, Cause, LeakCourse, RelativeLeak, TotalLeakage
 from sealscope.recordings.recording import Array

@@ -10,6 +10,11 @@ from typing import NamedTuple
 import numpy as np
 
 from sealscope.diagnosis.inference.circuit.holds.chambers import HeldChambers
+from sealscope.diagnosis.inference.comparison.conditions import find_unusual_conditions
+from sealscope.diagnosis.inference.comparison.laws import compare_laws
+from sealscope.diagnosis.inference.comparison.levels import held_rise, rise
+from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
+from sealscope.diagnosis.inference.comparison.rise import Mixture, Rise
 from sealscope.diagnosis.inference.leak_law import (
     EXPONENTS,
     LawWeight,
@@ -20,15 +25,6 @@ from sealscope.diagnosis.inference.leak_law import (
 )
 from sealscope.diagnosis.inference.observable import Flow, LeakRise, Remark
 from sealscope.diagnosis.inference.onset import BOUND_PROBABILITY, UPPER_95, WITHIN_95, Interval, StepTest
-from sealscope.diagnosis.inference.scatter import (
-    Mixture,
-    RecordingSums,
-    Rise,
-    compare_laws,
-    find_unusual_conditions,
-    held_rise,
-    rise,
-)
 from sealscope.diagnosis.inference.volumes.recorded import RecordedBalance
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.diagnosis.verdict.evidence import Cause, LeakCourse, RelativeLeak, TotalLeakage

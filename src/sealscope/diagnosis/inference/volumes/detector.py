@@ -19,18 +19,15 @@ from sealscope.diagnosis.inference.balance import (
 from sealscope.diagnosis.inference.blocks import ColumnRoles
 from sealscope.diagnosis.inference.circuit.store import recorded_oil_loss_tests
 from sealscope.diagnosis.inference.circuit.without_position import cycle_balances
+from sealscope.diagnosis.inference.comparison.coefficients import motion_change
+from sealscope.diagnosis.inference.comparison.conditions import find_unusual_conditions
+from sealscope.diagnosis.inference.comparison.levels import leak_deviations_from_mean, rise
+from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
+from sealscope.diagnosis.inference.comparison.rise import Rise
 from sealscope.diagnosis.inference.differences import Estimate, PriorScatter, compare_estimates
 from sealscope.diagnosis.inference.observable import Observable, Observed
 from sealscope.diagnosis.inference.regimes import add_pump_columns
 from sealscope.diagnosis.inference.rows.weak_form import STRIDE, stride_samples
-from sealscope.diagnosis.inference.scatter import (
-    RecordingSums,
-    Rise,
-    find_unusual_conditions,
-    leak_deviations_from_mean,
-    motion_change,
-    rise,
-)
 from sealscope.diagnosis.inference.terms import (
     CYLINDER,
     HOLDING,
@@ -185,7 +182,7 @@ class VolumeBalance:
         summary therefore has the sums for both cases, and log odds, which are later combined over all healthy
         recordings. Its entries are:
 
-        - the fields of `scatter.RecordingSums` that are known, for a pump that stays connected at rest;
+        - the fields of `recording_sums.RecordingSums` that are known, for a pump that stays connected at rest;
         - `terms`: names of the balance's terms;
         - `scale`: factor from computed to true flows (`Size`), 0 if no flow can be stated in L/min;
         - `shut_sums`, `shut_odds`, if the machine rests: Gram matrices for a pump that valves cut off at rest, and log

@@ -30,6 +30,7 @@ from sealscope.diagnosis.inference.circuit.holds.hold import (
     find_locked_holds,
 )
 from sealscope.diagnosis.inference.circuit.holds.oil import CylinderSides
+from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
 from sealscope.diagnosis.inference.differences import Estimate
 from sealscope.diagnosis.inference.leak_law import find_leak_step
 from sealscope.diagnosis.inference.observable import Observable
@@ -44,7 +45,6 @@ from sealscope.diagnosis.inference.onset import (
     step_test,
 )
 from sealscope.diagnosis.inference.regimes import fit_with_robust_covariance, rest_log_odds
-from sealscope.diagnosis.inference.scatter import RecordingSums
 from sealscope.diagnosis.inference.terms import (
     LAG,
     LOCKED,

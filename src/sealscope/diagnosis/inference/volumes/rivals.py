@@ -16,19 +16,14 @@ import numpy as np
 
 from sealscope.diagnosis.inference.blocks import ColumnRoles, solve
 from sealscope.diagnosis.inference.circuit.holds.leaks import HeldLeaks
+from sealscope.diagnosis.inference.comparison.coefficients import coefficient_level
+from sealscope.diagnosis.inference.comparison.laws import compare_laws, compare_with_leak
+from sealscope.diagnosis.inference.comparison.levels import MIN_WITH_HOLDS, held_pump_rise, rise
+from sealscope.diagnosis.inference.comparison.oil import predict_thinning
+from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
+from sealscope.diagnosis.inference.comparison.rise import RISE
 from sealscope.diagnosis.inference.differences import compare_with_healthy, excess_error, size_penalty
 from sealscope.diagnosis.inference.observable import Observable
-from sealscope.diagnosis.inference.scatter import (
-    MIN_WITH_HOLDS,
-    RISE,
-    RecordingSums,
-    coefficient_level,
-    compare_laws,
-    compare_with_leak,
-    held_pump_rise,
-    predict_thinning,
-    rise,
-)
 from sealscope.diagnosis.inference.terms import AIR, LEAK, SPEED_LOSS, TURNING
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Array

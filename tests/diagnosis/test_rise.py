@@ -9,16 +9,12 @@ import pytest
 from scipy.stats import binom, kstest, norm
 
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles
-from sealscope.diagnosis.inference.scatter import (
-    Mixture,
-    Population,
-    RecordingSums,
-    Resistance,
-    Rise,
-    find_unusual_conditions,
-    motion_change,
-    rise,
-)
+from sealscope.diagnosis.inference.comparison.coefficients import motion_change
+from sealscope.diagnosis.inference.comparison.conditions import find_unusual_conditions
+from sealscope.diagnosis.inference.comparison.levels import rise
+from sealscope.diagnosis.inference.comparison.population import Population
+from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums, Resistance
+from sealscope.diagnosis.inference.comparison.rise import Mixture, Rise
 from sealscope.diagnosis.inference.terms import LAG, LEAK, Equation, Term
 from sealscope.diagnosis.inference.volumes.detector import compare_motion
 from sealscope.diagnosis.priors.inference import INFERENCE

@@ -1,0 +1,157 @@
+"""Coefficients of the volume balance, estimated from the Gram matrices of a recording and of healthy recordings.
+
+The Gram matrices of the healthy recordings are added up and give the coefficients of all terms of the balance. A
+recording's residual under these coefficients, projected on the leak's column, is its rise. The recording's other
+coefficients may differ from the healthy ones within a prior. The zero of the flow repeats: a free one would absorb a
+leak whose flow is nearly constant, and what it changes from day to day is part of the scatter. The priors are in
+`priors.toml`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from sealscope.diagnosis.inference.blocks import ColumnRoles, solve
+from sealscope.diagnosis.inference.comparison.rise import TINY
+from sealscope.diagnosis.inference.terms import LAG, LEAK
+from sealscope.recordings.recording import Array
+
+
+def coefficient_level(gram: Array, columns: Sequence[ColumnRoles]) -> tuple[float, float]:
+    """Estimate the leak coefficient, at least 0, and its standard error from the Gram matrices `gram` (E, m, m).
+
+    `columns`: for each equation the indices of its columns by role (leak, motion, left side). The coefficients of the
+    other terms (nuisances) are eliminated from each equation by the Schur complement, and the equations are added up;
+    those that recordings do not share are already eliminated from `gram` (`eliminate_unshared`). Both results are 0 if
+    the matrices have no information on the leak.
+    """
+    precision, moment = 0.0, 0.0
+    for e, roles in enumerate(columns):
+        nuisance = [k for k in roles.compared if k != roles.leak and np.isfinite(roles.between_deviation[k])]
+        cross = gram[e][nuisance, roles.leak]
+        solved = solve(gram[e][np.ix_(nuisance, nuisance)], np.column_stack([cross, gram[e][nuisance, roles.left]]))
+        precision += float(gram[e][roles.leak, roles.leak] - cross @ solved[:, 0])
+        moment += float(gram[e][roles.leak, roles.left] - cross @ solved[:, 1])
+    return (max(moment, 0.0) / precision, precision**-0.5) if precision > 0.0 else (0.0, 0.0)
+
+
+def motion_change(judged: Array, healthy: Array, roles: ColumnRoles) -> tuple[float, float]:
+    """Estimate the log ratio of a recording's motion coefficient (area of the piston) to that of healthy recordings.
+
+    Returns the logarithm and its standard error, which contains the error of the recording's fit but not the error of
+    the healthy fit. The ratio differs from 1 if area over displacement changed: another machine, or another scale of a
+    sensor.
+
+    The regression is the volume balance. `judged`, `healthy`: its Gram matrices (m, m) of the recording and of the sum
+    of the healthy ones; `roles`: indices of their columns by role (leak, motion, left side). Each of the two fits gives
+    a coefficient for each direction of the motion and each loaded side. Their mean, weighted by the sums of squares of
+    these columns in the recording, is the motion coefficient [m^2]. In the recording's fit the motion, its delay
+    (`terms.LAG`) and the leak are free; without the leak, the motion would absorb leakage in proportion to the speed.
+    The other coefficients differ from the healthy ones by a normal prior (`between` in `priors.toml`).
+    """
+    motion = [k for k in roles.motion if roles.names[k] != LAG]
+    fitted = [k for k in roles.compared if k == roles.leak or np.isfinite(roles.between_deviation[k])]
+    reference = solve(healthy[np.ix_(fitted, fitted)], healthy[fitted, roles.left])
+    is_free = np.isin(fitted, [*roles.motion, roles.leak])
+    leak_coefficient = reference[fitted.index(roles.leak)]
+    precision = roles.difference_precisions(fitted, reference, leak_coefficient)
+    gram = judged[np.ix_(fitted, fitted)]
+    # limited to a precision that is enough to fix a coefficient
+    prior = np.where(is_free, 0.0, np.minimum(precision, 1e9 * np.diag(gram)))
+    weights = np.where(np.isin(fitted, motion), np.diag(gram), 0.0)
+    # second right side: gives the variance of the weighted sum of the coefficients
+    right_sides = np.column_stack([judged[fitted, roles.left] + prior * reference, weights])
+    coefficients, error_weights = solve(gram + np.diag(prior), right_sides).T
+    # means of the motion coefficients, times the sum of the weights, which cancels in both results
+    motion_sum, healthy_sum = (max(abs(float(weights @ c)), TINY) for c in (coefficients, reference))
+    return math.log(motion_sum / healthy_sum), math.sqrt(max(float(weights @ error_weights), 0.0)) / motion_sum
+
+
+def eliminate_unshared(gram: Array, columns: Sequence[ColumnRoles]) -> Array:
+    """Eliminate the coefficients that recordings do not share, such as a constant loss of oil, from each equation.
+
+    These are the coefficients without a prior on differences between recordings. The leakage of a pump that holds the
+    load is not eliminated, but set to zero first, since it counts only within a recording (`ColumnRoles.hold_leak`).
+    `gram` (E, m, m): Gram matrices of E equations; `columns`: for each equation the indices of its columns by role
+    (leak, motion, left side). The result is the Schur complement of the same shape, in which the rows and columns of
+    the eliminated coefficients are zero.
+    """
+    reduced = gram.copy()
+    for e, roles in enumerate(columns):
+        if roles.hold_leak is not None:
+            reduced[e][roles.hold_leak] = reduced[e][:, roles.hold_leak] = 0.0
+        unshared = [k for k in roles.compared if k != roles.leak and not np.isfinite(roles.between_deviation[k])]
+        cross = reduced[e][:, unshared].copy()
+        reduced[e] -= cross @ solve(reduced[e][np.ix_(unshared, unshared)], cross.T)
+        reduced[e][unshared] = reduced[e][:, unshared] = 0.0
+    return reduced
+
+
+class Residual(NamedTuple):
+    """Residual of a recording's volume balance under the coefficients of healthy recordings.
+
+    `products` (m,): scalar products of the residual with each column, and last with itself; `nuisance`: indices of
+    the c columns whose coefficients may differ between recordings; `prior_precision` (c,): precisions of the priors
+    on these differences.
+    """
+
+    products: Array
+    nuisance: list[int]
+    prior_precision: Array
+
+
+def residual_products(gram: Array, reference: Array, roles: ColumnRoles, *, has_leak: bool = False) -> Residual:
+    """Compute the residual of a recording under the coefficients fitted to other recordings (`Residual`).
+
+    `gram`, `reference` (m, m): Gram matrices of the recording and of the sum of the others; `roles`: indices of their
+    columns by role (leak, motion, left side). Compared coefficients with a prior on their differences may differ from
+    the coefficients of the other recordings within this prior. The leak's coefficient may differ only with `has_leak`,
+    by the prior `between.pump`.
+    """
+    compared = [k for k in roles.compared if k == roles.leak or np.isfinite(roles.between_deviation[k])]
+    coefficients = np.zeros(len(gram))
+    coefficients[compared] = -solve(reference[np.ix_(compared, compared)], reference[compared, roles.left])
+    nuisance = [k for k in compared if has_leak or k != roles.leak]
+    prior = roles.difference_precisions(nuisance, coefficients[nuisance], coefficients[roles.names.index(LEAK)])
+    coefficients[roles.left] = 1.0  # residual = left side - sum of the fitted terms
+    products = gram @ coefficients
+    products[roles.left] = coefficients @ products  # the residual's sum of squares
+    # limited, as the prior on a coefficient of zero has an infinite precision
+    prior = np.minimum(prior, 1e9 * np.diag(gram)[nuisance])
+    return Residual(products, nuisance, prior_precision=prior)
+
+
+def estimate_leak_excess(
+    gram: Array, reference: Array, columns: Sequence[ColumnRoles], widths: Array
+) -> tuple[Array, Array]:
+    """Estimate by how much a recording's leak coefficient exceeds that of other recordings, and the standard errors.
+
+    Both results have the shape (s,), for s widths of a prior, and are 0 where there is no information.
+
+    - `gram`, `reference` (E, m, m): Gram matrices of the recording, and of the sum of the others, for E equations.
+    - `columns`: for each equation the indices of its columns by role (leak, nuisances, left side).
+    - `widths` (s,): factors on the prior standard deviations by which the nuisance coefficients, i.e. those of the
+      other terms, differ between recordings.
+
+    The excess is fitted to the residual under the coefficients of the others (`residual_products`). The nuisance
+    coefficients are eliminated (Schur complement). Each equation then states precision x excess = moment. Precisions
+    and moments are summed over the equations, and the excess is moment / precision.
+    """
+    precision, moment = np.zeros((2, len(widths)))
+    for e, roles in enumerate(columns):
+        residual, nuisance, prior = residual_products(gram[e], reference[e], roles)
+        matrix, cross = gram[e][np.ix_(nuisance, nuisance)], gram[e][nuisance, roles.leak]
+        right_sides = np.column_stack([cross, residual[nuisance]])
+        for index, width in enumerate(widths):
+            # the prior's precision is limited to 1e9 times the recording's, which is enough to fix a coefficient
+            regularised = matrix + np.diag(np.minimum(prior / width**2, 1e9 * np.diag(matrix)))
+            solved = solve(regularised, right_sides)
+            precision[index] += float(gram[e][roles.leak, roles.leak] - cross @ solved[:, 0])
+            moment[index] += float(residual[roles.leak] - cross @ solved[:, 1])
+    is_known = precision > 0.0
+    divisor = np.where(is_known, precision, 1.0)
+    return np.where(is_known, moment / divisor, 0.0), np.where(is_known, divisor**-0.5, 0.0)

@@ -1,0 +1,339 @@
+"""Rise of a recording's leakage, i.e. the leakage above that of healthy recordings, whose scatter is estimated.
+
+The rise r_j of each healthy recording over the n - 1 others (`coefficients`) measures the scatter, including all
+effects that the model does not describe. The comparison uses y_j = r_j (n - 1)/n, the rise over the mean of all n, and
+for the judged recording y, its rise.
+
+The width of the prior on the other coefficients is known only to within a factor: one machine, held at one temperature,
+repeats its coefficients to a thousandth; another changes by a tenth from run to run. With too narrow a prior the rises
+scatter, with too wide a prior they are imprecise. Therefore y is computed for several widths, each weighted by its
+prior and by the likelihood of the healthy recordings, p(y_1 .. y_n).
+
+Levels that are clearly above zero are compared as logarithms: z = asinh(a / 2 c). Here a = mean level + y is the level
+(leak coefficient) of a recording, and c, which follows from the errors of a, is the level below which z is linear. For
+each width all z are normal about an unknown mean. These effects contribute to their covariance:
+
+- Scatter of single recordings: sigma^2 on the diagonal. sigma has a log-uniform prior from a recording's standard error
+  to a tenth of the flow, so five recordings that agree allow a smaller sigma than two do.
+- Sessions: recordings of one session share oil and set-up. The deviation tau of a session has a half-normal prior.
+  Sessions are separated by date; undated recordings form one session.
+- Oil (`oil`): z has a slope in the temperature or in the viscous drop, and a recording with oil outside of the known
+  range is less certain; unknown oil is covered by tau.
+- Conditions (`conditions`): load and speed outside of the known range make a recording less certain.
+
+The rise follows the mixture over all of these. The priors are in `priors.toml`.
+
+Source: A. Gelman et al., Bayesian Data Analysis, 3rd ed. (2013), sections 3.2, 5.4 and 5.7; C. E. Rasmussen and C. K.
+I. Williams, Gaussian Processes for Machine Learning (2006), section 2.7 (an unknown mean).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sealscope.diagnosis.inference.blocks import ColumnRoles
+from sealscope.diagnosis.inference.comparison.coefficients import (
+    coefficient_level,
+    eliminate_unshared,
+    estimate_leak_excess,
+)
+from sealscope.diagnosis.inference.comparison.conditions import find_unusual_conditions
+from sealscope.diagnosis.inference.comparison.oil import OilHypothesis, oil_hypotheses
+from sealscope.diagnosis.inference.comparison.population import Population, number_sessions
+from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
+from sealscope.diagnosis.inference.comparison.rise import NODES, Mixture, Rise, rise_of_mixture
+from sealscope.diagnosis.inference.rows.weak_form import MAX_READING
+from sealscope.diagnosis.priors.inference import INFERENCE
+from sealscope.recordings.recording import Array
+
+#: Largest standard deviation between sessions on the grid, over its prior.
+MAX_SESSION_RATIO = 3.0
+#: Number of widths of the prior on differences between recordings, and the largest log width [standard deviations].
+SCALES, MAX_SCALE = 11, 2.5
+#: Minimum number of healthy recordings with holds under pressure: for a mean and a scatter.
+MIN_WITH_HOLDS = 2
+#: A normal distribution of z is replaced by this number of narrower ones, with this fraction of its deviation.
+PARTS, PART_WIDTH = 7, 0.5
+#: Limit of abs(z).
+MAX_Z = 30.0
+
+
+def rise(judged: RecordingSums, baseline: Sequence[RecordingSums], columns: Sequence[ColumnRoles]) -> Rise:
+    """Estimate by how much a recording's leak coefficient exceeds that of healthy recordings of the same machine.
+
+    `judged`: summary of the recording, i.e. Gram matrices of its volume balance, mean flow and mean pressure;
+    `baseline`: summaries of the healthy recordings; `columns`: for each equation the indices of its columns by role
+    (leak, motion, left side), the same for all recordings. The rise and its standard deviation are in the unit of the
+    leak's coefficient, for the laminar leak m^3/(s Pa).
+
+    The other coefficients may differ between recordings within a prior. As its width is uncertain, the rises are
+    estimated for several widths, and the result is an average over them (`_compare_levels`).
+    """
+    healthy_sums = np.sum([recording.sums for recording in baseline], axis=0)
+    count, prior = len(baseline), INFERENCE.scatter
+    # factors on the prior standard deviations; log(`prior.between`) is the standard deviation of their logarithm
+    widths = prior.between ** np.linspace(-MAX_SCALE, MAX_SCALE, SCALES)
+    rises, rise_errors = np.zeros((SCALES, count)), np.zeros((SCALES, count))
+    if count > 1:  # rises of each healthy recording over the others, scaled to its rise over the mean of all
+        projections = [
+            estimate_leak_excess(recording.sums, healthy_sums - recording.sums, columns, widths)
+            for recording in baseline
+        ]
+        rises, rise_errors = (
+            np.array(estimates).T * ((count - 1) / count) for estimates in zip(*projections, strict=True)
+        )
+    values, error = estimate_leak_excess(judged.sums, healthy_sums, columns, widths)
+    level, level_error = coefficient_level(healthy_sums, columns)
+    # error of a rise for each width: a fraction of the typical standard error, at least the fraction `prior.finest` of
+    # the pump's mean flow, as a conductance, and never 0 (1 / MAX_READING)
+    errors = prior.estimate * np.median(np.column_stack([error, rise_errors]), axis=1)
+    errors = np.maximum(errors, max(prior.finest * judged.conductance_of_flow, 1.0 / MAX_READING))
+    return _compare_levels(judged, baseline, _Estimates(values, rises, errors, level, level_error))
+
+
+def held_rise(judged: RecordingSums, baseline: Sequence[RecordingSums]) -> Rise | None:
+    """Estimate the rise of the leakage past the piston over healthy recordings, from holds.
+
+    A hold is a time in which shut valves keep the load in place. `judged`: summary of the recording; `baseline`:
+    summaries of the healthy recordings. The leak may have begun within the recording, whose mean then contains only a
+    part of it (`Rise.may_be_partial`). Return None if the judged recording has no holds, or if fewer than
+    `MIN_WITH_HOLDS` healthy recordings have holds.
+    """
+    baseline = [recording for recording in baseline if recording.held is not None]
+    if judged.held is None or len(baseline) < MIN_WITH_HOLDS:
+        return None
+    # the first two values of `HeldLeaks`: leak past the piston, and its standard deviation
+    leaks = np.array([recording.held[:2] for recording in (*baseline, judged) if recording.held is not None])
+    min_crossover = INFERENCE.scatter.largest * judged.conductance_of_flow
+    return _compare_held(judged, baseline, leaks, min_crossover=min_crossover)._replace(may_be_partial=True)
+
+
+def held_pump_rise(judged: RecordingSums, baseline: Sequence[RecordingSums]) -> Rise | None:
+    """Estimate the rise of the pump's leakage over healthy recordings, from the time just before holds.
+
+    `judged`: summary of the recording; `baseline`: summaries of the healthy recordings. Return None if the pump's
+    leakage is unknown in the judged recording, or known in fewer than `MIN_WITH_HOLDS` healthy recordings.
+    """
+    baseline = [recording for recording in baseline if recording.held_pump is not None]
+    if judged.held_pump is None or len(baseline) < MIN_WITH_HOLDS:
+        return None
+    leakages = np.array([r.held_pump for r in (*baseline, judged) if r.held_pump is not None])
+    # the relative deviation between sessions, times the mean leakage of the healthy recordings
+    session_deviation = INFERENCE.held_oil.pump_session * abs(float(leakages[:-1, 0].mean()))
+    return _compare_held(judged, baseline, leakages, session_deviation=session_deviation)
+
+
+def _compare_held(judged: RecordingSums, baseline: Sequence[RecordingSums], leaks: Array, **priors: float) -> Rise:
+    """Estimate the rise of a leak that holds measure over its mean in the healthy recordings.
+
+    `leaks` (n + 1, 2): conductance and standard deviation [m^3/(s Pa)] in each of the n recordings `baseline`, and last
+    in the recording `judged`; `priors`: `min_crossover` and `session_deviation` of `_Estimates`.
+    """
+    *healthy_leaks, leak = leaks[:, 0]
+    level = float(np.mean(healthy_leaks))
+    min_error = max(INFERENCE.scatter.finest * judged.conductance_of_flow, 1.0 / MAX_READING)  # above 0
+    error = np.maximum(np.median(leaks[:, 1]), min_error)
+    estimates = _Estimates(
+        values=np.array([leak - level]),
+        rises=(np.array(healthy_leaks) - level)[None],
+        errors=error[None],
+        level=max(level, 0.0),
+        level_error=error / np.sqrt(len(baseline)),
+        **priors,
+    )
+    # `error` is included already; a less precise judged recording adds the difference
+    return _compare_levels(judged, baseline, estimates).widen(float(leaks[-1, 1]) ** 2 - float(error) ** 2)
+
+
+class _Estimates(NamedTuple):
+    """Rises of the leak coefficient, estimated with each of s prior standard deviations of the other coefficients.
+
+    These priors are on the differences of the coefficients between recordings. `values` (s,): rises of the judged
+    recording; `rises` (s, n): rises of n healthy recordings over their mean; `errors` (s,): standard error of one rise;
+    `level`: mean coefficient of the healthy recordings; `level_error`: its standard error; `min_crossover`: minimum of
+    `_LevelScale.crossover`, large where healthy levels are about zero; `session_deviation`: prior standard deviation
+    between sessions with the same oil, None for that of the whole leakage (`scatter.session` of `priors.toml`). All
+    have the unit of the coefficient.
+    """
+
+    values: Array
+    rises: Array
+    errors: Array
+    level: float
+    level_error: float
+    min_crossover: float = 0.0
+    session_deviation: float | None = None
+
+
+def _compare_levels(judged: RecordingSums, baseline: Sequence[RecordingSums], estimates: _Estimates) -> Rise:
+    """Estimate by how much the judged leak coefficient exceeds the coefficient that the healthy recordings predict.
+
+    `judged`, `baseline`: summaries of the judged recording and of n healthy ones; `estimates`: rises of all of them
+    over the healthy mean, with their errors. Each of its s rows belongs to one width of the prior on the other
+    coefficients; there is one row if no such prior is used.
+
+    The sum of healthy mean and rise is the leak coefficient a of a recording. Leak coefficients are compared as z =
+    asinh(a / (2 c)), which is logarithmic for large a (`_LevelScale`). From z the predicted effect of the oil is
+    subtracted. The rest is normal about an unknown mean, with an unknown standard deviation sigma of single recordings;
+    sessions, oil and unusual conditions add covariances (see the module).
+    """
+    values, rises, errors, level, level_error, min_crossover, session_deviation = estimates
+    prior = INFERENCE.scatter
+    if session_deviation is None:
+        session_deviation = prior.session * judged.conductance_of_flow
+    # log width of the prior in each row, in standard deviations; estimates from holds have no such prior
+    log_widths = np.linspace(-MAX_SCALE, MAX_SCALE, SCALES) if len(values) == SCALES else np.zeros(len(values))
+    recordings = [*baseline, judged]
+    oils = oil_hypotheses(recordings)
+    # scatter that the oil does not explain: warmer oil is thinner and leaks more
+    oil_factor = np.exp(oils[0].thinning[:-1])
+    unexplained = rises - level * (oil_factor - oil_factor.mean())
+    scatter = float(np.median(unexplained.std(axis=1)))
+    # c, below which z is linear in a: the largest of the errors, the scatter and a tenth of the level
+    scale = _LevelScale(level, max(level_error, float(np.median(errors)), scatter, 0.1 * level, min_crossover))
+    steepness = scale.slope(level)  # dz/da at the healthy mean
+    relative_slope = steepness * level  # change of z for a relative change of a
+    log_condition_excess = sum(condition.log_excess for condition in find_unusual_conditions(judged, baseline))
+    pause = 3600.0 * INFERENCE.oil.shift  # from hours to seconds
+    sessions = number_sessions([recording.start_s for recording in recordings], pause)
+    # grid of sigma in z, for each row of the estimates: from the standard error to the largest plausible scatter, at
+    # least to ten standard errors
+    max_scatter = min(steepness * prior.largest * judged.conductance_of_flow, prior.relative)
+    max_sigma = np.maximum(max_scatter, 10.0 * steepness * errors)
+    sigma = np.geomspace(steepness * errors, max_sigma, NODES, axis=1)
+    judged_z, healthy_z = scale.transform(values), scale.transform(rises)
+    # log Jacobian of z, plus log prior of the width, for each row
+    log_priors = np.log(scale.slope(level + rises)).sum(axis=1) - 0.5 * log_widths**2
+    predictions = []
+    for oil in oils:
+        thinned = level * np.exp(oil.thinning)  # predicted levels
+        candidates = _candidate_covariances(
+            sessions,
+            oil,
+            scale.slope(thinned) * thinned,
+            oil_deviation=relative_slope * oil.session_deviation,
+            session_deviation=steepness * session_deviation,
+            condition_deviation=relative_slope * (log_condition_excess * INFERENCE.conditions.leak),
+        )
+        shifts = scale.transform(thinned - level) - scale.transform(np.zeros(1))  # effect of the oil on z
+        predicted = Population(*candidates).predict(
+            judged_z - shifts[-1], healthy_z - shifts[:-1], sigma, log_priors + oil.log_probability
+        )
+        predictions.append(scale.to_levels(predicted, judged_z))
+    all_oils = Mixture(*(np.concatenate(parts, axis=1) for parts in zip(*predictions, strict=True)))
+    return rise_of_mixture(all_oils, values)
+
+
+def _candidate_covariances(
+    sessions: Sequence[int],
+    oil: OilHypothesis,
+    relative_slopes: Array,
+    *,
+    oil_deviation: float,
+    session_deviation: float,
+    condition_deviation: float,
+) -> tuple[Array, Array]:
+    """Build the candidate covariances of transformed leak coefficients z between recordings, with log priors.
+
+    z = asinh(a / (2 c)) of a leak coefficient a (`_LevelScale`) is logarithmic for large coefficients.
+
+    Parameters
+    ----------
+    sessions : sequence of int, length n + 1
+        Session number of each recording, the judged one last.
+    oil : OilHypothesis
+        Hypothesis on the oil of the recordings.
+    relative_slopes : array of float, shape (n + 1,)
+        Change of z per relative change of each recording's leak coefficient.
+    oil_deviation : float
+        Standard deviation of z between sessions by unknown oil; 0 if the oil is known.
+    session_deviation : float
+        Prior standard deviation of z between sessions with the same oil.
+    condition_deviation : float
+        Standard deviation of the judged z due to unusual load and speed.
+
+    Returns
+    -------
+    covariances : array of float, shape (g, n + 1, n + 1)
+    log_priors : array of float, shape (g,)
+    """
+    # grid of the standard deviation between sessions over its prior, denser near zero; the log priors are those of a
+    # half-normal density times the distance of the grid points, which grows with the root of the ratio
+    ratios = MAX_SESSION_RATIO * ((np.arange(NODES) + 0.5) / NODES) ** 2
+    log_priors = 0.5 * np.log(ratios) - 0.5 * ratios**2
+    if len(set(sessions)) == 1:
+        ratios, log_priors = np.zeros(1), np.zeros(1)
+    session_variances = (np.hypot(oil_deviation, session_deviation) * ratios) ** 2
+    # recordings of one session share the deviation of the session
+    covariances = session_variances[:, None, None] * np.equal.outer(np.array(sessions), np.array(sessions))
+    # the predicted effect of the oil has errors of its slope and of its values
+    effects = relative_slopes * oil.thinning
+    covariances = covariances + np.outer(effects, effects) * oil.slope_deviation**2
+    covariances += np.diag(relative_slopes**2 * oil.variances)
+    covariances[:, -1, -1] += condition_deviation**2
+    if oil_deviation > 0.0 and sessions[-1] not in sessions[:-1]:
+        # two cases: the oil in the judged recording's session is like the oil in the healthy sessions, or unlike it;
+        # unlike oil adds the variance of a difference between two sessions
+        unlike = INFERENCE.scatter.unlike
+        log_priors = (np.log([[1.0 - unlike], [unlike]]) + log_priors).ravel()
+        covariances = np.tile(covariances, (2, 1, 1))
+        covariances[len(ratios) :, -1, -1] += 2.0 * oil_deviation**2
+    return covariances, log_priors
+
+
+class _LevelScale(NamedTuple):
+    """Transform z = asinh(a / (2 c)) of a leak coefficient a: logarithmic for a far above c, linear far below c.
+
+    `level`: mean coefficient of the healthy recordings; `crossover`: c. Both are in the unit of the coefficient.
+    """
+
+    level: float
+    crossover: float
+
+    def transform(self, excess: Array) -> Array:
+        """Compute z = asinh(a / (2 c)) of leak coefficients a = `level` + `excess`, of any shape, with c = `crossover`.
+
+        `level` is the mean coefficient of the healthy recordings.
+        """
+        return np.asarray(np.arcsinh((self.level + excess) / (2.0 * self.crossover)))
+
+    def slope(self, level: Any) -> Any:
+        """Compute dz/da = 1 / sqrt(a^2 + (2 c)^2) of z = asinh(a / (2 c)) at leak coefficients a = `level`.
+
+        c is the `crossover`. `level`: a number or an array; the result has the same shape.
+        """
+        return 1.0 / np.hypot(level, 2.0 * self.crossover)
+
+    def to_levels(self, predicted: Mixture, transformed: Array) -> Mixture:
+        """Convert a distribution of z to a distribution of the leak coefficient, relative to the healthy mean `level`.
+
+        `predicted`: mixture of normal distributions of z, shape (s, g, nodes) as from `Population.predict`, whose
+        weights are logarithms and whose centres are relative to `transformed` (s,), the z of the judged recording. Each
+        normal distribution is split into `PARTS` narrower ones, along a new last axis, within which the coefficient is
+        nearly linear in z. Their mixture has the mean and the variance of the original distribution.
+        """
+        x, part_weights = np.polynomial.hermite_e.hermegauss(PARTS)  # centres of the parts [standard deviations]
+        centres, deviations = predicted.centres + transformed[:, None, None], predicted.deviations[..., None]
+        z = np.clip(centres[..., None] + np.sqrt(1.0 - PART_WIDTH**2) * deviations * x, -MAX_Z, MAX_Z)
+        return Mixture(
+            predicted.weights[..., None] + np.log(part_weights / part_weights.sum()),
+            2.0 * self.crossover * np.cosh(z) * PART_WIDTH * deviations,  # da/dz times the deviation of a part
+            2.0 * self.crossover * np.sinh(z) - self.level,
+        )
+
+
+def leak_deviations_from_mean(recordings: Sequence[RecordingSums], columns: Sequence[ColumnRoles]) -> Array:
+    """Compute the deviation of each recording's leak coefficient from the mean of all n recordings, shape (n,).
+
+    It is (n - 1)/n times the difference of the recording's coefficient from the common coefficient of the other n - 1
+    recordings. The coefficients of all other terms may differ between recordings within the usual prior; only the flow
+    offset may differ freely. `columns`: for each equation the indices of its columns by role (leak, motion, left side).
+    """
+    usual_width, columns = np.ones(1), [roles.with_free_zero() for roles in columns]  # a factor of 1 on the priors
+    all_sums = [eliminate_unshared(recording.sums, columns) for recording in recordings]
+    total = np.sum(all_sums, axis=0)
+    rises = [estimate_leak_excess(sums, total - sums, columns, usual_width)[0] for sums in all_sums]
+    return np.array(rises) * ((len(recordings) - 1) / len(recordings))

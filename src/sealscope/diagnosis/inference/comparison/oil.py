@@ -1,0 +1,118 @@
+"""Effect of the oil's viscosity on the leakage of several recordings, by its temperature or the viscous drop.
+
+Leakage is proportional to the inverse of the viscosity. If the oil's temperature is known for all recordings, the
+logarithm of the leakage has a slope in the temperature with a prior. Otherwise the viscous pressure drop of the motion
+(`changes.motion_fit`) may show the viscosity, or the oil is unknown. The priors are in `priors.toml`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums, Resistance
+from sealscope.diagnosis.priors.inference import INFERENCE
+from sealscope.recordings.recording import Array
+
+
+class OilHypothesis(NamedTuple):
+    """Hypothesis on how the oil's viscosity changed the leakage of n + 1 recordings, the judged one last.
+
+    - `thinning` (n + 1,): predicted logarithm of the leakage, relative to the mean over the n healthy recordings;
+    - `variances` (n + 1,): variance of the error of each prediction, without the error of its slope;
+    - `log_probability`: log prior probability of the hypothesis;
+    - `slope_deviation`: relative standard deviation of the slope of `thinning` in temperature or pressure drop;
+    - `session_deviation`: standard deviation of the logarithm between sessions, 0 if the oil is known.
+    """
+
+    thinning: Array
+    variances: Array
+    log_probability: float = 0.0
+    slope_deviation: float = 0.0
+    session_deviation: float = 0.0
+
+
+def predict_thinning(recordings: Sequence[RecordingSums]) -> Array:
+    """Predict by how much thin oil raised the log leakage of each recording (n + 1,), the judged one last.
+
+    The predictions are relative to the mean over the n healthy recordings. They are all 0 if nothing shows the oil's
+    viscosity.
+    """
+    return oil_hypotheses(recordings)[0].thinning
+
+
+def oil_hypotheses(recordings: Sequence[RecordingSums]) -> list[OilHypothesis]:
+    """List the hypotheses on how the oil changed the leakage of `recordings`, the judged one last.
+
+    If all recordings have an oil temperature, the temperature predicts the effect. Otherwise the viscous drop of the
+    motion may show the viscosity (`_oils_by_drop`), or the oil is unknown. The most probable hypothesis is the first.
+    """
+    prior, zeros = INFERENCE.oil, np.zeros(len(recordings))
+    temperatures = [recording.oil_degC for recording in recordings if recording.oil_degC is not None]
+    if len(temperatures) == len(recordings):
+        warmer = np.array(temperatures) - np.mean(temperatures[:-1])
+        slope_deviation = prior.per_kelvin_deviation / prior.per_kelvin
+        return [OilHypothesis(prior.per_kelvin * warmer, zeros, slope_deviation=slope_deviation)]
+    # half the log range is the standard deviation between two sessions, which is sqrt(2) times that of one session
+    unknown = OilHypothesis(zeros, zeros, session_deviation=float(np.sqrt(0.125) * np.log(prior.warmest)))
+    by_drop = _oils_by_drop(recordings, unknown.session_deviation)
+    if not by_drop:
+        return [unknown]
+    oils = [*by_drop, unknown._replace(log_probability=float(np.log1p(-prior.drop_tells)))]
+    return sorted(oils, key=lambda oil: -oil.log_probability)
+
+
+def _oils_by_drop(recordings: Sequence[RecordingSums], unknown_deviation: float) -> list[OilHypothesis]:
+    """List the hypotheses by which the viscous drop of the motion shows the oil of `recordings`, the judged one last.
+
+    The resistance to the motion at the top speed v, friction + drop v, is known well. Friction and viscous drop are
+    known less well, since friction varies with speed and load. There are two hypotheses:
+
+    - Friction changed, as if seals wore, and the drop is the fitted one.
+    - Friction was what it is in the healthy recordings, and drop = (resistance at v - healthy friction) / v.
+
+    Their probabilities follow from the judged friction and from the n healthy drops. Splitting the resistance wrongly
+    makes these drops scatter more. With an unknown scatter, their density is proportional to S^(-(n - 1) / 2), where S
+    is the sum of the squares of their logarithms about the mean and of their relative errors.
+
+    A drop below its standard error is replaced by this error. A recording without a drop gets the mean drop, and the
+    error of unknown oil: `unknown_deviation`, the standard deviation of the logarithm of the leakage. The list is empty
+    if the judged recording or all healthy ones have no drop.
+    """
+    prior, no_fit = INFERENCE.oil, np.full(len(Resistance._fields), np.nan)
+    friction, friction_error, drop, drop_error, speed = np.array(
+        [no_fit if recording.resistance is None else recording.resistance for recording in recordings]
+    ).T
+    is_known = np.isfinite(drop)
+    if not (is_known[-1] and is_known[:-1].any()):
+        return []
+    healthy = np.flatnonzero(is_known[:-1])
+    sign = np.sign((friction / friction_error)[healthy].sum()) or 1.0  # friction resists the motion
+    friction, drop = sign * friction, sign * drop
+    usual_friction, top_speed = (float(np.median(values[healthy])) for values in (friction, speed))
+    drops, log_densities = [drop], np.zeros(1)
+    if min(usual_friction, friction[-1]) > 0.0:  # else their ratio has no logarithm
+        drops.append(drop + (friction - usual_friction) / top_speed)
+        change = float(np.log(friction[-1] / usual_friction))
+        # prior deviations of this change under the two hypotheses: friction changed, or did not
+        deviations = np.array([prior.friction_changes, prior.friction_session])
+        log_densities = -0.5 * (change / deviations) ** 2 - np.log(deviations)
+    shown_drops = np.maximum(drops, drop_error)  # (hypotheses, n + 1)
+    healthy_logs = np.log(shown_drops[:, healthy])
+    squares = (healthy_logs - healthy_logs.mean(axis=1, keepdims=True)) ** 2
+    squares += (drop_error[healthy] / shown_drops[:, healthy]) ** 2
+    log_densities = log_densities - 0.5 * (len(healthy) - 1) * np.log(squares.sum(axis=1))
+    log_probabilities = np.log(prior.drop_tells) + log_densities - np.logaddexp.reduce(log_densities)
+    variance, oils = unknown_deviation**2, list[OilHypothesis]()
+    for shown, mean, log_probability in zip(
+        shown_drops, healthy_logs.mean(axis=1).tolist(), log_probabilities.tolist(), strict=True
+    ):
+        error_variance = (prior.per_drop * drop_error / shown) ** 2
+        # variance of the true drop over that of the measured one
+        reliability = np.where(is_known, variance / (variance + error_variance), 0.0)
+        thinning = -prior.per_drop * reliability * np.where(is_known, np.log(shown) - mean, 0.0)
+        deviation = prior.per_drop_deviation / prior.per_drop
+        oils.append(OilHypothesis(thinning, (1.0 - reliability) * variance, log_probability, slope_deviation=deviation))
+    return oils

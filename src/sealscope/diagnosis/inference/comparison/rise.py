@@ -1,0 +1,251 @@
+"""Excess of a leak coefficient over that of healthy recordings, and its distribution without a leak."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from sealscope.diagnosis.inference.onset import BOUND_PROBABILITY
+from sealscope.diagnosis.priors.inference import INFERENCE
+from sealscope.evaluation.scalar_search import find_near_root, find_root
+from sealscope.recordings.recording import Array
+
+#: `Observable.data` of the leakage against healthy recordings.
+RISE = "rise"
+#: Number of points of each grid, of standard deviations or of rises.
+NODES = 32
+#: Reach of a grid of rises [standard deviations].
+MAX_LOG = 4.0
+#: Lower limit of divisors and of arguments of logarithms.
+TINY = 1e-300
+#: Parts of a mixture are omitted if their log weight is lower than the largest by more than this.
+NEGLIGIBLE = 16.0
+#: Number of parts of a large mixture that give the first estimate of a quantile, and step for the slope there.
+SAMPLED, SLOPE_STEP = 1000, 1e-3
+
+
+class Mixture(NamedTuple):
+    """Mixture of k normal distributions: their `weights`, standard `deviations` and `centres`, (k,) each."""
+
+    weights: Array
+    deviations: Array
+    centres: Array
+
+    def quantile(self, probability: float) -> float:
+        """Compute the quantile of the mixture: the value below which it lies with the given probability."""
+        from scipy.special import ndtr, ndtri
+
+        # scale by a typical deviation (very large ones count in part), so that the quantile is of the order of one
+        scale = max(float(self.weights @ np.minimum(self.deviations, 1e3 * self.deviations.min())), TINY)
+        scaled = self._replace(centres=self.centres / scale, deviations=self.deviations / scale)
+
+        def excess(value: float, mixture: Mixture = scaled) -> float:
+            """Compute the probability of values below `value`, minus the wanted `probability`."""
+            return float(mixture.weights @ ndtr((value - mixture.centres) / mixture.deviations)) - probability
+
+        part_quantiles = scaled.centres + ndtri(probability) * scaled.deviations
+        low, high = float(part_quantiles.min()), float(part_quantiles.max())  # the quantile is between them
+        root = None
+        if len(self.weights) > 4 * SAMPLED:  # begin at the quantile of a sample of the normal distributions
+            weights, deviations, centres = (values[:: len(values) // SAMPLED] for values in scaled)
+            sample = Mixture(weights / weights.sum(), deviations, centres)
+            sample_excess = partial(excess, mixture=sample)
+            if sample_excess(low) < 0.0 < sample_excess(high):
+                start = find_root(sample_excess, low, high)
+                difference = sample_excess(start + SLOPE_STEP) - sample_excess(start - SLOPE_STEP)
+                root = find_near_root(excess, start, difference / (2.0 * SLOPE_STEP), low, high)
+        if root is None:
+            root = low if not excess(low) < 0.0 < excess(high) else find_root(excess, low, high)
+        return scale * root
+
+
+class Rise(NamedTuple):
+    """Amount by which a recording's leak coefficient exceeds that of healthy recordings, with its distribution.
+
+    `value`: the estimate, and `deviation`: its standard deviation, both in the unit of the coefficient (of a laminar
+    leak m^3/(s Pa)). In a healthy recording `value` has the distribution `mixture`. If `mixture` is None, `value` over
+    `deviation` has Student's t distribution with `degrees_of_freedom`. `may_be_partial`: the leak may have begun within
+    the recording, whose mean then contains only a part of the rise. `share`: fraction of the allowed false alarms that
+    is left to this rise, by which its p-value is divided (`share_alarms`).
+    """
+
+    value: float
+    deviation: float
+    degrees_of_freedom: float
+    mixture: Mixture | None = None
+    may_be_partial: bool = False
+    share: float = 1.0
+
+    def share_alarms(self, share: float) -> Rise:
+        """Return this rise with its p-value divided by `share`, for use beside another rise of which the best counts.
+
+        `share`: fraction of the false-alarm probability of both that this rise may use.
+        """
+        return self._replace(share=share)
+
+    def widen(self, variance: float) -> Rise:
+        """Return the rise with an additional independent error of the given variance, in the square of its unit.
+
+        The variance is added to the variance of the rise and to the variance of each part of its mixture. The rise
+        remains unchanged if it has no mixture, or if the variance is not positive.
+        """
+        if self.mixture is None or not variance > 0.0:
+            return self
+        mixture = self.mixture._replace(deviations=np.sqrt(self.mixture.deviations**2 + variance))
+        return self._replace(deviation=float(np.sqrt(self.deviation**2 + variance)), mixture=mixture)
+
+    @property
+    def score(self) -> float:
+        """The estimated rise, `value`, divided by its standard deviation."""
+        return self.value / self.deviation
+
+    @property
+    def chance(self) -> float:
+        """Probability that a healthy recording has a higher score (a one-sided p-value), over `share`, at most 1.
+
+        The score is the estimated rise over its standard deviation.
+        """
+        from scipy.special import ndtr, stdtr
+
+        if self.mixture is None:
+            chance = float(stdtr(self.degrees_of_freedom, -self.score))
+        else:
+            weights, deviations, centres = self.mixture
+            chance = float(weights @ ndtr((centres - self.score * self.deviation) / deviations))
+        return min(chance / max(self.share, TINY), 1.0)
+
+    def threshold(self, chance: float) -> float:
+        """Compute the score whose p-value (`chance`) is the argument `chance`, between 0 and 1.
+
+        The score is the estimated rise of the leakage over its standard deviation.
+        """
+        from scipy.special import stdtrit
+
+        probability = 1.0 - chance * self.share
+        if self.mixture is None:
+            return float(stdtrit(self.degrees_of_freedom, probability))
+        return self.mixture.quantile(probability) / self.deviation
+
+    def log_ratio(self, rise: float, log_deviation: float = 0.0) -> float:
+        """Compute the log likelihood ratio of a true rise of the leak's coefficient by `rise` to no rise.
+
+        Both hypotheses are compared with the estimate `value`; `rise` is in its unit. `log_deviation`: standard
+        deviation of the logarithm of the true rise about log(`rise`); 0 if the true rise is known to be `rise`. If the
+        true rise is known and `may_be_partial`, `value` may contain any fraction of it.
+        """
+        if log_deviation > 0.0 and rise > 0.0:
+            return self._log_ratio_lognormal(rise, log_deviation)
+        if self.may_be_partial and rise > 0.0:
+            return self._log_ratio_partial(rise)
+        return self._log_density(self.value - rise) - self._log_density(self.value)
+
+    def _log_ratio_partial(self, rise: float) -> float:
+        """Compute the log likelihood ratio of a true rise by `rise` to none, if the recording shows a fraction of it.
+
+        `rise` is in the unit of `value`. The likelihood is averaged over fractions from 0 to 1.
+        """
+        densities = [self._log_density(self.value - part) for part in np.linspace(0.0, rise, NODES)]
+        if 0.0 < self.value < rise:  # the likeliest fraction, which the grid may miss
+            densities.append(self._log_density(0.0))
+        return float(np.logaddexp.reduce(densities) - np.log(len(densities))) - self._log_density(self.value)
+
+    def log_ratio_within(self, rise: float, tail: float) -> float:
+        """Compute the log likelihood ratio of a true rise by `rise` to no rise, robust to outlying estimates.
+
+        Each of the two densities of `value` is at least the density at the quantiles `tail` and 1 - `tail` of a healthy
+        recording. An estimate that is improbable with the rise and without it is therefore evidence for neither.
+        """
+        tail_values = [self.threshold(chance) * self.deviation for chance in (tail, 1.0 - tail)]
+        min_log_density = min(self._log_density(value) for value in tail_values)
+        with_rise = max(self._log_density(self.value - rise), min_log_density)
+        return with_rise - max(self._log_density(self.value), min_log_density)
+
+    def _log_ratio_lognormal(self, rise: float, log_deviation: float) -> float:
+        """Compute the log likelihood ratio of a true rise with a log-normal prior about `rise` to no rise.
+
+        `log_deviation`: standard deviation of the logarithm of the true rise. The likelihood is integrated over a
+        grid of true rises, which resolves both the prior and the likelihood.
+        """
+        grid_deviations = np.linspace(-MAX_LOG, MAX_LOG, NODES)
+        grid = np.concatenate(
+            [rise * np.exp(log_deviation * grid_deviations), self.value + self.deviation * grid_deviations]
+        )
+        grid = np.unique(grid[grid > TINY])
+        z = np.log(grid / rise) / log_deviation
+        log_prior = -0.5 * z**2 - np.log(grid * log_deviation * np.sqrt(2.0 * np.pi))
+        log_densities = [self._log_density(self.value - true_rise) for true_rise in grid]
+        log_integrand = log_prior + log_densities - self._log_density(self.value)
+        log_max = float(log_integrand.max())
+        return log_max + float(np.log(max(np.trapezoid(np.exp(log_integrand - log_max), grid), TINY)))
+
+    def _log_density(self, value: float) -> float:
+        """Compute the log probability density at `value` of the estimated rise if the recording is healthy.
+
+        `value` is in the unit of the leak's coefficient. A constant is left out.
+        """
+        if self.mixture is None:
+            z = value / self.deviation
+            if np.isinf(self.degrees_of_freedom):  # Student's t is then normal
+                return -0.5 * z * z
+            return float(-0.5 * (self.degrees_of_freedom + 1.0) * np.log1p(z * z / self.degrees_of_freedom))
+        weights, deviations, centres = self.mixture
+        log_weights = np.log(np.maximum(weights, np.finfo(float).tiny)) - np.log(deviations)
+        return float(np.logaddexp.reduce(log_weights - 0.5 * ((value - centres) / deviations) ** 2))
+
+    def bound(self, probability: float = BOUND_PROBABILITY) -> float:
+        """Compute the upper bound of the true rise of the leakage, in the unit of the estimate.
+
+        The true rise is below it with the given probability. A negative estimate counts as zero:
+
+            bound = max(value, 0) - threshold(probability) deviation,
+
+        where threshold(probability), usually negative, is the score that a healthy recording exceeds with this
+        probability.
+        """
+        return max(self.value, 0.0) - self.threshold(probability) * self.deviation
+
+    def interval(self, probability: float = BOUND_PROBABILITY) -> tuple[float, float]:
+        """Compute the central interval (low, high) that contains the true rise with the given `probability`."""
+        tail = 0.5 - 0.5 * probability  # on either side of the interval
+        max_error, min_error = (self.threshold(chance) * self.deviation for chance in (tail, 1.0 - tail))
+        return self.value - max_error, self.value - min_error
+
+
+def rise_of_mixture(predicted: Mixture, values: Array) -> Rise:
+    """Estimate the rise of a judged value over the value that healthy recordings predict for it.
+
+    `values` (s,): the judged value by s alternative estimates; `predicted`: mixture of predicted values of shape
+    (s, ...), for each of these estimates along the first axis, with log weights. The difference of judged and predicted
+    value follows the mixture over all estimates. The rise is its median, and the standard deviation half of its central
+    68 % interval.
+    """
+    judged = np.reshape(values, (-1, *[1] * (predicted.centres.ndim - 1)))  # (s, 1, ..., 1)
+    log_weights, deviations = predicted.weights.ravel(), predicted.deviations.ravel()
+    centres = (predicted.centres - judged).ravel()
+    is_counted = log_weights > log_weights.max() - NEGLIGIBLE
+    weights = np.exp(log_weights[is_counted] - log_weights.max())
+    mixture = Mixture(weights / weights.sum(), deviations[is_counted], centres[is_counted])  # predicted minus judged
+    low, median, high = (mixture.quantile(probability) for probability in (0.16, 0.5, 0.84))
+    errors = mixture._replace(centres=mixture.centres - median)
+    return Rise(value=-median, deviation=0.5 * (high - low), degrees_of_freedom=np.inf, mixture=errors)
+
+
+def student_rise(value: float, deviations: Sequence[float] | Array, prior_scatter: float) -> Rise:
+    """Make a rise by `value` whose error follows Student's t, with the scatter of n healthy recordings as its scale.
+
+    `deviations` (n,): deviation d_j of each healthy recording from the mean of the others; `prior_scatter`: prior
+    standard deviation s of a recording, which counts as much as m recordings (`scatter.freedom` of `priors.toml`). All
+    are in the unit of `value`. With m + n - 1 degrees of freedom,
+
+        deviation^2 = (m s^2 + ((n - 1)/n)^2 sum d_j^2) / (m + n - 1) (1 + 1/n).
+    """
+    prior, count = INFERENCE.scatter, len(deviations)
+    sum_of_squares = prior.freedom * prior_scatter * prior_scatter
+    freedom = prior.freedom + count - 1
+    if count > 1:
+        sum_of_squares += float(np.sum(np.square(deviations))) * ((count - 1) / count) ** 2
+    deviation = max(float(np.sqrt(sum_of_squares / freedom * (1.0 + 1.0 / count))), np.finfo(float).tiny)
+    return Rise(value, deviation, degrees_of_freedom=freedom)
