@@ -155,3 +155,15 @@ def test_each_law_has_a_share_of_the_false_alarms() -> None:
     assert shared.chance == pytest.approx(min(1.0, 4.0 * test.chance))
     assert shared.threshold(0.01) == pytest.approx(test.threshold(0.0025), rel=1e-6)
     assert shared.score == test.score
+
+
+def test_an_orifice_describes_its_own_flow_best() -> None:
+    """A conductance that follows the mean pressure of each block describes it less well, as rivals of the leak do."""
+    result = simulate_experiment(
+        Experiment.of(command="3 sin(4t)", duration=60.0, leak="0.05 L/min orifice from 30 s", seed=2)
+    )
+    balance = VolumeBalance(load_rig("thesis")).balance(result.recording)
+    assert balance is not None
+    best, second = balance.observables[:2]
+    assert best.name == ORIFICE
+    assert best.score > second.score + 4.0

@@ -254,3 +254,22 @@ def test_the_outside_is_named_unless_the_data_exclude_it(likelihood_ratio: float
     outside = [observable(f"volumes: external leak {side}", chance) for side in "AB"]
     evidence = judge_leak(leak, *outside)
     assert (evidence.verdict, evidence.cause) == ("leak", cause)
+
+
+@pytest.mark.parametrize(
+    ("ratio", "verdict", "cause"),
+    [
+        (0.1, "leak", "piston or pump leak"),
+        (3.0, "leak", "internal or external leak"),
+        (30.0, "leak", "internal or external leak"),
+        (1e3, "no leak", "external leak"),
+    ],
+)
+def test_oil_that_leaks_inside_or_outside_is_a_leak_until_one_of_them_is_sure(
+    ratio: float, verdict: str, cause: str
+) -> None:
+    """With a likelihood ratio of 30 it is outside by three to one, which is too little to exclude the piston."""
+    leak = MeasuredLeak(step(8.0))
+    outside = [observable(f"volumes: external leak {side}", leak.step.chance / ratio) for side in "AB"]
+    evidence = judge_leak(leak, *outside)
+    assert (evidence.verdict, evidence.cause) == (verdict, cause)

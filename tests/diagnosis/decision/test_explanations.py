@@ -114,7 +114,7 @@ def test_a_step_of_the_turning_pump_s_leakage_is_a_leak() -> None:
 def test_a_rare_change_with_an_improbable_cause_is_by_chance() -> None:
     """Only a scale explains the motion; its odds against chance are its probability times the Bayes factor."""
     scale = EVENTS["scale of the motion"]
-    for chance, happened in ((1e-4, False), (1e-8, True)):
+    for chance, happened in ((3e-4, False), (1e-8, True)):
         motion = observable("motion: motion", chance)
         explained = explain([motion])
         assert probability_of(explained, causes=[scale.cause], data_kind="motion") > 0.99

@@ -123,6 +123,22 @@ class Case:
             return 0.0
         return probability_of(self.explanations, causes=["external leak"], data_kind=self._data_kind(alarm))
 
+    def shows_leak(self, alarm: LeakTest) -> bool:
+        """Return True if a leak caused an alarm, or if the recording does not tell a leak from an external leak.
+
+        `alarm`: the test that raised the alarm. There are two cases, with limits of `[explanation]` in `priors.toml`:
+
+        - The probability of a leak past piston or pump is above `leak`.
+        - The probability of this leak or an external leak is above `named`, that of the external leak alone is not, and
+          neither of the two is excluded, i.e. both have a probability above 1 - `sure`.
+        """
+        limits, leak = DECISION.explanation, self.leak_probability(alarm)
+        if leak > limits.leak or not self.weigh_rivals:
+            return leak > limits.leak
+        external, data_kind = self.external_probability(alarm), self._data_kind(alarm)
+        either = probability_of(self.explanations, *LEAK_EVENTS, causes=["external leak"], data_kind=data_kind)
+        return either > limits.named >= external and min(leak, external) > 1.0 - limits.sure
+
     def _data_kind(self, alarm: LeakTest) -> str:
         """Return the kind of data (`Observable.data`) by which the test `alarm` raised its alarm.
 

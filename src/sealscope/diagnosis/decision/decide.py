@@ -8,8 +8,9 @@ The verdict is `leak` if both conditions hold for one test of the leakage:
   quarter, and the comparison with them the rest. Without them, the former gets three quarters if there is a limit in
   the rig's file to test, which gets the rest, else all (`case._leak_tests`). Score and threshold are the same
   comparison, for display.
-- No better explanation: the probability that a leak caused the alarm (`Case.leak_probability`) is above 0.5. An alarm
-  by the limit in the rig's file is judged by the alarm for a change within the recording; without one it is a leak.
+- No better explanation: the probability that a leak caused the alarm (`Case.leak_probability`) is above 0.5, or the
+  recording tells only that oil leaks, inside or outside (`Case.shows_leak`). An alarm by the limit in the rig's file is
+  judged by the alarm for a change within the recording; without one it is a leak.
 
 A detector that measures no leakage has a single test, with the whole probability of a false alarm.
 
@@ -86,8 +87,7 @@ def decide(
     if weigh_rivals:
         observables += [observable for report in rivals for observable in report.observables]
     case = Case(judge, observables, null, false_alarm_probability, weigh_rivals)
-    min_probability = DECISION.explanation.leak
-    alarm = next((alarm for alarm in case.alarms if case.leak_probability(alarm) > min_probability), None)
+    alarm = next((alarm for alarm in case.alarms if case.shows_leak(alarm)), None)
     return _evidence_without_leak(case) if alarm is None else _leak_evidence(case, alarm)
 
 

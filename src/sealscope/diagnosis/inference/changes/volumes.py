@@ -180,8 +180,6 @@ def _is_tested(term: Term, roles: ColumnRoles, has_accumulator: bool) -> bool:
         return False
     if term.name == SPEED_LOSS:
         return False  # the motion in a single recording varies too little to determine this coefficient
-    if term.name == ORIFICE:
-        return False  # a leak through an orifice is tested as another law of the leak
     if term.name == HOLDING:
         return False  # a leaking piston raises this coefficient as well: the test of the leak covers it
     if AIR in roles.names and term.cause == "air in the oil" and term.nuisance:
