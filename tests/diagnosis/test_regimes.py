@@ -344,3 +344,18 @@ def test_a_reversal_is_no_rest_and_a_missing_sample_neither() -> None:
     assert 3.8 < np.count_nonzero(rests) / RATE < 4.2
     stopped[700] = np.nan
     assert not find_rests(stopped, RATE, 0.05)[690:711].all()
+
+
+def test_the_volumes_of_a_hold_begin_where_no_recording_moves() -> None:
+    """A lift that made one short stroke had its dead volumes in proportion to it: its leak passed for one outside."""
+    shifted = [
+        Recording(healthy.t, {**healthy.channels, "x": healthy["x"] + shift}, healthy.units, RATE)
+        for healthy, shift in ((press(0), 0.0), (press(1), -0.1), (press(2), 0.3))
+    ]
+    alone, beside = (
+        VolumeBalance(RIG).observe(press(3), healthy).leak for healthy in ([press(0), press(1), press(2)], shifted)
+    )
+    assert isinstance(alone, BalanceLeak) and isinstance(beside, BalanceLeak)
+    assert alone.balance.chambers is not None and beside.balance.chambers is not None
+    sides, wider = alone.balance.chambers.sides, beside.balance.chambers.sides
+    assert (wider.low, wider.high) == pytest.approx((sides.low - 0.1, sides.high + 0.3), abs=1e-3)

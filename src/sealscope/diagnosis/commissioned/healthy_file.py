@@ -134,8 +134,8 @@ def _check_sums(summary: Any) -> Any:
     column and the left side must have positive sums of squares, and their sum of products must obey Cauchy's
     inequality. The other arrays of the summary are checked, too: `shut_sums` (1, m + 2, m + 2) are the sums for a pump
     that valves cut off at rest, which needs two more columns; `held` are the leaks while valves hold the load;
-    `held_pump` are the pump's leakage just before these times and its standard deviation; and `resistance` is what
-    resists the motion (`recording_sums.Resistance`).
+    `held_pump` are the pump's leakage just before these times and its standard deviation; `stroke` are the ends of the
+    recorded motion; and `resistance` is what resists the motion (`recording_sums.Resistance`).
     """
     size = len(summary.terms) + 1
     if summary.sums.ndim != 3 or not len(summary.sums) or summary.sums.shape[1:] != (size, size):
@@ -145,6 +145,8 @@ def _check_sums(summary: Any) -> Any:
         raise ValueError(f"shut_sums must be of the shape (1, {size + 2}, {size + 2}), got {shut.shape}")
     if summary.held is not None and summary.held.shape != (len(HeldLeaks._fields),):
         raise ValueError(f"held must hold {len(HeldLeaks._fields)} numbers, got the shape {summary.held.shape}")
+    if summary.stroke is not None and (summary.stroke.shape != (2,) or summary.stroke[0] > summary.stroke[1]):
+        raise ValueError(f"stroke must hold the lower and the upper end of the motion, got {summary.stroke}")
     if summary.held_pump is not None and summary.held_pump.shape != (2,):
         raise ValueError(f"held_pump must hold two numbers, got the shape {summary.held_pump.shape}")
     resistance = summary.resistance
@@ -213,6 +215,7 @@ _BALANCE = table_type(
     held_odds=(_Number, None),
     creep_odds=(_Number, None),
     sign_log_odds=(_Array, None),
+    stroke=(_Array, None),
     flow=_Magnitude,
     pressure=_Magnitude,
     start_s=(_Time, None),

@@ -190,6 +190,7 @@ class VolumeBalance:
         - `held`, `held_odds`, if it holds a load at rest: leaks while shut valves hold the load, and log odds that the
           valves are shut, from these leaks; `held_pump`, if known: leakage of the pump just before;
         - `sign_log_odds`, with a position: log odds of each balance that the recorded flow has the right sign;
+        - `stroke`, with a position: ends of the recorded motion [m];
         - `creep_odds`, if no pump's flow is recorded (`is_creep`): log odds that the load creeps by leakage.
         """
         has_position_balance = bool(equations(self.rig, frozenset(recording.channels)))
@@ -201,6 +202,8 @@ class VolumeBalance:
         summary = {name: value for name, value in balance.recording_sums._asdict().items() if value is not None}
         if recorded is not None:
             summary["sign_log_odds"] = np.array(recorded.sign_log_odds)
+        if balance.recorded_stroke is not None:
+            summary["stroke"] = np.array(balance.recorded_stroke)
         if recorded is not None and recorded.shut is not None:
             shut_balance = self._build_balance(recording, recorded.shut)  # supposing that valves hold the load
             shut_sums, hold_odds = shut_balance.recording_sums, shut_balance.locked_log_odds(balance.conductance)
@@ -294,7 +297,7 @@ class VolumeBalance:
             return Observed(self.name, lack=_NO_BALANCE[has_position].format(recording.duration))
         if balance is None or not self._is_held_by_valves(balance, summaries):
             return Observed(self.name, lack=_NO_CREEP.format(self.rig.circuit.needed_channels))
-        balance = replace(balance, locked=is_locked)
+        balance = replace(balance, locked=is_locked, known_stroke=_joint_stroke(summaries))
         # summaries do not list the leakage of a pump that turns or holds the load, which has terms of its own if valves
         # cut the pump off at rest
         names = [name for name in balance.columns[0].names if name not in (TURNING, HOLDING)]
@@ -389,6 +392,12 @@ def _healthy_sign_log_odds(summaries: Sequence[Summary], n_balances: int) -> Arr
     rewired: float = INFERENCE.sense.rewired
     limit = float(np.log((1.0 - rewired) / rewired))
     return np.clip(total, -limit, limit)
+
+
+def _joint_stroke(summaries: Sequence[Summary]) -> tuple[float, float] | None:
+    """Return the ends of the motion in all recordings with the given `summaries` [m]; None if none has a position."""
+    strokes = [summary["stroke"] for summary in summaries if "stroke" in summary]
+    return (float(min(low for low, _ in strokes)), float(max(high for _, high in strokes))) if strokes else None
 
 
 def _are_valves_shut(summaries: Sequence[Summary]) -> bool:

@@ -111,6 +111,7 @@ class RecordedBalance:
     - `plain`: the blocks without the correction of the pressure offset, None if there is no such correction.
     - `shut`: true if valves cut the pump off at rest, so that only the piston leaks then (`regimes`).
     - `locked`: true if shut valves hold the load at rest, so that these times measure the leaks (`chambers`).
+    - `known_stroke`: ends of the motion in other recordings of the machine [m], None if unknown.
     """
 
     blocks: Blocks
@@ -122,6 +123,7 @@ class RecordedBalance:
     plain: Blocks | None = None
     shut: bool = False
     locked: bool = False
+    known_stroke: tuple[float, float] | None = None
 
     @property
     def units(self) -> frozenset[tuple[str, str]]:
@@ -327,20 +329,31 @@ class RecordedBalance:
         return float(np.clip(odds, -max_odds, max_odds))
 
     def _cylinder_sides(self) -> CylinderSides | None:
-        """Estimate the piston areas and the ends of the recorded stroke; None if they are not determined.
+        """Estimate the piston areas and the ends of the stroke; None if they are not determined.
 
-        They are not determined if nothing moves, or if the ratio of the areas is implausible. The ends are quantiles of
-        the position (`END_QUANTILE`).
+        They are not determined if nothing moves, or if the ratio of the areas is implausible. The stroke is that of all
+        known recordings (`known_stroke`).
         """
         area_A, area_B, deviation_A, deviation_B = self._signed_areas()
-        x = self.recording["x"][np.isfinite(self.recording["x"])]
-        if not x.size:
+        if (stroke := self.recorded_stroke) is None:
             return None
-        low, high = (float(end) for end in np.quantile(x, (END_QUANTILE, 1.0 - END_QUANTILE)))
+        # the dead volumes are beyond the motion of all recordings
+        lows, highs = zip(stroke, self.known_stroke or stroke, strict=True)
+        low, high = min(lows), max(highs)
         max_area_ratio: float = INFERENCE.held_oil.unlike
         if not (area_A and high > low and 1.0 / max_area_ratio < area_A / area_B < max_area_ratio):
             return None
         return CylinderSides(area_A, area_B, low, high, deviation_A, deviation_B)
+
+    @property
+    def recorded_stroke(self) -> tuple[float, float] | None:
+        """Ends of the recorded motion [m], as quantiles of the position (`END_QUANTILE`); None without a position."""
+        x = self.recording["x"] if "x" in self.recording else np.empty(0)
+        x = x[np.isfinite(x)]
+        if not x.size:
+            return None
+        low, high = np.quantile(x, (END_QUANTILE, 1.0 - END_QUANTILE))
+        return float(low), float(high)
 
     def _signed_areas(self) -> tuple[float, float, float, float]:
         """Estimate the piston areas of A and B [m^2], as measured with the assumed displacement of the pump.
