@@ -40,11 +40,7 @@ _Conversion = tuple[Fraction, float, Fraction, Fraction]
 
 
 class Unit(NamedTuple):
-    """A unit of measurement, with an exact conversion to SI.
-
-    SI value = (value + offset) * factor * pi**pi_power. `powers`: pairs of a base unit and its exponent; their
-    product is the SI unit.
-    """
+    """A unit of measurement: SI value = (value + offset) * factor * pi**pi_power, in base units with exponents."""
 
     factor: Fraction = Fraction(1)
     pi_power: Fraction = Fraction(0)
@@ -52,10 +48,7 @@ class Unit(NamedTuple):
     offset: Fraction = Fraction(0)
 
     def times(self, other: Unit, power: Fraction) -> Unit:
-        """Multiply this unit by `other` raised to `power`; the result has no offset.
-
-        Raises ValueError if the factor exceeds the range of doubles.
-        """
+        """Multiply by `other` to a power, without offset; raise ValueError for a factor beyond the range of doubles."""
         bits = max(other.factor.numerator, other.factor.denominator).bit_length()
         if abs(power) * bits > _MAX_BITS:  # checked first, as the power itself could take forever
             raise ValueError
@@ -69,21 +62,14 @@ class Unit(NamedTuple):
 
 
 def _build_unit(row: Mapping[str, Any]) -> Unit:
-    """Build the Unit of a row of `units.toml`.
-
-    The keys of a row are base units with their powers, and, if needed, `factor`, `pi` (power of pi) and `offset`,
-    which is added to a value before the multiplication.
-    """
+    """Build the Unit of a row of `units.toml`: powers of base units, and, if needed, factor, power of pi and offset."""
     powers = {base: Fraction(power) for base, power in row.items() if base not in _DEFAULTS}
     factor, pi_power, offset = (Fraction(row.get(name, default)) for name, default in _DEFAULTS.items())
     return Unit(factor, pi_power, tuple(sorted(powers.items())), offset)
 
 
 def _absolute_unit(unit: Unit) -> Unit:
-    """Build the unit of absolute pressure for a unit of gauge pressure, such as `bara` for `bar`.
-
-    The SI value (value + offset) * factor is a gauge pressure, as always here: the offset is -1 atmosphere, in `unit`.
-    """
+    """Build the unit of absolute pressure for one of gauge pressure, the SI value: the offset is -1 atmosphere."""
     return unit._replace(offset=-_TABLES["absolute"]["atmosphere"] / unit.factor)
 
 
@@ -128,10 +114,7 @@ def _registry() -> Any:
 
 
 def _parse_name(name: str) -> Unit:
-    """Look up a single unit by its name, in `units.toml` and then in pint.
-
-    Raises InputError for an unknown name, and for a unit of pint that is not proportional to an SI unit.
-    """
+    """Look up a unit in `units.toml` and then in pint; raise InputError unless it is proportional to an SI unit."""
     unit_of_table = _ATOMS.get(_SPELLINGS.get(name, name))
     if unit_of_table is not None:
         return unit_of_table
@@ -151,10 +134,7 @@ def _parse_name(name: str) -> Unit:
 
 
 def _tokenize(text: str) -> list[str]:
-    """Split the text of a unit into names, powers such as `^2`, brackets and slashes.
-
-    Raises ValueError for a text that contains anything else.
-    """
+    """Split the text of a unit into names, powers such as `^2`, brackets and slashes; raise ValueError for others."""
     tokens, position = [], 0
     while position < len(text):
         match = _TOKEN.match(text, position)
@@ -251,7 +231,7 @@ def _describe_dimension(si_unit: str) -> str:
 
 
 def same_dimension(unit: str, other: str) -> bool:
-    """Return True if values can be converted between two units; False also if one of the texts is not a unit."""
+    """Test whether values can be converted between two units; False also if one of the texts is not a unit."""
     try:
         return parse_unit(unit).powers == parse_unit(other).powers
     except InputError:
@@ -259,26 +239,21 @@ def same_dimension(unit: str, other: str) -> bool:
 
 
 def is_familiar(unit: str) -> bool:
-    """Return True if a unit is known without pint, alone or as a quotient, such as `bar`, `psig` and `cm3/s`.
+    """Test whether a unit is known without pint, alone or as a quotient, such as `bar`, `psig` and `cm3/s`.
 
     Pint knows thousands of names, many of them ordinary words, such as `rod`, which is 5 m.
     """
     names = {*_ATOMS, *_SPELLINGS} - {""}
     parts = [unit] if unit in names else unit.split("/")
-    for part in parts:
-        without_power = part.rstrip("23")
-        without_mark = part[:-1] if part.endswith(("a", "g")) else part  # of absolute or gauge pressure
-        if names.isdisjoint((part, without_power, without_mark)):
-            return False
-    return True
+    # without a power, and without the mark of an absolute or gauge pressure
+    return all(names & {part, part.rstrip("23"), part[:-1] if part.endswith(("a", "g")) else part} for part in parts)
 
 
 @lru_cache(maxsize=1024)
 def _conversion(unit: str, si_unit: str) -> _Conversion:
     """Compute the exact conversion between two units: (factor, power of pi, first offset, second offset).
 
-    Target value = (value + first offset) * factor * pi**power - second offset. Raises InputError if the dimensions
-    differ.
+    Target value = (value + first offset) * factor * pi**power - second offset. Raises InputError for other dimensions.
     """
     source, target = parse_unit(unit), parse_unit(si_unit)
     if source.powers != target.powers:
@@ -287,11 +262,7 @@ def _conversion(unit: str, si_unit: str) -> _Conversion:
 
 
 def _find_conversion(unit: str, si_unit: str, name: str, place: str | None) -> _Conversion:
-    """Compute the exact conversion from `unit` to `si_unit`: (factor, power of pi, first offset, second offset).
-
-    Target value = (value + first offset) * factor * pi^power - second offset. If the dimensions differ, raises an
-    InputError that states `name`, the expected dimension and, if it is not None, the file or option `place`.
-    """
+    """Compute the `_conversion` from `unit` to `si_unit`, or raise an InputError with `name` and `place`."""
     try:
         return _conversion(unit, si_unit)
     except InputError as error:
@@ -301,11 +272,7 @@ def _find_conversion(unit: str, si_unit: str, name: str, place: str | None) -> _
 
 
 def _convert_exactly(value: Fraction, conversion: _Conversion) -> float:
-    """Convert one number exactly and round it once; infinite if it exceeds the range of doubles.
-
-    `conversion`: (factor, power of pi, first offset, second offset), as `_conversion` returns it. The result is
-    (value + first offset) * factor * pi^power - second offset; with a power of pi, rounding errors of doubles remain.
-    """
+    """Convert one number by a `_conversion`, exactly but for pi, and round it once; infinite if beyond doubles."""
     factor, pi_power, first_offset, second_offset = conversion
     exact = (value + first_offset) * factor
     try:
@@ -325,9 +292,9 @@ def to_si(
 ) -> Array | float:
     """Convert `values` (any shape, or one number) in `unit` to doubles in `si_unit`.
 
-    One number is converted exactly and rounded once, except for units with pi, such as rpm. An array is converted to
-    within 2 units in the last place. Raises InputError for a unit of another dimension; the message states `name`, the
-    unit, the expected dimension and the file `place`.
+    One number is converted exactly and rounded once, except for units with pi, such as rpm; an array to within 2 units
+    in the last place. Raises InputError for a unit of another dimension; the message states `name`, the unit, the
+    expected dimension and the file `place`.
     """
     scalar = isinstance(values, int | float)
     if unit == si_unit:
@@ -358,10 +325,9 @@ def from_si(values: ArrayLike, unit: str, si_unit: str, *, name: str = ..., plac
 def from_si(
     values: ArrayLike | float, unit: str, si_unit: str, *, name: str = "value", place: str | None = None
 ) -> Array | float:
-    """Convert `values` (any shape, or one number) in `si_unit` to doubles in `unit`.
+    """Convert `values` (any shape, or one number) in `si_unit` to doubles in `unit`; the inverse of `to_si`.
 
-    This is the inverse of `to_si`, with the same precision. Raises InputError if `unit` has another dimension; the
-    message states `name`, the unit, the expected dimension and the file `place`.
+    Raises InputError if `unit` has another dimension; the message states `name`, that dimension and the file `place`.
     """
     _find_conversion(unit, si_unit, name, place)  # raises the error on `unit`; that of `to_si` would be on `si_unit`
     return to_si(values, si_unit, unit, name=name, place=place)
@@ -370,11 +336,10 @@ def from_si(
 def parse_quantity(
     value: float | str, si_unit: str, *, name: str = "value", place: str | None = None, finite: bool = True
 ) -> float:
-    """Parse a text such as ``2[L/min]``, ``3 psi`` or ``5`` to a number in `si_unit`.
+    """Parse a text such as ``2[L/min]``, ``3 psi`` or ``5``, or a number, to a number in `si_unit`, the default unit.
 
-    A number, or a text without a unit, is taken to be in `si_unit`. Raises InputError if the text does not begin with
-    a number, if the unit has another dimension or, with `finite`, if the number is infinite or NaN. The message names
-    the quantity (`name`) and the file or option (`place`).
+    Raises InputError if the text does not begin with a number, if the unit has another dimension or, with `finite`, if
+    the number is infinite or NaN. The message names the quantity (`name`) and the file or option (`place`).
     """
     suffix = f" ({place})" if place else ""
     text = value if isinstance(value, str) else ""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from sealscope.parameters.fields import Part, choice, quantity
+from sealscope.parameters.fields import Part, choice, conductance, quantity
 
 #: Largest difference of a double-rod cylinder's areas, divided by their mean: makers' tolerances.
 _MAX_DOUBLE_ROD_UNEVENNESS = 0.1
@@ -37,8 +37,8 @@ class Cylinder(Part):
     p_opp: float = quantity("pressure that feeds the opposing cylinder", "Pa", absent=0, ge=0, le=1e9)
     C_opp: float = quantity("coefficient of the orifice in that feed", "m^3/(s Pa^0.5)", absent=1, gt=0, le=1)
     F_l: float = quantity("constant external load", "N", ge=-1e8, le=1e8)
-    G_ext_A: float = quantity("leakage conductance of the rod seal of A", "m^3/(s Pa)", ge=0, le=1e-6)
-    G_ext_B: float = quantity("leakage conductance of the rod seal of B", "m^3/(s Pa)", ge=0, le=1e-6)
+    G_ext_A: float = conductance("leakage conductance of the rod seal of A")
+    G_ext_B: float = conductance("leakage conductance of the rod seal of B")
 
     @property
     def unevenness(self) -> float:

@@ -11,15 +11,11 @@ from sealscope.errors import InputError
 class HydraulicCircuit(NamedTuple):
     """Connection of pump and cylinder chambers: one of `CIRCUITS`, chosen by a parameter of the rig (`Rig.circuit`).
 
-    Other modules read the properties below instead of comparing circuits, so that another circuit can be added:
-
-    - `valve_controlled` chooses the laws of `physics/rig.py` and `physics/standstill.py`, the longest step of
-      `physics/solvers/limits.py` (as `valved`), and the drawing of `reporting/schematic.py`.
-    - `pump_feeds_chambers` chooses the volume balance (`diagnosis/inference/terms.py`: `equations`) and the
-      controller's model of the drive (`control/drive.py`: `drive_of`).
-
-    A circuit that is diagnosed but never simulated needs an entry in `CIRCUITS` only, and its `value` among those that
-    the parameter may have.
+    Other modules read the properties below instead of comparing circuits. `valve_controlled` chooses the laws of
+    `physics/rig.py` and `physics/standstill.py`, the longest step of `physics/solvers/limits.py` (as `valved`), and the
+    drawing of `reporting/schematic.py`; `pump_feeds_chambers` the volume balance (`diagnosis/inference/terms.py`:
+    `equations`) and the controller's model of the drive (`control/drive.py`: `drive_of`). A circuit that is only
+    diagnosed needs no more than an entry in `CIRCUITS`, and its `value` among those of the parameter.
 
     Attributes
     ----------
@@ -68,11 +64,7 @@ class HydraulicCircuit(NamedTuple):
 
     @property
     def size_parameters(self) -> tuple[str, ...]:
-        """Dotted names of the parameters to which flows of the volume balance are proportional (`flow_size`).
-
-        They are both piston areas if `flow_size` is "area", as in a valve-controlled rig, and the pump's displacement
-        if it is "displacement", as in a pump-controlled one.
-        """
+        """Dotted names of the parameters to which flows of the volume balance are proportional (`flow_size`)."""
         return ("cylinder.A_A", "cylinder.A_B") if self.flow_size == "area" else ("pump.q_b",)
 
 
@@ -112,10 +104,9 @@ CIRCUITS = (PUMP_CIRCUIT, VALVE_CIRCUIT)
 
 
 def check_circuit_property(subject: str, rig: str, circuit: HydraulicCircuit, flag: str) -> None:
-    """Check that a rig's circuit has a property, the bool attribute named `flag`, such as "pump_is_measured".
+    """Raise InputError unless a rig's circuit has a property, the bool attribute `flag`, such as "pump_is_measured".
 
-    Raises InputError otherwise. For the message, `subject` names what needs the property, such as "a simulation", and
-    `rig` is the name of the rig.
+    For the message, `subject` names what needs the property, such as "a simulation".
     """
     if not getattr(circuit, flag):
         suitable = " or ".join(str(candidate) for candidate in CIRCUITS if getattr(candidate, flag))

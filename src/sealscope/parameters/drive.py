@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from sealscope.parameters.fields import Part, choice, quantity
+from sealscope.parameters.fields import Part, choice, conductance, quantity
 
 
 class Motor(Part):
@@ -33,13 +33,9 @@ class Pump(Part):
     """
 
     q_b: float = quantity("displacement", "m^3/rev", gt=0, le=0.1)
-    G_pump: float = quantity("internal leakage conductance of the pump", "m^3/(s Pa)", ge=0, le=1e-6)
-    G_healthy: float = quantity(
-        "most that pump and piston of a healthy machine pass together, as a conductance (0: not known)",
-        "m^3/(s Pa)",
-        absent=0,
-        ge=0,
-        le=1e-6,
+    G_pump: float = conductance("internal leakage conductance of the pump")
+    G_healthy: float = conductance(
+        "most that pump and piston of a healthy machine pass together, as a conductance (0: not known)", absent=0
     )
     C_st: float = quantity("turbulent slip coefficient", "1", absent=0, ge=0, le=1)
     C_f: float = quantity("friction torque over that of the pressure", "1", absent=0, ge=0, le=1)
@@ -68,9 +64,7 @@ class HydraulicLine(Part):
     V_2: float = quantity("volume of the line at pump port 2", "m^3", gt=0, le=1)
     open_A: float = quantity("opening of the shut-off valve in line A", "1", absent=1, ge=0, le=1)
     open_B: float = quantity("opening of the shut-off valve in line B", "1", absent=1, ge=0, le=1)
-    G_circ: float = quantity(
-        "conductance of the circulation valve where it is open", "m^3/(s Pa)", absent=0, ge=0, le=1e-6
-    )
+    G_circ: float = conductance("conductance of the circulation valve where it is open", absent=0)
     R_A: float = quantity("resistance of the filter in line A", "Pa s/m^3", absent=0, ge=0, le=1e13)
     R_B: float = quantity("resistance of the filter in line B", "Pa s/m^3", absent=0, ge=0, le=1e13)
     k_clog_A: float = quantity(
@@ -83,9 +77,7 @@ class HydraulicLine(Part):
         "law of clogging: 0 cake, 1 intermediate, 1.5 standard, 2 complete", "1", absent=0, ge=0, le=2
     )
     p_bypass: float = quantity("pressure that opens a filter's bypass valve", "Pa", absent=3.5e5, gt=0, le=1e8)
-    G_bypass: float = quantity(
-        "conductance of a filter's bypass above that pressure", "m^3/(s Pa)", absent=0, ge=0, le=1e-6
-    )
+    G_bypass: float = conductance("conductance of a filter's bypass above that pressure", absent=0)
 
 
 class Fluid(Part):
@@ -123,6 +115,4 @@ class MakeUp(Part):
     p_relief: float = quantity(
         "pressure above the accumulator's that opens a relief valve", "Pa", absent=2e7, gt=0, le=1e9
     )
-    G_relief: float = quantity(
-        "conductance of a relief valve above its pressure", "m^3/(s Pa)", absent=0, ge=0, le=1e-6
-    )
+    G_relief: float = conductance("conductance of a relief valve above its pressure", absent=0)

@@ -20,17 +20,21 @@ from sealscope.storage.plain_values import format_error
 def quantity(name: str, unit: str, *, absent: float | None = None, **bounds: float) -> Any:
     """Declare a numeric parameter with its name in words, its SI unit ("1" if it has none) and its bounds.
 
-    `bounds`: `gt`, `ge`, `lt` or `le`, in that unit. `absent`: the value for a rig without the part or effect that
-    the number describes, or None if every rig must state the parameter.
+    `bounds`: `gt`, `ge`, `lt` or `le`, in that unit. `absent`: the value for a rig without the part or effect that the
+    number describes, or None if every rig must state the parameter.
     """
     return Field(title=name, json_schema_extra={"unit": unit, "absent": absent}, **bounds)  # type: ignore[call-overload]
 
 
-def choice(name: str, *, absent: str | None = None) -> Any:
-    """Declare a parameter that has one of several named options, such as the law of friction.
+def conductance(name: str, *, absent: float | None = None) -> Any:
+    """Declare a conductance of 0 to 1e-6 m^3/(s Pa), of a leak or a valve, as `quantity` does."""
+    return quantity(name, "m^3/(s Pa)", absent=absent, ge=0, le=1e-6)
 
-    `name`: the parameter in words; the options are in the field's annotation, a Literal. `absent`: the option for a
-    rig whose file does not state the parameter, or None if every rig must state it.
+
+def choice(name: str, *, absent: str | None = None) -> Any:
+    """Declare a parameter, `name` in words, with one of the options in the field's annotation, a Literal.
+
+    `absent`: the option for a rig whose file does not state the parameter, or None if every rig must state it.
     """
     return Field(title=name, json_schema_extra={"unit": "", "absent": absent})
 
@@ -42,10 +46,7 @@ def unit_of(field: FieldInfo) -> str:
 
 
 def absent_of(field: FieldInfo) -> float | str | None:
-    """Return the value that a parameter has in a rig whose file does not state it; None if every rig must state it.
-
-    With this value the part or effect that the parameter describes is absent from the model.
-    """
+    """Return the value of a parameter in a rig without the part or effect it describes; None if all must state it."""
     extra = field.json_schema_extra
     return extra["absent"] if isinstance(extra, dict) else None  # type: ignore[return-value]
 
@@ -62,11 +63,9 @@ def with_unit(number: float, unit: str) -> str:
 
 
 def format_broken_rule(error: ValidationError, model: type[BaseModel]) -> str:
-    """Format one of the errors found by pydantic as a line such as "SYMBOL must be ..., got ...".
+    """Format the first of the errors found by pydantic, or an unknown name, as a line "SYMBOL must be ..., got ...".
 
-    `model`: class of the group of parameters that could not be made. The line states the first error, but an unknown
-    name before any other error (`format_error`). If the broken rule is a bound, such as "must be > 0", the parameter's
-    unit follows the bound.
+    `model`: class of the group of parameters that could not be made. The parameter's unit follows a broken bound.
     """
     first = error.errors(include_url=False)[0]
     symbol = ".".join(map(str, first["loc"]))
@@ -89,10 +88,7 @@ class Part(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
     def __init__(self, **values: Any) -> None:
-        """Make the group of parameters from their values by name.
-
-        Raises InputError for the first broken rule, PartsDisagreeError if this rule relates several parameters.
-        """
+        """Make the group from its values by name; raise InputError, or PartsDisagreeError if a rule relates several."""
         try:
             super().__init__(**values)
         except ValidationError as error:
@@ -101,21 +97,14 @@ class Part(BaseModel):
             raise (PartsDisagreeError if is_joint_rule else InputError)(format_broken_rule(error, type(self))) from None
 
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
-        """Return an unchanged copy of this group of parameters.
-
-        Raises InputError if `update` is given, because pydantic would not validate its values.
-        """
+        """Return an unchanged copy of this group; raise InputError for an `update`, which would not be validated."""
         if update:
             raise InputError("a rig must be changed by Rig.with_overrides, got model_copy(update=...)")
         return super().model_copy(deep=deep)
 
 
 def iter_fields(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, FieldInfo]]:
-    """Yield the dotted name and the declaration of each parameter of a rig or of a group of parameters, in order.
-
-    `model`: class of the rig or group; the groups that it contains are searched, too. `prefix`: beginning of the dotted
-    names, "" for a rig.
-    """
+    """Yield dotted name (after `prefix`) and declaration of each parameter of a class and of its groups, in order."""
     for symbol, field in model.model_fields.items():
         annotation = field.annotation
         if isinstance(annotation, type) and issubclass(annotation, BaseModel):

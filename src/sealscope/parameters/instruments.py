@@ -12,8 +12,7 @@ from sealscope.parameters.fields import Part, quantity, with_unit
 class PressureTransducer(Part):
     """A pressure transducer with the errors of its reading: noise, offset, drift, mains hum, delay and failures.
 
-    Its white noise `noise` is independent of that of other channels. `sensors.common_noise`, which is equal in all
-    pressure channels, is added to it.
+    Its white noise `noise` is independent of that of other channels; `sensors.common_noise` is equal in all of them.
     """
 
     range_lo: float = quantity("lower end of the range", "Pa", ge=-1e9, le=1e9)
@@ -34,10 +33,7 @@ class PressureTransducer(Part):
 
     @model_validator(mode="after")
     def _check_range(self) -> Self:
-        """Check that range_lo < range_hi, and return the transducer unchanged.
-
-        Raises ValueError otherwise, as pydantic requires.
-        """
+        """Raise ValueError, as pydantic requires, unless range_lo < range_hi."""
         if self.range_lo >= self.range_hi:
             raise ValueError(f"range_lo must be < range_hi = {with_unit(self.range_hi, 'Pa')}, got {self.range_lo}")
         return self
@@ -79,11 +75,7 @@ class Sensors(Part):
 
 
 class Daq(Part):
-    """Data acquisition board.
-
-    A transducer's range from `range_lo` to `range_hi` corresponds to `sensor_volts_lo` to `sensor_volts_hi` at the
-    board's input.
-    """
+    """Data acquisition board; its inputs read `sensor_volts_lo` to `sensor_volts_hi` over a transducer's range."""
 
     bits: int = quantity("resolution of the conversion", "bit", ge=2, le=32)
     range: float = quantity("input range: plus and minus this voltage", "V", gt=0, le=1e3)
@@ -95,11 +87,7 @@ class Daq(Part):
 
     @model_validator(mode="after")
     def _check_output_volts(self) -> Self:
-        """Check that -range <= sensor_volts_lo < sensor_volts_hi <= range, and return the board unchanged.
-
-        The transducers' outputs are then within the board's input range. Raises ValueError otherwise, as pydantic
-        requires.
-        """
+        """Raise ValueError, as pydantic requires, unless -range <= sensor_volts_lo < sensor_volts_hi <= range."""
         lo, hi = self.sensor_volts_lo, self.sensor_volts_hi
         if lo >= hi:
             raise ValueError(f"sensor_volts_lo must be < sensor_volts_hi = {with_unit(hi, 'V')}, got {lo}")

@@ -99,18 +99,12 @@ def _load_packaged(name: str) -> Rig:
 
 
 def _is_path(text: str) -> bool:
-    """Return True if a text is the path of a rig's file, rather than the name of a packaged rig.
-
-    A path ends in .toml, contains a slash or the system's path separator, or names an existing file.
-    """
+    """Test whether a text is a rig file's path: it ends in .toml, contains a slash, or names an existing file."""
     return text.endswith(".toml") or "/" in text or os.sep in text or is_file_path(text)
 
 
 def _load_file(path: Path, place: str) -> Rig:
-    """Load a rig from its file and from the files that this one extends.
-
-    `place`: name of the file in messages.
-    """
+    """Load a rig from its file, called `place` in messages, and from the files that this one extends."""
     rig_table, entries, columns = _read_layers(path, place, visited=())
     name, title = rig_table.get("name", path.stem), rig_table.get("title", "")
     rig = Rig.from_entries(entries, name=name, title=title, place=place)
@@ -120,8 +114,8 @@ def _load_file(path: Path, place: str) -> Rig:
 def save_channel_map(path: str | os.PathLike[str], columns: Mapping[str, str]) -> None:
     """Write a channel map into a rig's file, as its table `[map]`; an earlier map is replaced.
 
-    `columns`: mapping from channel to column of the machine's logs. Raises InputError if `path` is not the file of
-    a rig or cannot be written; the file is then unchanged.
+    `columns`: mapping from channel to column of the machine's logs. Raises InputError if `path` is not the file of a
+    rig or cannot be written; the file is then unchanged.
     """
     if os.fspath(path) in rig_names():
         raise InputError(f"a map is saved beside a rig of your own, a .toml file, got the packaged rig {path}")
@@ -142,24 +136,19 @@ def save_channel_map(path: str | os.PathLike[str], columns: Mapping[str, str]) -
 
 
 class _RigFile(NamedTuple):
-    """Content of a rig's file, including the files that it extends.
+    """Content of a rig's file, including the files that it extends."""
 
-    `head`: its table `[rig]`; `entries`: the parameters by dotted name; `columns`: channel -> column of the machine's
-    logs.
-    """
-
-    head: dict[str, str]
-    entries: dict[str, ParameterEntry]
-    columns: dict[str, str]
+    head: dict[str, str]  # its table `[rig]`
+    entries: dict[str, ParameterEntry]  # the parameters by dotted name
+    columns: dict[str, str]  # channel -> column of the machine's logs
 
 
 def _read_layers(path: Path, place: str, visited: tuple[Path, ...]) -> _RigFile:
     """Read a rig's file together with the files that it extends.
 
-    A parameter in the file replaces the same parameter of an extended file. A table `[map]` in the file replaces the
-    extended file's table as a whole. Tables of a commissioned machine's file that do not describe a rig
-    (`MACHINE_TABLES`) are left out. `place`: name of the file in messages; `visited`: the files that extend this one,
-    to detect circles. Raises InputError for a wrong table or key, a circle, or more than `_MAX_LAYERS` files.
+    Its parameters, and its table `[map]` as a whole, replace those of an extended file. Tables of a commissioned
+    machine that do not describe a rig (`MACHINE_TABLES`) are left out. `place`: the file in messages; `visited`: the
+    files that extend it. Raises InputError for a wrong table or key, a circle, or more than `_MAX_LAYERS` files.
     """
     file = path.resolve()
     if file in visited or len(visited) >= _MAX_LAYERS:

@@ -19,11 +19,10 @@ _OTHER_NAMES = {
 
 
 def resolve_name(name: str, dotted: Sequence[str]) -> str:
-    """Find the dotted name of a parameter from a shorter name, such as `V_1` or `p_A.noise`, or from the dotted name.
+    """Find the dotted name of a parameter from its end, such as `V_1` or `p_A.noise`, or from the dotted name itself.
 
-    A shorter name is the end of exactly one dotted name. `dotted`: the dotted names of all parameters. Raises
-    InputError if no parameter has the name, or if several have it. The error for a name that is usual in other
-    programs (`_OTHER_NAMES`) suggests the parameter.
+    `dotted`: the dotted names of all parameters. Raises InputError if no parameter has the name, or if several have it.
+    The error for a name that is usual in other programs (`_OTHER_NAMES`) suggests the parameter.
     """
     if name in dotted:
         return name
@@ -41,11 +40,7 @@ def resolve_name(name: str, dotted: Sequence[str]) -> str:
 
 
 def parse_override(text: str) -> tuple[str, str]:
-    """Split an override `NAME=VALUE[unit]` into name and value.
-
-    The value stays a text, which `Rig.with_overrides` parses. Raises InputError if the name, the equals sign or the
-    value is missing.
-    """
+    """Split an override `NAME=VALUE[unit]` into name and value, a text; raise InputError if a part is missing."""
     name, equals, value = text.partition("=")
     name, value = name.strip(), value.strip()
     if not (name and equals and value):
@@ -54,10 +49,7 @@ def parse_override(text: str) -> tuple[str, str]:
 
 
 def parse_overrides(texts: Sequence[str]) -> dict[str, str]:
-    """Split the overrides `NAME=VALUE[unit]` of a command into a mapping from name to value.
-
-    Raises InputError for a name with two different values.
-    """
+    """Split overrides `NAME=VALUE[unit]` to name -> value; raise InputError for a name with two different values."""
     overrides: dict[str, str] = {}
     for text in texts:
         name, value = parse_override(text)

@@ -25,8 +25,7 @@ _STATED = "stated when this file was written: replace by drawing or data sheet"
 def piston_areas(bore: float, rod: float, *, double_rod: bool = False) -> tuple[float, float]:
     """Compute the piston areas [m^2] of sides A and B from the diameters of bore and rod [m].
 
-    With `double_rod` the rod is on both sides, otherwise on side B only. Raises InputError if the rod is not thinner
-    than the bore.
+    The rod is on side B, with `double_rod` on both. Raises InputError if the rod is not thinner than the bore.
     """
     if not (math.isfinite(bore) and 0.0 <= rod < bore):
         raise InputError(f"rod must be 0 to below the bore, {1e3 * bore:g} mm, got {1e3 * rod:g} mm")
@@ -44,12 +43,8 @@ def rig_text(name: str, area_A: float, area_B: float, stroke: float, displacemen
     ----------
     name : str
         Name of the rig.
-    area_A, area_B : float
-        Piston areas [m^2].
-    stroke : float
-        Stroke [m].
-    displacement : float
-        Displacement of the pump [m^3/rev].
+    area_A, area_B, stroke, displacement : float
+        Piston areas [m^2], stroke [m], and displacement of the pump [m^3/rev].
 
     Raises
     ------
@@ -88,12 +83,8 @@ def valve_rig_text(
     ----------
     name : str
         Name of the rig.
-    area_A, area_B : float
-        Piston areas [m^2].
-    stroke : float
-        Stroke [m].
-    rated_flow : float
-        Rated flow of the valve [m^3/s].
+    area_A, area_B, stroke, rated_flow : float
+        Piston areas [m^2], stroke [m], and rated flow of the valve [m^3/s].
     rated_drop : float, optional
         Pressure drop of one edge at the rated flow [Pa]; by default that of a servo valve, 35 bar.
     pressure : float, optional
@@ -133,10 +124,7 @@ def valve_rig_text(
 
 
 def _check_arguments(name: str, sizes: dict[str, float]) -> None:
-    """Check that the name of a new rig is valid, and that its sizes are finite and > 0; raise InputError otherwise.
-
-    `sizes`: mapping from the name of an argument, such as "stroke", to its value.
-    """
+    """Raise InputError unless the name of a new rig is valid, and its sizes, by argument, are finite and > 0."""
     for argument, value in sizes.items():
         if not (math.isfinite(value) and value > 0):
             raise InputError(f"{argument} must be > 0, got {value:g}")
@@ -145,24 +133,20 @@ def _check_arguments(name: str, sizes: dict[str, float]) -> None:
 
 
 def _read_template(file: str) -> Template:
-    """Read the template of a rig's file from the file named `file` in the folder of this module."""
+    """Read the template of a rig's file from this module's folder."""
     return Template(Path(__file__).with_name(file).read_text(encoding="utf-8"))
 
 
 def _volume_ratio(base: Rig, area_A: float, area_B: float, stroke: float) -> float:
-    """Compute a new cylinder's chamber volume, divided by the chamber volume V of the rig `base`.
-
-    The volumes are those of the larger side at mid-stroke: for the new cylinder, area times half the stroke plus an
-    assumed dead volume. `area_A`, `area_B` [m^2], `stroke` [m]: piston areas and stroke of the new cylinder.
-    """
+    """Compute a new cylinder's chamber volume, with an assumed dead volume, over the volume V of the rig `base`."""
     return (0.5 + _DEAD_VOLUME_RATIO) * max(area_A, area_B) * stroke / base.cylinder.V
 
 
 def _cylinder_parameters(base: Rig, area_A: float, area_B: float, stroke: float) -> dict[str, str]:
     """Format the cylinder and friction parameters of a new rig, scaled from the rig `base`, for a template.
 
-    `area_A`, `area_B` [m^2], `stroke` [m]: piston areas and stroke of the new cylinder. Returns a mapping from the
-    names in the template to texts: areas in mm^2, lengths in mm, volumes in cm^3, and other values in SI units.
+    `area_A`, `area_B` [m^2] and `stroke` [m] are those of the new cylinder. In the texts, areas are in mm^2, lengths in
+    mm, volumes in cm^3, and other values in SI units.
     """
     volume_ratio = _volume_ratio(base, area_A, area_B, stroke)
     bore_ratio = math.sqrt(max(area_A, area_B) / max(base.cylinder.A_A, base.cylinder.A_B))

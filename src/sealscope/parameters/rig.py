@@ -123,11 +123,7 @@ class Rig(Part):
 
     @model_validator(mode="after")
     def _check_parts(self) -> Self:
-        """Check the rules that relate several parameters, and return the rig unchanged.
-
-        Examples are that the chamber volumes exceed what the piston sweeps, and that the gas of an accumulator exceeds
-        the oil that the rod displaces. Raises ValueError, as pydantic requires, if a rule is broken.
-        """
+        """Raise ValueError, as pydantic requires, if a rule that relates several parameters is broken."""
         cylinder, makeup, friction = self.cylinder, self.makeup, self.friction
         V, V_rod = cylinder.V, cylinder.V_rod
         if V_rod >= V:
@@ -161,10 +157,10 @@ class Rig(Part):
         return self
 
     def _check_circuit(self) -> None:
-        """Check the parameter values that the rig's circuit requires, and those of a servo valve's supply.
+        """Raise ValueError unless parameters have the values that the rig's circuit and a servo valve's supply require.
 
         If the rig has a supply, the speed loop of its motor must have an integral gain > 0, and the precharge of its
-        accumulator, if any, must be below the supply's pressure. Raises ValueError otherwise.
+        accumulator, if any, must be below the supply's pressure.
         """
         supply, circuit = self.supply, self.circuit
         for name, required in circuit.required.items():
@@ -184,10 +180,10 @@ class Rig(Part):
             )
 
     def _check_lines(self) -> None:
-        """Check the shut-off valves and filters of the lines, and the viscosities of the oil.
+        """Raise ValueError unless shut-off valves, filters and viscosities fit together.
 
-        Shut-off valves and filters require lines, clogging and bypass valves require a filter, and the oil must be
-        thinner at 100 than at 40 deg C. Raises ValueError otherwise.
+        Valves and filters require lines, clogging and bypass a filter, and the oil must be thinner at 100 than at 40
+        deg C.
         """
         line, oil = self.line, self.fluid
         # `absent`: value of a parameter that describes no valve or filter
@@ -246,10 +242,7 @@ class Rig(Part):
         return dict(self._channel_map)
 
     def with_channel_map(self, columns: Mapping[str, str]) -> Rig:
-        """Return the same rig with another channel map.
-
-        `columns`: mapping from channel to column of the machine's logs.
-        """
+        """Return the same rig with another map from channel to column of the machine's logs."""
         rig = self.model_copy()
         rig._channel_map = tuple(columns.items())
         return rig
@@ -262,30 +255,25 @@ class Rig(Part):
         return value  # type: ignore[no-any-return]
 
     def entry(self, name: str) -> ParameterEntry:
-        """Return a parameter as it was stated: value, unit, source, and the file or option that states it.
-
-        `name`: dotted name of the parameter, or the bare symbol if that is unique.
-        """
+        """Return a parameter, given by its bare or dotted name, as it was stated."""
         return self._stated_entries()[resolve_name(name, declared_names())]
 
     def states(self, *names: str) -> bool:
-        """Return True if all the named parameters are stated for this machine; False if a value is assumed.
-
-        The source of an assumed value begins with `assumed:`.
-        """
+        """Test whether all the named parameters are stated for this machine, i.e. have no source `assumed: ...`."""
         return not any(self.entry(name).source.startswith(ASSUMED) for name in names)
 
     def as_assumed(self, reason: str) -> Rig:
         """Return the same rig with all values marked as assumed; `reason` becomes part of the values' sources."""
         entries = {name: entry._replace(source=f"{ASSUMED} {reason}") for name, entry in self._stated_entries().items()}
-        rig = Rig.from_entries(entries, name=self._name, title=self._title, place=self._name)
+        return self._with_entries(entries, self._name)
+
+    def _with_entries(self, entries: Mapping[str, ParameterEntry], place: str) -> Rig:
+        """Build a rig from other entries, stated in `place`, with this rig's name, title and channel map."""
+        rig = Rig.from_entries(entries, name=self._name, title=self._title, place=place)
         return rig.with_channel_map(self.channel_map)
 
     def _stated_entries(self) -> dict[str, ParameterEntry]:
-        """Return the entries of all parameters by dotted name.
-
-        Raises InputError for a rig that was built from bare parts, without sources.
-        """
+        """Return the entries of all parameters by dotted name; raise InputError for a rig built from bare parts."""
         if not self._entries:
             raise InputError("a rig must have sources; make it with load_rig or Rig.from_entries, not from bare parts")
         return dict(self._entries)
@@ -307,18 +295,14 @@ class Rig(Part):
             if full_name in names_by_parameter:
                 raise InputError(f"{full_name} must be set once, got {names_by_parameter[full_name]} and {name}")
             names_by_parameter[full_name] = name
-            new_value, unit = _parse_value(full_name, value, source)
-            entries[full_name] = ParameterEntry(new_value, unit, source=source, place=source)
-        rig = Rig.from_entries(entries, name=self._name, title=self._title, place=source)
-        return rig.with_channel_map(self.channel_map)
+            entries[full_name] = _make_entry(full_name, value, source, source)
+        return self._with_entries(entries, source)
 
     def with_areas(self, A_A: float, A_B: float, *, source: str) -> Rig:
-        """Return the same rig with other piston areas [m^2], and with volumes that suit these areas.
+        """Return the same rig with other piston areas [m^2] from `source`, and with volumes that suit these areas.
 
-        The areas have the source `source`. If the chamber volumes depend on the position, the dead volume, which the
-        piston does not sweep, is scaled with the larger area. The gas of a make-up accumulator is scaled likewise, and
-        is at least `GAS_OVER_ROD` times the oil that the rod displaces in a stroke. Scaled values are marked as
-        assumed.
+        The dead volume of chambers whose volume depends on the position, and the gas of an accumulator, are scaled with
+        the larger area; the gas is at least `GAS_OVER_ROD` times the rod's volume. Scaled values are marked as assumed.
         """
         entries, cylinder = self._stated_entries(), self.cylinder
         scale = max(A_A, A_B) / max(cylinder.A_A, cylinder.A_B)
@@ -334,10 +318,8 @@ class Rig(Part):
         stated_values = {"cylinder.A_A": A_A, "cylinder.A_B": A_B}
         sources = dict.fromkeys(scaled_values, assumed) | dict.fromkeys(stated_values, source)
         for full_name, value in {**scaled_values, **stated_values}.items():
-            new_value, unit = _parse_value(full_name, value, source)
-            entries[full_name] = ParameterEntry(new_value, unit, source=sources[full_name], place=source)
-        rig = Rig.from_entries(entries, name=self._name, title=self._title, place=source)
-        return rig.with_channel_map(self.channel_map)
+            entries[full_name] = _make_entry(full_name, value, sources[full_name], source)
+        return self._with_entries(entries, source)
 
     def table(self) -> list[ParameterRow]:
         """List all parameters as rows of a table, in the order of their declaration."""
@@ -358,9 +340,8 @@ class Rig(Part):
     def present_values(self) -> dict[str, Value]:
         """Return the SI values of the parameters whose part or effect is in the model, by dotted name.
 
-        A parameter is left out if it has the `absent` value of its declaration, such as the volume 0 of a hose. The
-        result identifies a machine across versions of the package: a parameter that a later version adds has its
-        `absent` value in older rigs, and so does not change their result.
+        Without `absent` values, such as the volume 0 of a hose, it identifies a machine across versions of the package,
+        as a parameter that a later version adds is absent in older rigs.
         """
         return {name: self[name] for name, field in declared_fields().items() if self[name] != absent_of(field)}
 
@@ -378,10 +359,7 @@ class Rig(Part):
 
     @classmethod
     def from_dict(cls, tree: Mapping[str, Any], *, place: str) -> Rig:
-        """Build the rig from the nested values of `as_dict`, for example in a recording's provenance.
-
-        `place`: where the values come from, for messages. Raises InputError for invalid values.
-        """
+        """Build the rig from the values of `as_dict`, found in `place`; raise InputError for invalid values."""
         table = tree.get("rig")
         name, title = (table.get("name", ""), table.get("title", "")) if isinstance(table, Mapping) else ("", "")
         parts = ((key, item) for key, item in tree.items() if key != "rig")
@@ -389,19 +367,16 @@ class Rig(Part):
 
     @classmethod
     def from_entries(cls, entries: Mapping[str, ParameterEntry], *, name: str, title: str = "", place: str) -> Rig:
-        """Build a rig from the entries of its parameters by dotted name.
+        """Build a rig from the entries of its parameters by dotted name; `place`: where they come from, for messages.
 
-        A parameter without an entry gets its `absent` value, with which its part or effect is absent from the
-        model. `place`: where the entries come from, for messages. Raises InputError if a parameter has neither entry
-        nor `absent` value, for an unknown name, and for an invalid value.
+        A missing entry gets its `absent` value. Raises InputError if it has none, for an unknown name or an invalid
+        value.
         """
         entries = {**_absent_entries(place), **entries}
         names = declared_names()
         for full_name in entries:
             if full_name not in declared_fields():
-                raise InputError(
-                    f"{full_name} is not a parameter{suggestion(full_name, names)} ({entries[full_name].place})"
-                )
+                raise _unknown_name_error(full_name, entries[full_name].place)
         for full_name in names:
             if full_name not in entries:
                 raise InputError(f"{full_name} is missing ({place})")
@@ -418,10 +393,7 @@ def declared_fields() -> dict[str, FieldInfo]:
 
 
 def _absent_entries(place: str) -> dict[str, ParameterEntry]:
-    """Build the entries of the parameters that a rig's file may omit, with the values that they then have.
-
-    With these values their parts and effects are absent from the model (`absent_of`). `place`: the file, for messages.
-    """
+    """Build the entries that a rig's file `place` may omit, with the values for an absent part or effect."""
     return {
         full_name: ParameterEntry(value, unit_of(field), "absent from the model: not stated", place)
         for full_name, field in declared_fields().items()
@@ -435,12 +407,16 @@ def declared_names() -> tuple[str, ...]:
     return tuple(declared_fields())
 
 
+def _unknown_name_error(full_name: str, place: str) -> InputError:
+    """Build the InputError for a dotted name, stated in `place`, that no parameter has."""
+    return InputError(f"{full_name} is not a parameter{suggestion(full_name, declared_names())} ({place})")
+
+
 def _build_part(model: type[P], path: str, entries: Mapping[str, ParameterEntry], place: str) -> P:
     """Build a part of a rig, such as its pump, from the entries of its parameters.
 
-    `model`: class of the part; `path`: beginning of the dotted names of its parameters, such as "pump.", empty for
-    the whole rig. Raises InputError for an invalid value, with the place that states it, or with `place` if a rule on
-    several parameters is broken.
+    `path`: beginning of the dotted names of its parameters, such as "pump.", empty for the whole rig. Raises InputError
+    for an invalid value, with the place that states it, or with `place` if a rule on several parameters is broken.
     """
     values: dict[str, Any] = {}
     for symbol, field in model.model_fields.items():
@@ -459,10 +435,7 @@ def _build_part(model: type[P], path: str, entries: Mapping[str, ParameterEntry]
 
 
 def _qualify_symbol(full_name: str, text: str) -> str:
-    """Replace the symbol at the beginning of a message by the parameter's dotted name, unless the symbol is unique.
-
-    `full_name`: the dotted name; `text`: the message, which may be the symbol only.
-    """
+    """Replace the symbol at the beginning of a message by the parameter's dotted name, unless the symbol is unique."""
     symbol = full_name.rpartition(".")[2]
     is_unique = sum(name.rpartition(".")[2] == symbol for name in declared_names()) <= 1
     return text if is_unique else full_name + text[len(symbol) :]
@@ -477,9 +450,7 @@ def _short_name(full_name: str) -> str:
 def _si_value(full_name: str, field: FieldInfo, entry: ParameterEntry) -> Value:
     """Convert the entry of a parameter to a number in SI, or to the value of a choice.
 
-    `full_name`: dotted name of the parameter; `field`: declaration of the parameter, with unit and options. Raises
-    InputError for a wrong type or unit, a number that is not finite, an unknown option, or an entry that does not state
-    the `source` of its value.
+    Raises InputError for a wrong type or unit, a number that is not finite, an unknown option, or no source.
     """
     short_name, place = _short_name(full_name), entry.place
     if not isinstance(entry.source, str) or not entry.source.strip():
@@ -504,28 +475,28 @@ def _si_value(full_name: str, field: FieldInfo, entry: ParameterEntry) -> Value:
     return int(number) if field.annotation is int and number.is_integer() else number
 
 
-def _parse_value(full_name: str, value: Any, place: str) -> tuple[Value, str]:
-    """Parse a new value of a parameter; return the value in SI and the SI unit, or the option of a choice and "".
+def _make_entry(full_name: str, value: Any, source: str, place: str) -> ParameterEntry:
+    """Make the entry of a parameter's new value, in SI and the SI unit, or the option of a choice without unit.
 
-    `full_name`: dotted name of the parameter; `value`: a number in SI, a text with a unit such as "50[cm^3]", or an
-    option, from which blanks at the ends are removed; `place`: where the value comes from, for messages. Raises
-    InputError for a text that is not a quantity of the parameter's dimension. Range and options are checked later
-    (`_si_value`, `Part`).
+    `value`: a number in SI, a text with a unit such as "50[cm^3]", or an option. Raises InputError for a text that is
+    not a quantity of the parameter's dimension; range and options are checked later.
     """
     field = declared_fields()[full_name]
+    unit = unit_of(field)
     if choices_of(field):
-        return (value.strip() if isinstance(value, str) else value), ""
-    si_unit = unit_of(field)
-    if isinstance(value, str):
-        return parse_quantity(value, si_unit, name=_short_name(full_name), place=place), si_unit
-    return (value.item() if isinstance(value, np.generic) else value), si_unit
+        value = value.strip() if isinstance(value, str) else value
+    elif isinstance(value, str):
+        value = parse_quantity(value, unit, name=_short_name(full_name), place=place)
+    elif isinstance(value, np.generic):
+        value = value.item()
+    return ParameterEntry(value, unit, source, place)
 
 
 def flatten_entries(tree: Iterable[tuple[str, Any]], place: str, prefix: str = "") -> dict[str, ParameterEntry]:
     """Flatten nested tables `{group: {symbol: {value, unit, source}}}` to entries by dotted name.
 
-    `tree`: pairs of key and table; `place`: the file, for messages; `prefix`: beginning of the dotted names. Raises
-    InputError for an unknown name, and for an entry that `_parse_entry` refuses.
+    `tree`: pairs of key and table; `prefix`: beginning of the dotted names. Raises InputError for an unknown name, and
+    for an entry that `_parse_entry` refuses.
     """
     entries: dict[str, ParameterEntry] = {}
     for key, item in tree:
@@ -535,18 +506,14 @@ def flatten_entries(tree: Iterable[tuple[str, Any]], place: str, prefix: str = "
         elif isinstance(item, dict):
             entries |= flatten_entries(item.items(), place, full_name + ".")
         else:
-            raise InputError(f"{full_name} is not a parameter{suggestion(full_name, declared_names())} ({place})")
+            raise _unknown_name_error(full_name, place)
     return entries
 
 
 def _parse_entry(full_name: str, item: Any, place: str) -> ParameterEntry:
-    """Check the table of a parameter in a rig's file, and convert it to an entry.
-
-    `full_name`: dotted name of the parameter; `item`: the table with value, unit and source; `place`: the file, for
-    messages. Raises InputError for an unknown name, a wrong key or a wrong type.
-    """
+    """Check the table of a parameter with value, unit and source, and convert it; raise InputError if it is wrong."""
     if full_name not in declared_fields():
-        raise InputError(f"{full_name} is not a parameter{suggestion(full_name, declared_names())} ({place})")
+        raise _unknown_name_error(full_name, place)
     short_name = _short_name(full_name)
     if not isinstance(item, dict):
         raise InputError(f"{short_name} must be {{ value = ..., unit = ..., source = ... }}, got {item!r} ({place})")

@@ -41,10 +41,7 @@ class ServoValve(Part):
 
     @model_validator(mode="after")
     def _check_overlaps(self) -> Self:
-        """Check that every edge opens or closes within the spool's stroke, |overlap| < x_max; return the valve.
-
-        Raises ValueError otherwise, as pydantic requires.
-        """
+        """Raise ValueError, as pydantic requires, unless every edge opens or closes within the spool's stroke."""
         for name in ("o_PA", "o_AT", "o_PB", "o_BT"):
             overlap = getattr(self, name)
             if not abs(overlap) < self.x_max:

@@ -10,45 +10,28 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-#: Channel names and the unit each has inside Sealscope; `docs/nomenclature.md` explains them.
-CHANNEL_UNITS: Mapping[str, str] = MappingProxyType(
-    {
-        "u": "V",
-        "omega": "rad/s",
-        "theta": "rad",
-        "x": "m",
-        "p_1": "Pa",
-        "p_2": "Pa",
-        "p_A": "Pa",
-        "p_B": "Pa",
-        "q_leak": "m^3/s",
-        "q_comp": "m^3/s",
-        "q_pump": "m^3/s",
-        "T_oil": "K",
-    }
-)
+#: Channel -> its unit inside Sealscope, and what it measures; `docs/nomenclature.md` explains the names.
+_CHANNELS = {
+    "u": ("V", "command"),
+    "omega": ("rad/s", "motor speed"),
+    "theta": ("rad", "motor angle"),
+    "x": ("m", "piston position"),
+    "p_1": ("Pa", "pressure at pump port 1"),
+    "p_2": ("Pa", "pressure at pump port 2"),
+    "p_A": ("Pa", "pressure in chamber A"),
+    "p_B": ("Pa", "pressure in chamber B"),
+    "q_leak": ("m^3/s", "leakage flow"),
+    "q_comp": ("m^3/s", "leakage flow that the controller makes good"),
+    "q_pump": ("m^3/s", "flow to the cylinder by a meter"),
+    "T_oil": ("K", "oil temperature"),
+}
+CHANNEL_UNITS: Mapping[str, str] = MappingProxyType({name: unit for name, (unit, _) in _CHANNELS.items()})
+#: What each channel, and the time, measures.
+LONG_NAMES: Mapping[str, str] = MappingProxyType({"t": "time"} | {name: text for name, (_, text) in _CHANNELS.items()})
 #: Channels from which the flow to the cylinder is computed, best first: pump angle, speed, flow meter, command.
 FLOW_SOURCES = ("theta", "omega", "q_pump", "u")
 #: Channels that change slowly, over minutes, in which constant or mostly missing values are not defects.
 SLOW = frozenset({"T_oil"})
-#: What each channel, and the time, measures.
-LONG_NAMES: Mapping[str, str] = MappingProxyType(
-    {
-        "t": "time",
-        "u": "command",
-        "omega": "motor speed",
-        "theta": "motor angle",
-        "x": "piston position",
-        "p_1": "pressure at pump port 1",
-        "p_2": "pressure at pump port 2",
-        "p_A": "pressure in chamber A",
-        "p_B": "pressure in chamber B",
-        "q_leak": "leakage flow",
-        "q_comp": "leakage flow that the controller makes good",
-        "q_pump": "flow to the cylinder by a meter",
-        "T_oil": "oil temperature",
-    }
-)
 #: Unit of a channel whose column states none: raw counts of a converter.
 COUNTS = "count"
 
@@ -57,8 +40,5 @@ UNUSED = "columns not used"
 
 
 def flow_source(channels: Container[str]) -> str | None:
-    """Choose the best available channel for computing the flow to the cylinder; None if there is none.
-
-    The order of preference is that of `FLOW_SOURCES`.
-    """
+    """Choose the best of `FLOW_SOURCES` for computing the flow to the cylinder; None if all are absent."""
     return next((name for name in FLOW_SOURCES if name in channels), None)

@@ -22,32 +22,27 @@ _EQUAL_PEAKS = 0.05
 def find_cycle(recording: Recording) -> float | None:
     """Find the period of the duty cycle [s], with which the machine's motion repeats; None if nothing repeats.
 
-    The period is estimated (`estimate_period`) from the command if the command moves, else from p_A - p_B or the only
-    chamber pressure. The result is cached; copies of the recording with fewer channels (`Recording.only`) share it.
+    It is that of the command if this moves, else of p_A - p_B or the only chamber pressure, and is cached.
     """
     names = ("u",) if "u" in recording and is_moving(recording["u"]) else chambers_of(recording)
-
-    def compute(recording: Recording) -> float | None:
-        """Estimate the period [s] of the channels `names`; None if nothing repeats."""
-        return estimate_period(duty_signal([recording[name] for name in names]), recording.rate)
-
-    return compute_once(recording, "cycle", compute, names) if names else None
+    if not names:
+        return None
+    return compute_once(
+        recording, "cycle", lambda part: estimate_period(duty_signal([part[name] for name in names]), part.rate), names
+    )
 
 
 def duty_signal(channels: Sequence[Array]) -> Array:
-    """Compute the signal (n,) in which the duty cycle shows.
-
-    `channels`: the command (n,), or one or both chamber pressures (n,). The result is the only channel, or p_A - p_B.
-    """
+    """Compute the signal (n,) in which the duty cycle shows: the only one of `channels` (n,), or p_A - p_B of both."""
     return channels[0] - channels[1] if len(channels) == 2 else channels[0]
 
 
 def estimate_period(signal: Array, rate: float) -> float | None:
     """Estimate the period [s] of a signal (n,) sampled at `rate` [Hz]; None if nothing repeats.
 
-    The period is the lag of a maximum of the autocorrelation, which is 1 at lag 0. Of the maxima after the first
-    negative value, the first that is nearly as high as the highest is taken, and its lag is refined by a parabola. The
-    maximum must reach 0.6, and the period must be between 0.2 s and 20 s and at most a fifth of the signal.
+    It is the lag of the first maximum of the autocorrelation after a negative value that is nearly as high as the
+    highest, refined by a parabola. The maximum must reach 0.6 of that at lag 0, and the period must be between 0.2 s
+    and 20 s and at most a fifth of the signal.
     """
     stride = max(1, int(rate / _CYCLE.rate))  # samples averaged to one, to save time
     n = signal.size // stride
@@ -83,7 +78,7 @@ def fundamental_frequency(signal: Array, t: Array, period: float) -> float:
 
     The signal, without its mean, is multiplied by exp(-2 pi i t/period) and averaged over each period. The phase of
     these averages drifts by 2 pi times the difference of the frequency from 1/period. `t` (n,): times [s] in even
-    steps; `period`: approximate period [s], as from `estimate_period`. The signal must cover at least two periods.
+    steps; the signal must cover two or more of the approximate `period` [s].
     """
     n_period = max(1, round(period / (t[1] - t[0])))
     n_periods = t.size // n_period

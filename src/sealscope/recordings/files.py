@@ -47,11 +47,7 @@ _MAX_NESTING = 3
 
 
 def _detect_format(path: Path) -> str:
-    """Detect the format of a file, or its kind of archive, from its content.
-
-    Returns its name in `formats.toml`, such as "netcdf" or "zip". Raises UnreadableFile if the file cannot be read, or
-    has a format that is not supported.
-    """
+    """Detect the format in `formats.toml`, such as "zip", from a file's content; raise UnreadableFile without one."""
     try:
         with open_regular(path, "a recording") as file:
             head = file.read(SNIFF)
@@ -80,15 +76,13 @@ def _detect_format(path: Path) -> str:
 
 
 def _find_format(head: bytes, *, is_text: bool) -> str | None:
-    """Find the format whose function `recognise` (`formats.toml`) returns True for the first bytes `head` of a file.
-
-    `is_text`: True to test only formats that are text, False to test all others. None if no function returns True.
-    """
-    candidates = {kind: entry["recognise"] for kind, entry in _FORMATS.items() if "recognise" in entry}
-    for kind, function in candidates.items():
-        if bool(_FORMATS[kind].get("text")) == is_text and _format_function(kind, function)(head):
-            return kind
-    return None
+    """Find the format, text or not, whose function `recognise` (`formats.toml`) accepts a file's first bytes `head`."""
+    candidates = {
+        kind: entry["recognise"]
+        for kind, entry in _FORMATS.items()
+        if "recognise" in entry and bool(entry.get("text")) == is_text
+    }
+    return next((kind for kind, name in candidates.items() if _format_function(kind, name)(head)), None)
 
 
 def _format_function(kind: str, name: str) -> Callable[..., Any]:
@@ -202,10 +196,7 @@ def read_parts(
 
 
 def _iter_parts(file: Path, every: float, request: Request) -> Iterator[Recording]:
-    """Yield a recording in parts of `every` [s], as `read_parts` does.
-
-    `request` chooses the columns. Formats other than text are read as a whole and cut.
-    """
+    """Yield a recording in parts of `every` [s]; formats other than text are read as a whole and cut."""
     with _unpacked_file(file) as (inner, kind):
         if kind != "text":
             recording = _read_unpacked(inner, kind, request)
@@ -220,10 +211,7 @@ def _iter_parts(file: Path, every: float, request: Request) -> Iterator[Recordin
 
 @contextmanager
 def _unpacked_file(file: Path) -> Iterator[tuple[Path, str]]:
-    """Yield the path and the format of a file, which is unpacked first if it is an archive.
-
-    The unpacked file is removed at the end. Error messages name both the unpacked file and the archive.
-    """
+    """Yield path and format of a file, unpacked meanwhile if it is an archive; errors then name both files."""
     with ExitStack() as folders:
         inner, kind = file, _detect_format(file)
         max_bytes = max_unpacked_size(file) if kind in _ARCHIVES else 0
@@ -242,11 +230,9 @@ def _unpacked_file(file: Path) -> Iterator[tuple[Path, str]]:
 
 
 def _read_unpacked(file: Path, kind: str, request: Request) -> Recording:
-    """Read a recording from a file that is not packed in an archive.
+    """Read a recording from a file of the format `kind` that is not packed in an archive.
 
-    `kind`: format of the file; `request`: the user's choice of columns. Formats that are not marked as `safe` in
-    `formats.toml`, i.e. all but text logs and LabVIEW's .lvm files, are read in a subprocess, with limits on time,
-    memory and disk space.
+    Formats that `formats.toml` does not call `safe` are read in a subprocess with limited time, memory and disk space.
     """
     with raising_unreadable(f"{_FORMATS[kind]['words']} file", file):
         if kind in _SAFE_FORMATS:

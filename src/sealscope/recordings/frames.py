@@ -13,7 +13,7 @@ from sealscope.errors import InputError
 from sealscope.recordings.channels import LONG_NAMES, Array
 from sealscope.recordings.formats.columns import Request
 from sealscope.recordings.formats.headings.labels import Label
-from sealscope.recordings.formats.headings.preamble import collect_remarks, stated_rate
+from sealscope.recordings.formats.headings.preamble import collect_attributes, stated_rate
 from sealscope.recordings.formats.libraries import import_library
 from sealscope.recordings.formats.netcdf import make_attributes
 from sealscope.recordings.formats.table import FORMAT_VERSION, RecordingFields, Series, build_fields, parse_description
@@ -28,8 +28,8 @@ def to_pandas(
 ) -> pandas.DataFrame:
     """Make a data frame of a recording's samples, with the index `t [s]` and columns such as `p_A [Pa]`.
 
-    `values`, `units`, `description`: as from `Recording.series`. The `attrs` of the frame contain the units by
-    column, the rate, the provenance and the history. Raises MissingExtra without pandas.
+    `values`, `units`, `description`: as from `Recording.series`. The `attrs` of the frame contain the units by column,
+    the rate, the provenance and the history. Raises MissingExtra without pandas.
     """
     pandas = import_library("pandas", "a data frame", "pandas")
     columns = {f"{name} [{units[name]}]": series.copy() for name, series in values.items() if name != "t"}
@@ -65,17 +65,12 @@ def read_pandas(frame: pandas.DataFrame, request: Request) -> RecordingFields:
         description = parse_description({"format": FORMAT_VERSION, **frame.attrs})
     except InputError:  # not written by `to_pandas`
         description = None
-    remarks = collect_remarks(
-        (name, value) for name, value in frame.attrs.items() if isinstance(value, str | int | float)
-    )
+    remarks = collect_attributes(frame.attrs)
     return build_fields(series, request, "pandas", remarks, stated_rate(remarks), description=description)
 
 
 def _convert_column(dtypes: Any, series: Any, name: str) -> NDArray[Any]:
-    """Convert a column, a pandas series, to an array of datetime64, timedelta64, doubles or texts.
-
-    `dtypes`: the module pandas.api.types; `name`: name of the column in messages. Raises InputError for other types.
-    """
+    """Convert a pandas series, with `dtypes` = pandas.api.types, to datetime64, timedelta64, doubles or texts (n,)."""
     if dtypes.is_datetime64_any_dtype(series.dtype):
         if getattr(series.dtype, "tz", None) is not None:
             series = series.dt.tz_convert("UTC").dt.tz_localize(None)
@@ -91,10 +86,9 @@ def _convert_column(dtypes: Any, series: Any, name: str) -> NDArray[Any]:
 
 
 def to_xarray(values: Mapping[str, Array], units: Mapping[str, str], description: Mapping[str, Any]) -> xarray.Dataset:
-    """Make a data set of a recording's samples, as variables over the coordinate `t`.
+    """Make a data set of a recording's samples: variables over the coordinate `t`, with attributes as in NetCDF files.
 
-    `values`, `units`, `description`: as from `Recording.series`. The variables have the attributes `units` and
-    `long_name` as in the NetCDF files. Raises MissingExtra without xarray.
+    `values`, `units`, `description`: as from `Recording.series`. Raises MissingExtra without xarray.
     """
     xarray = import_library("xarray", "a data set", "xarray")
     variables = {

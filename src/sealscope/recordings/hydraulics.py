@@ -18,14 +18,9 @@ _COPY_TOLERANCE = 1e-6
 def find_implausibility(recording: Recording) -> str | None:
     """Find a reason, in words, why the channels cannot come from one hydraulic machine; None if there is none.
 
-    Three defects are recognised:
-
-    - p_B is a copy of p_A;
-    - the motor speed differs from the rate of the motor angle by a constant factor;
-    - p_A - p_B, or the only chamber pressure that varies, is nothing but noise.
-
-    Unit, offset and range of the pressures do not matter. Constant and absent channels are ignored, as one chamber may
-    rest at the charge pressure.
+    p_B may be a copy of p_A; the motor speed may differ from the rate of the motor angle by a constant factor; p_A -
+    p_B, or the only chamber pressure that varies, may be nothing but noise. Unit, offset and range of the pressures do
+    not matter. Constant and absent channels are ignored, as one chamber may rest at the charge pressure.
     """
     # the third difference of `_is_noise` needs four samples
     names = [name for name in chambers_of(recording) if len(recording) > 3 and not is_constant(recording[name])]
@@ -45,9 +40,8 @@ def find_implausibility(recording: Recording) -> str | None:
 def _describe_speed_mismatch(recording: Recording) -> str | None:
     """Describe a motor speed that differs from the rate of the motor angle by a constant factor, as by a wrong unit.
 
-    The factor is the least-squares ratio of the speed to the rate of the angle. None if the factor is between 1 / m and
-    m, with m = `readings.misfit` of `priors.toml`; if speed and rate do not correlate; if the speed or the angle is
-    absent or in raw counts; or if there are too few samples.
+    None if the least-squares factor is between 1 / m and m, with m = `readings.misfit` of `priors.toml`, if the two do
+    not correlate or are in raw counts, or if samples are missing.
     """
     if not {"theta", "omega"} <= {name for name, unit in recording.units.items() if unit != "count"}:
         return None
@@ -66,21 +60,16 @@ def _describe_speed_mismatch(recording: Recording) -> str | None:
 
 
 def _is_noise(values: Array) -> bool:
-    """Return True if a signal (n,) is mostly white noise.
+    """Test whether a signal (n,) is mostly white noise, or lacks samples.
 
-    The mean square of the third difference of white noise is 20 times the noise's variance. The signal is noise if this
-    mean square exceeds 20 times the signal's variance times `readings.noise` of `priors.toml`, or if samples are
-    missing.
+    The mean square of the third difference of white noise is 20 times its variance (`readings.noise` of `priors.toml`).
     """
     # `not <=`, so that missing samples count as noise
     return not np.mean(np.diff(values, 3) ** 2) <= 20.0 * _PRIORS.noise * np.var(values)
 
 
 def describe_missing_chambers(recording: Recording) -> str | None:
-    """Describe in words that a recording has no chamber pressure; None if one is present.
-
-    The text names the unused columns of the file.
-    """
+    """Describe in words, with the unused columns, that a recording has no chamber pressure; None if one is present."""
     if chambers_of(recording):
         return None
     unused = [line for line in recording.history if line.startswith(UNUSED)]

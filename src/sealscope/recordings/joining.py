@@ -32,9 +32,8 @@ _TWELVE_HOURS = re.compile(
 def start_seconds(recording: Recording, file: str = "") -> float | None:
     """Find the time of a recording's first sample [s since 1970]; None if it is not known.
 
-    The time of t = 0 is the entry `start` of the provenance, else the date in the name of the recording's file; the
-    `t` of the first sample is added. The name of the file is that in the provenance, else the argument `file`. Dates
-    and times are taken as UTC; a date without a time of day means midnight.
+    The time of t = 0 is the entry `start` of the provenance, else the date in the file's name, which is that in the
+    provenance, else `file`. Dates and times are taken as UTC; a date without a time of day means midnight.
     """
     start = parse_epoch(str(recording.provenance.get("start", "")))
     if start is None:
@@ -43,11 +42,7 @@ def start_seconds(recording: Recording, file: str = "") -> float | None:
 
 
 def file_seconds(recording: Recording, path: Path) -> float:
-    """Find the time of the first sample [s since 1970] of the recording in the file `path`.
-
-    The time is taken from the provenance, else from the file's name (`start_seconds`). If neither states it, the last
-    sample is assumed to have the time at which the file was last modified.
-    """
+    """Find the time of a file's first sample [s since 1970]: stated, or from the time of its last modification."""
     start = start_seconds(recording, path.name)
     if start is not None:
         return start
@@ -77,10 +72,7 @@ def _time_zero(recording: Recording) -> float | None:
 
 
 def _check_compatible(recordings: Sequence[Recording], names: Sequence[str]) -> None:
-    """Check that recordings have samples, and the same channels, units and rate; raise InputError otherwise.
-
-    `names`: names of the recordings in messages.
-    """
+    """Raise InputError unless recordings, called `names`, have samples and the same channels, units and rate."""
     first = recordings[0]
     for name, recording in zip(names, recordings, strict=True):
         if len(recording) == 0:

@@ -43,8 +43,7 @@ def is_moving(values: Array) -> bool:
 class Holds(NamedTuple):
     """Samples at which a pressure is held, i.e. repeats one value for too long to be a reading.
 
-    `flags` (n,): True for held samples. `pending`: index of the first sample whose flag may still change when later
-    samples are appended.
+    `flags` (n,): True for held samples. `pending`: index of the first flag that later samples may still change.
     """
 
     flags: NDArray[np.bool_]
@@ -54,9 +53,8 @@ class Holds(NamedTuple):
 def find_holds(values: Array, rate: float, before: float = math.nan) -> Holds:
     """Find the samples at which a pressure `values` (n,) repeats one value for longer than its noise allows.
 
-    A run of equal samples is a hold if it is longer than 1.5 s and 64 samples. Its first sample is a reading and is not
-    flagged. `rate` [Hz]: sampling rate; `before`: value of a hold that ends just before `values`, NaN if there is none.
-    A run of this value at the beginning continues that hold, and is flagged as a whole.
+    A run of equal samples is a hold if it is longer than 1.5 s and 64 samples. Its first sample is a reading and not
+    flagged, unless the run continues an earlier hold of the value `before`.
     """
     max_length = max(round(_HOLD.seconds * rate), _HOLD.samples)
     edges = np.concatenate([[0], np.flatnonzero(values[1:] != values[:-1]) + 1, [len(values)]])
@@ -75,9 +73,7 @@ def find_holds(values: Array, rate: float, before: float = math.nan) -> Holds:
 def describe_hold(recording: Recording) -> str | None:
     """Describe a chamber pressure that does not move, although its noise should move it; None if there is none.
 
-    Such a pressure repeats one value for too long (`find_holds`), and the longest repetition is described; or it is a
-    straight line to within `ROUNDING`. No sample may be missing. Short recordings and constant channels, which
-    `inspect` reports, are not described.
+    It repeats one value for too long (`find_holds`), or is a straight line. No sample may be missing.
     """
     for name in chambers_of(recording):
         values = recording[name]
@@ -100,31 +96,24 @@ def find_runs(flags: NDArray[np.bool_]) -> NDArray[np.intp]:
 
 
 def smallest_step(values: Array) -> float:
-    """Find the smallest difference between neighbours in `values` (n,), which are sorted in increasing order.
-
-    Differences up to `ROUNDING` times the range of the values do not count; 0 if there are no others.
-    """
+    """Find the smallest step in sorted `values` (n,) above rounding (`ROUNDING` of their range), else 0."""
     steps = np.diff(values)
     steps = steps[steps > ROUNDING * (values[-1] - values[0])]
     return float(steps.min()) if steps.size else 0.0
 
 
 def estimate_quantum(values: Array) -> float:
-    """Estimate the quantisation step of a channel (n,), the smallest difference of two of its values.
-
-    Of a long channel only some `_QUANTUM_SAMPLES` evenly spaced samples are compared.
-    """
+    """Estimate the quantisation step of a channel (n,), the smallest difference of two of its values."""
     return smallest_step(np.unique(values[:: max(1, values.size // _QUANTUM_SAMPLES)]))
 
 
 def find_stuck(values: Array) -> NDArray[np.intp]:
     """Find runs of equal values that are too long for the signal around them: first index and length of each (k, 2).
 
-    Let p be the fraction of samples that equal the previous one among the 100 samples before or after a run, whichever
-    fraction is larger. A run of length m then begins at a given sample with the probability p^(m-1). The run is too
-    long if fewer than 1e-6 such runs are expected in the channel `values` (n,), and if the value jumps by more than 3.5
-    quantisation steps at the beginning or end. A slow quantised signal at a turning point does not move either, but
-    leaves in single steps. Runs of fewer than 5 samples, and runs near the ends of the channel, are not found.
+    Let p be the larger fraction of samples that equal the previous one among the 100 samples before or after a run. A
+    run of length m then begins at a given sample with the probability p^(m-1). It is too long if fewer than 1e-6 such
+    runs are expected in `values` (n,), and if the value jumps by more than 3.5 quantisation steps at an end; a slow
+    quantised signal turns in single steps. Runs of fewer than 5 samples, and near the ends, are not found.
     """
     no_runs = np.empty((0, 2), dtype=np.intp)
     if values.size < 2 * _NEIGHBOURHOOD:
@@ -142,10 +131,7 @@ def find_stuck(values: Array) -> NDArray[np.intp]:
     n_unchanged = np.r_[0, np.cumsum(is_same)]
 
     def unchanged_fraction(begin: NDArray[Any], end: NDArray[Any]) -> Array:
-        """Estimate the fraction of samples between the indices `begin` and `end` (k,) that equal the one before.
-
-        If m of n samples do, the estimate is (m + 1) / (n + 2), which is neither 0 nor 1.
-        """
+        """Estimate the fraction of samples between these indices (k,) that equal the one before, never 0 or 1."""
         begin, end = np.maximum(begin, 0), np.minimum(end, is_same.size)
         return np.asarray((n_unchanged[end] - n_unchanged[begin] + 1) / (end - begin + 2), dtype=np.float64)
 

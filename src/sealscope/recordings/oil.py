@@ -8,19 +8,13 @@ from sealscope.recordings.recording import Recording
 
 
 def oil_temperature(recording: Recording) -> float | None:
-    """Compute the mean oil temperature [deg C] of a recording; None if it is not known.
-
-    If the channel T_oil has no plausible reading, the temperature in the header of the file is returned.
-    """
+    """Compute the mean oil temperature [deg C] of a recording, else read it in the file's header; None if unknown."""
     measured = measured_oil_temperature(recording)
     return stated_oil_temperature(recording.provenance) if measured is None else measured
 
 
 def measured_oil_temperature(recording: Recording) -> float | None:
-    """Compute the mean reading [deg C] of the channel T_oil; None if there is no plausible one.
-
-    Only temperatures that hydraulic oil can have (`oil` in `priors.toml`) are averaged.
-    """
+    """Compute the mean plausible reading [deg C] of the channel T_oil (`oil` in `priors.toml`); None without one."""
     if "T_oil" not in recording or recording.units["T_oil"] != "K":
         return None
     limits, kelvin = RECORDINGS.oil, recording["T_oil"]

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from functools import lru_cache
+from dataclasses import dataclass
+from functools import lru_cache, partial
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -37,9 +37,9 @@ class Finding:
     """One defect of a recording.
 
     `code`: name of the kind of defect; `severity`: ``fatal`` (the recording cannot be analysed as it is), ``warning``
-    (check the time or the channel before relying on a verdict) or ``note``; `channel`: the channel, None for the
-    time; `count`: number of samples or intervals concerned; `first_t`: time of the first of them [s], None if it has
-    none; `text`: description in words.
+    (check the time or the channel before relying on a verdict) or ``note``; `channel`: the channel, None for the time;
+    `count`: number of samples or intervals concerned; `first_t`: time of the first of them [s], None if it has none;
+    `text`: description in words.
     """
 
     code: str
@@ -68,11 +68,6 @@ def inspect(recording: Recording) -> tuple[Finding, ...]:
     tuple of Finding
         Findings on the time first, then on each channel; empty if there is no defect.
 
-    Raises
-    ------
-    InputError
-        If the argument is missing, or there are other arguments.
-
     Examples
     --------
     >>> import numpy as np
@@ -92,24 +87,22 @@ def inspect(recording: Recording) -> tuple[Finding, ...]:
     return tuple(findings)
 
 
-def _sample_time(recording: Recording, index: int) -> float | None:
-    """Return the time [s] of the sample with the number `index`; None if this sample does not exist or has no time."""
-    t = float(recording.t[index]) if index < recording.t.size else np.nan
-    return t if np.isfinite(t) else None
+def _make_finding(
+    recording: Recording, code: str, channel: str | None, count: int, first: int, text: str, severity: Severity
+) -> Finding:
+    """Make a finding on `count` samples, the first at index `first`, which may have no time."""
+    t = float(recording.t[first]) if first < recording.t.size else np.nan
+    return Finding(code, severity, channel, count, t if np.isfinite(t) else None, text)
 
 
 def _time_findings(recording: Recording) -> list[Finding]:
-    """List the defects of a recording's times.
-
-    They are missing, reversed and repeated times, gaps, irregular intervals, a wrong rate and too few samples.
-    """
+    """List the defects of a recording's times and sampling rate."""
     t, findings, step = recording.t, list[Finding](), 1.0 / recording.rate
 
     def add(code: str, indices: NDArray[Any], text: str, severity: Severity = "warning") -> None:
-        """Add a `Finding` with this code, text and severity on the samples or intervals `indices`, if there are any."""
+        """Add a finding on the samples or intervals `indices`, if there are any."""
         if indices.size:
-            first_t = _sample_time(recording, int(indices[0]))
-            findings.append(Finding(code, severity, None, indices.size, first_t, text))
+            findings.append(_make_finding(recording, code, None, indices.size, int(indices[0]), text, severity))
 
     timed, untimed = np.flatnonzero(np.isfinite(t)), np.flatnonzero(~np.isfinite(t))
     steps = np.diff(t[timed])
@@ -119,11 +112,8 @@ def _time_findings(recording: Recording) -> list[Finding]:
     longest = float(-steps[reversed_steps].min(initial=0.0))
     text = f"time goes back {_format_repetitions(reversed_steps.size)}, by up to {longest:g} s"
     add("reversed_time", timed[reversed_steps + 1], text)
-    add(
-        "duplicated_time",
-        timed[equal_steps + 1],
-        f"{format_count(equal_steps.size, 'time stamp')} equal to the one before",
-    )
+    text = f"{format_count(equal_steps.size, 'time stamp')} equal to the one before"
+    add("duplicated_time", timed[equal_steps + 1], text)
     if positive_steps.size:
         median_step = float(np.median(positive_steps))
         # coarse stamps repeat, and then step by two sampling steps
@@ -140,11 +130,9 @@ def _time_findings(recording: Recording) -> list[Finding]:
         regular_steps = positive_steps[positive_steps <= _MAX_STEP * step] / step
         scatter = float(regular_steps.std()) if regular_steps.size else 0.0
         if scatter > _CLOCK.scatter:
-            irregular = np.flatnonzero(
-                (steps > 0) & (steps <= _MAX_STEP * step) & (np.abs(steps / step - 1.0) > _CLOCK.scatter)
-            )
+            is_irregular = (steps > 0) & (steps <= _MAX_STEP * step) & (np.abs(steps / step - 1.0) > _CLOCK.scatter)
             text = f"intervals scatter by {100 * scatter:.0f} % of the sampling step"
-            add("irregular_sampling", timed[irregular], text)
+            add("irregular_sampling", timed[np.flatnonzero(is_irregular)], text)
     if len(recording) < SHORTEST:
         text = f"{format_count(len(recording), 'sample')}; the slowest detail needs {SHORTEST}"
         findings.append(Finding("too_short", "warning", None, len(recording), None, text))
@@ -159,9 +147,7 @@ def _format_repetitions(count: int) -> str:
 def _creep_findings(recording: Recording) -> list[Finding]:
     """Find a steady drift of (p_A + p_B)/2 over a whole recording, which a sealed circuit does not show.
 
-    The recording is cut into equal parts. The steps of the mean pressure from part to part must be alike, and the drift
-    fast enough (`creep` in `priors.toml`). The list is empty if there is no such drift, if the recording is too short,
-    or if a chamber pressure is absent or not in Pa.
+    Its steps between equal parts of the recording must be alike, and the drift fast enough (`creep` in `priors.toml`).
     """
     duration = len(recording) / recording.rate
     if duration < _CREEP.seconds or any(recording.units.get(name) != "Pa" for name in ("p_A", "p_B")):
@@ -179,116 +165,92 @@ def _creep_findings(recording: Recording) -> list[Finding]:
         f"p_A, p_B: their mean creeps evenly by {creep_rate / 1e3:+.2g} kPa/s: oil is fed or lost, or a "
         "simulator balanced volumes in place of mass"
     )
-    return [Finding("creeping_pressures", "note", None, len(recording), _sample_time(recording, 0), text)]
-
-
-@dataclass
-class _ChannelReport:
-    """Collects the findings on one channel of a recording."""
-
-    recording: Recording
-    name: str
-    findings: list[Finding] = field(default_factory=list)
-
-    def add(self, code: str, count: int, first: int, text: str, severity: Severity = "warning") -> None:
-        """Add a `Finding` with this code, text and severity on `count` samples, the first at index `first`."""
-        first_t = _sample_time(self.recording, first)
-        self.findings.append(Finding(code, severity, self.name, count, first_t, f"{self.name}: {text}"))
-
-    def format_value(self, value: float, digits: int = 6, *, is_span: bool = False) -> str:
-        """Format a value in the unit that the channel had in its log, with `digits` significant digits.
-
-        `is_span`: the value is a difference of two values.
-        """
-        return self.recording.format_value(self.name, value, digits, is_span=is_span)
+    return [_make_finding(recording, "creeping_pressures", None, len(recording), 0, text, "note")]
 
 
 def _channel_findings(recording: Recording, name: str, values: Array) -> list[Finding]:
     """Find the defects in the values (n,) of the channel `name`."""
-    report = _ChannelReport(recording, name)
+    findings = list[Finding]()
+    format_value = partial(recording.format_value, name)
+
+    def add(code: str, count: int, first: int, text: str, severity: Severity = "warning") -> None:
+        """Add a finding on `count` samples, the first at index `first`."""
+        findings.append(_make_finding(recording, code, name, count, first, f"{name}: {text}", severity))
+
     unit = recording.units[name]
     is_pressure = name.startswith("p_")
     may_rest = name in ("u", "q_leak", "q_comp")  # channels that may stay constant for long
     if is_pressure and unit == COUNTS:
         text = f"is in raw counts: state the unit (--map '{name}=COLUMN bar'), or a leak's size stays relative"
-        report.add("raw_counts", values.size, 0, text, "note")
-    _report_missing(report, values)
+        add("raw_counts", values.size, 0, text, "note")
+    if missing := _describe_missing(values, recording.rate):
+        add(*missing)
     infinite = np.flatnonzero(np.isinf(values))
     if infinite.size:
-        report.add("infinite", infinite.size, int(infinite[0]), f"{format_count(infinite.size, 'infinite sample')}")
+        add("infinite", infinite.size, int(infinite[0]), f"{format_count(infinite.size, 'infinite sample')}")
     is_impossible = flag_impossible(values, unit)
     impossible = np.flatnonzero(is_impossible)
     if impossible.size:
-        first = report.format_value(values[impossible[0]])
+        first = format_value(values[impossible[0]])
         text = f"{format_count(impossible.size, 'sample')} beyond what any sensor reads, first {first}"
-        report.add("impossible", impossible.size, int(impossible[0]), text)
+        add("impossible", impossible.size, int(impossible[0]), text)
     present = np.flatnonzero(np.isfinite(values) & ~is_impossible)
     readings = values[present]
     if readings.size < 2:
-        return report.findings
+        return findings
     if is_constant(readings):
         # a flow meter on a closed bypass reads one value; a pressure never does
-        text = f"is constant at {report.format_value(readings[0])}"
-        report.add("constant", readings.size, int(present[0]), text, "note" if may_rest else "warning")
-        return report.findings
+        text = f"is constant at {format_value(readings[0])}"
+        add("constant", readings.size, int(present[0]), text, "note" if may_rest else "warning")
+        return findings
     stuck = find_stuck(readings)
     may_be_clipped = is_pressure or name == "q_leak"
     for rail in find_rails(readings, stuck, low_end=is_pressure) if may_be_clipped else ():
         n_clipped = format_count(rail.samples, "sample")
-        text = f"{n_clipped} at the {rail.side} end, {report.format_value(rail.value)}: clipped"
-        report.add("clipped", rail.samples, int(present[rail.first]), text)
+        text = f"{n_clipped} at the {rail.side} end, {format_value(rail.value)}: clipped"
+        add("clipped", rail.samples, int(present[rail.first]), text)
     if is_pressure:  # runs at the smallest or largest value are reported as clipped
         stuck = stuck[(readings[stuck[:, 0]] > readings.min()) & (readings[stuck[:, 0]] < readings.max())]
     if stuck.size and not may_rest:
         start, length = map(int, stuck[0])
         times = _format_repetitions(len(stuck))
         text = f"does not move {times} while it should, first for {length / recording.rate:g} s"
-        report.add("stuck", int(stuck[:, 1].sum()), int(present[start]), text)
+        add("stuck", int(stuck[:, 1].sum()), int(present[start]), text)
     # the spectrum of a channel with many missing samples would be wrong
     for line in find_hum(readings, recording.rate) if readings.size > 0.9 * values.size else ():
-        text = f"mains hum of {line.frequency:g} Hz, amplitude {report.format_value(line.amplitude, 3, is_span=True)}"
+        text = f"mains hum of {line.frequency:g} Hz, amplitude {format_value(line.amplitude, 3, is_span=True)}"
         text += f", {100 * line.power_fraction:.2g} % of the power over 20 Hz"
         text += ": is the sensor connected?" if line.power_fraction > _HUM.alone else ""
         severity: Severity = "warning" if line.power_fraction > _HUM.loud else "note"
-        report.add("mains_hum", readings.size, int(present[0]), text, severity)
-    return report.findings
+        add("mains_hum", readings.size, int(present[0]), text, severity)
+    return findings
 
 
-def _report_missing(report: _ChannelReport, values: Array) -> None:
-    """Add a finding on missing samples to a channel's report, if there are any.
-
-    `values` (n,): samples of the channel, NaN where missing. If only every k-th row has a value, the finding says so.
-    """
-    is_missing, rate = np.isnan(values), report.recording.rate
+def _describe_missing(values: Array, rate: float) -> tuple[str, int, int, str] | None:
+    """Describe the missing samples of a channel (n,): (code, number, first index, text); None if there are none."""
+    is_missing = np.isnan(values)
     if not is_missing.any():
-        return
+        return None
     runs = find_runs(is_missing)
     n_missing, first = int(np.count_nonzero(is_missing)), int(runs[0, 0])
     period = _row_period(np.flatnonzero(~is_missing))
     if period:
         text = f"has a value on every {_format_ordinal(period)} row only ({rate / period:g} Hz among {rate:g} Hz)"
-        report.add("mixed_rate", n_missing, first, text)
-    elif n_missing == values.size:
-        report.add("missing", n_missing, 0, "has no values at all")
-    else:
-        text = f"{format_count(n_missing, 'sample')} missing in {format_count(len(runs), 'stretch')}"
-        report.add("missing", n_missing, first, f"{text}, the longest {runs[:, 1].max() / rate:g} s")
+        return "mixed_rate", n_missing, first, text
+    if n_missing == values.size:
+        return "missing", n_missing, 0, "has no values at all"
+    text = f"{format_count(n_missing, 'sample')} missing in {format_count(len(runs), 'stretch')}"
+    return "missing", n_missing, first, f"{text}, the longest {runs[:, 1].max() / rate:g} s"
 
 
 def flag_impossible(values: Array, unit: str) -> NDArray[np.bool_]:
-    """Flag the finite samples (n,) whose magnitude no sensor can read, such as over 1e10 Pa.
-
-    `unit`: SI unit of `values`, for which the table `possible` of `priors.toml` has the largest magnitude.
-    """
+    """Flag the finite samples (n,) over the largest that sensors read in `unit` (`possible` of `priors.toml`)."""
     limit: float = _SENSOR_LIMITS.get(unit, _SENSOR_LIMITS["any"])
     return np.asarray(np.isfinite(values) & (np.abs(values) > limit))
 
 
 def _row_period(present: NDArray[np.intp]) -> int:
-    """Find the k >= 2 for which a channel has a value on every k-th row only; 0 if there is no such k.
-
-    `present`: indices of the rows with a value, in increasing order.
-    """
+    """Find the k >= 2 for which a channel has a value on every k-th row only, here `present`; 0 if there is none."""
     steps = np.diff(present)
     period = int(np.median(steps)) if present.size >= 3 else 0
     is_regular = period >= 2 and np.mean(steps == period) > 0.95  # some values may be missing
@@ -304,35 +266,24 @@ def _format_ordinal(number: int) -> str:
 def uniform_segments(recording: Recording, channels: Sequence[str] | None = None) -> list[slice]:
     """Split a recording into stretches with even sampling and no missing values; return them as slices.
 
-    Rows with missing values are in no stretch. `channels`: names of the channels that must be complete, by default
-    all but the slow ones. Each interval of a stretch lasts between half and one and a half sampling steps. Raises
-    InputError for a channel that the recording lacks.
+    `channels` must be complete, by default all but the slow ones. Each interval lasts between half and one and a half
+    sampling steps. Raises InputError for a channel that the recording lacks.
     """
     n = len(recording)
-    is_complete = np.isfinite(recording.t)
     names = [name for name in recording.channels if name not in SLOW] if channels is None else channels
-    for name in names:
-        is_complete = is_complete & np.isfinite(recording[name])
-    continues = is_complete[1:] & is_complete[:-1] & _flag_even_steps(recording)
+    is_complete = np.all([np.isfinite(values) for values in (recording.t, *map(recording.__getitem__, names))], axis=0)
+    with np.errstate(invalid="ignore"):
+        steps = np.diff(recording.t) * recording.rate
+        is_even = (steps > _MIN_STEP) & (steps < _MAX_STEP)
+    continues = is_complete[1:] & is_complete[:-1] & is_even
     # [:n] and [-n:] make the flags of no samples empty
     starts = np.flatnonzero(is_complete & np.r_[True, ~continues][:n])
     stops = np.flatnonzero(is_complete & np.r_[~continues, True][-n:]) + 1 if n else starts
     return [slice(int(a), int(b)) for a, b in zip(starts, stops, strict=True)]
 
 
-def _flag_even_steps(recording: Recording) -> NDArray[np.bool_]:
-    """Flag the intervals (n - 1,) between samples that last 0.5 to 1.5 sampling steps."""
-    with np.errstate(invalid="ignore"):
-        steps = np.diff(recording.t) * recording.rate
-    return np.asarray((steps > _MIN_STEP) & (steps < _MAX_STEP))
-
-
 class Rail(NamedTuple):
-    """An end of a channel's range at which its samples are clipped.
-
-    `side`: "low" or "high"; `value`: the value at this end; `samples`: number of samples with this value; `first`:
-    index of the first of them.
-    """
+    """An end ("low" or "high" `side`) of a channel's range at which it is clipped: value, count, and first index."""
 
     side: str
     value: float
@@ -341,18 +292,15 @@ class Rail(NamedTuple):
 
 
 def is_mostly_clipped(values: Array) -> bool:
-    """Test whether more than half of the finite values (n,) are clipped at the ends of the channel's range.
-
-    This is so in a chamber that drains to the tank.
-    """
+    """Test whether more than half of the finite values (n,) are clipped, as in a chamber that drains to the tank."""
     finite = values[np.isfinite(values)]
     return sum(rail.samples for rail in find_rails(finite)) > len(finite) / 2
 
 
 def find_rails(values: Array, stuck: NDArray[np.intp] | None = None, low_end: bool = True) -> list[Rail]:
-    """Find the ends of a channel's range at which its finite values (n,) are clipped.
+    """Find the ends of the range of a channel's finite values (n,) at which they are clipped.
 
-    The range is that of the values. With `low_end` False only its high end is examined. An end is clipped in two cases:
+    With `low_end` False only the high end is examined. An end is clipped in two cases:
 
     - Far more samples have this value than any of the five nearest values, and the signal enters or leaves the longest
       run of them (3 samples or more) by a jump of more than 3.5 quantisation steps, or 1.5 for a long run. This
@@ -388,10 +336,9 @@ def find_rails(values: Array, stuck: NDArray[np.intp] | None = None, low_end: bo
 
 @lru_cache(maxsize=16)
 def fast_length(count: int) -> int:
-    """Find the smallest length n >= `count` for which a fast Fourier transform is fast.
+    """Find the smallest length n >= `count` for which a fast Fourier transform is fast, with prime factors 2, 3 and 5.
 
-    Such a length is a product of powers of 2, 3 and 5. The result equals `scipy.fft.next_fast_len(count, real=True)`,
-    but scipy.fft is not loaded.
+    The result equals `scipy.fft.next_fast_len(count, real=True)`, but scipy.fft is not loaded.
     """
     odd_factors = (3**i * 5**j for i in range(40) for j in range(28) if 3**i * 5**j < 2 * count)
     # times the smallest power of two >= count / factor; higher powers of 3 and 5 exceed any count
@@ -407,11 +354,10 @@ class HumLine(NamedTuple):
 
 
 def find_hum(values: Array, rate: float) -> list[HumLine]:
-    """Find spectral lines of the mains, at 50 or 60 Hz, in values (n,) sampled at `rate` [Hz].
+    """Find spectral lines of the mains, at 50 or 60 Hz, in values (n,) sampled at `rate` [Hz] for 1.5 s or more.
 
-    The spectrum X is that of the detrended values times a Hann window w, and the amplitude of a line is 2 |X| /
-    sum(w). A line must exceed 10 times the median and 4 times the largest of the amplitudes within 5 Hz of it. The
-    list is empty for less than 1.5 s.
+    The spectrum X is that of the detrended values times a Hann window w, and the amplitude of a line is 2 |X| / sum(w).
+    It must exceed 10 times the median and 4 times the largest of the amplitudes within 5 Hz of it.
     """
     n = values.size
     if n / rate < _HUM.shortest:

@@ -1,7 +1,7 @@
 """The Recording: time series with names, units, a sampling rate and a history, on which the whole project is built.
 
-A Recording is what a rig's data logger would have written. Only its provenance states where it comes from (a
-simulator, a file, a stream); the truth of a simulation is never part of it.
+A Recording is what a rig's data logger would have written. Only its provenance states where it comes from (a simulator,
+a file, a stream); the truth of a simulation is never part of it.
 """
 
 from __future__ import annotations
@@ -40,10 +40,7 @@ _PLOT_UNITS = {"m": "mm", "rad/s": "rpm", "m^3/s": "L/min", "K": "degC"}
 
 
 def _freeze(values: Any) -> Array:
-    """Convert values to a read-only array of doubles.
-
-    The values are copied, unless they already are a read-only array of doubles that owns its memory.
-    """
+    """Convert values to a read-only array of doubles, by a copy unless they are one that owns its memory."""
     if type(values) is np.ndarray and values.dtype == np.float64 and values.base is None and not values.flags.writeable:
         return values
     array = np.array(values, dtype=np.float64)
@@ -53,10 +50,7 @@ def _freeze(values: Any) -> Array:
 
 @dataclass
 class _CachedResult:
-    """A result that one thread computes while others wait for it.
-
-    `known` is True once `value` is computed; `lock` is held while it is computed.
-    """
+    """A result that one thread computes, holding the `lock`, while others wait; `known` is True afterwards."""
 
     lock: Lock = field(default_factory=Lock)
     value: Any = None
@@ -214,10 +208,7 @@ class Recording:
         return clean_remarks(self.provenance)
 
     def unit_in_log(self, name: str) -> str | None:
-        """Return the unit in which a channel was logged.
-
-        None if it was in SI units or counts already, or if it was not read from a log.
-        """
+        """Return the unit in which a channel was logged; None if it was in SI units or counts, or came from no log."""
         units = self.provenance.get("log_units")
         return str(units[name]) if isinstance(units, Mapping) and name in units else None
 
@@ -248,10 +239,7 @@ class Recording:
         return self._select(rows, f"cut to samples {rows.start} to {rows.stop}")
 
     def _select(self, rows: Any, note: str) -> Recording:
-        """Return a recording of the selected rows; `note` is added to its history.
-
-        `rows`: a slice, or a mask (n,) of bool.
-        """
+        """Return a recording of the selected rows, a slice or a mask (n,); `note` is added to its history."""
         channels = {name: values[rows] for name, values in self.channels.items()}
         bridged = None if self.bridged is None else self.bridged[rows]
         return replace(self, t=self.t[rows], channels=channels, history=(*self.history, note), bridged=bridged)
@@ -263,10 +251,9 @@ class Recording:
         return part
 
     def series(self) -> tuple[dict[str, Array], dict[str, str], dict[str, Any]]:
-        """Return the content of the recording for writers of files: (values, units, description).
+        """Return the content for writers of files: (name -> samples, name -> unit, description).
 
-        `values`: name -> samples (n,), with the time as series `t`; `units`: name -> unit; `description`: rate,
-        provenance and history as JSON values. Raises InputError for values that JSON does not have.
+        The time is `t`; the description has rate, provenance and history as JSON values, or raises InputError.
         """
         from sealscope.recordings.formats.table import make_description
 
@@ -276,9 +263,8 @@ class Recording:
     def to_pandas(self) -> pandas.DataFrame:
         """Copy the recording to a data frame with the index ``t [s]`` and columns such as ``p_A [Pa]``.
 
-        The frame's ``attrs`` contain the units by column, the sampling rate, the provenance and the history;
-        `from_pandas` reads them. Raises MissingExtra if pandas is not installed, and InputError if JSON cannot
-        express a value of the provenance.
+        Its ``attrs``, which `from_pandas` reads, have units by column, rate, provenance and history. Raises
+        MissingExtra without pandas, and InputError if the provenance has values that JSON does not have.
         """
         from sealscope.recordings.frames import to_pandas
 
@@ -387,7 +373,7 @@ def compute_once(
     """Return `compute(recording)`, which is computed once for each `key` and then cached with the recording.
 
     `channels`: the channels on which the result depends, by default all. Copies of the recording with fewer channels
-    (`Recording.only`) share the result if they have these channels.
+    (`Recording.only`) share the result if they have these.
     """
     all_channels = frozenset(recording.channels)
     names = all_channels if channels is None else all_channels.intersection(channels)

@@ -112,11 +112,9 @@ _idle: list[_Process] = []
 def _take_process() -> _Process:
     """Take an idle subprocess that is still alive, or start a new one."""
     with suppress(IndexError):  # none is idle
-        while True:
-            process = _idle.pop()
-            if process.is_alive:
-                return process
+        while not (process := _idle.pop()).is_alive:
             process.end()
+        return process
     return _Process()
 
 
@@ -127,8 +125,7 @@ def run_in_subprocess(
 
     `limit`: longest time [s]; `memory`: most memory [bytes], at most `MAX_MEMORY` and half the machine's; `disk`:
     largest file that it may write [bytes]. Raises CrashedSubprocessError if the process crashes or exceeds `limit`.
-    SealscopeError and MemoryError of `work` are raised as they are, other errors as a RuntimeError with the same
-    text.
+    SealscopeError and MemoryError of `work` are raised as they are, other errors as a RuntimeError with the same text.
     """
     with _slots:
         process = _take_process()
@@ -149,11 +146,7 @@ def run_in_subprocess(
 
 
 def run_on_file(work: Callable[..., T], file: Path, *arguments: Any, **limits: Any) -> T:
-    """Run ``work(file, *arguments)`` in a subprocess and return its result.
-
-    `limits`: as for `run_in_subprocess`. The subprocess gets the absolute path, but errors name the file as the
-    caller did.
-    """
+    """Run ``work(file, *arguments)`` by `run_in_subprocess`; errors name the file as the caller did."""
     place = file.absolute()  # the process may work in another folder
     try:
         return run_in_subprocess(work, place, *arguments, **limits)
@@ -162,10 +155,9 @@ def run_on_file(work: Callable[..., T], file: Path, *arguments: Any, **limits: A
 
 
 def _set_limits(seconds: float, memory: int, disk: int) -> None:
-    """Limit the time, the `memory` [bytes] and the size of written files, `disk` [bytes], of this process.
+    """Limit the time [s], the `memory` [bytes] and the size of written files, `disk` [bytes], of this process.
 
-    `seconds`: time after which a timer of the operating system ends the process, even if its parent is dead; 0 for
-    no limit. On a system without such limits nothing is limited.
+    The operating system's timer ends it even if its parent is dead; 0 is no limit. Other systems limit nothing.
     """
     with suppress(ImportError, AttributeError, OSError, ValueError):
         signal.setitimer(signal.ITIMER_REAL, seconds)
@@ -181,10 +173,7 @@ def _set_limits(seconds: float, memory: int, disk: int) -> None:
 
 
 def _is_spent() -> bool:
-    """Test whether this process occupies too much memory to serve another request (`_MAX_IDLE_MEMORY`).
-
-    False on a system that does not state the memory of processes in `/proc`.
-    """
+    """Test whether this process occupies over `_MAX_IDLE_MEMORY`; False on a system that does not say."""
     try:
         pages = int(Path("/proc/self/statm").read_text().split()[5])  # data pages, which RLIMIT_DATA limits
     except OSError:
@@ -193,10 +182,7 @@ def _is_spent() -> bool:
 
 
 def _serve() -> None:
-    """Run requests from standard input in this process, one after the other, until the input ends.
-
-    The answers go to standard output; text that libraries print there is discarded.
-    """
+    """Run requests from standard input, one after the other, and answer to standard output until the input ends."""
     responses = os.fdopen(os.dup(1), "wb")
     discard = os.open(os.devnull, os.O_WRONLY)
     os.dup2(discard, 1)
@@ -216,10 +202,7 @@ def _serve() -> None:
 
 
 def _run_work(work: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[Any, str | None]:
-    """Call `work` in this process; return (result, None), or (error, traceback as text) if it fails.
-
-    Errors other than SealscopeError and MemoryError become a RuntimeError, which the program can unpickle.
-    """
+    """Call `work`; return (result, None), or (error that the program can unpickle, traceback as text)."""
     try:
         return work(*arguments), None
     except (SealscopeError, MemoryError) as error:

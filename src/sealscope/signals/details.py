@@ -55,33 +55,21 @@ class Details:
         return int(self.values.shape[0])
 
     def __getitem__(self, level: int) -> Array:
-        """Return the detail d_j of the level j, (n,), including the samples at both ends that depend on padding.
-
-        Raises InputError if `level` is not one of 1, the finest, to `levels`.
-        """
+        """Return the detail d_j (n,) of the level j, from 1, the finest, to `levels`; raise InputError for others."""
         if not 1 <= level <= self.levels:
             raise InputError(f"level must be 1 to {self.levels}, got {level!r}")
         return np.asarray(self.values[level - 1])
 
     def product(self) -> Array:
-        """Compute the product d_3 d_4 sample by sample, (n,) [unit^2], the thesis's d3d4.
-
-        The samples at both ends that depend on padding are included.
-        """
+        """Compute the product d_3 d_4 sample by sample, (n,) [unit^2], the thesis's d3d4."""
         return self[3] * self[4]
 
     def quantities(self) -> Array:
-        """Stack d1, d2, d3, d4 [unit] and d3d4 [unit^2] as the rows of an array (5, n), for details with four levels.
-
-        The samples at both ends that depend on padding are included.
-        """
+        """Stack d1, d2, d3, d4 [unit] and d3d4 [unit^2] as the rows of an array (5, n); needs four levels."""
         return np.vstack([self.values, self.product()])
 
     def inside(self, level: int | None = None) -> slice:
-        """Return the slice of the samples of a level that do not depend on padding.
-
-        `level`: 1 for d_1, or None for the samples that do not depend on padding in any level.
-        """
+        """Return the slice of the samples that do not depend on padding in a level, or in any level with None."""
         before, after = self.edges[(level or self.levels) - 1]  # the deepest level has the longest edges
         return slice(int(before), self.values.shape[1] - int(after))
 
@@ -111,10 +99,7 @@ def edge_samples(wavelet: str = "db8", levels: int = 4, transform: Transform = "
 
 
 def min_samples(wavelet: str = "db8", levels: int = 4, transform: Transform = "stationary") -> int:
-    """Compute how many samples a signal needs, so that each level has a sample that does not depend on padding.
-
-    The result is 226 for db8 to level 4 and the stationary transform.
-    """
+    """Compute how many samples a signal needs, so that each level has one without padding: 226 for db8 to level 4."""
     deepest_edges = edge_samples(wavelet, levels, transform)[-1]  # the largest of all levels
     return int(deepest_edges.sum()) + 1
 
@@ -136,12 +121,11 @@ def details(
     - "decimated": Mallat's transform, with each coefficient of level j repeated 2^j times;
     - "reconstructed": d_j is the part of the signal that comes from level j.
 
-    `edge` is the way in which the signal is padded beyond its ends; `Details.inside` excludes the samples that depend
-    on it.
+    The signal is padded by `edge` beyond its ends; `Details.inside` excludes the samples that depend on it.
 
-    The alignment is that of PyWavelets: the energy of an event appears 5, 7, 9 and 13 samples early in db8's d_1 ..
-    d_4 (5 in every decimated level, 0 in every reconstructed one). A causal system knows d_j of sample n only at
-    sample ``n + (L/2)(2^j - 1)``, for db8 8, 24, 56 and 120 samples later.
+    The alignment is that of PyWavelets: the energy of an event appears 5, 7, 9 and 13 samples early in db8's d_1 .. d_4
+    (5 in every decimated level, 0 in every reconstructed one). A causal system knows d_j of sample n only at sample ``n
+    + (L/2)(2^j - 1)``, for db8 8, 24, 56 and 120 samples later.
 
     Raises InputError for a signal that is not finite and one-dimensional or is shorter than `min_samples`, for an
     unknown wavelet, transform or edge, and for invalid levels. Source: "Understanding Effect and Diagnosis of Internal
@@ -162,19 +146,12 @@ def details(
 
 
 def mean_squares(transformed: Details, bounds: ArrayLike) -> Array:
-    """Compute the mean squares of the wavelet details d1, d2, d3, d4 and of d3 times d4 in k segments of a signal.
-
-    The result has the shape (k, 5). `transformed`: details of the signal, with four levels; `bounds` (k + 1,): segment
-    i has the samples bounds[i] to bounds[i + 1] - 1.
-    """
+    """Compute the mean squares (k, 5) of the details d1, d2, d3, d4 and d3 times d4 in segments (`segment_means`)."""
     return segment_means(np.square(transformed.quantities()), bounds).T
 
 
 def segment_means(values: Array, bounds: ArrayLike) -> Array:
-    """Compute the means (r, k) of the rows of `values` (r, n) over k segments.
-
-    `bounds` (k + 1,): segment i has the columns bounds[i] to bounds[i + 1] - 1.
-    """
+    """Compute the means (r, k) of `values` (r, n) over the columns bounds[i] to bounds[i + 1] - 1 of k segments."""
     limits = np.asarray(bounds)
     sums = np.add.reduceat(values, limits[:-1], axis=1)
     # reduceat sums the last segment to the end of the row, not to its limit
@@ -183,20 +160,16 @@ def segment_means(values: Array, bounds: ArrayLike) -> Array:
 
 
 def _check_choice(value: object, choices: Any, name: str) -> None:
-    """Check that `value` is one of the values of the Literal type `choices`; raise InputError otherwise.
-
-    `name` is the name of the argument in the error message.
-    """
+    """Raise InputError, with `name`, unless `value` is one of the values of the Literal type `choices`."""
     allowed = get_args(choices)
     if value not in allowed:
         raise InputError(f"{name} must be one of {', '.join(allowed)}, got {value!r}")
 
 
 def _atrous_details(x: Array, wavelet: Any, levels: int, edge: Edge) -> tuple[Array, Array]:
-    """Compute stationary details (levels, n) and approximation (n,) of a signal x (n,) by the a trous transform.
+    """Compute stationary details (levels, n), d_1 first, and approximation (n,) of a signal x (n,).
 
-    Row 0 of the details is d_1. `wavelet`: a `pywt.Wavelet`; `edge`: mode of `pywt.pad` by which the signal is extended
-    beyond its ends before the transform.
+    This is the a trous transform. `wavelet`: a `pywt.Wavelet`; `edge`: mode of `pywt.pad` beyond the signal's ends.
     """
     import pywt
 
@@ -210,10 +183,10 @@ def _atrous_details(x: Array, wavelet: Any, levels: int, edge: Edge) -> tuple[Ar
 
 
 def _mallat_details(x: Array, wavelet: Any, levels: int, edge: Edge) -> tuple[Array, Array]:
-    """Compute decimated details (levels, n) and approximation (n,) of a signal x (n,) by Mallat's transform.
+    """Compute decimated details (levels, n), d_1 first, and approximation (n,) of a signal x (n,).
 
-    Each coefficient of level j is repeated 2^j times, so that all levels have the length of the signal. Row 0 of the
-    details is d_1. `wavelet`: a `pywt.Wavelet`; `edge`: mode of `pywt.wavedec` at the ends of the signal.
+    This is Mallat's transform, with each coefficient of level j repeated 2^j times, so that all levels have the length
+    of the signal. `wavelet`: a `pywt.Wavelet`; `edge`: mode of `pywt.wavedec` at the ends of the signal.
     """
     import pywt
 
@@ -233,22 +206,17 @@ def _mallat_details(x: Array, wavelet: Any, levels: int, edge: Edge) -> tuple[Ar
 
 
 def _inverse_details(x: Array, wavelet: Any, levels: int, edge: Edge) -> tuple[Array, Array]:
-    """Compute reconstructed details (levels, n) and approximation (n,) of a signal x (n,).
+    """Compute reconstructed details (levels, n), d_1 first, and approximation (n,) of a signal x (n,), their sum.
 
-    Mallat's transform is inverted with the coefficients of one level at a time, so that the details and the
-    approximation sum up to the signal. Row 0 of the details is d_1. `wavelet`: a `pywt.Wavelet`; `edge`: mode of
-    `pywt.wavedec` and `pywt.waverec` at the ends of the signal.
+    Mallat's transform is inverted with the coefficients of one level at a time. `wavelet`: a `pywt.Wavelet`; `edge`:
+    mode of `pywt.wavedec` and `pywt.waverec` at the signal's ends.
     """
     import pywt
 
     coefficients = pywt.wavedec(x, wavelet, mode=edge, level=levels)
 
     def reconstruct_level(index: int) -> Array:
-        """Compute the part of the signal that comes from one level of the wavelet transform, (n,).
-
-        The transform is inverted with all coefficients set to zero except those at `index` of PyWavelets' list: 0 is
-        the approximation, 1 the deepest level, and the last one level 1.
-        """
+        """Compute the part of the signal (n,) from the `coefficients` at `index`, 0 for the approximation."""
         level_coefficients = [c if i == index else np.zeros_like(c) for i, c in enumerate(coefficients)]
         return np.asarray(pywt.waverec(level_coefficients, wavelet, mode=edge), dtype=np.float64)[: x.size]
 

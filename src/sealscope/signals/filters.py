@@ -63,8 +63,7 @@ def reach(wavelet: str = "db8", levels: int = 4) -> IntArray:
 def require_finite(values: ArrayLike, name: str = "signal", ndim: int | None = None) -> Array:
     """Convert `values` to an array of doubles; raise InputError unless they are real and finite.
 
-    If `ndim` is given, the array must have this number of dimensions; otherwise it must have at least one. `name`
-    names the values in the error message.
+    The array must have `ndim` dimensions, or at least one by default. `name` names the values in the error message.
     """
     try:
         array = np.asarray(values)
@@ -88,10 +87,7 @@ def require_finite(values: ArrayLike, name: str = "signal", ndim: int | None = N
 
 
 def require_positive_int(value: object, name: str, unit: str = "") -> int:
-    """Return `value` as an int if it is a whole number of 1 or more; raise InputError otherwise.
-
-    `name` and `unit` describe the value in the error message.
-    """
+    """Return `value` as an int if it is a whole number of 1 or more; raise InputError with `name` and `unit` if not."""
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
         raise InputError(f"{name} must be a whole number >= 1{unit}, got {value!r}")
     return int(value)

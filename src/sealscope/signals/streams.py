@@ -1,8 +1,7 @@
 """Stationary wavelet details of live signals, block by block and in bounded memory.
 
 One call filters a block of all signals and allocates nothing but views. Eight signals share a vector register
-(`kernels`), so that small blocks cost little more than large ones. Results depend only on the samples, not on how
-they were divided into blocks.
+(`kernels`), so that small blocks cost little more than large ones. Results do not depend on the division into blocks.
 """
 
 from __future__ import annotations
@@ -75,7 +74,6 @@ class DetailStream:
     def __init__(
         self, channels: int | tuple[int, int] = 1, levels: int = 4, *, wavelet: str = "db8", threads: int = 1
     ) -> None:
-        """Prepare filters, buffers and threads; the class describes the arguments."""
         from sealscope.physics.lanes import WIDTH
         from sealscope.signals.kernels import CHUNK
 
@@ -151,11 +149,7 @@ class DetailStream:
         target = out.reshape(*self._shape_2d, self.levels, n)
 
         def filter_part(part: tuple[int, int], work: Array) -> int:
-            """Filter the block for a part of the groups of eight signals, in one thread.
-
-            `part`: (first, last + 1) of these groups; `work`: the thread's work array. Returns the number of rows that
-            are in use in the buffers afterwards, which is the same for all parts.
-            """
+            """Filter the groups (first, last + 1) in one thread; return the number of rows then used in the buffers."""
             return advance_details(part, x, self.buffers, self._fill, self._history, *self.taps, work, target)
 
         run = map if len(self._parts) == 1 else self._pool.map
@@ -173,8 +167,7 @@ class DetailStream:
     def state_dict(self) -> dict[str, Any]:
         """Return the state of the stream as plain values and arrays, from which `from_state` continues.
 
-        The entry `history` has the last inputs of each level's filters, as an array (rows, levels, samples, columns)
-        for signals in a table of rows and columns.
+        `history` has the last inputs of each level's filters: (rows, levels, samples, columns) for a table of signals.
         """
         # the columns of the table are in groups (first axis) of WIDTH (last axis): bring both axes together
         history = np.moveaxis(self.buffers[:, :, :, self._fill - self._history : self._fill], 0, -2)
@@ -188,10 +181,7 @@ class DetailStream:
 
     @classmethod
     def from_state(cls, state: dict[str, Any], *, threads: int = 1) -> DetailStream:
-        """Make a stream that continues from a saved `state_dict`, with results as if it had not been interrupted.
-
-        `threads`: number of threads, as for a new stream. Raises InputError if the state is not valid.
-        """
+        """Continue a saved `state_dict` as if it had not been interrupted; raise InputError if it is not valid."""
         channels, levels, wavelet = (require_part(state, name, object) for name in ("channels", "levels", "wavelet"))
         table = tuple(channels) if isinstance(channels, list) else channels
         stream = cls(table, levels, wavelet=wavelet, threads=threads)
@@ -206,10 +196,7 @@ class DetailStream:
 
 
 def aligned_zeros(shape: tuple[int, ...]) -> Array:
-    """Make an array of zeros that begins at a cache line of 64 bytes.
-
-    No row of 8 doubles is then divided between two cache lines.
-    """
+    """Make an array of zeros that begins at a cache line of 64 bytes, so that no row of 8 doubles is divided."""
     values = np.zeros(math.prod(shape) + 8)  # 8 doubles of 8 bytes are one cache line
     skip = -(values.ctypes.data // 8) % 8  # doubles before the next cache line
     return values[skip : skip + math.prod(shape)].reshape(shape)

@@ -1,9 +1,9 @@
 """RMS over sliding windows, of a complete series and of a stream, with identical results.
 
 The windows lie over the coefficients of the transformed signal (by default 1000 samples, 500 apart: "Understanding
-Effect and Diagnosis of Internal Leakage in Hydrostatic Actuation Systems", section 5.2). Squares are summed over
-pieces of gcd(size, step) samples, and each window adds its pieces in order. Unlike a running sum, this subtracts
-nothing, so that long or drifting series lose no precision.
+Effect and Diagnosis of Internal Leakage in Hydrostatic Actuation Systems", section 5.2). Squares are summed over pieces
+of gcd(size, step) samples, and each window adds its pieces in order. Unlike a running sum, this subtracts nothing, so
+that long or drifting series lose no precision.
 """
 
 from __future__ import annotations
@@ -27,8 +27,7 @@ class WindowedRms(NamedTuple):
     """RMS of sliding windows over a series.
 
     `rms` (..., w): RMS of each window, in the series' unit; `ends` (w,): number of the sample just after the window. A
-    window of `size` samples covers the samples ends - size .. ends - 1; its centre is at ``(ends - size / 2) / rate``
-    seconds.
+    window of `size` samples is centred at ``(ends - size / 2) / rate`` seconds.
     """
 
     ends: IntArray
@@ -38,8 +37,7 @@ class WindowedRms(NamedTuple):
 def rms(series: ArrayLike) -> Any:
     """Compute the root mean square ``sqrt(mean(x^2))`` over the last axis of an array (..., n), in its unit.
 
-    Returns a float for a single series, and an array (...,) for several. Raises InputError for an empty series or one
-    that is not finite.
+    Returns a float for a single series. Raises InputError for an empty series or one that is not finite.
     """
     x = require_finite(series, "series")
     if x.shape[-1] == 0:
@@ -54,10 +52,8 @@ def windowed_rms(
     """Compute the RMS of a series (..., n) in windows of `size` samples that begin every `step` samples.
 
     `first` is the number of the first sample, which is added to `ends` of the result. For `Details`, all levels are
-    used, samples that depend on padding are left out, and `ends` are sample numbers of the signal. A series shorter
-    than `size` gives no window.
-
-    Raises InputError for a series that is not finite, and for a size or a step below 1.
+    used, samples that depend on padding are left out, and `ends` are sample numbers of the signal. Raises InputError
+    for a series that is not finite, and for a size or a step below 1.
     """
     if isinstance(series, Details):
         inside = series.inside()
@@ -96,7 +92,6 @@ class RmsStream:
     """
 
     def __init__(self, size: int = WINDOW_SIZE, step: int = WINDOW_STEP, *, skip: int = 0, first: int = 0) -> None:
-        """Start with an empty stream; the class describes the arguments."""
         self.size = require_positive_int(size, "size", unit=" sample")
         self.step = require_positive_int(step, "step", unit=" sample")
         if isinstance(skip, bool) or not isinstance(skip, (int, np.integer)) or skip < 0:
@@ -182,10 +177,7 @@ class RmsStream:
 
 
 def _piece_sums(x: Array, piece: int) -> Array:
-    """Compute the sums of squares of consecutive pieces of a series, (..., n // piece).
-
-    Each piece has `piece` samples of `x` (..., n); an incomplete last piece is left out.
-    """
+    """Compute the sums of squares (..., n // piece) of consecutive pieces of `x` (..., n), of `piece` samples each."""
     n_pieces = x.shape[-1] // piece
     in_pieces = np.ascontiguousarray(x[..., : n_pieces * piece])
     return np.asarray(np.add.reduce(np.square(in_pieces.reshape(-1, piece)), axis=-1)).reshape(*x.shape[:-1], n_pieces)
@@ -194,8 +186,7 @@ def _piece_sums(x: Array, piece: int) -> Array:
 def _rms_of_pieces(sums: Array, size: int, step: int) -> Array:
     """Compute the RMS of each complete window of a series, (..., windows).
 
-    `sums` (..., pieces): sums of squares of consecutive pieces of gcd(size, step) samples, which are added in
-    order. `size`: number of samples in a window; `step`: number of samples from one window to the next.
+    `sums` (..., pieces): sums of squares of consecutive pieces of gcd(size, step) samples, which are added in order.
     """
     piece = math.gcd(size, step)
     pieces_per_window, pieces_per_step = size // piece, step // piece

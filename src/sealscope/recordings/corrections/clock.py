@@ -28,10 +28,9 @@ MAX_LATE_FRACTION: float = _PRIORS.late
 def resample_evenly(recording: Recording) -> Recording:
     """Resample a recording to evenly spaced times, with NaN in rows that the logger has lost.
 
-    A recording with even spacing is returned unchanged. If the intervals are whole numbers of sampling steps, to an rms
-    deviation of `clock.scatter` of `priors.toml`, the samples stay, and rows of NaN are inserted for lost ones; else
-    the samples are interpolated linearly. Rows without a time are dropped, and so are rows that are not later than all
-    rows before. If the times show that the file contains several recordings, only the longest is used.
+    Evenly spaced samples stay. If the intervals are whole numbers of sampling steps (`clock.scatter` of `priors.toml`),
+    rows of NaN are inserted for lost ones; else the samples are interpolated linearly. Rows without a time, or not
+    later than all rows before, are dropped. Of several recordings in one file only the longest is used.
     """
     rows = _ordered_rows(recording.t)
     rows = rows[_longest_dense_stretch(recording.t[rows], recording.rate)]
@@ -48,10 +47,9 @@ def resample_evenly(recording: Recording) -> Recording:
 
 
 def _ordered_rows(t: Array) -> NDArray[np.intp]:
-    """Find the indices of the rows that are later than all rows before.
+    """Find the indices of the rows that are later than all rows before; `t` (n,): times [s], NaN if missing.
 
-    `t` (n,): times [s]; rows with NaN are left out. If more than the fraction `MAX_LATE_FRACTION` of the rows is not
-    later, only the longest run of rows without a step back in time is used, without repeated times.
+    If over `MAX_LATE_FRACTION` of them are not, it is the longest run of rows without a step back or repeated time.
     """
     timed = np.flatnonzero(np.isfinite(t))
     if timed.size < 2:
@@ -85,8 +83,7 @@ def _longest_dense_stretch(t: Array, rate: float) -> slice:
 def _insert_lost_rows(recording: Recording, rows: NDArray[np.intp], steps: NDArray[np.int64]) -> Recording:
     """Insert rows of NaN for the samples that were lost between recorded ones.
 
-    `rows` (k,): indices of the recorded rows; `steps` (k - 1,): number of sampling steps from each recorded row to the
-    next.
+    `rows` (k,): indices of the recorded rows; `steps` (k - 1,): number of sampling steps from each of them to the next.
     """
     row_index = np.concatenate([[0], np.cumsum(steps)])
     n = int(row_index[-1]) + 1
@@ -97,7 +94,7 @@ def _insert_lost_rows(recording: Recording, rows: NDArray[np.intp], steps: NDArr
 
 
 def _interpolate_rows(recording: Recording, rows: NDArray[np.intp]) -> Recording:
-    """Interpolate the rows with the indices `rows` linearly to evenly spaced times at the recording's sampling rate."""
+    """Interpolate the rows with the indices `rows` linearly to evenly spaced times at the sampling rate."""
     t = recording.t[rows]
     even_times = t[0] + np.arange(int((t[-1] - t[0]) * recording.rate) + 1) / recording.rate
     channels = {}
@@ -109,10 +106,9 @@ def _interpolate_rows(recording: Recording, rows: NDArray[np.intp]) -> Recording
 
 
 def _interpolate(even_times: Array, t: Array, values: Array, *, is_slow: bool) -> Array:
-    """Interpolate samples (n,) at times `t` (n,) linearly to the times `even_times` (m,).
+    """Interpolate samples (n,) at times `t` (n,) linearly to the times `even_times` (m,), with NaN beyond the ends.
 
-    The result (m,) is NaN before the first and after the last sample. Unless the channel `is_slow`, such as a
-    temperature, it is also NaN within intervals longer than `MAX_INTERVAL` times the median interval.
+    Unless the channel `is_slow`, intervals over `MAX_INTERVAL` times the median interval are NaN, too.
     """
     if t.size < 2:
         return np.full(even_times.size, np.nan)

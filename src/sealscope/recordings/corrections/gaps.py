@@ -1,17 +1,17 @@
 """Gaps in a recording: they are bridged and marked, so that the data on both sides can be analysed together.
 
 A gap is a run of rows in which a needed channel has no value. The logger may have lost these rows, as the clock shows
-(`corrections.clock`), or may have written zeros for both chamber pressures (`remove_dropouts`). Up to `SPLINE`
-samples are bridged by a cubic spline. A longer gap is bridged by the channel's values whole duty cycles before or
-after, with an offset so that both ends meet, or by a straight line if the motion does not repeat. `Recording.bridged`
-marks these rows, as they are not readings. The flow balance gives less weight to blocks of samples with long gaps
-(`flag_holes`); other detectors omit the blocks that `flag_bridged` marks.
+(`corrections.clock`), or may have written zeros for both chamber pressures (`remove_dropouts`). Up to `SPLINE` samples
+are bridged by a cubic spline. A longer gap is bridged by the channel's values whole duty cycles before or after, with
+an offset so that both ends meet, or by a straight line if the motion does not repeat. `Recording.bridged` marks these
+rows, as they are not readings. The flow balance gives less weight to blocks of samples with long gaps (`flag_holes`);
+other detectors omit the blocks that `flag_bridged` marks.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -45,43 +45,39 @@ _MAX_MISMATCH = 0.4
 _SLACK = 2
 
 
-def remove_dropouts(recording: Recording) -> Recording:
-    """Set the samples of all channels to NaN in rows where both chamber pressures are exactly zero.
+def set_missing(recording: Recording, flags: Mapping[str, Flags]) -> Recording:
+    """Set flagged samples of a recording to NaN; `flags`: channel -> flags (n,) of its samples."""
+    channels = {name: np.where(is_flagged, np.nan, recording[name]) for name, is_flagged in flags.items()}
+    return replace(recording, channels={**recording.channels, **channels}) if channels else recording
 
-    A converter that is off writes zeros; two noisy transducers never read zero together. Returns the same recording
-    if there are no such rows.
+
+def remove_dropouts(recording: Recording) -> Recording:
+    """Set all channels to NaN in rows where both chamber pressures are exactly zero.
+
+    A converter that is off writes zeros; two noisy transducers never read zero together.
     """
     chambers = chambers_of(recording)
     if len(chambers) < 2:
         return recording
     is_dropout = np.logical_not(recording["p_A"]) & np.logical_not(recording["p_B"])  # both are 0, not NaN
-    if not is_dropout.any():
-        return recording
-    channels = {name: np.where(is_dropout, np.nan, values) for name, values in recording.channels.items()}
-    return replace(recording, channels=channels)
+    return set_missing(recording, dict.fromkeys(recording.channels, is_dropout)) if is_dropout.any() else recording
 
 
 def remove_impossible(recording: Recording) -> Recording:
     """Set samples to NaN whose magnitude no sensor can read, such as over 1e10 Pa (`quality.flag_impossible`).
 
-    A channel stays as it is if over a tenth of its samples are impossible, because its unit is then wrong. Returns the
-    same recording if there is nothing to remove.
+    A channel stays as it is if over a tenth of its samples are impossible, because its unit is then wrong.
     """
     flags = {name: flag_impossible(values, recording.units[name]) for name, values in recording.channels.items()}
     is_removed = {name: mask & (np.mean(mask) <= _MAX_IMPOSSIBLE_FRACTION) for name, mask in flags.items() if len(mask)}
-    if not any(mask.any() for mask in is_removed.values()):
-        return recording
-    channels = {name: np.where(is_removed[name], np.nan, values) for name, values in recording.channels.items()}
-    return replace(recording, channels=channels)
+    return set_missing(recording, is_removed) if any(mask.any() for mask in is_removed.values()) else recording
 
 
 def bridge(recording: Recording, needed: Sequence[str]) -> Recording:
     """Fill the gaps of the `needed` channels, except at the ends, and mark them in `Recording.bridged`.
 
-    A gap is a run of rows in which a needed channel has no value. It is filled by a spline if it is short, else from
-    another cycle of the motion or by a straight line. In its rows the missing values of all channels are filled;
-    recorded values stay. Returns the same recording if there is nothing to fill. The sampling times must be evenly
-    spaced (`clock.resample_evenly`).
+    A short gap is filled by a spline, others from another cycle of the motion or by a straight line; so are missing
+    values of other channels in the same rows. The times must be evenly spaced.
     """
     is_complete = np.all([np.isfinite(recording[name]) for name in needed], axis=0)
     if not len(recording) or is_complete.all() or not is_complete.any():
@@ -113,13 +109,10 @@ def bridge(recording: Recording, needed: Sequence[str]) -> Recording:
 
 
 def interpolate_short_gaps(recording: Recording, needed: Sequence[str]) -> Recording:
-    """Interpolate short gaps linearly in all channels except those in `needed`, and except at the ends.
+    """Interpolate short gaps linearly in all channels but the `needed` ones, which `bridge` fills, and not at the ends.
 
-    `needed`: channels that every sample must have, i.e. the chamber pressures and the command; their gaps are filled by
-    `bridge` instead. A gap is a run of missing samples, as a sensor that is slower than the logger leaves between its
-    samples. It is short up to `SPLINE` samples in a pressure, and up to `gaps.motion` [s] of `priors.toml` in other
-    channels, because a moving mass moves evenly over that time. Returns the same recording if these channels have no
-    missing values.
+    A sensor that is slower than the logger leaves such gaps. They are short up to `SPLINE` samples in a pressure, and
+    up to `gaps.motion` [s] of `priors.toml` in other channels, because a moving mass moves evenly over that time.
     """
     max_motion_gap = _GAPS.motion * recording.rate
     channels: dict[str, Array] = {}
@@ -137,11 +130,7 @@ def interpolate_short_gaps(recording: Recording, needed: Sequence[str]) -> Recor
 
 
 def flag_bridged(recording: Recording, bounds: Array | NDArray[np.integer]) -> Flags:
-    """Flag the blocks (n,) in which too many samples are filled in place of missing ones (`Recording.bridged`).
-
-    `bounds` (n + 1,): sample indices at which the blocks begin and end. A block is flagged if more than the fraction
-    `MAX_BRIDGED_FRACTION` of its samples is filled.
-    """
+    """Flag the blocks (n,) between the indices `bounds` (n + 1,) with over `MAX_BRIDGED_FRACTION` filled samples."""
     bounds = np.asarray(bounds)
     if recording.bridged is None:
         return np.zeros(max(bounds.size - 1, 0), dtype=bool)
@@ -150,10 +139,7 @@ def flag_bridged(recording: Recording, bounds: Array | NDArray[np.integer]) -> F
 
 
 def flag_holes(recording: Recording) -> Flags:
-    """Flag the rows (n,) of long gaps, whose missing values have been filled (`Recording.bridged`).
-
-    A gap is long if it is longer than `gaps.hole` [s] of `priors.toml` and longer than `MAX_INTERVAL` sampling steps.
-    """
+    """Flag the rows (n,) of filled gaps longer than `gaps.hole` [s] of `priors.toml` and `MAX_INTERVAL` steps."""
     flags = np.zeros(len(recording), dtype=bool)
     if recording.bridged is not None:
         max_gap = max(_GAPS.hole, MAX_INTERVAL / recording.rate)
@@ -172,10 +158,8 @@ def _finite_mean(values: Array) -> float:
 def _copy_other_cycle(channels: dict[str, Array], needed: Sequence[str], first: int, stop: int, period: float) -> bool:
     """Fill a gap in all channels, in place, from a nearby cycle of motion; return False if no cycle is similar enough.
 
-    `channels`: name -> values (n,); the gap has the samples `first` to `stop` - 1; `needed`: names of the channels that
-    must be complete in the other cycle; `period`: length of a cycle [samples], known to within `_SLACK`. The nearest
-    two cycles on either side of the gap are tried. A cycle is similar enough if its motion differs from that around the
-    gap by at most `_MAX_MISMATCH` (`_cycle_mismatch`). Otherwise nothing is filled.
+    `channels`: name -> values (n,); the gap has the samples `first` to `stop` - 1; `needed`: channels that must be
+    complete in the other cycle, one of the nearest two on either side; `period`: length of a cycle [samples].
     """
     half_cycle = round(0.5 * period)
     # the gap, and half a cycle beside it, must not overlap the copied samples
@@ -196,11 +180,10 @@ def _cycle_mismatch(
 ) -> float:
     """Compute how much the machine's motion around a gap differs from its motion `shift` samples later.
 
-    The motion is seen in the command, else in p_A - p_B or the only chamber pressure (`duty_signal`). Two stretches of
-    this signal are compared: one has the gap, i.e. the samples `first` to `stop` - 1, and up to `half_cycle` samples on
-    either side; the other begins `shift` samples later. The result is the rms difference of the stretches, after their
-    means are removed, divided by the standard deviation of the later stretch. It is infinite if too few samples are
-    known, or if one of the `needed` channels (name -> values (n,) in `channels`) lacks samples to copy into the gap.
+    The motion is seen in the command, else in p_A - p_B or the only chamber pressure (`duty_signal`). The gap, i.e. the
+    samples `first` to `stop` - 1, and up to `half_cycle` on either side are compared with the stretch `shift` samples
+    later: their rms difference, without means, over the standard deviation of the latter. It is infinite if too few
+    samples are known, or if one of the `needed` channels (name -> values (n,)) lacks samples to copy into the gap.
     """
     n = next(iter(channels.values())).size
     # half a cycle on either side of the gap, as far as both stretches lie within the recording
@@ -220,11 +203,7 @@ def _cycle_mismatch(
 
 
 def _copy_shifted(values: Array, first: int, stop: int, shift: int) -> None:
-    """Fill the missing values from index `first` to `stop` - 1, in place, by the values `shift` samples later.
-
-    `shift` is negative for earlier values. A linear offset is added to the copied values, so that they meet the means
-    of the values before and after the gap.
-    """
+    """Fill missing values from index `first` to `stop` - 1, in place, by those `shift` later plus a linear offset."""
     ends = (slice(first - _N_END, first), slice(stop, stop + _N_END))
     offset_before, offset_after = (
         _finite_mean(values[end]) - _finite_mean(values[end.start + shift : end.stop + shift]) for end in ends
@@ -235,10 +214,7 @@ def _copy_shifted(values: Array, first: int, stop: int, shift: int) -> None:
 
 
 def _fill_by_line(values: Array, rows: Flags) -> None:
-    """Fill the missing values in the flagged `rows` (n,) of `values` (n,), in place, by linear interpolation.
-
-    Values before the first and after the last known value stay missing.
-    """
+    """Fill missing values (n,) in the flagged `rows` (n,), in place, by linear interpolation, except at the ends."""
     known = np.flatnonzero(np.isfinite(values))
     missing = np.flatnonzero(rows & np.isnan(values))
     if missing.size and known.size:
@@ -247,10 +223,7 @@ def _fill_by_line(values: Array, rows: Flags) -> None:
 
 
 def _fill_by_spline(values: Array, rows: Flags) -> None:
-    """Fill the missing values in the flagged `rows` (n,) of `values` (n,), in place, by a cubic spline.
-
-    The spline passes through the known values. With up to `_N_END` known values nothing is filled.
-    """
+    """Fill missing values (n,) in the flagged `rows` (n,), in place, by a cubic spline through the known ones."""
     from scipy.interpolate import CubicSpline
 
     known = np.flatnonzero(np.isfinite(values))

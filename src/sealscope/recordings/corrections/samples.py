@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sealscope.paragraphs import format_count
 from sealscope.recordings.chambers import chambers_of
@@ -18,6 +17,7 @@ from sealscope.recordings.corrections.gaps import (
     interpolate_short_gaps,
     remove_dropouts,
     remove_impossible,
+    set_missing,
 )
 from sealscope.recordings.corrections.spikes import remove_spikes
 from sealscope.recordings.corrections.stale import (
@@ -35,8 +35,8 @@ from sealscope.recordings.recording import Recording
 class CorrectedSamples(NamedTuple):
     """A recording after the correction of its samples.
 
-    - `recording`: the samples at evenly spaced times, from the first to the last row with all chamber pressures and
-      the command.
+    - `recording`: the samples at evenly spaced times, from the first to the last row with all chamber pressures and the
+      command.
     - `findings`: the corrections that `correct_samples` reports.
     - `stuck`: names of chamber pressures that repeat one value for too long to be used.
     - `used_fraction`: fraction of the original samples within the time span of `recording`.
@@ -49,9 +49,7 @@ class CorrectedSamples(NamedTuple):
 
 
 def correct_samples(recording: Recording) -> CorrectedSamples:
-    """Correct the samples of a recording for the defects of loggers.
-
-    The defects are treated in this order:
+    """Correct the samples of a recording for the defects of loggers, in this order.
 
     1. impossible values, and dropouts, i.e. rows with zeros in both chamber pressures;
     2. rows, and then single pressures, that repeat one value for a long time;
@@ -64,7 +62,7 @@ def correct_samples(recording: Recording) -> CorrectedSamples:
     """
     part, findings = remove_dropouts(remove_impossible(recording)), list[Finding]()
     is_frozen = flag_frozen_rows(part)
-    part = _set_missing(part, dict.fromkeys(part.channels, is_frozen)) if is_frozen.any() else part
+    part = set_missing(part, dict.fromkeys(part.channels, is_frozen)) if is_frozen.any() else part
     chambers = chambers_of(part)
     # empty channels are left out, except chamber pressures
     names = [name for name in part.channels if name in chambers or np.any(np.isfinite(part[name]))]
@@ -72,7 +70,7 @@ def correct_samples(recording: Recording) -> CorrectedSamples:
     needed = (*chambers, "u") if "u" in part else chambers
     stuck = {name: rows for name in chambers if (rows := flag_stuck_rows(part, name)).any()}
     unusable = tuple(name for name, rows in stuck.items() if np.mean(rows) > MAX_STUCK_FRACTION)
-    part = _set_missing(part, {name: rows for name, rows in stuck.items() if name not in unusable})
+    part = set_missing(part, {name: rows for name, rows in stuck.items() if name not in unusable})
     for correct in (remove_spikes, interpolate_stale_samples, _resample, restore_speed_sign):
         part, new_findings = correct(part)
         findings += new_findings
@@ -91,17 +89,8 @@ def correct_samples(recording: Recording) -> CorrectedSamples:
     return CorrectedSamples(part, tuple(findings), unusable, n_within / max(len(recording), 1))
 
 
-def _set_missing(recording: Recording, flags: Mapping[str, NDArray[np.bool_]]) -> Recording:
-    """Set flagged samples of a recording to NaN; `flags`: channel -> flags (n,) of its samples."""
-    channels = {name: np.where(is_flagged, np.nan, recording[name]) for name, is_flagged in flags.items()}
-    return replace(recording, channels={**recording.channels, **channels}) if channels else recording
-
-
 def _cut_to_complete(recording: Recording, needed: Sequence[str]) -> Recording:
-    """Cut a recording to the rows from the first to the last row with values in all `needed` channels.
-
-    The result is empty if no row has values in all of them.
-    """
+    """Cut a recording to the rows from the first to the last with values in all `needed` channels, or to no rows."""
     is_complete = np.all([np.isfinite(recording[name]) for name in needed], axis=0) if needed else np.array([True])
     if is_complete.all():
         return recording
@@ -112,18 +101,14 @@ def _cut_to_complete(recording: Recording, needed: Sequence[str]) -> Recording:
 def remove_holes(recording: Recording) -> Recording:
     """Replace the filled samples of long gaps by NaN, for detectors that cannot give filled samples a lower weight.
 
-    All channels become NaN in the rows of `flag_holes`. Short gaps stay filled, and the result has no `bridged` flags.
-    Returns the same recording if there are no long gaps.
+    All channels become NaN in the rows of `flag_holes`. Short gaps stay filled, but are no longer marked as `bridged`.
     """
     is_hole = flag_holes(recording)
     if not is_hole.any():
         return recording
-    return replace(_set_missing(recording, dict.fromkeys(recording.channels, is_hole)), bridged=None)
+    return replace(set_missing(recording, dict.fromkeys(recording.channels, is_hole)), bridged=None)
 
 
 def _resample(recording: Recording) -> tuple[Recording, list[Finding]]:
-    """Resample a recording to evenly spaced times (`resample_evenly`).
-
-    Also returns an empty list, so that the signature is that of corrections with findings.
-    """
+    """Resample a recording to evenly spaced times; like other corrections, also return its findings, here none."""
     return resample_evenly(recording), []

@@ -28,11 +28,7 @@ _N_CHANGES = 2**15
 
 
 def remove_spikes(recording: Recording) -> tuple[Recording, list[Finding]]:
-    """Remove spikes, i.e. single samples at which a channel leaps and returns at once: they become NaN.
-
-    Slow channels and the command are left as they are. Returns the recording, and a finding for each channel with
-    spikes.
-    """
+    """Replace spikes by NaN, not in slow channels and the command; return the recording and its findings."""
     channels, findings = dict(recording.channels), list[Finding]()
     for name, values in recording.channels.items():
         spikes = find_spikes(values) if name not in SLOW and name != "u" else np.empty(0, dtype=np.intp)
@@ -50,10 +46,9 @@ def remove_spikes(recording: Recording) -> tuple[Recording, list[Finding]]:
 def find_spikes(values: Array) -> NDArray[np.intp]:
     """Find the indices of the samples at which a channel (n,) leaps and returns at once.
 
-    Such a sample lies above both neighbours, or below both. The smaller of the two changes must be several times
-    (`spike.times` of `priors.toml`) larger than usual changes, other leaps nearby and the local slope. Such samples are
-    taken for errors of the data logger: their number should have a Poisson distribution with the mean `spike.share`
-    times the number of samples. If it is improbably large, the signal itself leaps, and the result is empty.
+    Such a sample lies above both neighbours, or below both, by several times (`spike.times` of `priors.toml`) the usual
+    changes, other leaps nearby and the local slope. The errors of a logger have a Poisson distribution with the mean
+    `spike.share` times the number of samples; if there are too many, the signal itself leaps, and none is found.
     """
     known = np.flatnonzero(np.isfinite(values))
     if known.size < _MIN_SAMPLES:

@@ -33,11 +33,10 @@ _MAX_REPEAT = 3
 
 
 def interpolate_stale_samples(recording: Recording) -> tuple[Recording, list[Finding]]:
-    """Replace samples that repeat the previous one by linear interpolation between new readings.
+    """Replace samples that repeat the previous one by linear interpolation between new readings; also return findings.
 
-    Two kinds are found: a channel that repeats each sample for a fixed time (`estimate_holding_period`), and one or two
-    successive rows in which all channels repeat the row before (`_flag_repeated_rows`). Slow channels and the command
-    are neither tested nor changed. Returns the recording and the findings.
+    A channel holds each sample for a fixed time (`estimate_holding_period`), or all repeat a row
+    (`_flag_repeated_rows`).
     """
     names = [name for name in recording.channels if name not in SLOW and name != "u"]
     channels, findings = dict(recording.channels), list[Finding]()
@@ -64,10 +63,8 @@ def interpolate_stale_samples(recording: Recording) -> tuple[Recording, list[Fin
 def flag_stuck_rows(recording: Recording, name: str) -> NDArray[np.bool_]:
     """Flag the rows (n,) in which the chamber pressure `name` repeats one value for too long while the machine moves.
 
-    `motion.find_stuck` finds the repetitions that are too long. Motion is seen in the position, else in the pump's
-    angle, else in the other chamber pressure, although this pressure may also change while valves hold the cylinder. If
-    no such channel is recorded, the machine is assumed to move. Rows at the smallest or largest value of the channel
-    are clipped, and not flagged.
+    Motion is seen in the position, else in the pump's angle, else in the other chamber pressure; without these it is
+    assumed. Rows at the smallest or largest value of the channel are clipped, and not flagged.
     """
     values, flags = recording[name], np.zeros(len(recording), dtype=bool)
     known = np.flatnonzero(np.isfinite(values))
@@ -84,9 +81,9 @@ def flag_stuck_rows(recording: Recording, name: str) -> NDArray[np.bool_]:
 def flag_frozen_rows(recording: Recording) -> NDArray[np.bool_]:
     """Flag the rows (n,) in which a logger repeats its last row for a long time.
 
-    In such rows all channels are constant or missing, and both chamber pressures keep one value for longer than their
-    noise allows (`motion.find_holds`). No channel jumps at the first of these rows. After the last one at least one
-    channel jumps, because the machine has moved on; a machine at rest would continue smoothly.
+    All channels are constant or missing there, and both chamber pressures for longer than their noise allows
+    (`motion.find_holds`). No channel jumps at the first of these rows, but one does after the last, as the machine
+    moved on.
     """
     flags = np.zeros(len(recording), dtype=bool)
     pressures = [recording[name] for name in CHAMBERS if name in recording]
@@ -104,7 +101,7 @@ def flag_frozen_rows(recording: Recording) -> NDArray[np.bool_]:
             coincide
             and first > 1
             and stop < len(recording)
-            and all(_is_constant_or_missing(values[inner]) for values in channels)
+            and all(np.isnan(values[inner]).all() or np.ptp(values[inner]) == 0.0 for values in channels)
             and not any(_jumps_at(values, first) for values in channels)
             and any(_jumps_at(values, stop) for values in channels)
         ):
@@ -112,37 +109,23 @@ def flag_frozen_rows(recording: Recording) -> NDArray[np.bool_]:
     return flags
 
 
-def _is_constant_or_missing(values: Array) -> bool:
-    """Return True if all values (n,) are equal, or if all are NaN."""
-    return bool(np.isnan(values).all() or np.ptp(values) == 0.0)
-
-
 def _jumps_at(values: Array, row: int) -> bool:
-    """Return True if a channel (n,) changes across the index `row` by more than it usually does.
-
-    All changes are taken over `2 * _MAX_REPEAT + 1` samples. The usual change is a high quantile (`stale.leap` of
-    `priors.toml`) of the absolute changes of the channel.
-    """
+    """Test whether a channel (n,) changes around `row` by more than the quantile `stale.leap` of its usual changes."""
     change = np.abs(values[min(row + _MAX_REPEAT, len(values) - 1)] - values[max(row - _MAX_REPEAT - 1, 0)])
     usual_change = np.nanquantile(np.abs(values[2 * _MAX_REPEAT + 1 :] - values[: -2 * _MAX_REPEAT - 1]), _PRIORS.leap)
     return bool(change > usual_change)
 
 
 def _moves_in(values: Array, rows: NDArray[np.intp]) -> bool:
-    """Return True if a channel changes in the given rows by more than a small fraction of its range.
-
-    `rows` (k,): indices of the rows. The fraction is `stale.moves` of `priors.toml`.
-    """
+    """Test whether a channel changes in `rows` (k,) by more than `stale.moves` (`priors.toml`) of its range."""
     all_values, values_in_rows = values[np.isfinite(values)], values[rows][np.isfinite(values[rows])]
-    min_fraction: float = _PRIORS.moves
-    return bool(values_in_rows.size and np.ptp(values_in_rows) > min_fraction * np.ptp(all_values))
+    return bool(values_in_rows.size and np.ptp(values_in_rows) > _PRIORS.moves * np.ptp(all_values))
 
 
 def _find_equal_runs(values: Array) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """Find the k runs in which a channel (n,) repeats one value.
+    """Find the k runs in which a channel (n,) repeats one value: first indices (k,), and flags (k,).
 
-    Returns the index of the first value of each run (k,), and flags (k,) of the runs that both begin and end with a
-    jump. A jump is a change by more than `_MIN_JUMP` times the channel's resolution (`estimate_quantum`).
+    A run is flagged if it both begins and ends with a jump by more than `_MIN_JUMP` times the channel's resolution.
     """
     starts = np.flatnonzero(np.r_[True, values[1:] != values[:-1]])
     # flags of jumps at the starts of all runs but the first, which are also the ends of all runs but the last
@@ -151,13 +134,12 @@ def _find_equal_runs(values: Array) -> tuple[NDArray[np.intp], NDArray[np.bool_]
 
 
 def estimate_holding_period(t: Array, values: Array) -> float | None:
-    """Estimate the time [s] for which a channel (n,) repeats each reading; None if it does not.
+    """Estimate the time [s] for which a channel (n,), slower than its logger, repeats each reading; None if not.
 
-    A sensor that is slower than the logger causes this. `t` (n,): times [s]. The runs of equal values that begin and
-    end with a jump (`_find_equal_runs`) are used. A run is regular if its duration differs from the median duration by
-    at most the fraction `stale.spread` of `priors.toml`. The period is the mean duration of the regular runs. None if
-    there are fewer than `stale.runs` runs or too few regular ones (`stale.share`), if the median run is shorter than
-    two samples, or if the period is shorter than `stale.shortest`.
+    It is the mean duration of the regular runs of equal values that begin and end with a jump (`_find_equal_runs`).
+    There must be `stale.runs` runs (`priors.toml`), and the fraction `stale.share` must be regular, i.e. differ from
+    the median by at most the fraction `stale.spread`. A median below two samples, or a mean below `stale.shortest`,
+    gives None. `t` (n,): times [s].
     """
     t, values = t[:_N_ESTIMATE], values[:_N_ESTIMATE]
     known = np.isfinite(values) & np.isfinite(t)
@@ -181,8 +163,7 @@ def estimate_holding_period(t: Array, values: Array) -> float | None:
 def _flag_held(t: Array, values: Array, period: float) -> NDArray[np.bool_]:
     """Flag the samples (n,) that repeat the previous one, in a channel with a new reading every `period` [s].
 
-    A run of equal values is divided into periods from its first sample on. A sample is flagged if the sample before it
-    is in the same run and period. `t` (n,): times [s]; `values` (n,): samples of the channel, NaN where missing.
+    In a run of equal values, a sample is flagged unless it is the first of a period. `t` (n,): times [s].
     """
     known = np.flatnonzero(np.isfinite(values))
     starts, _ = _find_equal_runs(values[known])
@@ -198,11 +179,9 @@ def _flag_held(t: Array, values: Array, period: float) -> NDArray[np.bool_]:
 def _flag_repeated_rows(channels: list[Array]) -> NDArray[np.bool_]:
     """Flag the rows (n,) in which a logger got no new readings and repeated the previous row.
 
-    Each of `channels` (n,) that varies repeats its sample in such a row. A run of one or two such rows is a candidate
-    if one channel jumps, by more than `_MIN_JUMP` quantisation steps, both to the repeated reading and to the row after
-    the run. The candidates are flagged if their number is at least `stale.repeats` (`priors.toml`) times the number of
-    repeated rows expected by chance. The expected number assumes that channels repeat samples independently, and is at
-    least the fraction `stale.fewest` of all rows.
+    All of `channels` (n,) that vary repeat their samples there, in one or two rows, and one channel jumps, by more than
+    `_MIN_JUMP` quantisation steps, before and after. There must be at least `stale.repeats` (`priors.toml`) times as
+    many such rows as chance explains, if channels repeat independently, or the fraction `stale.fewest` of all rows.
     """
     moving = [values for values in channels if np.isfinite(values).any() and np.nanmax(values) > np.nanmin(values)]
     if not moving or moving[0].size < _PRIORS.runs:

@@ -31,10 +31,9 @@ _NAMES = {"omega": "speed", "q_pump": "flow"}
 
 
 def restore_speed_sign(recording: Recording) -> tuple[Recording, list[Finding]]:
-    """Restore the missing sign of a motor speed or of a flow meter, positive for flow into chamber A.
+    """Restore the sign of a speed or flow that stays on one side of zero while position or command moves both ways.
 
-    A sign is missing if the channel stays on one side of zero while the position, or without a position the command,
-    shows motion in both directions. Returns the recording, and a finding for each channel that was changed.
+    It is positive for flow into chamber A. Also returns a finding for each channel that was changed.
     """
     channels, findings = dict(recording.channels), list[Finding]()
     for name, quantity in _NAMES.items():
@@ -53,11 +52,7 @@ def restore_speed_sign(recording: Recording) -> tuple[Recording, list[Finding]]:
 
 
 def _has_one_sign(values: Array) -> bool:
-    """Return True if a channel (n,) stays on one side of zero, to within its noise.
-
-    The largest magnitude on the other side may be at most the largest magnitude on this side times `unsigned.noise` of
-    `priors.toml`.
-    """
+    """Test whether a channel (n,) stays on one side of zero, but for noise (`unsigned.noise` of `priors.toml`)."""
     finite = values[np.isfinite(values)]
     if not finite.size:
         return False
@@ -68,9 +63,8 @@ def _has_one_sign(values: Array) -> bool:
 def _find_sign(recording: Recording, magnitude: Array) -> tuple[Array | None, str]:
     """Find the signs (n,), +1 or -1, of the flow into chamber A; also return the source of the signs, in words.
 
-    `magnitude` (n,): absolute speed or flow. The signs are fitted to the position (`_fit_signs`); in a recording
-    without a position they are those of the command. Returns (None, "") if neither is recorded, if the absolute piston
-    speed or command does not correlate with `magnitude`, or if the piston moves in one direction only.
+    They are fitted to the position (`_fit_signs`), or without one those of the command. Returns (None, "") if neither
+    is recorded, correlates with the `magnitude` (n,) of the flow, and moves in both directions.
     """
     if "x" in recording:
         speed = _piston_speed(recording["x"], recording.rate)
@@ -84,11 +78,7 @@ def _find_sign(recording: Recording, magnitude: Array) -> tuple[Array | None, st
 
 
 def _piston_speed(x: Array, rate: float) -> Array:
-    """Compute the piston speed (n,) [m/s] from the position `x` (n,) [m] sampled at `rate` [Hz].
-
-    The speed is the central difference of the positions `unsigned.half` [s] of `priors.toml` before and after a sample.
-    Missing positions are interpolated linearly.
-    """
+    """Compute the piston speed (n,) [m/s] from the position `x` (n,) [m] over `unsigned.half` [s] before and after."""
     n_half = max(1, round(_PRIORS.half * rate))
     known = np.isfinite(x)
     x = np.interp(np.arange(x.size), np.flatnonzero(known), x[known]) if known.any() else np.zeros(x.size)
@@ -98,20 +88,13 @@ def _piston_speed(x: Array, rate: float) -> Array:
 
 
 def _moves_both_ways(values: Array) -> bool:
-    """Return True if a piston speed or a command (n,) has enough motion in both directions.
-
-    The positive values are summed, and so are the magnitudes of the negative ones. The smaller sum must exceed the
-    larger one times `unsigned.least` of `priors.toml`.
-    """
+    """Test whether a speed or command (n,) moves either way at least `unsigned.least` times as far as the other."""
     smaller, larger = sorted(float(np.nansum(np.maximum(signed, 0.0))) for signed in (values, -values))
     return smaller > _PRIORS.least * larger > 0.0
 
 
 def _correlation(first: Array, second: Array) -> float:
-    """Compute the correlation of two channels (n,) over the rows known in both.
-
-    The result is 0 if fewer than three rows are known, or if either channel is constant in them.
-    """
+    """Compute the correlation of two channels (n,) over the rows known in both; 0 if constant or under three rows."""
     known = np.isfinite(first) & np.isfinite(second)
     if np.count_nonzero(known) < 3 or not (np.ptp(first[known]) > 0.0 and np.ptp(second[known]) > 0.0):
         return 0.0
@@ -122,8 +105,7 @@ def _fit_signs(recording: Recording, speed: Array, magnitude: Array) -> Array:
     """Estimate the signs (n,) of the flow into chamber A from the piston speed and the chamber pressures.
 
     The model is sign x `magnitude` = a v + c (p_A - p_B), with the piston speed v = `speed` [m/s] and a coefficient a
-    for each direction. The first signs are those of the speed. Fits of the model then alternate with searches for the
-    signs until no sign changes, at most `_MAX_ITERATIONS` times.
+    for each direction. Fits alternate with searches for the signs, at first those of the speed, until none changes.
     """
     has_pressures = {"p_A", "p_B"} <= recording.channels.keys()
     difference = recording["p_A"] - recording["p_B"] if has_pressures else np.zeros(len(recording))
@@ -160,22 +142,14 @@ def _fit_signs(recording: Recording, speed: Array, magnitude: Array) -> Array:
 
 
 def _noise_variance(speed: Array, rate: float) -> float:
-    """Estimate the noise variance [(m/s)^2] of a piston speed (n,) sampled at `rate` [Hz].
-
-    Two speeds far enough apart in time are computed from different positions (`_piston_speed`), so that the variance is
-    half the mean square of their difference. The mean square is taken over a short time around each sample, and the
-    median of the mean squares makes the estimate robust to motion.
-    """
+    """Estimate the noise variance [(m/s)^2] of a piston speed (n,), from differences, robustly to motion."""
     n_lag = max(1, round(2.0 * _PRIORS.half * rate))
     steps = speed[n_lag:] - speed[:-n_lag]
     return 0.5 * float(np.median(_average_nearby(steps**2, rate))) if steps.size else 0.0
 
 
 def _average_nearby(values: Array, rate: float) -> Array:
-    """Average values (n,) over the time `unsigned.nearby` [s] of `priors.toml` on either side of each value.
-
-    `rate` [Hz]: sampling rate.
-    """
+    """Average values (n,) over the time `unsigned.nearby` [s] of `priors.toml` on either side of each value."""
     n_half = max(1, round(_PRIORS.nearby * rate))
     sums = np.concatenate([[0.0], np.cumsum(values)])
     first = np.maximum(np.arange(values.size) - n_half, 0)
@@ -187,9 +161,8 @@ def _draw_noise_signs(values: Array, rate: float) -> Array:
     """Restore the zero mean of noise that is recorded without its sign, by random signs; return values (n,).
 
     The magnitude of normal noise has a mean of sqrt(2 / (pi - 2)) = 1.32 times its standard deviation. Noise alone is
-    recorded where the ratio of local mean to local standard deviation of the `values` (n,), sampled at `rate` [Hz], is
-    at most 1.32 plus three standard errors. The standard deviation is estimated from second differences, which hardly
-    contain the motion. Elsewhere the values are returned as they are. The signs are the same in every call.
+    recorded where the ratio of local mean to local standard deviation, from second differences, of the `values` (n,) is
+    at most 1.32 plus three standard errors. Elsewhere the values stay. The signs are the same in every call.
     """
     if values.size < 3:
         return values
@@ -212,8 +185,8 @@ def _most_likely_signs(log_odds: Array, cost_of_change: Array) -> Array:
 
     `log_odds` l (n,): log odds of a positive over a negative sign, from each sample alone; `cost_of_change` c (n - 1,):
     log odds against a change of sign after each sample. The log odds of the best path up to sample k are o_k = l_k +
-    min(max(o_(k-1), -c_(k-1)), c_(k-1)). From the end backwards, the sign of sample k is that of o_k if |o_k| > c_k,
-    else that of sample k + 1.
+    min(max(o_(k-1), -c_(k-1)), c_(k-1)). From the end backwards, sample k has the sign of o_k if |o_k| > c_k, else that
+    of sample k + 1.
     """
     path_odds = np.empty(log_odds.size)
     odds = 0.0

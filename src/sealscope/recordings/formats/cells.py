@@ -49,7 +49,7 @@ _MAX_UNITS = 64
 
 
 def is_missing(cell: str) -> bool:
-    """Return True if a cell of a log stands for a missing sample: it is empty, or a mark such as `NaN` or `--`."""
+    """Test whether a cell of a log stands for a missing sample: it is empty, or a mark such as `NaN` or `--`."""
     return cell.strip().lower() in MISSING
 
 
@@ -70,11 +70,9 @@ def is_value(cell: str, decimal: str) -> bool:
 
 
 def parse_numbers(cells: Sequence[str], decimal: str, format_place: Callable[[int], str]) -> tuple[Array, list[int]]:
-    """Parse the cells of a column to an array of doubles (n,), and find the cells that contain words.
+    """Parse a column's cells to doubles (n,), NaN for words and missing samples; also return the indices of words.
 
-    A word is any text that is neither a number nor a mark of a missing sample; both words and missing samples become
-    NaN. `decimal`: decimal separator; `format_place`: function from the index of a cell to its place, for messages.
-    Returns the numbers and the indices of the words. Raises InputError for an infinite number.
+    `format_place`: index of a cell -> its place, for messages. Raises InputError for an infinite number.
     """
     # with a decimal comma a point is not a decimal separator: `?` makes `float` refuse the cell
     texts = [cell.replace(".", "?").replace(",", ".") for cell in cells] if decimal == "," else cells
@@ -93,10 +91,7 @@ def parse_numbers(cells: Sequence[str], decimal: str, format_place: Callable[[in
 
 
 def _parse_number(cell: str, cell_with_point: str, decimal: str) -> float:
-    """Parse a cell to a double; NaN if it is not a number.
-
-    `decimal`: decimal separator; `cell_with_point`: the cell with "." as the decimal separator.
-    """
+    """Parse a cell to a double, NaN if it is no number; `cell_with_point` has "." as the decimal separator."""
     with suppress(ValueError):
         return np.nan if "_" in cell_with_point else float(cell_with_point)  # Python takes 1_000 for a number
     text = cell.strip().replace("\u2212", "-")
@@ -110,8 +105,7 @@ def _parse_number(cell: str, cell_with_point: str, decimal: str) -> float:
 def has_prefixes(rows: Sequence[Sequence[str]]) -> bool:
     """Test whether the numbers in `rows` of cells end in SI prefixes, such as `170.3m`, and not in units.
 
-    Endings that are never units, such as `k` and `u`, are prefixes. All endings in a column are prefixes if they differ
-    from number to number, or if some of its numbers other than zero have no ending.
+    An ending in a column is a prefix if it is never a unit, as `k`, or if other numbers have another ending or none.
     """
     prefixes_by_column: dict[int, set[str]] = {}
     for row in rows:
@@ -134,20 +128,14 @@ def expand_prefixes(line: str) -> str:
 
 
 def _trailing_unit(cell: str) -> str | None:
-    """Find the text after the number in a cell such as `20 bar`; it need not be a known unit.
-
-    None if the cell is not a number with a short text after it.
-    """
+    """Find the text, not always a known unit, after the number in a cell such as `20 bar`; None for other cells."""
     cell = cell.strip()
     match = _QUANTITY.fullmatch(cell) if len(cell) <= _MAX_QUANTITY else None
     return None if match is None else match["unit"]
 
 
 def find_cell_units(rows: Sequence[Sequence[str]]) -> dict[int, str]:
-    """Find the units that are written after the numbers in the columns of a log: column -> most frequent unit.
-
-    `rows`: cells of each line of the log. A column is included if over half of its cells are numbers with known units.
-    """
+    """Find the units after the numbers in over half of a column's `rows` of cells: column -> most frequent unit."""
     is_known: dict[str, bool] = {}
     counts: dict[int, Counter[str]] = {}
     for row in rows:
@@ -169,11 +157,7 @@ def remove_units(line: str, units: Iterable[str]) -> str:
 
 
 def add_units(labels: Sequence[Label], units: Mapping[int, str], place: str) -> list[Label]:
-    """Add the units that were found in the cells of columns to the headings of these columns.
-
-    `labels`: the headings; those that state a unit stay as they are. `units`: column -> unit in its cells; `place`:
-    name of the file in messages. Raises InputError if a heading states another unit.
-    """
+    """Add the units in cells, column -> unit, to headings without one; raise InputError if a heading states another."""
     result = []
     for column, label in enumerate(labels):
         unit = units.get(column)
@@ -190,8 +174,8 @@ def strip_unit(cells: Sequence[str], unit: str, is_cut: bool, format_place: Call
     """Remove the unit after the number from each cell of a column.
 
     Words, and zeros without a unit, stay as they are. `is_cut`: the last cell may be incomplete, and becomes empty if
-    it does not end in `unit`; `format_place`: function from the index of a cell to its place, for messages. Raises
-    InputError for a number with another unit, and for a number other than zero without a unit.
+    it does not end in `unit`; `format_place`: index of a cell -> its place, for messages. Raises InputError for a
+    number with another unit, and for a number other than zero without a unit.
     """
     result = [cell.strip() for cell in cells]
     for index, text in enumerate(result):

@@ -44,15 +44,11 @@ REST = "*"
 
 @dataclass(frozen=True)
 class Request:
-    """Choices of a user for reading a file; invalid values raise InputError.
+    """Choices of a user for reading a file; invalid values raise InputError."""
 
-    `map`: channel -> column, or "auto" to choose by the columns' names; `rate`: sampling rate [Hz] in place of a time
-    column, or None; `file`: name of the file for the provenance.
-    """
-
-    map: ChannelMap
-    rate: float | None = None
-    file: str = ""
+    map: ChannelMap  # channel -> column, or "auto" to choose by the columns' names
+    rate: float | None = None  # sampling rate [Hz] in place of a time column
+    file: str = ""  # name of the file for the provenance
 
     def __post_init__(self) -> None:
         check_request(self.map, self.rate)
@@ -61,40 +57,28 @@ class Request:
     def infers_rate(self) -> bool:
         """True if the sampling rate must be computed from the times, even if a file that Sealscope wrote states it.
 
-        With a map the rate is computed because the map may choose another time column. For a data frame, i.e. without
-        a `file`, it is computed because rows may have been removed.
+        A map may choose another time column; in a data frame, i.e. without a `file`, rows may have been removed.
         """
         return bool(self.map) or not self.file
 
 
 @dataclass
 class ColumnMap:
-    """The columns of a table that are read, and their meaning; columns are numbered from 0.
-
-    - `labels`: headings of all columns.
-    - `rate`: sampling rate [Hz] from the caller or the file, or None.
-    - `time`: the time column, or None; `time_label`: name and unit used for it.
-    - `channels`: channel -> formula of columns.
-    - `parts`: part of the time, such as "hour" -> its column, if several columns form the time.
-    - `date`: column of the date, in case the time column contains only times of day. If the name of the time column
-      means a date, `date` is the time column itself, which may then contain only dates.
-    - `names`: channel -> its name in the file, if that differs.
-    - `unused`: names of columns with measured pressures, positions, speeds and flows that are in no channel.
-    - `unused_temperatures`: names of columns with temperatures, unless one is the oil's.
-    - `notes`: lines for the history of the recording.
-    """
+    """The columns of a table that are read, and their meaning; columns are numbered from 0."""
 
     labels: Sequence[Label]
-    rate: float | None = None
-    time: int | None = None
-    time_label: Label | None = None
+    rate: float | None = None  # sampling rate [Hz] from the caller or the file
+    time: int | None = None  # the time column
+    time_label: Label | None = None  # name and unit used for it
     channels: dict[str, Formula[int]] = field(default_factory=dict)
-    parts: dict[str, int] = field(default_factory=dict)
+    parts: dict[str, int] = field(default_factory=dict)  # part of a time in several columns, such as "hour" -> column
+    #: Column of the date, in case the time column contains only times of day. If the name of the time column means a
+    #: date, it is the time column itself, which may then contain only dates.
     date: int | None = None
-    names: dict[str, str] = field(default_factory=dict)
-    unused: tuple[str, ...] = ()
-    unused_temperatures: tuple[str, ...] = ()
-    notes: list[str] = field(default_factory=list)
+    names: dict[str, str] = field(default_factory=dict)  # channel -> its name in the file, if that differs
+    unused: tuple[str, ...] = ()  # names of columns with measured quantities that are in no channel
+    unused_temperatures: tuple[str, ...] = ()  # names of columns with temperatures, unless one is the oil's
+    notes: list[str] = field(default_factory=list)  # lines for the history of the recording
 
     @property
     def channel_of(self) -> dict[int, str]:
@@ -103,10 +87,7 @@ class ColumnMap:
 
     @property
     def columns(self) -> dict[int, str]:
-        """Mapping from each column to read to its kind, "numbers" or "time".
-
-        The time column comes last. It is read as numbers if it is also part of a channel.
-        """
+        """Mapping from each column to read to its kind, "numbers" or "time"; the time column comes last."""
         number_columns = {*self.channel_of, *self.parts.values()} - {self.time}
         columns = dict.fromkeys(sorted(number_columns), "numbers")
         if self.time is not None:
@@ -148,7 +129,7 @@ def check_request(channel_map: ChannelMap, rate: float | None) -> None:
 
 
 def uses_names(channel_map: ChannelMap) -> bool:
-    """Return True if a map from channels to columns contains "auto", i.e. if the columns' names choose channels."""
+    """Test whether a map from channels to columns contains "auto", i.e. whether the columns' names choose channels."""
     return isinstance(channel_map, str) or REST in channel_map
 
 
@@ -160,11 +141,7 @@ def explicit_columns(channel_map: ChannelMap) -> dict[str, str]:
 
 
 def reconstruct_map(provenance: Mapping[str, object]) -> dict[str, str]:
-    """Reconstruct the map, channel -> column, with which a recording was read, from its provenance.
-
-    The provenance has the heading of each channel's column, if the heading differs from the channel's name. A unit at
-    the end of a heading's name, as in `PA_bar`, is added in the map. Empty if the provenance names no columns.
-    """
+    """Reconstruct the map, channel -> column with its unit, with which a recording was read, from its provenance."""
     names = provenance.get("columns")
     columns = {str(channel): str(heading) for channel, heading in names.items()} if isinstance(names, Mapping) else {}
     proposed = proposed_map([Label.parse(heading) for heading in columns.values()])
@@ -172,10 +149,7 @@ def reconstruct_map(provenance: Mapping[str, object]) -> dict[str, str]:
 
 
 def _find_unit(label: Label, channel: str) -> str | None:
-    """Find the unit of a column in its heading `label`, or at the end of its name; None if there is none.
-
-    A unit at the end of the name counts only if `channel`, which the column is to become, can have this unit.
-    """
+    """Find the unit of a column in its heading, or one that suits `channel` at the end of its name; None if none."""
     name_unit = split_unit(label.name)[1] if label.unit is None else None
     is_possible = name_unit is not None and same_dimension(name_unit, "s" if channel == "t" else CHANNEL_UNITS[channel])
     return name_unit if is_possible else label.unit
@@ -187,11 +161,10 @@ def _format_columns(labels: Sequence[Label]) -> str:
 
 
 def _find_column(labels: Sequence[Label], name: str, description: str, mapped: bool = False) -> int | None:
-    """Find the index, from 0, of the column called `name`, which may be a number such as `#4`, counted from 1.
+    """Find the index, from 0, of the column called `name`, which may be a number such as `#4`, from 1; None without it.
 
-    Names are compared by several criteria, from strict to loose; the first that a column meets decides. With `mapped`,
-    the last words of a column's name are enough, such as `ch2`. None if there is no such column. Raises InputError if
-    several columns meet the deciding criterion; the message begins with `description`.
+    Names are compared by criteria from strict to loose; the first that a column meets decides. With `mapped`, the last
+    words of a column's name are enough, such as `ch2`. Raises InputError if several columns meet it.
     """
     folded = name.casefold()
     for matches_name in (
@@ -217,9 +190,8 @@ def _find_column(labels: Sequence[Label], name: str, description: str, mapped: b
 def _parse_mapping(labels: Sequence[Label], channel: str, column_text: str) -> Formula[int]:
     """Convert the entry of a channel in a user's map to a formula of column numbers.
 
-    `column_text`: the entry, i.e. a column's name, possibly with a unit, or a formula of several columns. The unit is
-    that in `column_text`, else that in the heading, else that at the end of the column's name. Raises InputError if a
-    column does not exist, or if a formula without a unit has columns in different units.
+    `column_text`: a column's name, possibly with a unit, or a formula of several columns. Their headings state the unit
+    if it does not. Raises InputError if a column does not exist, or if their units differ.
     """
     description = f"{column_text}, mapped to {channel},"
     name_before_blank, _, unit_after_blank = column_text.rpartition(" ")
@@ -248,15 +220,11 @@ def _parse_mapping(labels: Sequence[Label], channel: str, column_text: str) -> F
 
 
 def _choose_unit(channel: str, unit: str | None, description: str) -> tuple[str, str | None]:
-    """Choose the unit in which the values of a column are read as a channel; return it with a note for the history.
+    """Choose the unit in which a column in `unit` is read as a channel; also return a note for the history, or None.
 
-    The result is (the column's `unit`, None), with three exceptions:
-
-    - A column without a unit (None) is read as raw counts, i.e. numbers of an unknown scale; the note says so.
-    - A command u in a unit of current or in per cent is read as raw counts; the note says so.
-    - A speed omega in a unit of rotation, such as "1/min", is read in rpm, without a note.
-
-    `description`: the column in words, with which the note begins. Raises InputError for a unit of the wrong dimension.
+    This is the same unit, but a column without unit (None) and a command in amperes or per cent are read as raw counts,
+    i.e. numbers of an unknown scale, and a speed in turns per minute in rpm. The note begins with `description`. Raises
+    InputError for a unit of the wrong dimension.
     """
     if unit is None:
         return COUNTS, f"{description} has no unit: taken as raw counts"
@@ -289,10 +257,7 @@ def _apply_map(choice: ColumnMap, columns: Mapping[str, str]) -> None:
 
 
 def _apply_names(choice: ColumnMap) -> None:
-    """Complete `choice` with the channels and the time column that the names of columns show.
-
-    Channels and a time column that are already set, by the user's map, stay as they are.
-    """
+    """Complete `choice` with the channels and the time column that the names of columns show."""
     labels = choice.labels
     for channel in CHANNEL_UNITS:
         if channel in choice.channels:
@@ -313,10 +278,9 @@ def _apply_names(choice: ColumnMap) -> None:
 
 
 def _find_embedded_name(labels: Sequence[Label], channel: str) -> int | None:
-    """Find the only column whose name contains a channel's name, such as `Rig.Cyl.p_A [bar]` or `p_A_bar`.
+    """Find the only column with a channel's name in a path or before a unit, such as `Rig.Cyl.p_A [bar]` or `p_A_bar`.
 
-    The channel's name is part of a path or stands before a unit, and the unit must suit the channel. None if there is
-    no such column or several.
+    The unit must suit the channel. None if there is no such column or several.
     """
     matches = [
         i
@@ -332,10 +296,9 @@ def _find_embedded_name(labels: Sequence[Label], channel: str) -> int | None:
 
 
 def _find_time(labels: Sequence[Label]) -> int | None:
-    """Find the time column by its name; None if there is none.
+    """Find the time column by its name, first `t`, then other usual names; None if there is none.
 
-    A column called `t` comes first, then columns with usual names of a time. Of several columns with one name, the
-    first with a unit is preferred. Raises InputError if several columns are called `t`.
+    Of several columns with one name, the first with a unit is preferred. Raises InputError if several are called `t`.
     """
     if (exact := next((i for i, label in enumerate(labels) if label.name == "t"), None)) is not None:
         _find_column(labels, "t", "t")  # raises if there are several
@@ -352,13 +315,10 @@ def _find_time(labels: Sequence[Label]) -> int | None:
 
 
 def _choose_time_columns(choice: ColumnMap) -> None:
-    """Choose the time of a table if it is in several columns, or in a column whose name does not mean a time.
-
-    The result is stored in `choice`:
+    """Choose the time of a table in several columns, or in a column whose name does not mean a time, for `choice`.
 
     - Columns of hours, minutes and seconds form the time, alone or with a date.
-    - Otherwise, without a time column and a rate in the file, the time is a column of dates, or else the only column in
-      a unit of time.
+    - Otherwise, without a time column and a rate, it is a column of dates, or the only column in a unit of time.
     - Columns with parts of a second are added to the time.
     """
     labels, used = choice.labels, choice.channel_of
@@ -393,8 +353,7 @@ def _date_columns(choice: ColumnMap) -> list[int]:
 def _note_unused(choice: ColumnMap, used: Container[int | None]) -> None:
     """Add a note on unused columns to `choice`, with a map by which some of them could be read.
 
-    Set `choice.unused` to those that contain measured quantities, and, if no column is T_oil,
-    `choice.unused_temperatures` to those that contain temperatures. `used`: numbers of the used columns.
+    Also set `choice.unused` and, if no column is T_oil, `choice.unused_temperatures`. `used`: numbers of used columns.
     """
     unused = [label for i, label in enumerate(choice.labels) if i not in used and label.whole]
     choice.unused = tuple(label.whole for label in unused if is_measured(label))
@@ -413,15 +372,13 @@ def _note_unused(choice: ColumnMap, used: Container[int | None]) -> None:
 def choose_columns(labels: Sequence[Label], request: Request, stated_rate: float | None = None) -> ColumnMap:
     """Choose the columns of a table to read, and the channel of each.
 
-    `labels`: headings of all columns; `request`: the user's map, channel -> column, and sampling rate. With a requested
-    rate no time is read. Without a time column the rate is the `stated_rate` [Hz] of the file. If the map contains
-    "auto", the columns that it does not name are assigned to channels by their names and units (`proposed_map`). A
-    column in the map takes precedence over a column with the channel's name. Raises InputError if a column in the map
-    does not exist, if no column is a channel, if there is neither time nor rate, and for a unit of the wrong dimension.
+    With a requested rate no time is read. Without a time column the rate is the `stated_rate` [Hz] of the file. If the
+    map contains "auto", other columns are chosen by their names and units (`proposed_map`). A column in the map takes
+    precedence over a column with the channel's name. Raises InputError for a mapped column that does not exist, without
+    any channel, without time and rate, and for a unit of the wrong dimension.
     """
     choice = ColumnMap(labels, stated_rate)
-    columns = explicit_columns(request.map)
-    rate = request.rate
+    columns, rate = explicit_columns(request.map), request.rate
     if uses_names(request.map):
         mapped_columns: set[int] = set()
         for channel, column_text in columns.items():

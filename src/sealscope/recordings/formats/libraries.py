@@ -12,11 +12,10 @@ from sealscope.errors import MissingExtra
 
 
 def import_library(module: str, purpose: str, package: str) -> ModuleType:
-    """Import an optional library for reading a format, and silence its warnings and log.
+    """Import an optional library of the extra `io` for reading a format, and silence its warnings and log.
 
-    `purpose` ("a data frame") and `package`, its name for pip, appear in the error message. A library that the
-    program has already imported keeps its log handlers. Raises MissingExtra if the library, which belongs to the extra
-    `io`, is not installed.
+    `purpose` ("a data frame") and `package`, its name for pip, appear in the error message. A library that the program
+    has already imported keeps its log handlers. Raises MissingExtra if the library is not installed.
     """
     is_first = module not in sys.modules
     try:

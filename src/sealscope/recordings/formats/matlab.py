@@ -29,10 +29,7 @@ _STREAMS, _REFERENCES = "#sigstream#", "#refs#"
 
 
 def is_matlab_4(head: bytes) -> bool:
-    """Return True if `head`, the first bytes of a file, begins a MATLAB 4 file.
-
-    Such a file begins with five integers and the name of a variable, which ends in a zero byte.
-    """
+    """Test whether a file begins with five integers and a variable's name, ended by a zero byte, as in MATLAB 4."""
     for byte_order, order_sign in enumerate("<>" if len(head) > 20 else ""):  # little and big endian
         type_code, rows, columns, imaginary, name_length = struct.unpack(f"{order_sign}5i", head[:20])
         if (  # the decimal digits of the type code
@@ -92,8 +89,7 @@ def _check_links(file: Any) -> None:
 def _read_streams(file: Any) -> Iterator[Series]:
     """Yield the signals of an open HDF5 file that stores the samples of each signal as a stream of doubles.
 
-    Of each signal, `CompressedTime` contains first time, step and number of samples, and `DataR2` the number of its
-    stream.
+    Of each signal, `CompressedTime` contains first time, step and number of samples, and `DataR2` its stream's number.
     """
     import h5py
 
@@ -112,7 +108,7 @@ def _read_streams(file: Any) -> Iterator[Series]:
 
 
 def _decode_utf16(characters: Any) -> str:
-    """Decode a MATLAB text, an array of UTF-16 code units; the result is "" for None and for any other array."""
+    """Decode a MATLAB text, an array of UTF-16 code units; empty for None and for any other array."""
     if characters is None or characters.dtype != np.uint16:
         return ""
     return np.ravel(characters[()]).tobytes().decode("utf-16-le", errors="replace")

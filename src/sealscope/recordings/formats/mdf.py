@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sealscope.recordings.channels import Array
 from sealscope.recordings.formats.cells import MAX_WORD_FRACTION
 from sealscope.recordings.formats.columns import Request
 from sealscope.recordings.formats.headings.labels import Label
@@ -20,10 +21,7 @@ from sealscope.recordings.formats.table import Clock, RecordingFields, Series, b
 
 
 def read_mdf(path: Path, request: Request) -> RecordingFields:
-    """Read the requested channels of an MDF file, in physical values, to the fields of a recording.
-
-    Frames of a bus are not decoded. Raises MissingExtra without asammdf.
-    """
+    """Read the requested channels of an MDF file, in physical values, without frames of a bus; needs asammdf."""
     with _open_file(import_library("asammdf", "MDF", "asammdf").MDF, path) as file:
         start_time = np.datetime64(file.header.start_time.astimezone(UTC).replace(tzinfo=None), "us")
         # a file without a date states 1980 or before
@@ -33,15 +31,7 @@ def read_mdf(path: Path, request: Request) -> RecordingFields:
         for number, group in enumerate(groups):
             count = int(group.channel_group.cycles_nr)
             master = file.masters_db.get(number)  # index of the group's time channel
-
-            def read_seconds(number: int = number) -> Any:
-                """Read the times (n,) [s] of a group of channels, and the time stamp of 0 s.
-
-                The stamp is None if the file has no date. The default fixes `number` to the present group.
-                """
-                return np.asarray(file.get_master(number), dtype=np.float64), start
-
-            clock = None if master is None else Clock(number, read_seconds)
+            clock = None if master is None else Clock(number, partial(_read_times, file, number, start))
             name = str(getattr(group.channel_group, "comment", "") or "").strip() or f"group {number + 1}"
             for index, channel in enumerate(group.channels):
                 if index != master:
@@ -53,10 +43,9 @@ def read_mdf(path: Path, request: Request) -> RecordingFields:
 
 
 def _open_file(MDF: Any, path: Path) -> Any:
-    """Open an MDF file with `MDF`, the class of asammdf.
+    """Open an MDF file by the class `MDF` of asammdf.
 
-    If opening fails, the incomplete object is found in the traceback and marked as closed, because its destructor would
-    print an error.
+    If that fails, the incomplete object is marked as closed, because its destructor would print an error.
     """
     try:
         return MDF(path)
@@ -68,12 +57,15 @@ def _open_file(MDF: Any, path: Path) -> Any:
         raise
 
 
-def _read_values(file: Any, group: int, index: int) -> NDArray[Any]:
-    """Read the samples (n,) of a channel of an open MDF file.
+def _read_times(file: Any, group: int, start: np.datetime64 | None) -> tuple[Array, np.datetime64 | None]:
+    """Read the times (n,) [s] of a group of channels; return them with `start`, the time stamp of 0 s."""
+    return np.asarray(file.get_master(group), dtype=np.float64), start
 
-    `group`: number of the channel's group; `index`: number of the channel in the group. A conversion to physical values
-    may give a few texts among the numbers, such as `SNA`; these become NaN. With more than the fraction
-    `MAX_WORD_FRACTION` of texts the samples are returned as they are.
+
+def _read_values(file: Any, group: int, index: int) -> NDArray[Any]:
+    """Read the samples (n,) of the channel `index` of a `group` of an open MDF file.
+
+    Up to the fraction `MAX_WORD_FRACTION` of texts among numbers, such as `SNA`, becomes NaN.
     """
     values = np.asarray(file.get(group=group, index=index).samples)
     if values.dtype.kind not in "OSU":

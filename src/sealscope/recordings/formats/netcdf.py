@@ -37,10 +37,7 @@ _CHANNEL_ORDER = {name: place for place, name in enumerate(LONG_NAMES)}
 
 
 def read_netcdf(path: Path, request: Request) -> RecordingFields:
-    """Read the requested series of samples in a NetCDF-4 or HDF5 file to the fields of a recording.
-
-    A series is a one-dimensional data set, or a field of a data set of records.
-    """
+    """Read the requested one-dimensional data sets, or fields of records, of a NetCDF-4 or HDF5 file."""
     import h5py
 
     size = path.stat().st_size
@@ -74,19 +71,13 @@ def read_netcdf(path: Path, request: Request) -> RecordingFields:
 
 
 def _read_field(data: Any, name: str, field: str) -> NDArray[Any]:
-    """Read one field of a data set of records as doubles (n,).
-
-    `name`: the data set in messages; `field`: name of the field.
-    """
+    """Read one field of the data set of records `name` as doubles (n,)."""
     check_internal(name, data)
     return np.asarray(data[field], dtype=np.float64)
 
 
 def _is_series(item: Any) -> bool:
-    """Return True if an item of a file is a one-dimensional data set with samples.
-
-    False for the placeholder that NetCDF writes for a dimension without values.
-    """
+    """Test whether an item is a one-dimensional data set of samples, not NetCDF's placeholder of a dimension."""
     import h5py
 
     if not isinstance(item, h5py.Dataset) or item.ndim != 1:
@@ -103,10 +94,7 @@ def check_internal(name: str, data: Any) -> None:
 
 
 def _decode_text(value: Any) -> str | None:
-    """Decode an attribute or cell that contains a single text: a str, UTF-8 bytes, or an array with one of these.
-
-    None for any other value.
-    """
+    """Decode a single text: a str, UTF-8 bytes, or an array with one of these; None for any other value."""
     if isinstance(value, np.ndarray) and value.size == 1:
         value = value.reshape(-1)[0]
     if isinstance(value, bytes):
@@ -129,10 +117,9 @@ def _parse_label(name: str, data: Any) -> Label:
 
 
 def _read_values(data: Any, name: str, file_size: int) -> NDArray[Any]:
-    """Read a data set as texts (n,), or as doubles (n,) with scale, offset and fill values of the CF conventions.
+    """Read the data set `name` as texts (n,), or as doubles (n,) by the scale, offset and fill values of CF files.
 
-    `name`: the data set in messages; `file_size`: size of the file [bytes], by which texts are read in chunks
-    (`_read_texts`). Raises InputError for other types.
+    Raises InputError for other types.
     """
     check_internal(name, data)
     if data.dtype.kind in "OSU":
@@ -154,11 +141,9 @@ def _read_values(data: Any, name: str, file_size: int) -> NDArray[Any]:
 
 
 def _read_texts(data: Any, name: str, file_size: int) -> list[str]:
-    """Read a data set of texts (n,), in chunks if the lengths of the texts vary, to bound the memory.
+    """Read the data set `name` of texts (n,), in chunks if the lengths of the texts vary, to bound the memory.
 
-    Many cells may refer to the same text, which can be as long as the file. A chunk therefore has at most
-    `_CHUNK_BYTES` / `file_size` cells, but at least 1 and at most `_CHUNK_TEXTS`. `name`: the data set in messages;
-    `file_size`: size of the file [bytes]. Raises InputError for too many or too long texts, and lists or references.
+    Many cells may refer to one text as long as the file. Raises InputError for too many, too long or no texts.
     """
     import h5py
 
@@ -188,10 +173,7 @@ def _read_description(file: Any) -> dict[str, Any]:
 
 
 def make_attributes(description: Mapping[str, Any]) -> dict[str, Any]:
-    """Make the global attributes of a NetCDF file from the description of a recording (`table.make_description`).
-
-    `provenance` and `history` become JSON texts, as NetCDF has no nested values.
-    """
+    """Make the global attributes of a NetCDF file from a description; nested values become JSON texts."""
     return {
         "Conventions": "CF-1.11",
         "title": "Sealscope recording",
@@ -205,10 +187,9 @@ def make_attributes(description: Mapping[str, Any]) -> dict[str, Any]:
 def write_netcdf(
     path: Path, values: Mapping[str, Array], units: Mapping[str, str], description: Mapping[str, Any]
 ) -> None:
-    """Write the samples of a recording as a NetCDF-4 file without loss of precision.
+    """Write the content of `Recording.series` as a NetCDF-4 file without loss of precision.
 
-    `values`, `units`, `description`: as from `Recording.series`. The file is made in memory first, because libhdf5
-    aborts the process if the disk is full.
+    The file is made in memory first, because libhdf5 aborts the process if the disk is full.
     """
     import h5netcdf
 

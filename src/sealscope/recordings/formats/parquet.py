@@ -24,10 +24,7 @@ _DESCRIPTION_KEY = b"sealscope"
 
 
 def read_parquet(path: Path, request: Request) -> RecordingFields:
-    """Read the requested columns of a Parquet or Feather table to the fields of a recording.
-
-    Raises MissingExtra without pyarrow.
-    """
+    """Read the requested columns of a Parquet or Feather table; raise MissingExtra without pyarrow."""
     import_library("pyarrow", "Parquet", "pyarrow")
     with path.open("rb") as beginning:
         is_feather = beginning.read(6) == b"ARROW1"
@@ -64,11 +61,7 @@ def _read_remarks(schema: Any) -> dict[str, str]:
 
 
 def _list_series(schema: Any, read_column: Callable[[int], Any], n_rows: int) -> list[Series]:
-    """List the columns of a table as series, whose samples are read when they are needed.
-
-    `schema`: pyarrow's schema of the table; `read_column`: function that reads a column by its number; `n_rows`:
-    number of rows.
-    """
+    """List the columns of a pyarrow schema as series of `n_rows`, which `read_column` reads by number when needed."""
     series = []
     for number, field in enumerate(schema):
         metadata = field.metadata or {}
@@ -83,15 +76,12 @@ def _list_series(schema: Any, read_column: Callable[[int], Any], n_rows: int) ->
 
 
 def _is_text(field: Any) -> bool:
-    """Return True if a column of a table has a text type; `field`: the column in pyarrow's schema."""
+    """Test whether a column in pyarrow's schema has a text type."""
     return str(field.type) in ("string", "large_string")
 
 
 def _read_values(read_column: Callable[[], Any], field: Any, n_rows: int) -> NDArray[Any]:
-    """Read a column as doubles, datetime64, timedelta64 or texts (n,); raise InputError for other types.
-
-    `read_column`: function that reads the column; `field`: the column in pyarrow's schema; `n_rows`: number of rows.
-    """
+    """Read the column `field` as doubles, datetime64, timedelta64 or texts (n,); raise InputError for other types."""
     import pyarrow
     from pyarrow import compute, types
 
@@ -115,11 +105,7 @@ def _read_values(read_column: Callable[[], Any], field: Any, n_rows: int) -> NDA
 def write_parquet(
     path: Path, values: Mapping[str, Array], units: Mapping[str, str], description: Mapping[str, Any]
 ) -> None:
-    """Write the samples of a recording as a Parquet file with columns `t [s]`, `p_A [Pa]`, ... of doubles.
-
-    `values`, `units`, `description`: as from `Recording.series`. The description becomes metadata of the table.
-    Raises MissingExtra without pyarrow.
-    """
+    """Write the content of `Recording.series` as Parquet columns `t [s]`, `p_A [Pa]`, ... of doubles."""
     pyarrow = import_library("pyarrow", "Parquet", "pyarrow")
     columns = {f"{name} [{units[name]}]": pyarrow.array(series, from_pandas=False) for name, series in values.items()}
     table = pyarrow.table(columns).replace_schema_metadata({_DESCRIPTION_KEY: json.dumps(description).encode()})

@@ -26,8 +26,7 @@ _CHUNK = 2**20
 def read_spreadsheet(path: Path, request: Request) -> RecordingFields:
     """Read the requested columns of a spreadsheet, from the first sheet that has all of them.
 
-    Visible sheets come before hidden ones, and longer before shorter ones. If no sheet has the columns, the error of
-    the first sheet is raised.
+    Visible and then longer sheets come first. If no sheet has the columns, the error of the first sheet is raised.
     """
     _check_members(path)
     workbook = import_library("python_calamine", "a spreadsheet", "python-calamine").CalamineWorkbook.from_path(
@@ -52,10 +51,7 @@ def read_spreadsheet(path: Path, request: Request) -> RecordingFields:
 
 
 def _check_members(path: Path) -> None:
-    """Check that the members of a workbook, a ZIP archive, are whole and unpack to at most the permitted size.
-
-    Raises UnreadableFile or BadZipFile otherwise.
-    """
+    """Raise UnreadableFile or BadZipFile if the members of a workbook, a ZIP archive, are damaged or too large."""
     if not zipfile.is_zipfile(path):
         return
     with zipfile.ZipFile(path) as archive:
@@ -85,10 +81,7 @@ def _read_sheet(sheet: Any, request: Request, place: str) -> RecordingFields:
 
 
 def _format_cell(value: Any) -> str:
-    """Format a cell as text: numbers with all digits, dates and times in ISO form, durations in seconds.
-
-    The text of an empty cell, and of a truth value, is empty.
-    """
+    """Format a cell: numbers with all digits, times in ISO form, durations in seconds; truth values stay empty."""
     if isinstance(value, bool | None):
         return ""
     if isinstance(value, float | int):

@@ -2,10 +2,10 @@
 
 A reader of a format lists the series in a file, i.e. its named columns of samples; `build_fields` turns them into the
 fields of a recording. Series are in groups, which may have different sampling rates. If several groups have series of
-the same name, that in the group with most channels is used. Channels are brought to the clock of the chamber
-pressures: slower ones by linear interpolation, faster ones by averages over its intervals. Gaps of a series, and the
-time before its first and after its last sample, stay empty. In a long table, each row has one sample of one channel,
-and each name is a series.
+the same name, that in the group with most channels is used. Channels are brought to the clock of the chamber pressures:
+slower ones by linear interpolation, faster ones by averages over its intervals. Gaps of a series, and the time before
+its first and after its last sample, stay empty. In a long table, each row has one sample of one channel, and each name
+is a series.
 """
 
 from __future__ import annotations
@@ -67,38 +67,26 @@ Prepare = Callable[[Mapping[int, str], int | None], Sequence[str]]
 
 @dataclass(frozen=True)
 class Clock:
-    """Sampling times that one or more series of samples have in common.
+    """Sampling times that one or more series of samples have in common."""
 
-    `key`: equal for series that are sampled together; `read`: function that returns the times (n,) [s], and the time
-    stamp of 0 s or None if this stamp is not known.
-    """
-
-    key: Hashable
-    read: Callable[[], tuple[Array, np.datetime64 | None]]
+    key: Hashable  # equal for series that are sampled together
+    read: Callable[[], tuple[Array, np.datetime64 | None]]  # times (n,) [s], and the time stamp of 0 s, None if unknown
 
     @classmethod
     def of_times(cls, key: Hashable, t: Array, start: np.datetime64 | None = None) -> Clock:
-        """Make a clock from known times `t` (n,) [s], which count from the time stamp `start`.
-
-        Series with the same `key` are sampled together. `start` is None if it is not known.
-        """
+        """Make a clock from known times `t` (n,) [s], which count from the time stamp `start`, if it is known."""
         return cls(key, lambda: (t, start))
 
 
 @dataclass(frozen=True)
 class Series:
-    """A named column of samples in a file, which are read when they are needed.
+    """A named column of samples in a file, which are read when they are needed."""
 
-    `group`: name of the series' group, or ""; `label`: name and unit of the series; `count`: number of samples;
-    `values`: function that reads the samples (n,) as doubles, texts, datetime64 or timedelta64; `clock`: sampling
-    times, None if the file does not state them.
-    """
-
-    group: str
+    group: str  # name of the series' group, or ""
     label: Label
-    count: int
-    values: Callable[[], NDArray[Any]]
-    clock: Clock | None = None
+    count: int  # number of samples
+    values: Callable[[], NDArray[Any]]  # reads the samples (n,) as doubles, texts, datetime64 or timedelta64
+    clock: Clock | None = None  # sampling times, None if the file does not state them
 
     @property
     def path(self) -> str:
@@ -109,10 +97,7 @@ class Series:
 def uniform_clock(
     key: Hashable, count: int, step: float, first: float = 0.0, start: np.datetime64 | None = None
 ) -> Clock:
-    """Build the clock of `count` samples every `step` [s], the first at `first` [s] after the time stamp `start`.
-
-    Series share the clock if `key` and all other arguments are equal.
-    """
+    """Build the clock of `count` samples every `step` [s], from `first` [s] after the time stamp `start` on."""
     return Clock((key, count, step, first, start), lambda: (first + step * np.arange(count, dtype=np.float64), start))
 
 
@@ -148,10 +133,7 @@ def build_fields(
     If no columns can be chosen but the series form a long table, in which each row is one sample of a named channel,
     each of these names is read as a column.
 
-    - `series`: named columns of samples.
-    - `request`: the user's choice of the columns.
-    - `kind`: format of the file in words.
-    - `remarks`: entries in the file's header.
+    - `kind`: format of the file in words; `remarks`: entries in its header.
     - `rate` [Hz]: sampling rate stated by the file, for series without sampling times (`Series.clock`).
     - `description`: rate, provenance and history in a file that Sealscope has written.
     - `prepare`: function that reads all used columns together, before their values are needed.
@@ -179,13 +161,13 @@ def build_fields(
     if choice.time == len(candidates):  # `_CLOCK_LABEL`: sampling times of the series, not a column
         columns, more_notes = _align_clocks(choice, members)
         notes = [*notes, *more_notes]
-        return convert_columns(choice, columns, kind, request, notes, remarks=remarks, description=description)
-    last = members[[*kinds][-1]]  # the time, if there is one
-    for member in members.values():
-        if member.count != last.count:
-            required = f"{last.path} ({last.count})"
-            raise InputError(f"{member.path} must have as many samples as {required}, got {member.count}")
-    columns = {column: _read_samples(members[column], as_time=kinds[column] == "time") for column in kinds}
+    else:
+        last = members[[*kinds][-1]]  # the time, if there is one
+        for member in members.values():
+            if member.count != last.count:
+                required = f"{last.path} ({last.count})"
+                raise InputError(f"{member.path} must have as many samples as {required}, got {member.count}")
+        columns = {column: _read_samples(members[column], as_time=kinds[column] == "time") for column in kinds}
     return convert_columns(choice, columns, kind, request, notes, remarks=remarks, description=description)
 
 
@@ -202,10 +184,8 @@ def convert_columns(
 ) -> RecordingFields:
     """Convert the columns of a table that were read to the fields of a recording.
 
-    - `choice`: meaning of the columns.
     - `columns`: column -> values (n,), doubles or, for the time, datetime64.
-    - `kind`: format of the file in words; `request`: the user's choices; `remarks`: entries in the file's header.
-    - `notes`: lines for the history.
+    - `kind`: format of the file in words; `remarks`: entries in its header; `notes`: lines for the history.
     - `description`: rate, provenance and history in a file that Sealscope has written; None for other files.
     - `state`: state of the time column after the previous part of a text log, which is updated; None for a whole log.
 
@@ -257,10 +237,9 @@ def convert_columns(
 def _convert_channels(
     choice: ColumnMap, columns: Mapping[int, NDArray[Any]]
 ) -> tuple[dict[str, Array], dict[str, str], dict[str, str]]:
-    """Convert the chosen channels of a table to SI units or counts.
+    """Convert the chosen channels of a table, column -> values (n,), to SI units or counts.
 
-    `choice`: meaning of the columns; `columns`: column -> values (n,). Returns three mappings from the names of
-    channels: to values (n,), to units, and to units in the log where these differ.
+    Returns channel -> values (n,), channel -> unit, and channel -> unit in the log where this differs.
     """
     channels, units, log_units = {}, {}, {}
     for name, formula in choice.channels.items():
@@ -277,9 +256,7 @@ def _convert_channels(
 def _join_time(choice: ColumnMap, columns: Mapping[int, NDArray[Any]], label: Label, notes: list[str]) -> NDArray[Any]:
     """Combine the columns that form the time, such as date and hours, and add a line for the history to `notes`.
 
-    `choice`: meaning of the columns; `columns`: column -> values (n,); `label`: name and unit of the time. If the
-    values of the other columns cannot be parts of this time, the time column is returned unchanged. If this column
-    contains the hours, InputError is raised instead.
+    If they are no parts of this time, the time column is returned unchanged; InputError if it contains the hours.
     """
     assert choice.time is not None
     parts = {part: np.asarray(columns[column], dtype=np.float64) for part, column in choice.parts.items()}
@@ -297,10 +274,7 @@ def _join_time(choice: ColumnMap, columns: Mapping[int, NDArray[Any]], label: La
 
 
 def _has_time_of_day(time: NDArray[Any]) -> bool:
-    """Return True if any date stamp in `time` (n,) has a time of day other than midnight.
-
-    False if the values are not stamps.
-    """
+    """Test whether `time` (n,) has a date stamp with a time of day other than midnight."""
     known = time[~np.isnat(time)] if time.dtype.kind == "M" else time[:0]
     return not (known == known.astype("datetime64[D]").astype(known.dtype)).all()
 
@@ -308,9 +282,8 @@ def _has_time_of_day(time: NDArray[Any]) -> bool:
 def _assign_clocks(series: Sequence[Series]) -> list[Series]:
     """Give the series without sampling times the times in the column of times of their group.
 
-    Returns the series without these columns of times. If only one group has a column of times, it is kept, as the time
-    column of the whole file, and no times are assigned. A series with a name such as `data` or `value` that is alone in
-    its group gets the name of the group.
+    A single column of times stays, as that of the whole file; others are left out. A series that is alone in its group
+    gets the group's name if its own says nothing, as `data` or `value`.
     """
     time_of_group: dict[str, Series] = {}
     for member in series:
@@ -335,9 +308,8 @@ def _assign_clocks(series: Sequence[Series]) -> list[Series]:
 def read_times(time: Series, start: np.datetime64 | None = None) -> tuple[Array, np.datetime64 | None]:
     """Read the series `time`, a column of times; return the times (n,) [s] and the time stamp of 0 s.
 
-    If the column contains date stamps, the times count from the first stamp, which is also the time stamp of 0 s; for a
-    column in a group None is returned instead. If the column contains numbers or timedelta64, the time stamp of 0 s is
-    `start`, None if it is not known. Raises InputError if no row has a time.
+    Date stamps count from the first one, which is also the time stamp of 0 s, but None for a column in a group. For
+    numbers or timedelta64 this is `start`, None if it is not known. Raises InputError if no row has a time.
     """
     values = time.values()
     if values.dtype.kind == "m":
@@ -360,9 +332,8 @@ def timedelta_seconds(times: Any) -> Array:
 def _make_names_unique(series: Sequence[Series]) -> tuple[list[Series], list[str]]:
     """Give each series of a file a unique name; return the series, and lines for the history.
 
-    Of several series with one name, one keeps it: that of the group with most series named like channels or, among
-    groups with equally many, with most samples. The others are called by their paths, `group/name`. Series without
-    groups are returned unchanged.
+    The series in the group with most channels or, among equal groups, with most samples keeps its name. Others are
+    called by their paths, `group/name`. Series without groups stay.
     """
     if all(member.group == "" for member in series):
         return list(series), []
@@ -381,18 +352,20 @@ def _make_names_unique(series: Sequence[Series]) -> tuple[list[Series], list[str
         group = preferred[min(ambiguous)].group
         other_groups = join_names(dict.fromkeys(member.group for member in series if member.group != group), 4)
         notes.append(f"channels of group {group} read, not those of the same name of {other_groups}")
-    named = []
-    for name, member in zip(names, series, strict=True):
-        unique_name = member.label.name if preferred[name] is member else member.path
-        named.append(replace(member, group="", label=Label(member.path, unique_name, member.label.unit)))
-    return named, notes
+    unique_names = [
+        member.label.name if preferred[name] is member else member.path
+        for name, member in zip(names, series, strict=True)
+    ]
+    return [
+        replace(member, group="", label=Label(member.path, name, member.label.unit))
+        for name, member in zip(unique_names, series, strict=True)
+    ], notes
 
 
 def _read_samples(series: Series, *, as_time: bool = False) -> NDArray[Any]:
-    """Read the samples (n,) of a series as doubles, or date stamps as datetime64 with `as_time`.
+    """Read the samples (n,) of a series as doubles, or date stamps as datetime64 with `as_time`; InputError for others.
 
-    Words in a column of texts become NaN if they are at most the fraction `MAX_WORD_FRACTION` of its cells. Raises
-    InputError if there are more, and for types other than numbers, texts and times.
+    Up to the fraction `MAX_WORD_FRACTION` of words in a column of texts becomes NaN.
     """
     values = series.values()
     if values.dtype.kind in "OSU":
@@ -414,12 +387,10 @@ def _read_samples(series: Series, *, as_time: bool = False) -> NDArray[Any]:
 
 
 def _align_clocks(choice: ColumnMap, used: dict[int, Series]) -> tuple[dict[int, NDArray[Any]], list[str]]:
-    """Resample the columns to read to common sampling times, those of the chamber pressures.
+    """Resample the columns to read, `used`, to common sampling times, those of the chamber pressures.
 
-    Without chamber pressures these are the times of the pressures at the pump, or of the longest series. `choice`:
-    meaning of the columns; `used`: column -> series. Returns column -> values (n,), including the time, and lines for
-    the history. Raises InputError if no series has sampling times, or if a series without them has another number of
-    samples than the common times.
+    Without these they are those of the pressures at the pump, or of the longest series. Returns column -> values (n,),
+    with the time, and lines for the history. Raises InputError without sampling times, or if counts differ.
     """
     channel_of = choice.channel_of
     rank = {channel: number for number, channel in enumerate(_BASE_CHANNELS)}
@@ -455,10 +426,8 @@ def _align_clocks(choice: ColumnMap, used: dict[int, Series]) -> tuple[dict[int,
 def _resample(values: Array, member: Series, t: Array, start: np.datetime64 | None) -> tuple[Array, str]:
     """Resample the samples `values` of the series `member` to the times `t` (n,) [s] after the stamp `start`, if known.
 
-    Also returns a note for the history, which is empty if the series is sampled at these times already. A series with
-    the same or a lower sampling rate is interpolated linearly, except within long intervals, where the result is NaN. A
-    series with a higher rate is averaged over intervals around the times. Raises InputError if the times of the series
-    do not increase.
+    Also returns a note for the history, or "". At the same or a lower sampling rate, values are interpolated linearly,
+    and NaN within long intervals; at a higher rate, they are averaged around the times. Times must increase.
     """
     assert member.clock is not None
     times, member_start = member.clock.read()
@@ -487,10 +456,7 @@ def _resample(values: Array, member: Series, t: Array, start: np.datetime64 | No
 
 
 def _average(values: Array, times: Array, t: Array, step: float) -> Array:
-    """Average `values` (m,) at `times` (m,) over intervals of length `step` [s] centred at `t` (n,).
-
-    The result is NaN for an interval without values.
-    """
+    """Average `values` (m,) at `times` (m,) over intervals of length `step` [s] centred at `t` (n,); NaN if empty."""
     begin, end = np.searchsorted(times, t - 0.5 * step), np.searchsorted(times, t + 0.5 * step)
     sum_before = np.concatenate(([0.0], np.cumsum(values)))  # sum of the values before each index
     with np.errstate(invalid="ignore"):
@@ -498,11 +464,7 @@ def _average(values: Array, times: Array, t: Array, step: float) -> Array:
 
 
 def _find_long_columns(labels: Sequence[Label]) -> dict[str, int] | None:
-    """Find the columns of a long table, in which each row has one sample of one channel; None for other tables.
-
-    Returns a mapping from the meaning of a column to its number: "name" and "value", and "unit" and "valid" if they
-    exist.
-    """
+    """Find the columns "name", "value" and, if any, "unit" and "valid" of a table with one sample a row, else None."""
     names = [label.name.strip().casefold() for label in labels]
     columns_of_kind = {
         kind: [column for column, name in enumerate(names) if name in words] for kind, words in WORDS["long"].items()
@@ -513,59 +475,36 @@ def _find_long_columns(labels: Sequence[Label]) -> dict[str, int] | None:
     return first_columns if {"name", "value"} <= set(first_columns) else None
 
 
-@dataclass(frozen=True)
-class _LongTable:
-    """A table in which each row is one sample of a named channel.
+def _read_long_channel(
+    choice: ColumnMap, table: Mapping[int, NDArray[Any]], value_column: int, label: Label, rows: NDArray[np.intp]
+) -> tuple[Array, Array, np.datetime64 | None]:
+    """Read a channel from its `rows` (k,) of a long table: values (n,), times (n,) [s], and the stamp of 0 s, if known.
 
-    `choice`, `request`: meaning of the columns; `columns`: column -> cells (n,); `value`, `time`: numbers of the
-    columns with the samples and their times. The rows of each name are read like a recording with a single channel,
-    which is called `u` and in counts, so that its values are not converted.
+    `table`: column -> cells. The rows with a time are read like a recording with a single channel, which is called `u`
+    and in counts, so that its values are not converted. Raises InputError if too many samples are words.
     """
+    assert choice.time is not None
+    times = table[choice.time][rows]
+    timed_rows = rows[~np.isnat(times) if times.dtype.kind == "M" else np.isfinite(times)]
+    columns = {column: cells[timed_rows] for column, cells in table.items()}
+    is_word = np.isinf(columns[value_column])  # a column of the kind "any" has inf in place of words
+    if np.count_nonzero(is_word) > MAX_WORD_FRACTION * is_word.size:
+        raise InputError(f"{label.whole[:40]} must hold numbers, got text")
+    columns[value_column][is_word] = np.nan
+    fields = convert_columns(choice, columns, "", _count_request(value_column))
+    start: np.datetime64 | None = None
+    if "start_epoch_s" in fields.provenance:
+        start = np.datetime64(round(fields.provenance["start_epoch_s"] * 1e9), "ns")
+    elif "start" in fields.provenance:
+        start = np.datetime64(fields.provenance["start"]).astype("datetime64[ns]")
+    elif times.dtype.kind == "M" and times.size > 0:  # times of day without a date
+        start = np.nanmin(times)
+    return fields.channels["u"], fields.t, start
 
-    choice: ColumnMap
-    request: Request
-    columns: Mapping[int, NDArray[Any]]
-    value: int
-    time: int
 
-    def make_series(self, number: int, label: Label, rows: NDArray[np.intp]) -> Series:
-        """Make the series of one channel of the table, whose samples are read when they are needed.
-
-        `number`: number of the channel, the key of its clock, because each channel has its own sampling times; `label`:
-        name and unit of the channel; `rows` (k,): indices of the table's rows with a sample of this channel.
-        """
-        read_rows = cache(partial(self._read_rows, label, rows))
-        clock = Clock(number, lambda: self._read_clock(read_rows(), rows))
-        return Series("", label, rows.size, lambda: read_rows().channels["u"], clock)
-
-    def _read_rows(self, label: Label, rows: NDArray[np.intp]) -> RecordingFields:
-        """Convert the rows of one channel, except those without a time, to the fields of a recording.
-
-        `rows` (k,): indices of the channel's rows in the table; `label`: its name, for messages. Raises InputError if
-        too many samples are words.
-        """
-        times = self.columns[self.time][rows]
-        timed_rows = rows[~np.isnat(times) if times.dtype.kind == "M" else np.isfinite(times)]
-        columns = {column: cells[timed_rows] for column, cells in self.columns.items()}
-        is_word = np.isinf(columns[self.value])  # a column of the kind "any" has inf in place of words
-        if np.count_nonzero(is_word) > MAX_WORD_FRACTION * is_word.size:
-            raise InputError(f"{label.whole[:40]} must hold numbers, got text")
-        columns[self.value][is_word] = np.nan
-        return convert_columns(self.choice, columns, "", self.request)
-
-    def _read_clock(self, fields: RecordingFields, rows: NDArray[np.intp]) -> tuple[Array, np.datetime64 | None]:
-        """Return the times (n,) [s] of one channel, and the time stamp of 0 s, None if it is not known.
-
-        `fields`: the recording of the channel; `rows` (k,): indices of its rows in the table.
-        """
-        provenance, times = fields.provenance, self.columns[self.time][rows]
-        if "start_epoch_s" in provenance:
-            return fields.t, np.datetime64(round(provenance["start_epoch_s"] * 1e9), "ns")
-        if "start" in provenance:
-            return fields.t, np.datetime64(provenance["start"]).astype("datetime64[ns]")
-        # if the provenance states no start, stamps are times of day without a date
-        is_time_of_day = times.dtype.kind == "M" and times.size > 0
-        return fields.t, np.nanmin(times) if is_time_of_day else None
+def _count_request(value_column: int) -> Request:
+    """Request the column of values of a long table as a channel `u` in counts, so that they are not converted."""
+    return Request({"u": f"#{value_column + 1} count"})
 
 
 def _pivot_long_table(
@@ -573,10 +512,8 @@ def _pivot_long_table(
 ) -> tuple[list[Series], list[str]]:
     """Make a series for each channel of a table in which each row is one sample of a named channel.
 
-    `series`: columns of the table; `column_by_kind`: number of the columns "name", "value" and, if they exist, "unit"
-    and "valid"; `prepare`: function that reads all used columns before their values are needed, or None. Samples that
-    the file calls invalid become NaN. Also returns lines for the history. Raises InputError if there is no time, or if
-    there are too many names.
+    `column_by_kind`: number of the columns "name", "value" and, if they exist, "unit" and "valid". Samples called
+    invalid become NaN. Also returns lines for the history. Raises InputError without a time, or for too many names.
     """
     value_column, validity_column = column_by_kind["value"], column_by_kind.get("valid")
     text_columns = [column_by_kind[kind] for kind in ("name", "unit") if kind in column_by_kind]
@@ -584,9 +521,7 @@ def _pivot_long_table(
     if "timestring" in {label.name.casefold() for label in labels}:  # WinCC's exact times, in 1e-6 days
         days = Label("Time_ms", "t", "microday since 1899-12-30")
         labels = [days if label.name.casefold() == "time_ms" else label for label in labels]
-    # the values are read in counts, so that they are not converted
-    request = Request({"u": f"#{value_column + 1} count"})
-    choice = choose_columns(labels, request)
+    choice = choose_columns(labels, _count_request(value_column))
     assert choice.time is not None  # `choose_columns` raises InputError without a time
     choice.notes.clear()
     kinds = dict.fromkeys(text_columns, "texts") | ({} if validity_column is None else {validity_column: "any"})
@@ -607,13 +542,18 @@ def _pivot_long_table(
         raise InputError(f"a long table must have at most {_MAX_NAMES} names, got more")
     # the rows of the first key, then of the second, ...
     rows_by_key = np.split(np.argsort(key_of_row, kind="stable"), np.cumsum(np.bincount(key_of_row))[:-1])
-    table = _LongTable(choice, request, columns, value_column, choice.time)
+
+    def make_series(number: int, label: Label) -> Series:
+        """Make the series of the channel with this number, which is read when it is needed."""
+        rows = rows_by_key[number]
+        read_channel = cache(partial(_read_long_channel, choice, columns, value_column, label, rows))
+        return Series("", label, rows.size, lambda: read_channel()[0], Clock(number, lambda: read_channel()[1:]))
+
     result = []
     for number in np.argsort(first_rows).tolist():  # in the order of their first rows
         name, _, unit = str(keys[number]).partition("\n")
         if name or unit:
-            label = Label.parse(name[:200], unit[:40] or None)
-            result.append(table.make_series(number, label, rows_by_key[number]))
+            result.append(make_series(number, Label.parse(name[:200], unit[:40] or None)))
     n_rows, n_names = format_count(len(key_of_row), "row"), format_count(len(result), "name")
     return result, [*notes, f"long table: {n_rows} of {n_names}"]
 
@@ -621,8 +561,7 @@ def _pivot_long_table(
 def check_size(n_rows: int, n_columns: int, file_size: int | None = None) -> None:
     """Raise InputError if a table has more than `MAX_VALUES` values, or more than its file can hold.
 
-    A file of `file_size` [bytes], which may be compressed, can hold as many doubles as fit into `_MAX_EXPANSION` times
-    this size, or into `_MIN_LIMIT` bytes if these are more. With None only the number of values is checked.
+    A file, which may be compressed, holds up to `_MAX_EXPANSION` times its size [bytes] in doubles, or `_MIN_LIMIT`.
     """
     if n_rows * n_columns > MAX_VALUES:
         raise InputError(
@@ -636,11 +575,7 @@ def check_size(n_rows: int, n_columns: int, file_size: int | None = None) -> Non
 
 
 def check_texts(count: int, width: int, name: str) -> None:
-    """Raise InputError if a column has too many texts, or too long ones.
-
-    `count`: number of texts; `width`: length of the longest text [bytes]; `name`: the column in messages. The limits
-    are `_MAX_TEXTS` for `count`, `_MAX_TEXT_WIDTH` for `width`, and `_MAX_TEXT_BYTES` for their product.
-    """
+    """Raise InputError if the texts of the column `name` are too many (`count`) or too long (`width` [bytes])."""
     if count > _MAX_TEXTS or width > _MAX_TEXT_WIDTH or count * width > _MAX_TEXT_BYTES:
         raise InputError(
             f"{name} must hold numbers, or at most {_MAX_TEXTS} texts of {_MAX_TEXT_WIDTH} bytes, "
@@ -649,10 +584,7 @@ def check_texts(count: int, width: int, name: str) -> None:
 
 
 def make_description(rate: float, provenance: Mapping[str, Any], history: Sequence[str]) -> dict[str, Any]:
-    """Collect rate, provenance and history of a recording as JSON values.
-
-    Raises InputError for a value that JSON does not have.
-    """
+    """Collect rate, provenance and history of a recording as JSON values; raise InputError for others."""
     description = {"format": FORMAT_VERSION, "rate": rate, "provenance": dict(provenance), "history": list(history)}
     try:
         return json.loads(json.dumps(description, default=_convert_numpy))  # type: ignore[no-any-return]
@@ -668,10 +600,7 @@ def _convert_numpy(value: Any) -> Any:
 
 
 def parse_description(source: str | bytes | Mapping[str, Any]) -> dict[str, Any]:
-    """Parse the description of a recording from `make_description`: a JSON text, or a mapping.
-
-    Raises InputError if the description is damaged, or was written by a newer version.
-    """
+    """Parse a description from `make_description`; raise InputError if it is damaged, or of a newer version."""
     try:
         parsed = source if isinstance(source, Mapping) else json.loads(source)
         version, rate = int(parsed["format"]), float(parsed["rate"])

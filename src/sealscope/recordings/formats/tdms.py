@@ -12,7 +12,7 @@ import numpy as np
 
 from sealscope.recordings.formats.columns import Request
 from sealscope.recordings.formats.headings.labels import Label
-from sealscope.recordings.formats.headings.preamble import collect_remarks, stated_rate
+from sealscope.recordings.formats.headings.preamble import collect_attributes, stated_rate
 from sealscope.recordings.formats.libraries import import_library
 from sealscope.recordings.formats.table import Clock, RecordingFields, Series, build_fields, uniform_clock
 
@@ -20,10 +20,9 @@ _UNITS = ("unit_string", "NI_UnitDescription", "units", "unit", "Unit")
 
 
 def read_tdms(path: Path, request: Request) -> RecordingFields:
-    """Read the requested channels of a TDMS file to the fields of a recording.
+    """Read the requested channels of a TDMS file; raise MissingExtra without npTDMS.
 
-    Channels that state a waveform interval (``wf_increment``) have sampling times of their own. Raises MissingExtra
-    without npTDMS.
+    Channels that state a waveform interval (``wf_increment``) have sampling times of their own.
     """
     nptdms = import_library("nptdms", "TDMS", "npTDMS")
     # no warnings on a truncated last segment
@@ -38,21 +37,13 @@ def read_tdms(path: Path, request: Request) -> RecordingFields:
                 clock = _waveform_clock(properties, count)
                 series.append(Series(group.name, Label.parse(channel.name, unit), count, read_values, clock))
         # remarks on the file, and on each group
-        remarks, *group_remarks = (
-            collect_remarks(
-                (name, value) for name, value in member.properties.items() if isinstance(value, str | int | float)
-            )
-            for member in (file, *file.groups())
-        )
+        remarks, *group_remarks = (collect_attributes(member.properties) for member in (file, *file.groups()))
         rate = next(filter(None, map(stated_rate, (remarks, *group_remarks))), None)
         return build_fields(series, request, "TDMS", remarks, rate, size=path.stat().st_size)
 
 
 def _waveform_clock(properties: Mapping[str, Any], count: int) -> Clock | None:
-    """Build the sampling times (`Clock`) of a channel of `count` samples from its waveform properties.
-
-    None if the properties state no interval between samples.
-    """
+    """Build the sampling times of a channel from its waveform properties; None if these state no interval."""
     step = properties.get("wf_increment")
     if not isinstance(step, float | int) or not step > 0:
         return None

@@ -1,7 +1,7 @@
 """Text logs: CSV files written by Sealscope, and logs of other programs.
 
-A log is read in blocks of complete lines. Blocks that contain only numbers are read by pyarrow if it is installed,
-others row by row.
+A log is read in blocks of complete lines. pyarrow, if installed, reads the blocks that contain only numbers; others are
+read row by row.
 """
 
 from __future__ import annotations
@@ -98,12 +98,9 @@ def read_text(path: Path, request: Request) -> RecordingFields:
 def read_text_parts(path: Path, request: Request, every: float) -> Iterator[RecordingFields]:
     """Yield a text log in parts of `every` [s], each as the fields of a recording, in bounded memory.
 
-    `request`: the user's choice of columns. All parts have the same number of rows, `every` times the sampling rate of
-    the first rows; the last part may have fewer. The log is a single part if `every` = inf, or if it is:
-
-    - a log with a time column for each channel;
-    - a log that begins with the last sample;
-    - a long table, in which each row is one sample of a named channel.
+    All parts but the last have the same number of rows: `every` times the sampling rate of the first rows. The log is a
+    single part if `every` = inf, if it begins with the last sample, if each channel has a time column, or if it is a
+    long table, in which each row is one sample of a named channel.
     """
     layout = read_layout(path)
     description = None if layout.description is None else parse_description(layout.description)
@@ -123,11 +120,7 @@ def read_text_parts(path: Path, request: Request, every: float) -> Iterator[Reco
     log = _Log(path, layout, kinds=choice.columns, date=choice.date)
 
     def make_part(blocks: list[_Block], state: TimeState, more_notes: Sequence[str] = ()) -> RecordingFields:
-        """Convert the rows of one part of the log to the fields of a recording.
-
-        `state`: state of the time column after the previous part, which is updated; `more_notes`: further lines for
-        the history.
-        """
+        """Convert one part of the log; `state` is that of the time column after the previous part, and is updated."""
         columns, notes = log.join_blocks(blocks)
         notes = [*layout.notes, *notes, *more_notes]
         return convert_columns(
@@ -152,10 +145,9 @@ def read_text_parts(path: Path, request: Request, every: float) -> Iterator[Reco
 
 
 def _read_several_clocks(path: Path, layout: Layout, time_columns: Sequence[int], request: Request) -> RecordingFields:
-    """Read a log whose channels have sampling times of their own.
+    """Read a log whose channels have sampling times of their own, in `time_columns` before them.
 
-    `layout`: as from `read_layout`; `time_columns`: numbers of the time columns, each of which stands before its
-    channels. If there are none, the log is read as a long table, in which each row is one sample of a named channel.
+    Without such columns it is read as a long table, in which each row is one sample of a named channel.
     """
     cells_by_column: dict[int, NDArray[Any]] = {}
     columns = [column for column in range(len(layout.labels)) if column not in time_columns]
@@ -190,8 +182,7 @@ def _read_several_clocks(path: Path, layout: Layout, time_columns: Sequence[int]
 def _find_channel_times(labels: Sequence[Label]) -> list[int]:
     """Find the time columns of a log in which each channel, or group of channels, follows a time column of its own.
 
-    Returns the numbers of the time columns; empty for other logs. The names of the time columns may differ only in a
-    number at the end.
+    The names of the time columns may differ only in a number at the end. Empty for other logs.
     """
     names = [_NUMBER_SUFFIX.sub("", label.name.casefold()) for label in labels]  # without the numbers
     if names.count(names[0]) < 2 or not is_time(labels[0]):
@@ -203,10 +194,7 @@ def _find_channel_times(labels: Sequence[Label]) -> list[int]:
 
 
 def _split_blocks(blocks: Iterable[_Block], size: float) -> Iterator[list[_Block]]:
-    """Regroup blocks of rows of a log into lists with `size` rows each; the last list may have fewer rows.
-
-    With `size` = inf all rows are in one list.
-    """
+    """Regroup blocks of rows of a log into lists of `size` rows, or inf for a single list; the last may have fewer."""
     group: list[_Block] = []
     missing_rows = size
     for block in blocks:
@@ -238,21 +226,17 @@ def read_layout(path: Path) -> Layout:
 
 @dataclass
 class _Block:
-    """Consecutive rows of a text log.
+    """Consecutive rows of a text log."""
 
-    `columns`: column -> values (n,); `word_rows`: column -> indices of the rows with a word in place of a number;
-    `first_words`: column -> the first of these words with its place, for messages.
-    """
-
-    columns: dict[int, NDArray[Any]] = field(default_factory=dict)
-    word_rows: dict[int, NDArray[np.intp]] = field(default_factory=dict)
-    first_words: dict[int, str] = field(default_factory=dict)
+    columns: dict[int, NDArray[Any]] = field(default_factory=dict)  # column -> values (n,)
+    word_rows: dict[int, NDArray[np.intp]] = field(default_factory=dict)  # column -> rows with a word for a number
+    first_words: dict[int, str] = field(default_factory=dict)  # column -> the first of them with its place
 
     def __len__(self) -> int:
         return len(next(iter(self.columns.values())))
 
     def __getitem__(self, rows: slice) -> _Block:
-        """Return a block with the rows of a slice of this block."""
+        """Return the rows of a slice."""
         first, stop, _ = rows.indices(len(self))
         word_rows = {
             column: indices[(indices >= first) & (indices < stop)] - first for column, indices in self.word_rows.items()
@@ -261,64 +245,42 @@ class _Block:
 
 
 class _Log:
-    """Reader of the rows of a text log, block by block.
-
-    A word is a text in place of a number or a time stamp.
-
-    - `place`: path of the log in messages.
-    - `min_cells`: number of cells that a row needs.
-    - `n_rows`, `n_repeated`, `n_text_lines`: numbers of rows, repeated heading lines and lines of text read until now.
-    - `first_text_line`: the first line of text with its place, for messages.
-    - `has_stamps`: True if the time column contains date stamps, None before its first cell is read.
-    - `has_date`: True if a date column completes these stamps.
-    - `day_first`: True if the day precedes the month in dates, None until the first date such as 05/06/2024.
-    - `order_note`: line for the history if the dates leave the order of day and month open.
-    - `n_words`: number of words by column.
-    - `last_width`: number of cells in the last row.
-    - `uses_arrow`: True if pyarrow may read blocks; `null_values`: texts that pyarrow reads as missing.
-    """
+    """Reader of the rows of a text log, block by block; a word is a text in place of a number or a time stamp."""
 
     def __init__(self, path: Path, layout: Layout, kinds: Mapping[int, str], date: int | None) -> None:
         """Prepare to read the log at `path`, without reading rows, and decide if pyarrow can read its layout.
 
-        `layout`: as from `read_layout`; `date`: column of the date that belongs to the time, or None; `kinds`: column
-        to read -> kind of its values. The kinds are "numbers"; "any", i.e. numbers with inf in place of words; "time";
-        and "texts".
+        `kinds`: column to read -> kind of its values: "numbers"; "any", i.e. numbers with inf in place of words;
+        "time"; or "texts". `date`: column of the date that belongs to the time, or None.
         """
         self.path, self.place = path, str(path)
         self.layout = layout
         self.kinds = kinds
         self.date = date
-        self.min_cells = max(kinds) + 1
-        self.n_rows = self.n_repeated = self.n_text_lines = 0
-        self.first_text_line = ""
+        self.min_cells = max(kinds) + 1  # that a row needs
+        self.n_rows = self.n_repeated = self.n_text_lines = 0  # rows, repeated heading lines, lines of text until now
+        self.first_text_line = ""  # the first line of text with its place, for messages
         is_delimited = layout.encoding in ("utf-8", "utf-8-sig", "cp1252") and layout.delimiter != " "
         is_numeric = not layout.cell_units and not layout.prefixed and "texts" not in kinds.values()
         self.uses_arrow = (
             is_delimited and is_numeric and path.stat().st_size >= _MIN_ARROW_SIZE and find_spec("pyarrow") is not None
         )
-        self.null_values = ["", "NaN"]
-        self.has_stamps: bool | None = None
-        self.has_date = False
-        self.day_first: bool | None = None
-        self.order_note = ""
-        self.n_words = Counter[int]()
-        self.last_width = 0
+        self.null_values = ["", "NaN"]  # texts that pyarrow reads as missing
+        self.has_stamps: bool | None = None  # True if the time column contains date stamps; None before its first cell
+        self.has_date = False  # True if a date column completes these stamps
+        self.day_first: bool | None = None  # None until the first date such as 05/06/2024
+        self.order_note = ""  # line for the history if the dates leave the order of day and month open
+        self.n_words = Counter[int]()  # column -> number of words
+        self.last_width = 0  # number of cells in the last row
 
     def iter_blocks(self) -> Iterator[_Block]:
-        """Yield the rows of the log in blocks, in order.
-
-        A block is read by pyarrow if that is possible, else row by row. If the first block cannot be read by pyarrow,
-        later ones are not tried.
-        """
+        """Yield the rows of the log in blocks, read by pyarrow as far as possible, else row by row."""
         is_first = True
-
-        def n_bytes() -> int:
-            """Compute the number of bytes of the file to read next."""
-            return _CHUNK * (_ARROW_FACTOR if self.uses_arrow and not is_first else 1)
-
         with self.path.open("rb") as file:
-            line_blocks = _iter_line_blocks(file, self.layout.encoding, self.place, n_bytes)
+            line_blocks = _iter_line_blocks(
+                file, self.layout.encoding, self.place,
+                lambda: _CHUNK * (_ARROW_FACTOR if self.uses_arrow and not is_first else 1),
+            )  # fmt: skip
             for first_line, content, end, is_cut in line_blocks:
                 block = self._read_by_arrow(first_line, content, end) if self.uses_arrow and not is_cut else None
                 if is_first and block is None:  # later blocks may only have a comment or word that pyarrow cannot read
@@ -352,15 +314,15 @@ class _Log:
         return self._remove_text_rows(rows, line_numbers)
 
     def _count_rows(self, n_rows: int) -> None:
-        """Add `n_rows` to the rows read until now; raise InputError if the columns then have too many values."""
+        """Count rows that were read; raise InputError if the columns then have too many values."""
         self.n_rows += n_rows
         check_size(self.n_rows, len(self.kinds))
 
     def _read_by_arrow(self, first_line: int, block: bytes, end: int) -> _Block | None:
         """Read the rows of a block of bytes by pyarrow, and count them.
 
-        `first_line`: number of the block's first line, from 1; `end`: number of bytes of its complete lines.
-        Returns None, and counts no rows, unless all cells to read are plain finite numbers or missing.
+        `first_line`: number of the block's first line, from 1; `end`: number of bytes of its complete lines. Returns
+        None, and counts no rows, unless all cells to read are plain finite numbers or missing.
         """
         from pyarrow import ArrowInvalid, csv, float64, py_buffer
 
@@ -402,10 +364,7 @@ class _Log:
         return result
 
     def _select_samples(self, lines: Sequence[str], first: int) -> list[int]:
-        """List the indices of the lines that contain samples, from index `first` on.
-
-        Comments, blank lines and repeated headings are left out; repeated headings are counted in `n_repeated`.
-        """
+        """List the lines with samples, from index `first` on: no comments, blank lines or repeated headings."""
         blank = " " if self.layout.delimiter == "\t" else None  # a line of tabs is a row of missing samples
         content = [
             i for i in range(first, len(lines)) if lines[i].strip(blank) and not lines[i].lstrip().startswith(COMMENTS)
@@ -416,11 +375,10 @@ class _Log:
         return rows
 
     def _split_lines(self, lines: list[str], line_numbers: Sequence[int], is_cut: bool) -> list[list[str]]:
-        """Split lines of the log into cells.
+        """Split lines of the log into cells; `line_numbers` are those in the file.
 
-        `line_numbers`: number of each line in the file, for messages. Raises InputError for a quotation mark that is
-        not closed on its line. If the file ends within the last line (`is_cut`), a quotation mark may be open there,
-        and its cell becomes empty.
+        Raises InputError for a quotation mark that is not closed on its line. If the file ends within the last line
+        (`is_cut`), a mark may be open there, and its cell becomes empty.
         """
         delimiter = self.layout.delimiter
         if delimiter == " ":
@@ -444,10 +402,10 @@ class _Log:
     def _remove_text_rows(
         self, rows: list[list[str]], line_numbers: Sequence[int]
     ) -> tuple[list[list[str]], Sequence[int]]:
-        """Remove short rows of text, such as the mark of an event, and count them.
+        """Remove and count short rows of text, such as the mark of an event; also return the other rows' line numbers.
 
-        Returns the remaining rows and their line numbers. A row of text has fewer cells than a sample needs, no value
-        and at most `_MAX_TEXT_LINE` characters. Raises InputError for any other row with too few or too many cells.
+        A row of text has fewer cells than a sample needs, no value and at most `_MAX_TEXT_LINE` characters. Raises
+        InputError for any other row with too few or too many cells.
         """
         layout, max_cells = self.layout, len(self.layout.labels)
         if min(map(len, rows)) >= self.min_cells and max(map(len, rows)) <= max_cells:
@@ -455,13 +413,9 @@ class _Log:
         complete_rows: list[int] = []
         for i, row in enumerate(rows):
             is_short = len(row) < self.min_cells
-            is_text = (
-                is_short
-                and sum(map(len, row)) <= _MAX_TEXT_LINE
-                and not any(is_value(cell, layout.decimal) for cell in row)
-            )
+            has_value = any(is_value(cell, layout.decimal) for cell in row)
             place = f"(line {line_numbers[i]}, {self.place})"
-            if is_text:
+            if is_short and not has_value and sum(map(len, row)) <= _MAX_TEXT_LINE:
                 self.first_text_line = self.first_text_line or f"{layout.delimiter.join(row).strip()[:40]!r} {place}"
                 self.n_text_lines += 1
             elif is_short or any(cell.strip() for cell in row[max_cells:]):
@@ -473,9 +427,8 @@ class _Log:
     def _parse_rows(self, rows: Sequence[Sequence[str]], line_numbers: Sequence[int], is_cut: bool) -> _Block:
         """Parse rows of cells to a block of values.
 
-        `line_numbers`: number of each row's line in the file; `is_cut`: the last row is incomplete. Words, i.e. texts
-        in place of numbers or time stamps, become NaN or NaT, and are counted in `n_words`. In a column of the kind
-        "any" words become inf instead, and are not counted.
+        `line_numbers`: line of each row in the file; `is_cut`: the last row is incomplete. Words become NaN or NaT and
+        are counted in `n_words`; in a column of the kind "any" they become inf and are not counted.
         """
         block = _Block()
         for column, kind in self.kinds.items():
@@ -505,7 +458,7 @@ class _Log:
         return block
 
     def _is_stamped(self, cells: Sequence[str], rows: Sequence[Sequence[str]]) -> bool:
-        """Return True if the time column contains date stamps, as its first cell in the log shows.
+        """Test whether the time column contains date stamps, as its first cell in the log shows.
 
         `cells`: cells of the time column in `rows`. The first cell that is not missing sets `has_stamps` for the whole
         log, and `has_date`: True if the stamps are times of day, and the cell in the date column is a date.
@@ -520,10 +473,7 @@ class _Log:
         return bool(self.has_stamps)
 
     def _join_dates(self, rows: Sequence[Sequence[str]], column: int) -> list[str]:
-        """Return the cells of the time column, each with the date before it if there is a date column.
-
-        `column`: number of the time column. A cell is empty if its date or its time is missing.
-        """
+        """Return the cells of the time column after those of the date column, if any; empty if one is missing."""
         if not self.has_date or self.date is None:
             return [row[column] for row in rows]
         days = [row[self.date].strip() if self.date < len(row) else "" for row in rows]
@@ -531,21 +481,16 @@ class _Log:
         return [f"{day} {time}" if day and time else "" for day, time in zip(days, times, strict=True)]
 
     def _format_place(self, index: int, line_numbers: Sequence[int], column: int) -> str:
-        """Format the line, column and file of a cell for messages.
-
-        `index`: row of the cell in its block; `line_numbers`: line number of each of the block's rows; `column`: number
-        of the cell's column.
-        """
+        """Format the line, column and file of a cell for messages; `index` is its row in the block of these lines."""
         return f"(line {line_numbers[index]}, column {self.layout.labels[column].whole}, {self.place})"
 
     def _parse_dates(
         self, cells: list[str], format_place: Callable[[int], str]
     ) -> tuple[NDArray[np.datetime64], list[int]]:
-        """Parse cells of the time column to time stamps (n,); also return the indices of the words.
+        """Parse cells of the time column to time stamps (n,); also return the indices of words, texts without digits.
 
-        A word is a text without digits that is not a stamp. Words and missing cells become NaT. At the first ambiguous
-        date, such as 05/06/2024, the log's dates decide `day_first`. `format_place`: function from the index of a cell
-        to its place, for messages. Raises InputError for a cell with digits that is not a stamp.
+        Words and missing cells become NaT. At the first ambiguous date, such as 05/06/2024, the log's dates decide
+        `day_first`. `format_place`: index of a cell -> its place. Raises InputError for a number that is not a stamp.
         """
         texts = ["" if cell.strip().lower() in MISSING else cell for cell in cells]
         if self.day_first is None and ambiguous_dates(texts):
@@ -566,10 +511,9 @@ class _Log:
             raise InputError(f"{_STAMP_RULE}, got {cells[bad_row]!r} {format_place(bad_row)}") from None
 
     def _detect_day_first(self) -> bool:
-        """Detect if the day precedes the month in the dates of the log, such as 05/06/2024.
+        """Detect if the day precedes the month in the log's dates, reading on to the first with a number over 12.
 
-        The log is read up to the first date with a number over 12. Without such a date, the order is guessed
-        (`is_day_first`), and `order_note` says so.
+        Without such a date, the order is guessed (`is_day_first`), and `order_note` says so.
         """
         log = _Log(self.path, self.layout, self.kinds, self.date)  # reads ahead without changing this reader
         columns = [column for column, kind in self.kinds.items() if kind == "time"]
@@ -577,7 +521,7 @@ class _Log:
         with suppress(InputError), self.path.open("rb") as file:  # errors are raised when the row is read again
             line_blocks = _iter_line_blocks(file, self.layout.encoding, self.place, lambda: _CHUNK)
             for first_line, content, end, is_cut in line_blocks:
-                rows, _ = log._split_rows(first_line, content[:end], is_cut)
+                rows, _line_numbers = log._split_rows(first_line, content[:end], is_cut)
                 for column, column_dates in zip(columns, dates, strict=True):
                     column_dates.update(ambiguous_dates(self._join_dates(rows, column)))
                 if any(explicit_order(date) is not None for date in dates):
@@ -590,8 +534,7 @@ class _Log:
     def join_blocks(self, blocks: list[_Block]) -> tuple[dict[int, NDArray[Any]], list[str]]:
         """Join blocks of the log to whole columns, column -> values (n,); also return lines for the history.
 
-        Rows with a word in place of the time are left out. The columns are removed from the blocks to save memory.
-        Raises InputError if too many cells are words.
+        Rows without a time are left out, blocks emptied to save memory. Raises InputError if too many cells are words.
         """
         labels = self.layout.labels
         notes: list[str] = []
@@ -629,10 +572,7 @@ class _Log:
         return columns, notes
 
     def describe_text_lines(self) -> list[str]:
-        """Describe for the history how many lines of text and repeated headings were left out of the log.
-
-        The list is empty if no line was left out. Raises InputError if there are too many lines of text.
-        """
+        """Describe which lines of text were left out of the log; raise InputError if they are too many."""
         if self.n_text_lines > max(MAX_WORD_FRACTION * self.n_rows, _MAX_TEXT_LINES):
             raise InputError(f"a sample must be a number, got {self.first_text_line}")
         lines = format_count(self.n_text_lines, "line")
@@ -646,10 +586,9 @@ def _iter_line_blocks(
 ) -> Iterator[tuple[int, bytes, int, bool]]:
     """Yield a text file in blocks of lines: (number of the first line, bytes, end, is_cut).
 
-    The bytes before index `end` are complete lines; the bytes from `end` on come again in the next block. Only the last
-    block may have an incomplete last line, without a line end: then `is_cut` is True, and `end` is the block's length.
-    `place`: path of the file for messages; `n_bytes`: function that returns the number of bytes to read next. Raises
-    InputError for binary data, and for a line that is too long.
+    The bytes before index `end` are complete lines; the others come again in the next block. Only the last block may
+    have an incomplete last line, without a line end: then `is_cut` is True, and `end` is the block's length. `n_bytes`:
+    number of bytes to read next. Raises InputError for binary data, and for a line that is too long.
     """
     character_bytes = 2 if encoding.startswith("utf-16") else 1
     newline = "\n".encode(encoding if character_bytes == 2 else "ascii")
@@ -677,10 +616,7 @@ def _iter_line_blocks(
 
 
 def _last_newline(block: bytes, newline: bytes) -> int:
-    """Find the index of the last `newline` in a block of bytes; -1 if there is none.
-
-    In UTF-16 each character has two bytes, so that only an even index counts.
-    """
+    """Find the index of the last `newline` in a block of bytes, even if it has two bytes as in UTF-16; -1 if none."""
     end = block.rfind(newline)
     while end >= 0 and end % len(newline):
         end = block.rfind(newline, 0, end + 1)
@@ -700,8 +636,7 @@ def write_text(
 ) -> None:
     """Write a text log: `# sealscope: {...}`, the header `t [s],p_A [Pa],...` and one row per sample, without loss.
 
-    `values`, `units`, `description`: as from `Recording.series`; `delimiter`: separator of cells. Raises InputError
-    for an infinite sample.
+    `values`, `units`, `description`: as from `Recording.series`. Raises InputError for an infinite sample.
     """
     for name, series in values.items():
         if np.isinf(series).any():
@@ -717,10 +652,9 @@ def write_text(
 
 
 def _arrow_values(cells: Any) -> Array:
-    """Convert a pyarrow ChunkedArray of doubles to an array (n,), NaN for null.
+    """Convert a pyarrow ChunkedArray of doubles to an array (n,), NaN for null, by its buffers.
 
-    The method `to_numpy` of `cells` would load pandas. The buffers of each chunk are read instead: bits, which are 1
-    for known values, and the values.
+    `to_numpy` would load pandas. The buffers of a chunk are bits, which are 1 for known values, and the values.
     """
     parts = []
     for chunk in cells.chunks:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import codecs
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import accumulate, chain, islice, repeat
+from itertools import accumulate, chain, compress, islice, product, repeat
 
 from sealscope.errors import InputError
 from sealscope.paragraphs import format_count
@@ -35,11 +35,8 @@ DESCRIPTION_MARK = "# sealscope: "
 COMMENTS = ("#", "%", "//", '"#', "!")
 #: Rows from which the dialect is detected.
 _N_ROWS = 100
-#: Delimiters and decimal separators that are tried.
-_DIALECTS = (
-    ("\t", "."), ("\t", ","), (";", "."), (";", ","), (",", "."), ("|", "."), ("|", ","), (",", ","), (" ", "."),
-    (" ", ","),
-)  # fmt: skip
+#: Delimiters, each with the decimal separator of the dialect to try.
+_DIALECTS = (*product("\t;", ".,"), (",", "."), *product("|", ".,"), (",", ","), *product(" ", ".,"))
 #: A number and possibly its unit in one cell.
 _QUANTITY = re.compile(r"\d[ \u00a0\u202f]{0,2}(?![eEdDT][+-]?\d)(?:[^\W\d_]|[%\u00b0])")
 _RULER = re.compile(r"[-=_:+]{1,80}")
@@ -51,32 +48,20 @@ _DELIMITER_NAMES = {"\t": "tab", ";": "semicolon", ",": "comma", "|": "bar", " "
 
 @dataclass(frozen=True)
 class Layout:
-    """The layout of a text log.
-
-    - `encoding`: encoding of the text.
-    - `delimiter`: separator of cells, where a blank stands for any white space.
-    - `decimal`: decimal separator; `prefixed`: True if numbers end in SI prefixes.
-    - `labels`: headings of the columns; `cell_units`: column -> unit after each of its numbers.
-    - `first_row`: index of the first line of samples.
-    - `description`: JSON written by Sealscope, or None.
-    - `notes`: lines for the history.
-    - `remarks`: entries above the heading, name -> text.
-    - `lines_above`: lines above the first row, which some loggers repeat among the samples.
-    - `rate`: sampling rate stated in these lines [Hz], or None.
-    """
+    """The layout of a text log."""
 
     encoding: str
-    delimiter: str
-    decimal: str
-    labels: tuple[Label, ...]
-    first_row: int
-    description: str | None = None
-    notes: tuple[str, ...] = ()
-    remarks: Mapping[str, str] = field(default_factory=dict)
-    lines_above: frozenset[str] = frozenset()
-    rate: float | None = None
-    cell_units: Mapping[int, str] = field(default_factory=dict)
-    prefixed: bool = False
+    delimiter: str  # separator of cells, where a blank stands for any white space
+    decimal: str  # decimal separator
+    labels: tuple[Label, ...]  # headings of the columns
+    first_row: int  # index of the first line of samples
+    description: str | None = None  # JSON written by Sealscope
+    notes: tuple[str, ...] = ()  # lines for the history
+    remarks: Mapping[str, str] = field(default_factory=dict)  # entries above the heading, name -> text
+    lines_above: frozenset[str] = frozenset()  # lines above the first row, which some loggers repeat among the samples
+    rate: float | None = None  # sampling rate [Hz] stated in these lines
+    cell_units: Mapping[int, str] = field(default_factory=dict)  # column -> unit after each of its numbers
+    prefixed: bool = False  # True if numbers end in SI prefixes
 
     @property
     def kind(self) -> str:
@@ -88,8 +73,7 @@ class Layout:
 def detect_encoding(head: bytes) -> str | None:
     """Detect the encoding of a text from the first bytes of its file; None if they are not text.
 
-    The encodings are tried in this order: the one that a byte order mark states; UTF-16; UTF-8; gb18030 and Shift-JIS,
-    if the text then has a known word; cp1252, if few bytes are control characters.
+    Tried in turn: a byte order mark, UTF-16, UTF-8, gb18030 and Shift-JIS if they give a known word, cp1252.
     """
     for mark, name in (
         (codecs.BOM_UTF8, "utf-8-sig"),
@@ -99,10 +83,8 @@ def detect_encoding(head: bytes) -> str | None:
         if head.startswith(mark):
             return name
     if b"\0" in head:  # in UTF-16 without a mark every second byte of Latin text is 0
-        zero_fractions = [head[begin::2].count(0) / max(len(head) // 2, 1) for begin in (0, 1)]
-        names = [
-            name for name, fraction in zip(("utf-16-be", "utf-16-le"), zero_fractions, strict=True) if fraction > 0.8
-        ]
+        n_pairs = max(len(head) // 2, 1)
+        names = [name for i, name in enumerate(("utf-16-be", "utf-16-le")) if head[i::2].count(0) / n_pairs > 0.8]
         return names[0] if len(names) == 1 else None
     try:
         codecs.getincrementaldecoder("utf-8")().decode(head)
@@ -124,10 +106,9 @@ def split_at_blanks(line: str) -> list[str]:
 
 
 def split_cells(line: str, delimiter: str) -> list[str]:
-    """Split a line into cells at the `delimiter`; a blank stands for any number of blanks and tabs.
+    """Split a line into cells at the `delimiter`, but not within quotation marks; a blank stands for blanks and tabs.
 
-    Unless the delimiter is a blank, a cell may stand in double quotation marks, which are removed. A delimiter between
-    them does not split the cell.
+    Quotation marks are removed, and mean nothing if the delimiter is a blank.
     """
     if delimiter == " ":
         return split_at_blanks(line)
@@ -140,18 +121,14 @@ def split_cells(line: str, delimiter: str) -> list[str]:
 
 def _used_width(row: Sequence[str]) -> int:
     """Count the cells of a row without the empty cells at its end."""
-    width = len(row)
-    while width and not row[width - 1].strip():
-        width -= 1
-    return width
+    return max((i for i, cell in enumerate(row, 1) if cell.strip()), default=0)
 
 
 def _detect_dialect(body: Sequence[str]) -> tuple[str, str, int]:
-    """Detect (delimiter, decimal separator, number of cells in a row) from some lines of a log.
+    """Detect (delimiter, decimal separator, number of cells in a row) from some lines of a log, else (",", ".", 1).
 
-    All pairs of `_DIALECTS` are tried, and rated by the fraction of cells, missing ones aside, that are values (numbers
-    or time stamps) in rows of one width. This is the width with most values; these must be half of all values or more.
-    For lines without values the result is (",", ".", 1).
+    All pairs of `_DIALECTS` are rated by the fraction of cells, missing ones aside, that are values (numbers or time
+    stamps) in rows of one width. This is the width with most values, at least half of all.
     """
     ranks: dict[tuple[str, str, int], tuple[float, float, bool, int]] = {}
     text = "\n".join(body)
@@ -159,13 +136,14 @@ def _detect_dialect(body: Sequence[str]) -> tuple[str, str, int]:
         if delimiter not in text and not (delimiter == " " and any(sign in text for sign in "\t\v\f")):
             continue
         rows = [row for row in (split_cells(line, delimiter) for line in body) if len(row) > 1]
-        counts = [sum(is_value(cell, decimal) for cell in row) for row in rows]
         n_values = Counter[int]()  # by width of the row
-        for row, count in zip(rows, counts, strict=True):
+        cells: list[str] = []  # of rows with a value
+        for row in rows:
+            count = sum(is_value(cell, decimal) for cell in row)
             n_values[len(row)] += count
+            cells += row if count else []
         width = max(n_values, key=lambda row_width: (n_values[row_width], row_width), default=0)
-        if any(counts) and 2 * n_values[width] >= n_values.total():
-            cells = [cell for row, count in zip(rows, counts, strict=True) if count for cell in row]
+        if cells and 2 * n_values[width] >= n_values.total():
             n_present = sum(not is_missing(cell) for cell in cells)
             n_grouped = sum(is_grouped(cell, decimal) for cell in cells)  # prefer dialects without separated thousands
             # the first number decides, the others only between equals
@@ -177,8 +155,7 @@ def _detect_dialect(body: Sequence[str]) -> tuple[str, str, int]:
 def _split_heading(line: str, delimiter: str, width: int = 0) -> list[str]:
     """Split the heading line of a log into the names of columns.
 
-    If the delimiter is a blank, names end at each blank, but a unit in brackets stays with its name. If that does not
-    give one name for each of the `width` columns, and splitting at wider spaces does, names may contain single blanks.
+    At blanks, a unit in brackets stays with its name. Wider spaces separate names if only that gives `width` names.
     """
     if delimiter == " ":
         names = _SPACED_LABEL.findall(line)
@@ -188,10 +165,7 @@ def _split_heading(line: str, delimiter: str, width: int = 0) -> list[str]:
 
 
 def _parse_unit_row(cells: Sequence[str]) -> list[str | None] | None:
-    """Parse a row of units below or above the names of columns: the unit of each cell, None for an empty one.
-
-    At least 60 % of the cells that are not empty must be known units; the result is None for any other row.
-    """
+    """Parse a row of units, each None for an empty cell; None for a row with under 60 % known units."""
     texts = [cell.strip().strip("[]()<>'").strip() for cell in cells]
     units = [text if text and text != "-" else None for text in texts]
     n_known = sum(unit is not None and is_unit(unit) for unit in units)
@@ -201,19 +175,14 @@ def _parse_unit_row(cells: Sequence[str]) -> list[str | None] | None:
 def _parse_heading(
     lines: Sequence[str], first_row: int, delimiter: str, width: int, decimal: str
 ) -> tuple[list[Label], int]:
-    """Parse the heading of a log, which ends above the first line of samples.
+    """Parse the heading of a log: rows of names and units above the line `first_row` of `lines`, or names in a comment.
 
-    The heading consists of rows of names and units, or else of names in a comment. `lines`: lines of the log;
-    `first_row`: index of the first line of samples; `width`: number of cells in a row of samples; `delimiter`,
-    `decimal`: separators of cells and of decimals. Returns (labels of the columns, number of heading lines); ([], 0)
-    if there is no heading.
+    `width`: number of cells in a row of samples; `delimiter`, `decimal`: separators of cells and of decimals. Returns
+    (labels of the columns, number of heading lines); ([], 0) if there is no heading.
     """
 
     def split_names(line: str) -> list[str] | None:
-        """Split a heading line into the names of columns.
-
-        None if the number of names does not fit the number of columns, or if the line has values instead of names.
-        """
+        """Split a heading line into names of columns; None if they do not fit the number of columns, or are values."""
         cells = _split_heading(line, delimiter, width)
         if cells and not cells[-1]:  # drop empty cells at the end, beyond the width
             cells = cells[: max(_used_width(cells), min(width, len(cells)))]
@@ -229,19 +198,14 @@ def _parse_heading(
         return scope_heading
     rows: list[list[str]] = []
     for line in lines_above[:_MAX_HEADING]:
-        row = None if line.startswith(COMMENTS) else split_names(line)
-        if row is None:
+        if line.startswith(COMMENTS) or (row := split_names(line)) is None:
             break
         rows.append(row)
     if rows:
         labels, n_lines = _parse_keyed_rows(rows) or _parse_stacked_rows(rows)
         # descriptions of the columns may be in a row of labels, or in a table above the heading
-        label_lines = [
-            line
-            for line, row in zip(lines_above, rows, strict=False)
-            if row[0].strip().casefold() in WORDS["row"]["label"]
-        ]
-        description_lines = [*label_lines, *lines_above[n_lines:]][::-1]  # from the top down
+        is_label_row = [row[0].strip().casefold() in WORDS["row"]["label"] for row in rows]
+        description_lines = [*compress(lines_above, is_label_row), *lines_above[n_lines:]][::-1]  # from the top down
         return apply_descriptions(labels, [split_cells(line, delimiter) for line in description_lines]), n_lines
     if lines_above[0].startswith(COMMENTS) and not lines_above[0].startswith(DESCRIPTION_MARK):
         names_in_comment = split_names(lines_above[0].lstrip('#%/!" ').rstrip('"'))
@@ -250,11 +214,7 @@ def _parse_heading(
 
 
 def _parse_keyed_rows(rows: Sequence[Sequence[str]]) -> tuple[list[Label], int] | None:
-    """Parse heading rows that begin with keys such as `Name` and `Unit`.
-
-    `rows`: cells of the rows, from the lowest up. Returns (labels of the columns, number of rows), or None if there
-    are no such keys.
-    """
+    """Parse rows, from the lowest up, with keys such as `Name` and `Unit`, to (labels, number of rows); else None."""
     keys = [row[0].strip().rstrip(":").casefold() for row in rows]
     name_row = next((i for i, key in enumerate(keys) if key in WORDS["row"]["name"] and _used_width(rows[i]) > 1), None)
     unit_row = next((i for i, key in enumerate(keys) if key in WORDS["row"]["unit"]), None)
@@ -270,11 +230,10 @@ def _parse_keyed_rows(rows: Sequence[Sequence[str]]) -> tuple[list[Label], int] 
 
 
 def _parse_stacked_rows(rows: Sequence[Sequence[str]]) -> tuple[list[Label], int]:
-    """Parse heading rows without keys: a row of names, and possibly other rows.
+    """Parse heading rows without keys, from the lowest up: a row of names, and possibly other rows.
 
-    `rows`: cells of the rows, from the lowest up. Rulers such as `----` may stand below the names, units below or above
-    them, and names of groups of columns on top; the name of a group is put before the names of its columns. Returns
-    (labels of the columns, number of rows).
+    Rulers such as `----` may stand below the names, units below or above them, and names of groups of columns on top;
+    the name of a group is put before the names of its columns. Returns (labels of the columns, number of rows).
     """
     n_rulers = next((i for i, row in enumerate(rows[:-1]) if not _is_ruler(row)), len(rows) - 1)
     row, *rows_above = rows[n_rulers:]
@@ -307,10 +266,7 @@ def _parse_stacked_rows(rows: Sequence[Sequence[str]]) -> tuple[list[Label], int
 
 
 def _parse_graphtec_units(row: Sequence[str]) -> list[str | None] | None:
-    """Parse the row of units that Graphtec loggers write, `NO.,Time,ms,V,...`: the unit of each cell or None.
-
-    The result is None for any other row.
-    """
+    """Parse the row of units that Graphtec loggers write, `NO.,Time,ms,V,...`; return None for any other row."""
     cells = [cell.strip() for cell in row]
     if [cell.casefold() for cell in cells[:3]] != ["no.", "time", "ms"]:
         return None
@@ -318,17 +274,16 @@ def _parse_graphtec_units(row: Sequence[str]) -> list[str | None] | None:
 
 
 def _is_ruler(row: Sequence[str]) -> bool:
-    """Return True if a row is a ruler such as `----`, or repeats one text in all cells that is not a unit."""
+    """Test whether a row is a ruler such as `----`, or repeats one text in all cells that is not a unit."""
     cells = [cell.strip() for cell in row if cell.strip()]
     is_repeated = len(set(cells)) == 1 < len(cells) and _parse_unit_row(cells) is None
     return is_repeated or all(_RULER.fullmatch(cell) for cell in cells)
 
 
 def detect_layout(head: bytes, encoding: str, place: str, *, is_complete: bool) -> Layout:
-    """Detect the layout of a text log from its beginning `head` in the given encoding.
+    """Detect the layout of a text log from its beginning `head`, which may be the whole log (`is_complete`).
 
-    `place`: the file in messages; `is_complete`: `head` is the whole log. Raises InputError for a text without rows
-    of numbers.
+    `place`: the file in messages. Raises InputError for a text without rows of numbers.
     """
     text = head.decode(encoding, errors="replace").lstrip("\ufeff")
     lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
@@ -348,10 +303,10 @@ def detect_layout(head: bytes, encoding: str, place: str, *, is_complete: bool) 
     rows = content[max(1, min(len(content) // 2, len(content) - 20)) :] or content
     body = rows[-_N_ROWS:]
     original_lines = lines
-    if prefixed := _has_prefixes(rows):
+    if prefixed := any(map(has_prefixes, _iter_splits(rows))):
         body = [expand_prefixes(line) for line in body]
         lines = [_expand_sample_prefixes(line) for line in lines]
-    cell_units = {} if prefixed else _find_units(body)
+    cell_units = {} if prefixed else max(map(find_cell_units, _iter_splits(body)), key=len, default={})
     if cell_units:
         lines, body = ([remove_units(line, cell_units.values()) for line in part] for part in (lines, body))
     delimiter, decimal, width = _detect_dialect(body)
@@ -381,10 +336,7 @@ def detect_layout(head: bytes, encoding: str, place: str, *, is_complete: bool) 
 
 
 def _no_rows_error(line: str, delimiter: str | None) -> InputError:
-    """Build the InputError for a text without rows of numbers.
-
-    `line`: first line of the text; `delimiter`: separator of cells, or None if it is not known.
-    """
+    """Build the InputError for a text without rows of numbers, given its first line and its delimiter, if known."""
     kind = {"{": "JSON", "[": "JSON", "<": "XML or HTML"}.get(line.lstrip()[:1])
     if kind is not None:
         return InputError(f"a recording must be a table, got {kind}: export it as CSV")
@@ -401,17 +353,15 @@ def _is_content(line: str) -> bool:
 def _find_first_row(lines: Sequence[str], body: Sequence[str], delimiter: str, decimal: str, width: int) -> int | None:
     """Find the index of the first line with samples in over half of the numeric columns; None if there is none.
 
-    `lines`: lines of the log; `body`: lines of samples that show which columns are numeric; `width`: number of cells in
-    a row; `delimiter`, `decimal`: separators of cells and of decimals. Missing cells count as samples, but a row needs
-    at least one number or time stamp.
+    `body`: lines of samples that show which columns are numeric; `width`: number of cells in a row. Missing cells count
+    as samples, but a row needs at least one number or time stamp.
     """
     rows = [row for row in (split_cells(line, delimiter) for line in body) if len(row) == width]
     is_value_cell = [[is_value(cell, decimal) for cell in row] for row in rows]
     max_values = max(map(sum, is_value_cell), default=0)
     # rows with fewer than half as many values may belong to the lines above the samples
-    row_indices = [k for k, row in enumerate(is_value_cell) if 0 < max_values <= 2 * sum(row)]
-    rows = [rows[k] for k in row_indices]
-    is_value_cell = [is_value_cell[k] for k in row_indices]
+    has_samples = [0 < max_values <= 2 * sum(row) for row in is_value_cell]
+    rows, is_value_cell = [*compress(rows, has_samples)], [*compress(is_value_cell, has_samples)]
     numeric_columns = [
         i
         for i in range(width)
@@ -433,29 +383,14 @@ def _find_first_row(lines: Sequence[str], body: Sequence[str], delimiter: str, d
     return None
 
 
-def _has_prefixes(body: Sequence[str]) -> bool:
-    """Test whether the numbers in lines of a log end in SI prefixes, with any of the usual delimiters."""
-    # the quick search for a number with letters after it spares most logs the rest
-    return any(map(_QUANTITY.search, body)) and any(
-        has_prefixes([split_cells(line, delimiter) for line in body]) for delimiter in "\t;|,"
-    )
-
-
 def _expand_sample_prefixes(line: str) -> str:
-    """Replace the SI prefixes of the numbers in a line by exponents: `170.3m;2.5k` becomes `170.3e-3;2.5e3`.
-
-    A line in which no more than half of the cells are then numbers is returned unchanged, such as a heading.
-    """
+    """Replace SI prefixes of numbers, `2.5k` by `2.5e3`, in a line in which most cells are then numbers."""
     expanded = expand_prefixes(line)
     cells = re.split(r"[;,|\t]", expanded)
     return expanded if 2 * sum(is_value(cell, ".") for cell in cells) > len(cells) else line
 
 
-def _find_units(body: Sequence[str]) -> dict[int, str]:
-    """Find the units that are written after the numbers in lines of a log: column -> unit.
-
-    The delimiter is the one with which most columns have a unit.
-    """
-    if not any(map(_QUANTITY.search, body)):  # no number has letters after it
-        return {}
-    return max((find_cell_units([split_cells(line, delimiter) for line in body]) for delimiter in "\t;|,"), key=len)
+def _iter_splits(lines: Sequence[str]) -> Iterator[list[list[str]]]:
+    """Yield the cells of lines at each usual delimiter, if any number has letters after it, such as a unit."""
+    if any(map(_QUANTITY.search, lines)):  # a quick search, which spares most logs the rest
+        yield from ([split_cells(line, delimiter) for line in lines] for delimiter in "\t;|,")

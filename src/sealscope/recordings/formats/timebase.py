@@ -80,18 +80,13 @@ _Seconds = tuple[Array, dict[str, Any], list[str]]
 
 @dataclass
 class TimeState:
-    """State of a log's time column between two parts of the log, which are read one after the other.
+    """State of a log's time column between two parts of the log, which are read one after the other."""
 
-    `head`: numbers in the first part, if the column has no unit; `rate`: sampling rate [Hz]; `resolution`: step [s] of
-    coarse times that several samples share; `last_time`: last time as in the file; `last_seconds`: the same time in
-    seconds. Values that are not known are None, except `last_seconds`, which is then 0.0.
-    """
-
-    head: Array | None = None
-    rate: float | None = None
-    resolution: float | None = None
-    last_time: Any = None
-    last_seconds: float = 0.0
+    head: Array | None = None  # numbers in the first part, if the column has no unit
+    rate: float | None = None  # sampling rate [Hz]
+    resolution: float | None = None  # step [s] of coarse times that several samples share
+    last_time: Any = None  # as in the file
+    last_seconds: float = 0.0  # the same time in seconds
 
 
 def _parse_stamp(text: str) -> dict[str, str | None] | None:
@@ -126,8 +121,8 @@ def is_stamp(text: str) -> bool:
 def parse_stamps(cells: Sequence[str], day_first: bool | None = None) -> NDArray[np.datetime64]:
     """Parse stamps (ISO, day.month.year, month/day/year) and times of day to datetime64[ns], NaT for empty cells.
 
-    `day_first`: True if the day precedes the month in dates such as 05/06/2024 and 05-06-2024; by default decided
-    from these cells (`is_day_first`). Raises ValueError with the index of the first cell that is not a stamp.
+    `day_first`: True if the day precedes the month in dates such as 05/06/2024 and 05-06-2024; by default decided from
+    these cells (`is_day_first`). Raises ValueError with the index of the first cell that is not a stamp.
     """
     if day_first is None:
         day_first = is_day_first([ambiguous_dates(cells)])
@@ -151,29 +146,23 @@ def parse_stamps(cells: Sequence[str], day_first: bool | None = None) -> NDArray
 
 
 def ambiguous_dates(cells: Iterable[str]) -> dict[str, None]:
-    """Collect the dates written like 05/06/2024 or 05-06-24, a form in which the day or the month may come first.
-
-    `cells`: texts that may begin with such a date. The result is a dict without values, whose keys are the dates, each
-    once and in order.
-    """
+    """Collect the dates like 05/06/2024 or 05-06-24 at the beginnings of `cells`, each once, as keys of a dict."""
     return {match["date"]: None for cell in cells if (match := _EITHER_DATE.match(cell))}
 
 
 def explicit_order(dates: Iterable[str]) -> bool | None:
-    """Decide from dates such as 05/06/2024 if the day precedes the month.
+    """Decide from dates such as 05/06/2024 if the day precedes the month; None if they do not show it.
 
-    The first date in which exactly one of the two numbers is over 12 decides. The result is True if this is the first
-    number, as in 31/12/2024, False if it is the second; None if there is no such date.
+    The first date with exactly one number over 12 decides: True if this is its first number, as in 31/12/2024.
     """
     over_12 = ((first > _LAST_MONTH, second > _LAST_MONTH) for first, second, _ in map(_date_numbers, dates))
     return next((is_first_over for is_first_over, is_second_over in over_12 if is_first_over != is_second_over), None)
 
 
 def is_day_first(columns: Collection[Iterable[str]]) -> bool:
-    """Decide if the day precedes the month in dates such as 05/06/2024.
+    """Decide if the day precedes the month in dates such as 05/06/2024, the `ambiguous_dates` of similar columns.
 
-    `columns`: the `ambiguous_dates` of columns with the same format. These criteria are applied in turn until one
-    decides:
+    These criteria are applied in turn until one decides:
 
     - A date has a number over 12 (`explicit_order`).
     - No column goes back in time with one order, but some column does with the other.
@@ -194,10 +183,7 @@ def is_day_first(columns: Collection[Iterable[str]]) -> bool:
 
 
 def _ordinal_day(text: str, day_first: bool) -> int:
-    """Compute the day number (`date.toordinal`) of a date such as 05/06/2024; 0 if there is no such day.
-
-    `day_first`: True if the day precedes the month.
-    """
+    """Compute the day number (`date.toordinal`) of a date such as 05/06/2024; 0 if there is no such day."""
     first, second, year = _date_numbers(text)
     try:
         return date(year, *((second, first) if day_first else (first, second))).toordinal()
@@ -221,10 +207,7 @@ def _is_datetime(text: str) -> bool:
 
 
 def counts_from_1970(clock: float) -> bool:
-    """Test whether a clock reading [s] counts from 1970, rather than from the start of a machine.
-
-    A reading counts from 1970 if it then means a time between March 1973 and the year 5138.
-    """
+    """Test whether a clock reading [s] counts from 1970, i.e. then means a time from March 1973 to 5138."""
     return _MIN_EPOCH < clock < _MAX_EPOCH
 
 
@@ -251,10 +234,7 @@ def parse_epoch(stamp: str) -> float | None:
 
 
 def _format_clock(text: str) -> str:
-    """Rewrite a time of day as `hour:minute:second.fraction`.
-
-    `59:59.9` has no hour; the last part of `12:00:00:250` is the fraction.
-    """
+    """Rewrite times of day such as `120000`, `59:59.9` and `12:00:00:250` as `hour:minute:second.fraction`."""
     text = text.replace(",", ".")
     if ":" not in text:
         return f"{text[:2]}:{text[2:4]}:{text[4:]}"
@@ -264,10 +244,7 @@ def _format_clock(text: str) -> str:
 
 
 def _iso_date(parts: Mapping[str, str | None], day_first: bool) -> str:
-    """Format the date of a stamp, given by its parts, in ISO form; 1970-01-01 for a time of day without a date.
-
-    `day_first`: True if the day precedes the month in dates such as 05/06/2024.
-    """
+    """Format the date in a stamp's parts in ISO form, 1970-01-01 without one; `day_first` as in 31/12/2024."""
     if days := parts.get("days"):  # a duration
         return str(np.datetime64(_NO_DATE) + int(days))
     year, month, day = (parts.get(name) for name in ("year", "month", "day"))
@@ -280,10 +257,9 @@ def _iso_date(parts: Mapping[str, str | None], day_first: bool) -> str:
 def nominal_rate(t: Array) -> float:
     """Estimate the nominal sampling rate [Hz] of times `t` (n,) [s].
 
-    The estimate is the decimal number with the fewest digits that agrees with the reciprocal of the mean interval, to
-    within the rounding of the times. If the times do not increase throughout, or deviate from an even spacing by
-    `_MAX_ROUNDING` intervals or more, the median of the positive intervals is used instead of the mean. Raises
-    InputError if no interval is positive.
+    It is the decimal number with the fewest digits that agrees with the reciprocal of the mean interval, to within the
+    rounding of the times. For times that do not increase throughout or are uneven (`_MAX_ROUNDING`), the median of the
+    positive intervals is used instead. Raises InputError if no interval is positive.
     """
     steps = np.diff(t)
     span = float(t[-1] - t[0])
@@ -310,12 +286,10 @@ def is_falling(times: NDArray[Any]) -> bool:
 
 
 def _convert_stamps(values: NDArray[np.datetime64], name: str, state: TimeState) -> _Seconds:
-    """Convert date stamps (n,) of a time column to seconds from the first stamp.
+    """Convert date stamps (n,) of the time column `name` to seconds from the first stamp.
 
-    Returns (times (n,) [s], provenance of the start, lines for the history). Times of day without a date continue from
-    part to part of a log, from the last time in `state`; their jumps back at midnight or at the full hour are removed.
-    From stamps with a date, a single jump by an hour in the night, as of daylight saving time, is removed. `name`: the
-    column in messages. Raises InputError if no row has a stamp.
+    Times of day without a date continue from the last time in `state`; their jumps back at midnight or at the full hour
+    are removed, and of dated stamps a single jump by an hour in the night, as of daylight saving time.
     """
     nanoseconds = values.astype("datetime64[ns]")
     known = ~np.isnat(nanoseconds)
@@ -351,8 +325,7 @@ def _remove_jumps(t: Array, step: float, single: bool) -> Array | None:
     """Remove clock jumps of `step` [s], such as -86400 s at midnight, from times (n,).
 
     An interval is a jump if it differs from `step` plus the median interval by at most `_TOLERANCE` median intervals.
-    None if there is no jump, if there are several although `single` permits only one, or if intervals are so long that
-    ordinary ones could look like jumps.
+    None without a jump, with several if only a `single` one may be, or if ordinary intervals could look like jumps.
     """
     steps = np.diff(t)
     positive_steps = steps[np.isfinite(steps) & (steps > 0)]
@@ -369,10 +342,8 @@ def _remove_jumps(t: Array, step: float, single: bool) -> Array | None:
 def _convert_numbers(values: Array, unit: str | None, name: str, state: TimeState) -> _Seconds:
     """Convert a time column of numbers (n,) to seconds.
 
-    Returns (times (n,) [s], provenance of the start, lines for the history). `unit`: unit of the column, which may also
-    state an origin, as in `days since 1899-12-30`; None if it is to be guessed from the magnitude of the numbers. Two
-    arguments serve only this guess: `name`, the column in messages, and `state`, the state of the column after the
-    previous part of the log, which is updated. Raises InputError if no row has a number.
+    `unit`: may state an origin, as in `days since 1899-12-30`; None if it is to be guessed from the numbers. Only this
+    guess needs `name`, the column in messages, and `state`, that after the previous part of the log, which is updated.
     """
     finite = values[np.isfinite(values)]
     if not finite.size:
@@ -396,12 +367,10 @@ def _convert_numbers(values: Array, unit: str | None, name: str, state: TimeStat
 
 
 def _convert_without_unit(values: Array, finite: Array, name: str, state: TimeState) -> _Seconds:
-    """Convert a time column of numbers (n,) without a unit to seconds.
+    """Convert a time column of numbers (n,) without a unit to seconds; `finite` (m,) are the finite ones of `values`.
 
-    Returns (times (n,) [s], provenance of the start, lines for the history). A log may be read in parts. The size and
-    the steps of the finite values of the first part tell for the whole log whether the numbers are days or seconds, and
-    from which date they count. `finite` (m,): the finite `values` of this part; `name`: name of the column in messages;
-    `state`: state of the column after the previous part, which is updated. Raises InputError if the numbers count rows.
+    The finite values of a log's first part, kept in `state`, tell for all parts whether the numbers are days or
+    seconds, and from which date they count. Raises InputError if they count rows.
     """
     first = float(finite[0])
     is_first_part = state.head is None
@@ -431,12 +400,11 @@ def _convert_without_unit(values: Array, finite: Array, name: str, state: TimeSt
 
 
 def _detect_days(values: Array) -> tuple[np.datetime64 | None, str] | None:
-    """Find out if the numbers (n,) of a time column without a unit count days.
+    """Find out if the numbers (n,) of a time column without a unit count days: (origin, meaning in words), else None.
 
-    Returns (origin, meaning in words), or None if the numbers do not count days. They count days if the steps between
-    them, taken as seconds, would be shorter than those of any logger, and if one of two conditions is met. Either the
-    first number, counted as spreadsheets or MATLAB count days, is a date from 1982 to 2078. Or all numbers lie between
-    0 and 1: they are fractions of a day, and the origin is None.
+    They do if the steps between them, taken as seconds, would be shorter than those of any logger, and if the first,
+    counted as spreadsheets or MATLAB count days, is a date from 1982 to 2078, or if all lie between 0 and 1: they are
+    fractions of a day, and the origin is None.
     """
     steps = np.diff(values)
     steps = steps[steps > 0]
@@ -491,9 +459,8 @@ def time_base(
 def _space_shared_times(t: Array, state: TimeState) -> tuple[float, Array] | None:
     """Spread samples that share a time, because the times of the log have coarse steps, evenly over these steps.
 
-    `t` (n,): times [s]. Returns (step [s], new times (n,)). None if a time is missing, if the times step back, or
-    unless all steps have about equally many samples, at least two. If a part of a log is too short for estimating the
-    step, step and rate are those in `state`, unless the part has a gap.
+    Returns (step [s], new times (n,)) for the times `t` (n,) [s]; None if a time is missing or steps back, or unless
+    all steps have about equally many samples, at least two. Too short a part of a log has step and rate of `state`.
     """
     steps = np.diff(t)
     changes = np.flatnonzero(steps)  # indices of the last samples before the time changes

@@ -23,9 +23,8 @@ _UNIT_WITH_QUANTITY = re.compile(r"([^()]{0,20})\([^()]{0,40}\)")
 def apply_descriptions(labels: Sequence[Label], rows: Sequence[Sequence[str]]) -> list[Label]:
     """Replace the names of columns by the descriptions that a user has entered for them in the logger.
 
-    Descriptions are in a table of channels above the heading, or in a row of labels, whose first cell is `label` or
-    `labels`. `rows`: cells of the lines above the heading, and of the heading's rows of labels. A description may state
-    the unit if the heading does not. The replaced names are kept in `Label.called`.
+    They are in a table of channels above the heading, or in a row of labels, whose first cell is `label` or `labels`.
+    `rows`: cells of all these lines. A description may state the unit. Replaced names are kept in `Label.called`.
     """
     names: dict[str, str] = {}
     name_column: int | None = None
@@ -50,18 +49,12 @@ def _fold(text: str) -> str:
 
 
 def _column_key(label: Label) -> str:
-    """Return the last word of a column's name, in lower case, by which its description is found.
-
-    The words before it may be the name of a group of columns.
-    """
+    """Return the last word of a column's name, folded, as the words before it may name a group of columns."""
     return _fold(label.name.rpartition(" ")[2] or label.name)
 
 
 def _rename_label(label: Label, description: str) -> Label:
-    """Replace the name of a column by its description, unless that is empty, too long or the same as the name.
-
-    The last word of the old name, the column's short name, is kept in `called`.
-    """
+    """Replace a column's name by a new, short description, and keep its last word, the short name, in `called`."""
     if not description or len(description) > _MAX_NAME or _fold(description) == _column_key(label):
         return label
     renamed = Label.parse(description)  # it may end in a unit
@@ -70,11 +63,10 @@ def _rename_label(label: Label, description: str) -> Label:
 
 
 def parse_scope_heading(lines: Sequence[str], delimiter: str) -> tuple[list[Label], int] | None:
-    """Parse the heading of a TwinCAT Scope export to (labels of the columns, number of heading lines).
+    """Parse the heading of a TwinCAT Scope export to (labels of the columns, number of heading lines); None for others.
 
-    None for any other text. `lines`: the lines above the first sample; `delimiter`: separator of cells. Each row of the
-    heading has one property, such as the unit: above each time column the name of the property, and above each channel
-    its value. Times are in milliseconds since the start of the export.
+    `lines`: those above the first sample. Each row has one property, such as the unit: above each time column [ms] the
+    name of the property, and above each channel its value.
     """
     rows = [[cell.strip() for cell in line.split(delimiter)] for line in lines]
     # the last row of names; a row of two cells is a remark on the file
@@ -92,11 +84,10 @@ def parse_scope_heading(lines: Sequence[str], delimiter: str) -> tuple[list[Labe
 
 
 def split_pairs(labels: Sequence[Label]) -> list[Label]:
-    """Rename the columns of a table in which each channel has its own time column; other tables stay as they are.
+    """Rename the columns of a table in which a time column X precedes each channel Y; other tables stay as they are.
 
-    Columns of times X and of values Y alternate. They are named like `X [s], p_A [bar], X [s], p_B [bar]`, or like
-    `p_A X, p_A Y [bar], p_B X, p_B Y [bar]`. The times become `t`, in seconds if they have no unit; the values get the
-    channels' names.
+    Names are like `X [s], p_A [bar], X [s], p_B [bar]`, or like `p_A X, p_A Y [bar], p_B X, p_B Y [bar]`. The times
+    become `t`, in seconds if they have no unit; the values get the channels' names.
     """
     times, values = labels[::2], labels[1::2]
     are_times = all(label.unit is None or same_dimension(label.unit, "s") for label in times)

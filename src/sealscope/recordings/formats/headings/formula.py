@@ -25,10 +25,7 @@ K = TypeVar("K")
 
 @dataclass(frozen=True)
 class Formula(Generic[K]):
-    """A linear formula: `constant` plus the sum of columns times `factors`.
-
-    `factors`: name or number of a column -> factor; `unit`: unit of the result, None if it is not stated.
-    """
+    """A linear formula: `constant` plus the sum of columns, by name or number, times `factors`, in `unit` if known."""
 
     factors: Mapping[K, float]
     constant: float = 0.0
@@ -40,20 +37,14 @@ class Formula(Generic[K]):
         return next(iter(self.factors)) if self.constant == 0.0 and [*self.factors.values()] == [1.0] else None
 
     def plus(self, other: Formula[K], times: float = 1.0) -> Formula[K]:
-        """Return the sum of this formula and another one, which is multiplied by the number `times`.
-
-        The sum states no unit.
-        """
+        """Add `times` another formula to this one; the sum states no unit."""
         factors = dict(self.factors)
         for name, factor in other.factors.items():
             factors[name] = factors.get(name, 0.0) + times * factor
         return Formula(factors, self.constant + times * other.constant)
 
     def values(self, columns: Mapping[K, Array]) -> Array:
-        """Compute the values (n,) of the formula, in its unit, from the samples (n,) of its columns.
-
-        If the formula is a single column (`column`), its array itself is returned, not a copy.
-        """
+        """Compute the values (n,), in the formula's unit, from its columns (n,); a single column is not copied."""
         if self.column is not None:
             return columns[self.column]
         with np.errstate(over="ignore", invalid="ignore"):
@@ -62,11 +53,9 @@ class Formula(Generic[K]):
 
 
 def parse_formula(text: str) -> Formula[str]:
-    """Parse the text of a formula and the unit after it, such as `2*(ch1 - 0.5) + ch2/4 bar`.
+    """Parse the text of a formula and the unit after it, such as `2*(ch1 - 0.5) + ch2/4 bar`, without evaluating it.
 
-    Sums, brackets, products with numbers and quotients by numbers are permitted. The formula is the longest possible
-    beginning of the text; it is parsed as Python but never evaluated. Raises InputError for any other text, such as a
-    product of two columns.
+    The formula is the longest possible beginning of the text. Raises InputError if there is none that is linear.
     """
     if len(text) > _MAX_LENGTH:
         raise InputError(f"{_RULE}, got {len(text)} signs")
@@ -74,7 +63,7 @@ def parse_formula(text: str) -> Formula[str]:
         names: list[str] = []
 
         def replace_name(match: re.Match[str], names: list[str] = names) -> str:
-            """Append the name of a column to `names`, and return `columnN`, a name that Python can parse, instead."""
+            """Append a column's name to `names`; return `columnN`, which Python can parse, instead."""
             names.append(match[1] or match[2])
             return _COLUMN.format(len(names) - 1)
 
@@ -91,10 +80,7 @@ def parse_formula(text: str) -> Formula[str]:
 
 
 def _parse_linear(tree: ast.expr, names: list[str]) -> Formula[str]:
-    """Convert Python's syntax tree of a formula to a Formula; raise ValueError if it is not linear.
-
-    The name `columnN` in the tree stands for the column `names[N]`.
-    """
+    """Convert the syntax tree of a formula, in which `columnN` is `names[N]`; raise ValueError if it is not linear."""
     empty = Formula[str]({})  # `empty.plus(formula, number)` is `formula` times `number`
     match tree:
         case ast.Name(id=name):

@@ -17,23 +17,16 @@ _TRAILING_UNIT = re.compile(r"(?P<name>.{1,80}?)(?:\s+in\s+|\s*/|\s*,\s+)(?P<uni
 
 @dataclass(frozen=True)
 class Label:
-    """Heading of a column of a table.
+    """Heading of a column of a table."""
 
-    `whole`: the heading as written; `name`: the heading without the unit; `unit`: the unit, or None; `called`: the
-    logger's name of the column if `name` is a description that the user has entered for the channel, else "".
-    """
-
-    whole: str
-    name: str
+    whole: str  # the heading as written
+    name: str  # the heading without the unit
     unit: str | None = None
-    called: str = ""
+    called: str = ""  # the logger's name of the column if `name` is the description that the user has entered
 
     @classmethod
     def parse(cls, text: str, unit: str | None = None) -> Label:
-        """Parse a heading such as `p_A [psi]`, `p_A (psi)`, `p_A / psi` or `p_A in psi` into name and unit.
-
-        `unit`: unit that is stated elsewhere, such as in a row of units, and takes precedence.
-        """
+        """Parse a heading such as `p_A [psi]`, `p_A / psi` or `p_A in psi`; a `unit` from elsewhere counts first."""
         whole = text.strip().translate(_WIDE_BRACKETS)
         name, bracket_text = split_square_brackets(whole)
         if bracket_text is not None:

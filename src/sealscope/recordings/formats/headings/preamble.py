@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
+from typing import Any
 
 import numpy as np
 
@@ -31,10 +32,9 @@ _QUANTITY = re.compile(r"(?P<number>[+-]?\d{1,12}(?:[.,]\d{1,12})?(?:[eE][+-]?\d
 
 
 def stated_rate(remarks: Mapping[str, str]) -> float | None:
-    """Find the sampling rate [Hz] in the remarks of a file; None if it is not stated.
+    """Find the sampling rate [Hz], or the interval, first stated in the remarks of a file; None if there is none.
 
-    A remark may state the rate or the interval between samples, with its unit after the number, in the name or not at
-    all. The first remark with a positive number counts.
+    Its unit may stand after the number, in the remark's name or not at all.
     """
     for name, text in remarks.items():
         label = Label.parse(name)
@@ -66,11 +66,7 @@ def scope_start(remarks: Mapping[str, str]) -> np.datetime64 | None:
 
 
 def collect_remarks(pairs: Iterable[tuple[object, object]]) -> dict[str, str]:
-    """Collect remarks on a recording, name -> text, from pairs of name and text.
-
-    Names and texts are made printable and shortened. Of several remarks with one name the first is kept, and at most
-    `_MAX_REMARKS` in all.
-    """
+    """Collect up to `_MAX_REMARKS` pairs of name and text, made printable and shortened, the first of equal names."""
     remarks: dict[str, str] = {}
     for name, value in pairs:
         key, text = _clean_text(str(name), _MAX_NAME), _clean_text(str(value), _MAX_TEXT)
@@ -81,21 +77,19 @@ def collect_remarks(pairs: Iterable[tuple[object, object]]) -> dict[str, str]:
     return remarks
 
 
-def clean_remarks(provenance: Mapping[str, object]) -> dict[str, str]:
-    """Return the remarks on a recording, name -> text, made printable and shortened (`collect_remarks`).
+def collect_attributes(attributes: Mapping[Any, object]) -> dict[str, str]:
+    """Collect the remarks on a recording, name -> text, among the attributes of its file: texts and numbers."""
+    return collect_remarks(pair for pair in attributes.items() if isinstance(pair[1], str | int | float))
 
-    The remarks were read from the header of the file, and are in the entry `about` of the `provenance`. The result is
-    empty without this entry.
-    """
+
+def clean_remarks(provenance: Mapping[str, object]) -> dict[str, str]:
+    """Return the remarks from a file's header (`about` in the `provenance`), name -> text, printable and shortened."""
     remarks = provenance.get("about")
     return collect_remarks(remarks.items()) if isinstance(remarks, Mapping) else {}
 
 
 def parse_remarks(lines: Sequence[str], delimiter: str) -> dict[str, str]:
-    """Parse the remarks in the lines above a log's heading to name -> text.
-
-    A remark is written as in `Operator: N. N.`, `Oil = 40 degC` or `Date;2024-05-31`, with the delimiter of the log.
-    """
+    """Parse the remarks above a log's heading, such as `Operator: N. N.`, `Oil = 40 degC` or `Date;2024-05-31`."""
     pairs: list[tuple[str, str]] = []
     for line in lines[: 4 * _MAX_REMARKS]:
         text = line.strip().lstrip("#%/!\" '").strip()[:500]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import unicodedata
 from collections.abc import Mapping, Sequence
+from itertools import repeat
 from typing import NamedTuple
 
 from sealscope.recordings.channels import CHANNEL_UNITS
@@ -30,17 +31,16 @@ _LAST_WORD = re.compile(r"(?<=[a-z\d])[A-Z]+[a-z]*$")
 #: The number at the end of repeated names of columns, as in `X_Value.1`.
 _COUNTED = re.compile(r"[. _]?\d{1,3}$")
 _MAX_NAME = 80
+_UMLAUTS = str.maketrans(
+    {"ä": "ae", "ö": "oe", "ü": "ue", "ß": "ss", "Ä": "Ae", "Ö": "Oe", "Ü": "Ue", "ł": "l", "Ł": "L"}
+)
 
 
 class _Guess(NamedTuple):
-    """Guessed meaning of a column, from its name and its unit.
+    """Guessed meaning of a column, from its name and its unit."""
 
-    `kind`: the quantity, such as "pressure"; `side`: "A" or "B" for a chamber, "pump", "pump 1" or "pump 2" for a port
-    of the pump, "1" or "2" if only this number is known, or "" (`_find_side`); `unit`: the unit, or None.
-    """
-
-    kind: str
-    side: str
+    kind: str  # the quantity, such as "pressure"
+    side: str  # of the machine, as from `_find_side`
     unit: str | None
 
     @property
@@ -54,9 +54,8 @@ class _Guess(NamedTuple):
 def proposed_map(labels: Sequence[Label]) -> dict[str, str]:
     """Propose a map, channel (or ``t``) -> column, for the columns whose names reveal their meaning.
 
-    Columns that already have a channel's name are left out, and so are channels for which several columns are equally
-    likely. A unit at the end of a name (``PA_bar``) becomes the unit of the column. The map is empty if it would
-    contain only the time.
+    Columns with a channel's name and equally likely columns are left out. A unit at the end of a name (``PA_bar``)
+    becomes the unit of the column. The map is empty if it would contain only the time.
     """
     channel_names = {label.name.casefold() for label in labels} & {name.casefold() for name in CHANNEL_UNITS}
     head_side = _find_head_side(labels)  # the chamber that the word "head" means in these names
@@ -99,7 +98,7 @@ def format_map(channel_map: Mapping[str, str]) -> str:
 
 
 def is_time(label: Label) -> bool:
-    """Return True if the name of a column means a time, possibly with a number at its end."""
+    """Test whether the name of a column means a time, possibly with a number at its end."""
     guess = _guess_meaning(label)
     return _is_named_time(label) or (guess is not None and guess.kind == "time")
 
@@ -150,11 +149,13 @@ def split_unit(name: str) -> tuple[str, str | None]:
     return name, None
 
 
-def ends_in(name: str, words: str) -> bool:
-    """Return True if the name of a column ends in `words`.
+def _find_name_and_unit(label: Label) -> tuple[str, str | None]:
+    """Find name and unit of a column; without a unit in its heading, that at the end of its name, or None."""
+    return split_unit(label.name) if label.unit is None else (label.name, label.unit)
 
-    For example, `ADC1_Channel_2` ends in `ch2`, and `Main_Pa` in `Pa`.
-    """
+
+def ends_in(name: str, words: str) -> bool:
+    """Test whether the name of a column ends in `words`, as `ADC1_Channel_2` in `ch2` and `Main_Pa` in `Pa`."""
     token_lists = ([token.casefold() for token in _TOKEN.findall(_strip_accents(text))] for text in (name, words))
     # `ch`, `channel` and the like are equal
     name_tokens, ending = (["channel" if word in WORDS["input"] else word for word in tokens] for tokens in token_lists)
@@ -163,15 +164,12 @@ def ends_in(name: str, words: str) -> bool:
 
 def is_temperature(label: Label) -> bool:
     """Test whether the unit of a column, in its heading or at the end of its name, is one of temperature."""
-    unit = split_unit(label.name)[1] if label.unit is None else label.unit
+    _name, unit = _find_name_and_unit(label)
     return unit is not None and same_dimension(unit, "K")
 
 
 def is_measured(label: Label) -> bool:
-    """Return True if a column is a measured pressure, position, speed or flow, by its name or unit.
-
-    Set points, and values computed from other columns, are not measured.
-    """
+    """Test whether a column is a measured pressure, position, speed or flow, not a set point or computed."""
     if len(label.name) > _MAX_NAME:
         return False
     name, unit_of_name = split_unit(label.name)
@@ -181,31 +179,22 @@ def is_measured(label: Label) -> bool:
         return False
     if unit is not None:
         measured_units = ("Pa", "m", "rad/s", "m/s", "m^3/s")
-        return unit in WORDS["rotation_units"] or any(
-            same_dimension(unit, measured_unit) for measured_unit in measured_units
-        )
+        return unit in WORDS["rotation_units"] or any(map(same_dimension, repeat(unit), measured_units))
     kinds = (*(_MEASURED[kind] for kind in ("pressure", "position", "speed")), _KIND["supply"], _KIND["velocity"])
     return len(name) > 1 and any(words & known for known in kinds)
 
 
 def _strip_accents(text: str) -> str:
     """Remove accents from a text, and write umlauts as two letters: `ä` becomes `ae`."""
-    for umlaut, letters in zip("äöüßÄÖÜłŁ", ("ae", "oe", "ue", "ss", "Ae", "Oe", "Ue", "l", "L"), strict=True):
-        text = text.replace(umlaut, letters)
-    return "".join(
-        character for character in unicodedata.normalize("NFKD", text) if not unicodedata.combining(character)
-    )
+    decomposed = unicodedata.normalize("NFKD", text.translate(_UMLAUTS))
+    return "".join(character for character in decomposed if not unicodedata.combining(character))
 
 
 def _split_words(name: str) -> set[str]:
-    """Split a name into its words, in lower case.
+    """Split a name into its words, in lower case, and parts of words.
 
-    The result also contains parts of words:
-
-    - both parts of a German compound with a known ending, such as `kolbenseite` and `druck` of `kolbenseitendruck`, the
-      first part also without the letter n or s that links them;
-    - both letters of `pa` and `pb`, i.e. `p` and the side;
-    - known words of languages without spaces, such as Chinese.
+    Parts are both parts of a German compound with a known ending, such as `kolbenseite` and `druck`, without a linking
+    n or s; both letters of `pa` and `pb`; and known words of languages without spaces, such as Chinese.
     """
     words = {word for word in _UNSPACED if word in name}
     for token in (token.casefold() for token in _TOKEN.findall(_strip_accents(name))):
@@ -217,10 +206,7 @@ def _split_words(name: str) -> set[str]:
 
 
 def _find_head_side(labels: Sequence[Label]) -> str:
-    """Find the chamber, "A" or "B", that columns called "head" mean; "" if that is not known.
-
-    The chamber is A if some column is called rod or the like, else B if some column is called cap or the like.
-    """
+    """Find the chamber that "head" means: "A" if a column is called rod or the like, "B" if cap, "" if unknown."""
     words = {word for label in labels if len(label.name) <= _MAX_NAME for word in _split_words(label.name)}
     if not words & _SIDE["head"]:
         return ""
@@ -229,21 +215,17 @@ def _find_head_side(labels: Sequence[Label]) -> str:
 
 
 def _guess_meaning(label: Label, head_side: str = "") -> _Guess | None:
-    """Guess the meaning of a column from its name and unit; None if it is not known.
-
-    The unit is that of the heading, else that at the end of the name. `head_side`: the chamber, "A" or "B", that the
-    word "head" means in this file, or "" if that is not known.
-    """
+    """Guess the meaning of a column, or None; "head" means the chamber `head_side`, "A" or "B", or "" if unknown."""
     if len(label.name) > _MAX_NAME:
         return None
-    name, unit = split_unit(label.name)
-    words = _split_words(name if label.unit is None and unit is not None else label.name)
-    unit = label.unit if label.unit is not None else unit
+    name, unit = _find_name_and_unit(label)
+    words = _split_words(name)
     side = head_side if words & _SIDE["head"] and head_side else _find_side(words)
     if unit is not None and same_dimension(unit, "Pa"):
         return None if words & (_KIND["other"] | _KIND["wanted"]) else _Guess("pressure", side, unit)
     if unit is not None and same_dimension(unit, "K"):  # before `other`, whose words include oil
-        is_oil = words & _KIND["oil"] or _is_unnamed_temperature(words)
+        # the oil's, or of nothing that is named, as in `TT101` or `Temp 1`
+        is_oil = words & _KIND["oil"] or {word for word in words if not word.isdigit()} <= _KIND["temperature"]
         return _Guess("oil", "", unit) if is_oil else None
     if words & _MEASURED["spool"]:
         return _Guess("spool", "", unit) if unit is None or _is_command_unit(unit) else None
@@ -268,39 +250,27 @@ def _guess_meaning(label: Label, head_side: str = "") -> _Guess | None:
     return None
 
 
-def _is_unnamed_temperature(words: set[str]) -> bool:
-    """Return True if the words of a column's name mean a temperature but not of what, as in `TT101` or `Temp 1`."""
-    return {word for word in words if not word.isdigit()} <= _KIND["temperature"]
-
-
 def _is_command_unit(unit: str) -> bool:
     """Test whether a command can have this unit: a voltage, a current or a fraction of full scale."""
     return is_current_or_fraction(unit) or same_dimension(unit, "V")
 
 
 def is_current_or_fraction(unit: str) -> bool:
-    """Return True if a unit is one of current or of a fraction of full scale, such as %; both occur for commands."""
+    """Test whether a unit is one of current or of a fraction of full scale, such as %; both occur for commands."""
     return unit in _FRACTION_UNITS or same_dimension(unit, "A")
 
 
 def _guess_at_valve(label: Label, kind: str) -> _Guess | None:
-    """Guess from its name and unit if a column is a pressure before or behind a valve; None for other columns.
-
-    `kind`: "before" or "behind", the side to test. Returns the guessed meaning, in which no side is stated.
-    """
-    name, ending = split_unit(label.name)
-    unit = ending if label.unit is None else label.unit
-    words = _split_words(name if label.unit is None else label.name)
+    """Guess if a column is a pressure at the side `kind` of a valve, "before" or "behind"; None for other columns."""
+    name, unit = _find_name_and_unit(label)
+    words = _split_words(name)
     if unit is None or not same_dimension(unit, "Pa") or not words & _KIND[kind] or words & _KIND["wanted"]:
         return None
     return _Guess("pressure", "", unit)
 
 
 def suggest_map_entry(label: Label) -> str:
-    """Format the entry of a map for a column and its likely channel: `q_pump=Flow [l/min]`.
-
-    The channel is `CHANNEL` if it is not known.
-    """
+    """Format the entry of a map for a column and its likely channel, else `CHANNEL`: `q_pump=Flow [l/min]`."""
     guess = _guess_meaning(label)
     channel = None if guess is None else guess.channel
     if guess is not None and guess.kind == "flow":  # to either side of the cylinder
@@ -314,8 +284,7 @@ def suggest_map_entry(label: Label) -> str:
 def _find_side(words: set[str]) -> str:
     """Find the side of the machine that the words of a name mean; "" if it is not known.
 
-    The result is "A" or "B" for a chamber; "pump", "pump 1" or "pump 2" for a port of the pump; or "1" or "2" if only
-    this number is known.
+    The result is "A" or "B" for a chamber, "pump", "pump 1" or "pump 2" for a port, or "1" or "2" for only a number.
     """
     is_a, is_b = bool(words & _SIDE["A"]), bool(words & _SIDE["B"])
     number = next((digit for digit in ("1", "2") if digit in words), "")

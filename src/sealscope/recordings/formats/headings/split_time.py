@@ -24,11 +24,10 @@ _MIN_FRACTION = 0.9
 
 
 def find_time_parts(labels: Sequence[Label], used: Container[int], only_subsecond: bool = False) -> dict[str, int]:
-    """Find the columns that together form the time: part of the time, such as "hour" -> column.
+    """Find the columns that together form the time: part of the time, such as "hour" -> column; `used` are ignored.
 
-    There must be one column each of hours, minutes and seconds; otherwise the result is empty. Columns of milli-,
-    micro- and nanoseconds are added, and year, month and day if all three exist. With `only_subsecond`, the result has
-    only milli-, micro- and nanoseconds, which accompany a time column of whole seconds. `used`: columns to ignore.
+    Hours, minutes and seconds must have one column each. Parts of a second are added, and year, month and day if all
+    three exist. With `only_subsecond`, parts of a second beside a time column of whole seconds are found.
     """
     columns_of_part: dict[str, int] = {}
     for part, words in WORDS["part"].items():
@@ -51,9 +50,8 @@ def find_time_parts(labels: Sequence[Label], used: Container[int], only_subsecon
 def combine_time_parts(base: NDArray[Any], parts: Mapping[str, Array], unit: str | None) -> NDArray[Any] | None:
     """Combine several columns of a time, such as date, hours and minutes, to time stamps or seconds (n,).
 
-    `base` (n,): the time column, datetime64 or doubles in `unit`; if there is a part "hour", only the dates of `base`
-    are used. `parts`: part of the time, such as "hour" -> values (n,). None if the values cannot be parts of this time,
-    such as fractional hours, or milliseconds since the start.
+    `base` (n,): the time column, datetime64 or doubles in `unit`; only its dates count beside a part "hour". `parts`:
+    part -> values (n,). None if these cannot be parts of a time, such as milliseconds since the start.
     """
     subsecond_parts = [part for part in _SUBSECOND if part in parts]
     smallest_part = subsecond_parts[-1] if subsecond_parts else "second"
@@ -81,7 +79,7 @@ def combine_time_parts(base: NDArray[Any], parts: Mapping[str, Array], unit: str
 
 
 def _restarts_each_second(base: NDArray[Any], offset: Array) -> bool:
-    """Return True if parts of a second grow within each second and fall at the next second, as they should.
+    """Test whether parts of a second grow within each second and fall at the next second, as they should.
 
     `base` (n,): whole seconds or stamps; `offset` (n,): the parts of a second. A tenth of the steps may differ. False
     if fewer than half of the steps are within a second, because the parts then show no order.
@@ -97,10 +95,7 @@ def _restarts_each_second(base: NDArray[Any], offset: Array) -> bool:
 
 
 def _date_stamps(base: NDArray[Any], parts: Mapping[str, Array]) -> NDArray[np.datetime64]:
-    """Build date stamps (n,) at midnight from the columns year, month and day in `parts`, else from `base` (n,).
-
-    They are 1970-01-01 if neither has dates.
-    """
+    """Build stamps (n,) at midnight from year, month and day in `parts`, else from `base` (n,), else of 1970-01-01."""
     if all(part in parts for part in _DATE):
         year, month, day = (np.nan_to_num(parts[part], nan=1.0) for part in _DATE)
         # months since 1970, as numpy counts them

@@ -1,7 +1,6 @@
 """Recordings in an archive (.gz, .bz2, .xz, .zst, .zip, .tar), unpacked into a private folder while they are read.
 
-A subprocess unpacks them (`run_in_subprocess`), and stops if the output exceeds the limit for an archive of this
-size.
+A subprocess unpacks them (`run_in_subprocess`), and stops if the output exceeds the limit for an archive of this size.
 """
 
 from __future__ import annotations
@@ -34,19 +33,13 @@ _CHUNK, _MEMORY = 2**20, 2**30
 
 
 def is_workbook(path: Path) -> bool:
-    """Return True if a ZIP archive is a spreadsheet; raise UnreadableFile if it is damaged.
-
-    The archive is opened in a subprocess with a time limit.
-    """
+    """Test whether a ZIP archive is a spreadsheet, in a subprocess; raise UnreadableFile if it is damaged."""
     with raising_unreadable("a zip archive", path):
         return _run_limited(_is_workbook, path)
 
 
 def _run_limited(work: Callable[..., T], path: Path, *arguments: Any) -> T:
-    """Run `work(path, *arguments)` in a subprocess and return its result.
-
-    The time limit grows with the size of the file, as `_BASE_TIME` + size / `_MIN_SPEED`.
-    """
+    """Run `work(path, *arguments)` in a subprocess whose time limit grows with the file, and return its result."""
     limit = _BASE_TIME + path.stat().st_size / _MIN_SPEED
     return run_on_file(work, path, *arguments, limit=limit, memory=_MEMORY)
 
@@ -59,11 +52,10 @@ def _is_workbook(path: Path) -> bool:
 
 @contextmanager
 def unpack(path: Path, kind: str, max_bytes: int) -> Iterator[Path]:
-    """Unpack the single file of an archive, yield its path, and remove it at the end.
+    """Unpack the single file of a `kind` of archive, such as "zip", yield its path, and remove it at the end.
 
-    `kind`: kind of the archive, such as "zip". Raises UnreadableFile if a ZIP or tar contains no recording or
-    several, if the archive is damaged, or if it unpacks to more than `max_bytes` or half of the free disk space.
-    Raises MissingExtra for .zst without pyarrow.
+    Raises UnreadableFile without a single recording, if the archive is damaged, or if it unpacks to more than
+    `max_bytes` or half of the free disk space. Raises MissingExtra for .zst without pyarrow.
     """
     with tempfile.TemporaryDirectory(prefix="sealscope-") as folder:
         max_bytes = min(max_bytes, shutil.disk_usage(folder).free // 2)
@@ -73,10 +65,7 @@ def unpack(path: Path, kind: str, max_bytes: int) -> Iterator[Path]:
 
 
 def _unpack(path: Path, kind: str, folder: Path, max_bytes: int) -> Path:
-    """Unpack the single file of an archive into a folder, and return the path of the unpacked file.
-
-    `kind`: kind of the archive, such as "zip". Raises UnreadableFile if the file has more than `max_bytes`.
-    """
+    """Unpack the single file of an archive into a folder, up to `max_bytes`, and return its path."""
     name = path.stem if path.suffix.lower() in _SUFFIXES else path.name
     with _open_member(path, kind) as (source, member, size):
         check_unpacked(size, max_bytes, path)
@@ -91,10 +80,7 @@ def _unpack(path: Path, kind: str, folder: Path, max_bytes: int) -> Path:
 
 @contextmanager
 def _open_member(path: Path, kind: str) -> Iterator[tuple[IO[bytes], str, int]]:
-    """Open the single file in an archive; yield (stream, name, size [bytes]).
-
-    `kind`: kind of the archive, such as "zip". For kinds other than "zip" and "tar", name and size are "" and 0.
-    """
+    """Open the single file in a `kind` of archive; yield (stream, name, size [bytes]), "" and 0 if not known."""
     with ExitStack() as stack:
         if kind == "zip":
             zip_archive = stack.enter_context(zipfile.ZipFile(path))
@@ -115,10 +101,7 @@ def _open_member(path: Path, kind: str) -> Iterator[tuple[IO[bytes], str, int]]:
 
 
 def _select_recording(names: Sequence[str], path: Path) -> str:
-    """Select the only recording among the names of an archive's files, leaving out documents such as a readme.
-
-    Raises UnreadableFile if there is no recording or several; `path`: the archive.
-    """
+    """Select the only recording among an archive's files, documents aside; raise UnreadableFile if there is not one."""
     names = [name for name in names if "__MACOSX" not in name and not Path(name).name.startswith(".")]
     candidates = [name for name in names if Path(name).suffix.lower() not in _DOCUMENTS] if len(names) > 1 else names
     if len(candidates) > 1:

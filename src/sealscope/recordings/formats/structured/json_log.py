@@ -17,7 +17,7 @@ from sealscope.errors import InputError
 from sealscope.recordings.formats.cells import is_missing
 from sealscope.recordings.formats.columns import Request
 from sealscope.recordings.formats.headings.labels import Label
-from sealscope.recordings.formats.headings.preamble import collect_remarks, stated_rate
+from sealscope.recordings.formats.headings.preamble import collect_attributes, stated_rate
 from sealscope.recordings.formats.headings.proposal import is_time
 from sealscope.recordings.formats.structured.tree import iter_series
 from sealscope.recordings.formats.table import RecordingFields, Series, build_fields, check_size, check_texts
@@ -69,9 +69,7 @@ def read_json(path: Path, request: Request) -> RecordingFields:
         raise InputError("a recording must have samples, got empty JSON")
     first, remarks = members[0], dict[str, str]()
     if len(members) == 1 and isinstance(first, Mapping) and not all(map(_is_cell, first.values())):
-        remarks = collect_remarks(
-            (name, value) for name, value in first.items() if isinstance(value, str | int | float)
-        )
+        remarks = collect_attributes(first)
         series = list(iter_series(_convert_lists(first, place)))
     else:
         series = _parse_records(members, place)
@@ -83,11 +81,7 @@ def read_json(path: Path, request: Request) -> RecordingFields:
 
 
 def _read_members(text: str, place: str) -> tuple[list[Any], bool]:
-    """Read the values that stand one after the other in a JSON text (`_iter_members`).
-
-    Also returns True if the last value is truncated and was left out. `place`: the file, for messages. Raises
-    InputError for damaged JSON.
-    """
+    """Read the values of a JSON text, and whether the last is truncated; raise InputError for other damage."""
     members, is_cut = list[Any](), False
     try:
         for member in _iter_members(text):
@@ -107,9 +101,8 @@ def _read_members(text: str, place: str) -> tuple[list[Any], bool]:
 def _iter_members(text: str) -> Iterator[Any]:
     """Yield the values that stand one after the other in a JSON text, such as one record on each line.
 
-    Between the values may be white space, commas and record separators. The members of an outer array of arrays or
-    objects are yielded one by one, so that those before a truncated member are still read. Any other value is yielded
-    as a whole, such as a row of numbers. Raises json.JSONDecodeError where the text is damaged or truncated.
+    Between them may be white space, commas and record separators. The members of an outer array of arrays or objects
+    are yielded one by one, so that those before a truncated member are still read. Raises json.JSONDecodeError.
     """
     position, in_array = 0, False
     while (position := _SEPARATORS.match(text, position).end()) < len(text):  # type: ignore[union-attr]
@@ -131,14 +124,8 @@ def _iter_cells(group: str, name: str, value: Any, depth: int) -> Iterator[tuple
     """Yield the single values in an entry of a JSON record, as (group, name, cell, unit).
 
     `group`, `name`: names of the records around the entry, and of the entry; `depth`: number of records and vectors
-    around the entry. Its `value` may be:
-
-    - a single value, i.e. a text, a number or null; the unit is then None;
-    - a record `{"value": ..., "unit": ...}`;
-    - a vector, whose members are called `name(1)`, `name(2)`, ...;
-    - a record of further values, whose name then belongs to the group.
-
-    Raises InputError for other values.
+    around it. Its `value` is a text, number or null; `{"value": ..., "unit": ...}`; a vector, with members called
+    `name(1)`, `name(2)`, ...; or a record, whose name then belongs to the group. Raises InputError for others.
     """
     if isinstance(value, Mapping) and depth < _MAX_DEPTH:
         unit = value.get("unit")
@@ -160,9 +147,8 @@ def _iter_cells(group: str, name: str, value: Any, depth: int) -> Iterator[tuple
 def _parse_records(members: Sequence[Any], place: str) -> list[Series]:
     """Make a series of samples for each name in a sequence of JSON values.
 
-    The values are records (objects with the values of one row by their names), rows (arrays, the first of which may
-    have the names), or blocks of columns (objects of arrays). `place`: the file, for messages. Raises InputError for
-    other values, and for a name with several units.
+    The values are records (objects of the values of one row), rows (arrays, perhaps after one of names), or blocks of
+    columns (objects of arrays). Raises InputError for others, and for a name with several units.
     """
     columns: dict[tuple[str, str], dict[int, Any]] = {}
     units: dict[tuple[str, str], str] = {}
@@ -200,17 +186,14 @@ def _parse_records(members: Sequence[Any], place: str) -> list[Series]:
     check_size(rows, len(columns))
 
     def read_values(key: tuple[str, str]) -> NDArray[Any]:
-        """Convert the cells of a column to an array (n,), one value per row; `key`: group and name of the column."""
+        """Convert the cells of a column, given by its group and name, to an array (n,), one value per row."""
         return _parse_array([columns[key].get(row) for row in range(rows)], key[1])
 
     return [Series(key[0], Label.parse(key[1], units.get(key)), rows, partial(read_values, key)) for key in columns]
 
 
 def _block_length(member: Mapping[str, Any]) -> int | None:
-    """Find the number of rows in a block of columns; None if the value is not such a block.
-
-    A block of columns is a mapping of arrays of equal length, one of which is the time.
-    """
+    """Find the number of rows in a block of columns, i.e. arrays of equal length and one a time; None for others."""
     if not all(isinstance(value, list) for value in member.values()):
         return None
     lengths = set(map(len, member.values()))
@@ -218,10 +201,7 @@ def _block_length(member: Mapping[str, Any]) -> int | None:
 
 
 def _parse_array(cells: Sequence[Any], name: str) -> NDArray[Any]:
-    """Convert JSON values to doubles (n,), NaN if missing, or to texts (n,) if any of them is a text.
-
-    `name`: the column in messages. Raises InputError for an infinite number.
-    """
+    """Convert JSON values to doubles (n,), NaN if missing, or to texts; raise InputError for an infinite number."""
     if any(isinstance(cell, str) for cell in cells):
         texts = ["" if cell is None or is_missing(str(cell)) else str(cell) for cell in cells]
         check_texts(len(texts), max(map(len, texts)), name)
@@ -236,11 +216,10 @@ def _parse_array(cells: Sequence[Any], name: str) -> NDArray[Any]:
 
 
 def _convert_lists(value: Any, place: str, depth: int = 0) -> Any:
-    """Convert the lists in a JSON document, at any depth, to arrays or mappings of columns.
+    """Convert the lists in a JSON document, at any `depth` of mappings, to arrays or mappings of columns.
 
-    A list of samples or of equally long rows becomes an array, and a list of records a mapping from name to column. Any
-    other list of mappings becomes a mapping with the names `(1)`, `(2)`, ..., and any other list None. `depth`: number
-    of mappings around the value; `place`: the file, for messages.
+    Samples or equally long rows become an array, records a mapping from name to column, other mappings one with the
+    names `(1)`, `(2)`, ..., and any other list None.
     """
     if isinstance(value, Mapping) and depth < _MAX_TREE_DEPTH:
         return {key: _convert_lists(member, place, depth + 1) for key, member in value.items()}

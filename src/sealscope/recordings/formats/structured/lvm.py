@@ -26,33 +26,26 @@ _END_MARK = "***End_of_Header***"
 
 @dataclass
 class _Packet:
-    """A block of samples in a LabVIEW measurement file, with a header of its own.
+    """A block of samples in a LabVIEW measurement file, with a header of its own."""
 
-    `head`: rows of the header, name -> an entry for each channel; `names`: names of the columns; `rows`: samples of
-    each row, NaN where a row is shorter than others.
-    """
-
-    head: Mapping[str, list[str]]
-    names: list[str]
-    rows: list[Array] = field(default_factory=list)
+    head: Mapping[str, list[str]]  # rows of the header, name -> an entry for each channel
+    names: list[str]  # of the columns
+    rows: list[Array] = field(default_factory=list)  # samples of each row, NaN where it is shorter than others
 
     def entry(self, name: str, index: int) -> str:
-        """Return the entry of channel `index` in the row `name` of the packet's header; "" if there is none."""
+        """Return the entry of channel `index` in the row `name` of the header; empty if there is none."""
         cells = self.head.get(name, [])
         return cells[index] if index < len(cells) else ""
 
     def number(self, name: str, index: int) -> float:
-        """Convert the entry of channel `index` in the row `name` of the packet's header; NaN if it is not a number."""
+        """Convert the entry of channel `index` in the row `name` of the header; NaN if it is not a number."""
         try:
             return float(self.entry(name, index).replace(",", "."))
         except ValueError:
             return np.nan
 
     def moment(self, index: int, day_first: bool) -> np.datetime64 | None:
-        """Return the time stamp of the first sample of channel `index`; None if the header does not state it.
-
-        `day_first`: True if the day precedes the month in dates.
-        """
+        """Return the time stamp of the first sample of channel `index`; None if the header does not state it."""
         day, time = self.entry("date", index), self.entry("time", index).replace(",", ".")
         seconds, _, fraction = time.partition(".")  # of the fraction 9 digits are used, i.e. nanoseconds
         try:
@@ -61,23 +54,17 @@ class _Packet:
             return None
 
     def column(self, index: int) -> Array:
-        """Return the samples (rows,) in the packet's column with the number `index`, from 0."""
+        """Return the samples (rows,) in a column of the packet."""
         return np.array([row[index] for row in self.rows])
 
 
 def is_lvm(head: bytes) -> bool:
-    """Return True if `head`, the first bytes of a file, begins a LabVIEW measurement file.
-
-    In such a file a line begins with the end mark of a header.
-    """
+    """Test whether `head`, the first bytes of a file, has a line that begins with a LabVIEW header's end mark."""
     return any(f"{end}{_END_MARK}".encode(encoding) in head for end in "\n\r" for encoding in ("ascii", "utf-16-le"))
 
 
 def read_lvm(path: Path, request: Request) -> RecordingFields:
-    """Read the requested channels of a LabVIEW measurement file to the fields of a recording.
-
-    Packets with the same channels are joined.
-    """
+    """Read the requested channels of a LabVIEW measurement file, and join packets with the same channels."""
     with path.open("rb") as file:
         encoding = detect_encoding(file.read(SNIFF)) or "cp1252"
     with path.open(encoding=encoding, errors="replace") as text:
@@ -100,12 +87,7 @@ def read_lvm(path: Path, request: Request) -> RecordingFields:
 
 
 def _iter_packets(lines: Iterator[tuple[int, str]], delimiter: str, decimal: str, place: str) -> Iterator[_Packet]:
-    """Yield the packets of samples in a LabVIEW measurement file, from its numbered lines.
-
-    A packet is yielded as soon as the names of its columns are read; its rows are added later, on the way to the next
-    packet. `delimiter`, `decimal`: separators of cells and of decimals; `place`: the file, for messages. Raises
-    InputError for a word in place of a number.
-    """
+    """Yield the packets of a LabVIEW measurement file; rows are added to a packet on the way to the next one."""
     header: dict[str, list[str]] = {}
     packet: _Packet | None = None
     in_header = True
@@ -121,10 +103,7 @@ def _iter_packets(lines: Iterator[tuple[int, str]], delimiter: str, decimal: str
             names = packet.names
 
             def format_place(index: int, number: int = number, names: Sequence[str] = names) -> str:
-                """Format the line, column and file of a cell for messages.
-
-                `index`: column of the cell; the defaults of the other arguments are those of the present line.
-                """
+                """Format the place of cell `index` in the present line, which the defaults fix, for messages."""
                 return f"(line {number}, column {names[index]}, {place})"
 
             padded_cells = cells[: len(names)] + [""] * (len(names) - len(cells))
@@ -147,8 +126,8 @@ def _iter_packets(lines: Iterator[tuple[int, str]], delimiter: str, decimal: str
 def _list_series(packets: Sequence[_Packet], x_columns: str) -> list[Series]:
     """Join the samples of each channel from all packets that have the same columns as the first one.
 
-    Returns a series for each channel. `x_columns`: "one" if all channels share a column of times, "multi" if a column
-    of times stands before each channel, or "no" if the headers of the packets state start and step instead.
+    `x_columns`: "one" if all channels share a column of times, "multi" if a column of times stands before each channel,
+    or "no" if the headers of the packets state start and step instead.
     """
     first, names = packets[0], packets[0].names
     times = [column for column, name in enumerate(names) if name.casefold().startswith("x_value")]
@@ -181,11 +160,7 @@ def _list_series(packets: Sequence[_Packet], x_columns: str) -> list[Series]:
 
 
 def _compute_times(packet: _Packet, index: int, count: int) -> Array:
-    """Compute the times (count,) [s] of channel `index` from start and step in the header of its packet.
-
-    The start is `X0`, or 0 if `X0` is not stated, and the step is `Delta_X`. Raises InputError if the step is not
-    positive.
-    """
+    """Compute the times (count,) [s] of channel `index` from start `X0`, else 0, and step `Delta_X` in the header."""
     step = packet.number("delta_x", index)
     if not step > 0:
         raise InputError(f"Delta_X must be > 0 s, got {packet.head.get('delta_x')}")
@@ -193,11 +168,9 @@ def _compute_times(packet: _Packet, index: int, count: int) -> Array:
 
 
 def _packet_offsets(packets: Sequence[_Packet], day_first: bool) -> list[float]:
-    """Compute the time [s] from the first packet of samples to each packet.
+    """Compute the time [s] from the first packet of samples to each packet, by the date stamps in the headers.
 
-    The results are differences of the date stamps in the headers. All are 0 if the date of a packet is not known, or if
-    the start times `X0` increase from packet to packet, because the sampling times then continue by themselves.
-    `day_first`: True if the day precedes the month in dates.
+    All are 0 if a date is not known, or if the start times `X0` increase, as the times then continue by themselves.
     """
     moments = [packet.moment(0, day_first) for packet in packets]
     first_times = [packet.number("x0", 0) for packet in packets]

@@ -26,10 +26,7 @@ _COLUMN_NAME_FIELDS = ("colheaders", "header", "headers", "labels", "channels", 
 
 
 def iter_series(fields: Mapping[str, Any]) -> Iterator[Series]:
-    """Yield the series of samples in the values of a MATLAB or JSON file.
-
-    `fields`: name -> value, which is an array (n,) or (n, m), a struct as a mapping, a table or an object.
-    """
+    """Yield the series in the values of a MATLAB or JSON file: arrays (n,) or (n, m), structs, tables and objects."""
     # the file counts as no struct: its depth is -1, so that its values have the depth 0 (no struct around them)
     yield from _iter_struct(group="", name="", fields=fields, clock=None, depth=-1)
 
@@ -54,10 +51,7 @@ def _iter_value(group: str, name: str, value: Any, clock: Clock | None, depth: i
 
 
 def _struct_fields(value: Any) -> Mapping[str, Any] | None:
-    """Return the fields of a struct, or the properties of an object, by name; None for other values.
-
-    The fields of an array of structs are these structs, with the names `(1)`, `(2)`, ...
-    """
+    """Return a struct's or object's fields by name, an array's structs by `(1)`, `(2)`, ...; None for other values."""
     properties = getattr(value, "properties", value)
     if isinstance(properties, Mapping):
         return properties
@@ -72,9 +66,7 @@ def _struct_fields(value: Any) -> Mapping[str, Any] | None:
 def _iter_struct(group: str, name: str, fields: Mapping[str, Any], clock: Clock | None, depth: int) -> Iterator[Series]:
     """Yield the series of samples in a struct: a time series, a signal, or a group of other values.
 
-    A time series has samples and their times. A signal has samples and a unit or, in a Simulink log, the fields `name`
-    and `values`. `name`, `fields`: name of the struct, and its fields by name; `group`, `depth`: names and number of
-    the structs around it; `clock`: times of series that state none, None if unknown.
+    A signal has samples and a unit or, in a Simulink log, a name and `values`. Other arguments: as of `_iter_value`.
     """
     by_name = {key.rstrip("_").casefold(): value for key, value in fields.items()}
     unit = _first_text(by_name, _UNIT_FIELDS)
@@ -93,14 +85,10 @@ def _iter_struct(group: str, name: str, fields: Mapping[str, Any], clock: Clock 
 
 
 def _iter_time_series(group: str, name: str, by_name: Mapping[str, Any], clock: Clock, depth: int) -> Iterator[Series]:
-    """Yield the series of samples in a struct that also contains their times, in one of three layouts.
+    """Yield the series of samples in a struct that also contains their times: `by_name` and the `clock`.
 
-    - Simulink's structure with time: field `signals`, a struct or an array of structs with `values` and `label`.
-    - MATLAB's `timeseries`: field `data` with an array.
-    - Other time series: field `data` with a struct or another value that contains the series.
-
-    `name`, `by_name`: name of the struct, and its fields by their names in lower case; `group`, `depth`: names and
-    number of the structs around it; `clock`: the times.
+    The samples are in the structs of `signals`, as in Simulink's structure with time, in an array `data`, as in
+    MATLAB's `timeseries`, or in another value `data`. Other arguments: as of `_iter_value`.
     """
     data = by_name.get("data")
     if "signals" in by_name:
@@ -118,8 +106,7 @@ def _iter_time_series(group: str, name: str, by_name: Mapping[str, Any], clock: 
 def _iter_group(group: str, fields: Mapping[str, Any], clock: Clock | None, depth: int) -> Iterator[Series]:
     """Yield the series of samples in each field of a struct, with names and units from fields such as `units`.
 
-    `fields`: the fields by name; `group`: names of the struct and of the structs around it, with slashes between;
-    `depth`: number of structs around it; `clock`: times of series that state none, None if unknown.
+    `group`: names of the struct and of those around it, with slashes between; `depth`, `clock`: as of `_iter_value`.
     """
     units, column_names = _find_field_units(fields), _find_column_names(fields)
     for key, value in fields.items():
@@ -146,10 +133,7 @@ def _is_vector(value: Any) -> bool:
 
 
 def _first_text(by_name: Mapping[str, Any], names: tuple[str, ...]) -> str | None:
-    """Return the text of the first of the fields `names` that is present; None if none is present.
-
-    The result is empty if the field is not a text. `by_name`: fields by their names in lower case.
-    """
+    """Return the text of the first of the fields `names` that is present, empty if it is no text; None without one."""
     return next((_single_text(by_name[name]) for name in names if name in by_name), None)
 
 
@@ -177,10 +161,7 @@ def _find_column_names(fields: Mapping[str, Any]) -> list[str]:
 
 
 def _read_struct_times(by_name: Mapping[str, Any]) -> NDArray[np.float64] | None:
-    """Read the times (n,) [s] of a struct, given as numbers, or by start, increment and length.
-
-    `by_name`: fields by their names in lower case. None for a struct without times or without samples.
-    """
+    """Read the times (n,) [s] of a struct with samples: numbers, or start, increment and length; else None."""
     if "signals" not in by_name and "data" not in by_name:
         return None
     time = by_name.get("time")
@@ -204,11 +185,7 @@ def _list_structs(value: Any) -> list[Mapping[str, Any]]:
 def _iter_columns(
     group: str, name: str, value: NDArray[Any], unit: str | None, clock: Clock | None
 ) -> Iterator[Series]:
-    """Yield the series of a vector `value`, or one for each column of a matrix, with names such as `name(:,1)`.
-
-    `group`, `unit`, `clock`: group, unit and sampling times of the series, None if unknown. Arrays of other types or
-    shapes, or with too many columns, are left out.
-    """
+    """Yield the series of a vector, or of each column of a matrix, called `name(:,1)` etc.; leave out other arrays."""
     if value.dtype.kind not in "fiubmMU":
         return
     flat = np.squeeze(value)
@@ -222,10 +199,7 @@ def _iter_columns(
 
 
 def _iter_table(group: str, frame: Any) -> Iterator[Series]:
-    """Yield the columns of a table, a data frame, as series of the `group`.
-
-    If the index of `frame` contains times, these are the sampling times.
-    """
+    """Yield the columns of a data frame as series of the `group`; times in its index are the sampling times."""
     units = [str(unit) for unit in frame.attrs.get("VariableUnits", frame.attrs.get("varUnits", ()))]
     clock, index = None, np.asarray(frame.index)
     if index.dtype.kind in "mM" and index.size:
@@ -240,13 +214,13 @@ def _iter_table(group: str, frame: Any) -> Iterator[Series]:
 
 def _single_text(value: Any) -> str:
     """Return the only text in a value; empty if there is none or several."""
-    flat = np.asarray(value).reshape(-1) if value is not None else np.empty(0)
+    flat = np.asarray(value).reshape(-1)
     return str(flat[0]).strip() if flat.size == 1 and isinstance(flat[0], str) else ""
 
 
 def single_number(value: Any) -> float | None:
     """Return the only finite number in a value; None if there is none or several."""
-    flat = np.asarray(value).reshape(-1) if value is not None else np.empty(0)
+    flat = np.asarray(value).reshape(-1)
     return float(flat[0]) if flat.size == 1 and flat.dtype.kind in "fiu" and np.isfinite(flat[0]) else None
 
 
