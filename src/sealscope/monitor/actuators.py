@@ -1,9 +1,8 @@
 """The detectors and alarms of all actuators of a monitor, stored in its database with each block of samples.
 
-One transaction stores the identities of blocks, their estimates, alarms and samples. The samples are stored as
-pending until the next checkpoint, which stores the whole state of an actuator: after 16 blocks or 400 kB, and with
-each mark of a person. A restart loads the last checkpoint and judges the pending samples again, with the settings by
-which they were judged before.
+One transaction stores the identities of blocks, their estimates, alarms and samples. The samples are stored as pending
+until the next checkpoint, which stores the whole state of an actuator: after 16 blocks or 400 kB, and with each mark of
+a person. A restart loads the last checkpoint and judges the pending samples again, with the settings of the first time.
 """
 
 from __future__ import annotations
@@ -16,8 +15,9 @@ import time
 import zlib
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any
 
 from pydantic import ValidationError
 from sqlalchemy.exc import IntegrityError
@@ -50,30 +50,20 @@ _VERDICT_TEXTS = ("file", "verdict", "summary", "size", "odds", "reason")
 _ALARM_SAMPLES_S = 120.0
 
 
-class AlarmEvent(NamedTuple):
-    """A change of an actuator's alarm.
-
-    `alarm`: the alarm after the change; `kind`: name of the event, such as "raised" or "returned" (the leak has
-    ended); `t` [s]: time of the change.
-    """
-
-    alarm: Alarm
-    kind: str
-    t: float
+#: A change of an alarm: the changed alarm, name of the event, such as "raised" or "returned" (the leak has ended), and
+#: time of the change [s].
+_AlarmEvent = tuple[Alarm, str, float]
 
 
 @dataclass
 class _Actuator:
     """The state of one watched actuator in memory.
 
-    - `watch`: the leak detector; `judge`: decides on the alarm;
-    - `pending`, `bytes`: number and total size [bytes] of the blocks of samples since the last checkpoint, when the
-      state was stored in the database; `n_stored`: number of all blocks so far;
-    - `last`: the detector's last estimate, with flows averaged over the machine's cycles; `judged_s` [s]: end of the
-      last stretch of samples that the detector judged;
-    - `stored_summary`: the summary that was stored last; `oil_celsius` [deg C]: oil temperature, None if unknown;
-    - `verdict`: verdict on the last recording, None if whole recordings are not judged;
-    - `alarm_samples`: the last samples during an alarm, which may become a healthy recording in the machine's file.
+    `watch`, `judge`: decide on the leak and on the alarm; `pending`, `bytes`: number and size of the blocks of samples
+    since the last checkpoint, `n_stored` of all blocks; `last`: last estimate, with flows averaged over the machine's
+    cycles; `stored_summary`: summary stored last; `oil_celsius`: oil temperature [deg C], None if unknown; `judged_s`
+    [s]: end of the last judged samples; `verdict`: on the last recording, None if whole recordings are not judged;
+    `alarm_samples`: last samples during an alarm, which may become a healthy recording in the machine's file.
     """
 
     settings: ActuatorSettings
@@ -91,21 +81,20 @@ class _Actuator:
 
     def judge_samples(
         self, samples: Recording, *, follows: bool, settings: WatchSettings, verdict: RecordingVerdict | None = None
-    ) -> tuple[list[BlockEstimate], list[AlarmEvent]]:
-        """Judge new samples of the actuator; return the detector's estimates from them, and the changes of the alarm.
+    ) -> tuple[list[BlockEstimate], list[_AlarmEvent]]:
+        """Judge new samples; return the leakage estimates of blocks of some seconds, and the changes of the alarm.
 
-        The detector divides the samples into blocks of some seconds, and estimates the leakage of each. `follows`:
-        False if there is a gap between these samples and those before; `settings`: thresholds of the alarm; `verdict`:
-        verdict on the samples as a whole recording, None for none. If this verdict decides
-        (`RecordingVerdict.decides`), it alone updates the alarm, and the returned estimates state the leak of this
-        verdict. Otherwise each estimate updates the alarm. The result depends only on the arguments and the state of
-        the actuator.
+        `follows`: False after a gap; `settings`: thresholds of the alarm; `verdict`: verdict on the samples as a whole
+        recording, None for none. A verdict that decides (`RecordingVerdict.decides`) alone updates the alarm, and the
+        estimates state its leak; otherwise each estimate updates it. The result depends only on arguments and state.
         """
-        estimates, events = [], []
+        estimates: list[BlockEstimate] = []
+        events: list[_AlarmEvent] = []
         deciding_verdict = verdict if verdict is not None and verdict.decides else None
         self.pending += 1  # blocks of samples since the last checkpoint
         self.bytes += count_bytes(samples)
-        self._update_oil_temperature(samples)
+        if (oil_celsius := measured_oil_temperature(samples)) is not None:
+            self.oil_celsius = oil_celsius
         for estimate, leak in self.watch.each(samples, follows=follows):  # leak: the one found by then, or None
             self.last = self.watch.with_cycle_means(estimate)
             if estimate.judged or self.judged_s is None or self.judged_s > estimate.t:  # the clock may be set back
@@ -116,14 +105,14 @@ class _Actuator:
             estimates.append(estimate)
             change = self.judge.update(self.last, leak, self._baseline_version(), settings)
             if change is not None:
-                events.append(AlarmEvent(*change, estimate.t))
+                events.append((*change, estimate.t))
         if deciding_verdict is not None:
             if deciding_verdict.clears and self.watch.leak is not None:  # the detector withdraws its leak
                 self.watch.dismiss()
             version = self._baseline_version()
             change = self.judge.update_from_verdict(deciding_verdict, self.verdict, version, settings)
             if change is not None:
-                events.append(AlarmEvent(*change, deciding_verdict.end_s))
+                events.append((*change, deciding_verdict.end_s))
         self.verdict = verdict
         self._update_alarm_samples(samples, follows=follows)
         return estimates, events
@@ -132,18 +121,8 @@ class _Actuator:
         """Return the version number of the actuator's healthy baseline, 0 while a baseline is being learned."""
         return 0 if self.watch.baseline is None else self.watch.baseline.version
 
-    def _update_oil_temperature(self, samples: Recording) -> None:
-        """Set `oil_celsius` to the mean of the plausible oil temperatures in `samples`, if there are any."""
-        oil_celsius = measured_oil_temperature(samples)
-        if oil_celsius is not None:
-            self.oil_celsius = oil_celsius
-
     def _update_alarm_samples(self, samples: Recording, *, follows: bool) -> None:
-        """Append new samples to `alarm_samples` while an alarm is open; keep the last `_ALARM_SAMPLES_S` seconds.
-
-        Older samples are discarded after a gap (`follows` is False), or if the channels, units or sampling rate
-        change.
-        """
+        """Keep the last `_ALARM_SAMPLES_S` seconds of samples, without gap, of one format, while an alarm is open."""
         first = self.alarm_samples[0] if self.alarm_samples else samples
         same_format = (first.units, first.rate) == (samples.units, samples.rate)
         if self.judge.alarm is None or not follows or not same_format:
@@ -155,19 +134,11 @@ class _Actuator:
                 del self.alarm_samples[0]
 
     def state(self) -> dict[str, Any]:
-        """Return the actuator's state as plain values, for a checkpoint in the database.
-
-        The state consists of the leak detector and the alarm, the last estimate, the oil temperature, the time of the
-        last judged block, and the verdict on the last recording.
-        """
+        """Convert the detector, the alarm and the last results to plain values, for a checkpoint in the database."""
         return save_attributes(self, ("watch", "judge", "last", "oil_celsius", "judged_s", "verdict"))
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Restore the state of the actuator, except its alarm, from the plain values of a checkpoint.
-
-        Restored are the leak detector, the last estimate, the oil temperature, the time of the last judged block, and
-        the verdict on the last recording. `_load_checkpoint` restores the alarm.
-        """
+        """Restore detector and last results from the plain values of a checkpoint; the alarm is not restored."""
         self.watch = Watch.from_state(state["watch"])
         self.last = None if state["last"] is None else restore(BlockEstimate, state["last"], "last")
         self.oil_celsius, self.judged_s = state.get("oil_celsius"), state.get("judged_s")
@@ -177,9 +148,8 @@ class _Actuator:
     def _machine_state(self) -> MachineState:
         """Determine the state of the machine by NAMUR NE 107, such as "good" or "maintenance required".
 
-        An active alarm determines the state, otherwise the verdict on the last recording. Without alarm and verdict the
-        state tells what the detector does: "no data", "not comparable" (no block was judged for some time), "learning"
-        (of the healthy baseline) or "watched".
+        It comes from an active alarm, else from the verdict on the last recording, else from what the detector does:
+        "no data", "not comparable" (no block was judged for some time), "learning" (the healthy baseline) or "watched".
         """
         alarm, baseline, alarm_end_s = self.judge.alarm, self.watch.baseline, self.judge.over_s
         if alarm is not None and alarm.active:
@@ -198,17 +168,14 @@ class _Actuator:
     def summary(self) -> dict[str, Any]:
         """Build the summary of the actuator for the page, the metrics and messages, as plain values by name.
 
-        If whole recordings are judged, status and time come from the last verdict, and so do the flows if this verdict
-        decides (`RecordingVerdict.decides`). Otherwise they come from the detector's last block. Unknown values are
-        None. The names are:
+        Status and time come from the last verdict on a whole recording, if there is one, and the flows if this verdict
+        decides (`RecordingVerdict.decides`); otherwise from the detector's last block. Unknown values are None.
 
-        - `blocks`: number of the detector's blocks so far, some seconds each; `counters`: its counters;
-          `by`: what it watches, "volumes" or "pressures";
-        - `t`: end of the last block or recording [s since 1970]; `status`: its result in words;
-        - `state`: state of the machine by NAMUR NE 107;
-        - `total_lpm`, `leak_lpm` [L/min]: total leakage and the leak; `total_interval_lpm`, `leak_interval_lpm`: their
-          95 % intervals; `bound_lpm` [L/min]: upper bound of a leak that is not found;
-        - `recording`: texts of the last verdict; `why_no_litres`: reason why no L/min are stated, else "";
+        - `blocks`, `counters`: number of the detector's blocks so far, some seconds each, and its counters; `by`: what
+          it watches, "volumes" or "pressures"; `why_no_litres`: reason why no L/min are stated, else "";
+        - `t`: end of the last block or recording [s since 1970]; `status`: its result; `state`: state by NAMUR NE 107;
+        - `total_lpm`, `leak_lpm`, `bound_lpm` [L/min]: total leakage, leak, and upper bound of a leak that is not
+          found; `total_interval_lpm`, `leak_interval_lpm`: 95 % intervals; `recording`: texts of the last verdict;
         - `oil_celsius`: oil temperature [deg C]; `baseline`: version, hours and leakage of the healthy baseline;
         - `alarm`: id of the open alarm; `status_word`: its status word, 0 without an alarm.
         """
@@ -240,36 +207,12 @@ class _Actuator:
         }
 
 
-def _parse_settings(stored: str) -> WatchSettings | None:
-    """Parse the settings (JSON) stored with a checkpoint; return None if another version wrote them in another form."""
-    try:
-        return WatchSettings.model_validate_json(stored)
-    except ValidationError:
-        return None
-
-
-def _has_same_learning_settings(stored: Watch, fresh: Watch) -> bool:
-    """Return True if two leak detectors learn their healthy baseline with the same settings and rig.
-
-    `stored`: detector from the database; `fresh`: detector by the present settings. The pump displacements of the rigs
-    may differ by up to 5 %, as two measurements of a displacement do.
-    """
-    rig, *learning_settings = fresh.learned_with
-    stored_rig, *stored_learning_settings = stored.learned_with
-    is_same_machine = rig == stored_rig or is_remeasured(rig, stored_rig)
-    return learning_settings == stored_learning_settings and is_same_machine
-
-
 class _AlreadyStored(Exception):  # noqa: N818 (says what happened)
     """Raised if the database already has one of the blocks of samples that are to be stored."""
 
 
 class WatchedActuators:
-    """The watched actuators of a monitor, restored from its database.
-
-    `settings`: settings of each actuator; `store`: the database; `keep_days`: days of operation whose estimates are
-    stored.
-    """
+    """The watched actuators of a monitor, restored from its `store`; `keep_days`: days of stored estimates."""
 
     def __init__(self, settings: list[ActuatorSettings], store: MonitorStore, keep_days: float = 90.0) -> None:
         self.store, self.settings = store, {setting.name: setting for setting in settings}
@@ -283,11 +226,7 @@ class WatchedActuators:
         self._actuators = {name: self._restore(self.settings[name]) for name in self.settings}
 
     def _restore(self, settings: ActuatorSettings) -> _Actuator:
-        """Restore an actuator from its last checkpoint in the database and the samples since, or create a new one.
-
-        The leak detector (`watch`) starts anew if the rig or the learning time changed since the checkpoint, or if
-        another version stored the checkpoint.
-        """
+        """Restore an actuator from its last checkpoint in the database and the samples since, or create a new one."""
         name = settings.name
         machine = load_watched(settings.rig)
         fresh = watch(
@@ -309,8 +248,8 @@ class WatchedActuators:
         """Restore an actuator from its checkpoint `stored` in the database, and judge the samples since then again.
 
         The detector (`watch`) starts anew if another version saved its state, or if it learned with another rig or
-        learning time. Returns True if a new checkpoint must be saved, because the detector starts anew or the
-        settings changed.
+        learning time; pump displacements of rigs may differ by up to 5 %, as two measurements do. Returns True if the
+        detector starts anew or the settings changed: a new checkpoint must then be saved.
         """
         settings, name = actuator.settings, actuator.settings.name
         fresh, state = actuator.watch, stored.state
@@ -322,13 +261,18 @@ class WatchedActuators:
             fresh.continue_from(n_blocks, baseline_version)
             return True
         actuator.load_state(state)
-        stored_settings = _parse_settings(stored.settings)
+        stored_settings = None
+        with suppress(ValidationError):  # another version may have written them in another form
+            stored_settings = WatchSettings.model_validate_json(stored.settings)
         for samples, follows, verdict in stored.pending:  # judged with the settings of the first time, if readable
             actuator.judge_samples(samples, follows=follows, settings=stored_settings or settings, verdict=verdict)
         actuator.watch.false_alarms_per_1000_h = settings.false_alarms_per_1000_h  # may change without a new baseline
         if actuator.watch.healthy is not None:  # None after a person has marked a repair
             actuator.watch.healthy = fresh.healthy
-        if _has_same_learning_settings(actuator.watch, fresh):
+        rig, *learning_settings = fresh.learned_with
+        stored_rig, *stored_learning_settings = actuator.watch.learned_with
+        is_same_rig = rig == stored_rig or is_remeasured(rig, stored_rig)
+        if is_same_rig and learning_settings == stored_learning_settings:
             return stored_settings != settings.watched_with
         _log.warning("%s: its rig or learn_hours are others than it learned with, begins anew", name)
         fresh.continue_from(actuator.watch.blocks, actuator.watch.baseline_version)
@@ -350,20 +294,18 @@ class WatchedActuators:
     def process_blocks(self, blocks: Sequence[SourceBlock]) -> None:
         """Judge blocks of samples, and store them with their estimates and alarms in one transaction.
 
-        Blocks of actuators that are not in the settings are only counted. Errors of the database are raised; the call
-        can then be repeated.
+        Blocks of actuators not in the settings are only counted. After an error of the database, call again.
         """
         with self._lock:
             known_blocks = [block for block in blocks if block.actuator in self.settings]
-            for name in {block.actuator for block in known_blocks}:
-                self._last_block_clock[name] = time.monotonic()
+            self._last_block_clock |= dict.fromkeys((block.actuator for block in known_blocks), time.monotonic())
             self._store_once(known_blocks)
             self.count("blocks of an actuator that is not in the settings", len(blocks) - len(known_blocks))
 
     def _store_once(self, blocks: Sequence[SourceBlock]) -> None:
         """Judge and store those blocks that are not in the database yet.
 
-        Repeated blocks are rare: the database is searched for repeated blocks only after it has refused a block.
+        Repeated blocks are rare: the database is searched for them only after it has refused a block.
         """
         if not blocks:
             return
@@ -386,10 +328,7 @@ class WatchedActuators:
         self._notify_change()
 
     def _store_new(self, blocks: Sequence[SourceBlock]) -> None:
-        """Judge and store blocks in one transaction.
-
-        Raises _AlreadyStored, before any detector is updated, if the database has one of the blocks.
-        """
+        """Judge and store blocks in one transaction; raise _AlreadyStored, before judging, if one is stored."""
         rows = StoredRows()
         with self.store.writing() as connection:
             pairs = [(block, self._actuator(block.actuator)) for block in blocks]
@@ -420,7 +359,7 @@ class WatchedActuators:
         estimates, events = actuator.judge_samples(samples, follows=follows, settings=settings, verdict=verdict)
         rows.add_estimates(name, estimates, actuator.oil_celsius)
         for event in events:
-            rows.add_alarm(event.alarm, event.kind, event.t)
+            rows.add_alarm(*event)
         # the hash of the name spreads the checkpoints of the actuators over time
         is_due = (actuator.n_stored + zlib.crc32(name.encode())) % PENDING_BLOCKS == 0
         if is_due or actuator.bytes >= PENDING_BYTES:
@@ -430,11 +369,7 @@ class WatchedActuators:
             self._add_summary(actuator, rows)
 
     def _checkpoint(self, actuator: _Actuator, rows: StoredRows) -> None:
-        """Add a checkpoint of an actuator's state to the rows that will be stored.
-
-        Also add the running numbers up to which the actuator's blocks and estimates are too old and will be deleted.
-        The count of blocks since the last checkpoint begins again at 0.
-        """
+        """Add a checkpoint of an actuator's state to the rows to store, and mark its old rows for deletion."""
         settings = actuator.settings
         rows.add_checkpoint(settings.name, settings.watched_with.model_dump_json(), actuator.state())
         self._add_summary(actuator, rows)
@@ -458,8 +393,7 @@ class WatchedActuators:
 
         - ``acknowledged``, ``comment``, or ``valid``, which confirms the leak;
         - ``shelved``: the alarm is not announced for `hours` of operation;
-        - ``invalid``: the detector withdraws the leak;
-        - ``repaired``: the detector withdraws the leak and learns a new healthy baseline.
+        - ``invalid``: the detector withdraws the leak; ``repaired``: it also learns a new healthy baseline.
 
         A mark ``valid``, ``invalid`` or ``repaired`` is also written to the file of a commissioned machine, and an
         event states the result. Raises InputError if there is no open alarm or an argument is invalid.
@@ -504,17 +438,13 @@ class WatchedActuators:
 
     @property
     def false_alarms_per_1000_h(self) -> float:
-        """Upper limit of the expected number of false alarms in 1000 h of operation, of all actuators together.
-
-        The limit applies if all actuators run and are healthy.
-        """
+        """Limit of the expected number of false alarms in 1000 h of operation, if all actuators run and are healthy."""
         return sum(settings.false_alarms_per_1000_h for settings in self.settings.values())
 
     def summaries(self) -> dict[str, dict[str, Any]]:
         """Read the last stored summary of each actuator in the settings, by name.
 
-        The state in a summary is replaced by "no data" if it is unknown, or if no block has come for `no_data_s`
-        seconds. States that report a leak (`LEAKING`) are kept.
+        The state is "no data" if unknown or, unless it reports a leak, if no block has come for `no_data_s` seconds.
         """
         stored_summaries, now = self.store.summaries(), time.monotonic()
         summaries = {}

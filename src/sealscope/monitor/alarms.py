@@ -1,9 +1,8 @@
 """Alarms: raised when the estimated leakage exceeds a threshold [L/min], with debounce and hysteresis.
 
-An alarm is new until a person acknowledges it. A person marks it as valid or, with a reason, as invalid. It closes
-when its cause has ended and a person has seen it, or when a person marks a repair; an invalid alarm ends at once. (A
-new alarm whose cause has ended is "returned to normal, unacknowledged" in ISA-18.2, Management of Alarm Systems for
-the Process Industries.)
+An alarm is new until a person acknowledges it. A person marks it as valid or, with a reason, as invalid. It closes when
+its cause has ended and a person has seen it, or when a person marks a repair; an invalid alarm ends at once. (A new
+alarm whose cause has ended is "returned to normal, unacknowledged" in the standard ISA-18.2.)
 """
 
 from __future__ import annotations
@@ -37,14 +36,12 @@ MARKS = ("acknowledged", "comment", "shelved", *JUDGEMENTS)
 class Alarm:
     """An alarm of an actuator; times [s] are those of its samples, intervals have 95 % confidence.
 
-    - `id`: name of the actuator with a running number; `level`: "warning" or "error";
-    - `raised_s`, `updated_s`: times at which the alarm was raised and last changed;
-    - `onset_s`: time at which the leak began; `returned_s`: time at which it ended, None while it lasts;
-    - `leak_lpm`: leak flow [L/min]; `cause`: path of the leaking oil; `baseline`: version of the healthy baseline;
-    - `evidence`: reason for the alarm, in one line; `next_check`: recommended inspection;
-    - `mark`: last mark of a person ("valid", "invalid" or "repaired"); `reason`: why the alarm is invalid;
-    - `shelved_until_s`: time before which the alarm is not announced;
-    - `by_chance_per_1000_h`: most false alarms of this strength that a healthy actuator raises in 1000 operating hours.
+    `id`: name of the actuator with a running number; `raised_s`, `updated_s`: times at which the alarm was raised and
+    last changed; `onset_s`, `returned_s`: begin and end of the leak, None while it lasts; `leak_lpm`: leak flow
+    [L/min]; `cause`: path of the leaking oil; `evidence`: reason for the alarm, in one line; `next_check`: recommended
+    inspection; `baseline`: version of the healthy baseline; `mark`: last mark of a person ("valid", "invalid" or
+    "repaired"); `reason`: why the alarm is invalid; `shelved_until_s`: time before which it is not announced;
+    `by_chance_per_1000_h`: most false alarms of this strength that a healthy actuator raises in 1000 operating hours.
     """
 
     id: str
@@ -95,10 +92,7 @@ class Alarm:
         return (level_bit if self.active else 0) | new_bit
 
     def as_dict(self) -> dict[str, Any]:
-        """Convert the alarm to plain values, with the state of the machine by NE 107.
-
-        The entry `diagnostic_number` is the code of the alarm's level for other systems (`DIAGNOSTIC_NUMBERS`).
-        """
+        """Convert the alarm to plain values, with the code of its level and the machine's state by NAMUR NE 107."""
         machine_state = state_of(self.condition, self.cause if self.active else None, since_s=self.onset_s)
         derived_values = {"diagnostic_number": DIAGNOSTIC_NUMBERS[self.level], "shelved": self.shelved}
         return {**vars(self), **derived_values, "machine_state": machine_state.as_dict()}
@@ -109,8 +103,8 @@ class AlarmJudge:
     """Raises, updates and ends the alarm of one actuator from its estimates; at most one alarm is open at a time.
 
     `alarm`: the open alarm, None if there is none; `raised`: number of alarms so far; `above`, `error`, `below`:
-    numbers of successive blocks above the warning threshold, above the error threshold, and below the threshold at
-    which the alarm ends; `over_s` [s]: time of the last change of an alarm that was no longer active (`Alarm.active`).
+    numbers of successive blocks above the thresholds of a warning and of an error, and below the threshold at which the
+    alarm ends; `over_s` [s]: time of the last change of an alarm that was no longer active (`Alarm.active`).
     """
 
     actuator: str
@@ -128,15 +122,13 @@ class AlarmJudge:
 
         The event is "raised", "error" or "warning" (a change of the level), "returned" (the cause has ended), or "" for
         none of these. Returns None if the block is not judged, or if no alarm was active and none is raised. `leak`:
-        the leak that the actuator's detector has found, None if there is none; `baseline`: version of the healthy
-        baseline; `settings`: thresholds [L/min], and how many successive blocks must lie beyond a threshold before the
-        alarm changes (`debounce_blocks`).
+        found by the actuator's detector, or None; `baseline`: version of the healthy baseline; `settings`: thresholds
+        [L/min], and number of successive blocks beyond a threshold before the alarm changes (`debounce_blocks`).
 
-        An alarm is raised while a leak is found and its flow reaches the threshold of a warning or an error. The alarm
-        ends, or an error becomes a warning, when the flow is below `return_share` times the threshold of its level. A
-        leak without a flow in L/min is a warning. A leak that comes back before anybody has acknowledged its alarm
-        raises the same alarm again. If the detector is restarted during an alarm, `leak` is None; the alarm then stays,
-        because the leak may last.
+        An alarm is raised while a leak is found and its flow reaches the threshold of a warning or an error. It ends,
+        or an error becomes a warning, when the flow is below `return_share` times the threshold of its level. A leak
+        without a flow in L/min is a warning. A leak that comes back before anybody has acknowledged its alarm raises
+        the same alarm again. After a restart of the detector, when `leak` is None, the alarm stays: the leak may last.
         """
         if not estimate.judged:
             return None
@@ -192,15 +184,11 @@ class AlarmJudge:
     def _raise_alarm(self, **findings: Any) -> Alarm:
         """Raise an alarm and return it: a new one, or the open alarm again if its leak had ended before.
 
-        An alarm that is raised again keeps its id and its shelving. `findings`: all other fields of the alarm, except
-        for actuator and state.
+        An alarm that is raised again keeps its id and shelving; `findings` has the fields but actuator and state.
         """
-        shelved_until_s = 0.0
-        if self.alarm is None:
-            self.raised += 1
-        else:
-            shelved_until_s = self.alarm.shelved_until_s
+        self.raised += self.alarm is None
         alarm_id = f"{self.actuator}-{self.raised}"
+        shelved_until_s = 0.0 if self.alarm is None else self.alarm.shelved_until_s
         self.alarm = Alarm(alarm_id, self.actuator, state="new", shelved_until_s=shelved_until_s, **findings)
         return self.alarm
 
@@ -209,14 +197,12 @@ class AlarmJudge:
     ) -> tuple[Alarm, str] | None:
         """Update the alarm with the verdict on a whole recording; return the alarm and the name of the event.
 
-        A leak at or above the warning threshold raises an alarm if the verdict on the previous recording was `leak`,
-        too, or if leak-free recordings get such a verdict seldom enough for the allowed rate of false alarms. The
-        verdict `no leak`, or a leak below the warning threshold, ends the alarm. `earlier`: verdict on the previous
-        recording, None if there is none; `baseline`: version of the healthy baseline; `settings`: thresholds and the
-        allowed rate of false alarms.
-
-        The event is "raised", "error" or "warning" (a change of the level), "returned" (the leak has ended), or ""
-        for none of these. Returns None for the verdict `cannot tell`, or if no alarm was active and none is raised.
+        A leak at or above the warning threshold raises an alarm if the verdict on the `earlier` recording (None for
+        none) was `leak`, too, or if leak-free recordings get such a verdict seldom enough for the allowed rate of false
+        alarms. The verdict `no leak`, or a leak below the warning threshold, ends the alarm. `baseline`: version of the
+        healthy baseline; `settings`: thresholds and the allowed rate. The event is "raised", "error" or "warning" (a
+        change of the level), "returned" (the leak has ended), or "" for none of these. Returns None for the verdict
+        `cannot tell`, or if no alarm was active and none is raised.
         """
         alarm, lpm = self.alarm, verdict.leak_lpm
         is_active = alarm is not None and alarm.active
@@ -255,8 +241,7 @@ class AlarmJudge:
     def _set_alarm(self, alarm: Alarm) -> Alarm:
         """Store a changed alarm as the open alarm, or forget it if it is closed or invalid; return the changed alarm.
 
-        When the cause of an alarm ends, the alarm stays open until a person has seen it. Each change of an alarm that
-        is no longer active sets `over_s`, the time from which the machine counts as watched again.
+        An alarm whose cause has ended stays open until a person has seen it; `over_s` is the time of its last change.
         """
         if not alarm.active:  # the cause has ended, or the alarm is closed or invalid
             self.over_s = alarm.updated_s
@@ -267,10 +252,9 @@ class AlarmJudge:
         """Apply the mark that a person gives the open alarm at time `t` [s], and return the changed alarm.
 
         `mark`: "acknowledged", "comment" (which changes nothing), "shelved", "valid", "invalid" or "repaired"; `until`
-        [s]: time until which a shelved alarm is not announced; `reason`: why the alarm is invalid. All marks but a
-        comment also reset the counts of successive blocks beyond a threshold (`above`, `error`, `below`). Raises
-        InputError for an unknown mark, if there is no open alarm, if the alarm has the state of this mark already, or
-        if the mark ``invalid`` has no reason.
+        [s]: end of the shelving, during which the alarm is not announced; `reason`: why the alarm is invalid. All marks
+        but a comment also reset the counts of successive blocks beyond a threshold. Raises InputError for an unknown
+        mark or a mark that the alarm has already, if there is no open alarm, or if ``invalid`` has no reason.
         """
         if mark not in MARKS:
             raise InputError(f"an alarm must be marked {', '.join(MARKS)}, got {mark[:40]!r}")
@@ -303,13 +287,11 @@ def rank_actuators(summaries: Mapping[str, Mapping[str, Any]], alarms: list[dict
     """Sort actuators by urgency, and return their summaries as rows, each with the `name` and the open `alarm` or None.
 
     More urgent is, in this order: the more severe state; a new alarm; the stronger evidence (fewer such alarms of a
-    healthy actuator by chance); the larger lower end of the leak's interval; the larger leak. Ties are decided by the
-    name. `summaries`: summary of each actuator by name; `alarms`: the open alarms, for each actuator with the latest
-    first.
+    healthy actuator by chance); the larger lower end of the leak's interval; the larger leak; then the name decides.
+    `summaries`: by name; `alarms`: the open alarms, for each actuator with the latest first.
     """
 
     def rank(row: Mapping[str, Any]) -> tuple[Any, ...]:
-        """Compute the sorting key of an actuator's row, which is smallest for the most urgent actuator."""
         low_lpm, _ = row["leak_interval_lpm"] or (0.0, 0.0)
         by_chance = (row["alarm"] or {}).get("by_chance_per_1000_h")
         evidence = math.inf if by_chance is None else by_chance

@@ -10,11 +10,7 @@ _Item = TypeVar("_Item")
 
 
 class QueueLoad(NamedTuple):
-    """Load of the queue of blocks of samples that wait to be stored.
-
-    `n_blocks`: number of these blocks; `n_bytes`: their total size; `n_waits`: how often a source of blocks had to wait
-    since the start because the queue was full.
-    """
+    """Blocks that wait to be stored, their bytes, and how often a source had to wait because the queue was full."""
 
     n_blocks: int = 0
     n_bytes: int = 0
@@ -22,10 +18,7 @@ class QueueLoad(NamedTuple):
 
 
 class BoundedQueue(Generic[_Item]):
-    """A queue between threads, limited to `max_items` items and `max_bytes` bytes.
-
-    The caller of `put` states the size of each item. An empty queue accepts an item of any size.
-    """
+    """A queue between threads, limited to `max_items` items and `max_bytes` bytes; one item of any size always fits."""
 
     def __init__(self, max_items: int, max_bytes: int) -> None:
         self._max_items, self._max_bytes = max_items, max_bytes
@@ -39,13 +32,9 @@ class BoundedQueue(Generic[_Item]):
             return len(self._items), self._bytes
 
     def put(self, item: _Item, size: int, timeout: float = 0.0, *, always: bool = False) -> bool:
-        """Append an item of `size` bytes; return True, or False if the queue stays full for `timeout` [s].
-
-        `always`: True to append it even if the queue is full.
-        """
+        """Append an item of `size` bytes; return False if the queue, unless `always`, stays full for `timeout` [s]."""
 
         def has_room() -> bool:
-            """Return True if the item may be appended now."""
             fits = len(self._items) < self._max_items and self._bytes + size <= self._max_bytes
             return always or not self._items or fits
 
@@ -58,10 +47,7 @@ class BoundedQueue(Generic[_Item]):
             return True
 
     def pop(self, max_items: int, timeout: float) -> list[_Item]:
-        """Remove and return up to `max_items` items, waiting up to `timeout` [s] for the first one.
-
-        The list is empty if no item arrives in time.
-        """
+        """Remove and return up to `max_items` items, waiting up to `timeout` [s] for the first one."""
         with self._changed:
             self._changed.wait_for(lambda: bool(self._items), timeout)
             items = [self._items.popleft() for _ in range(min(max_items, len(self._items)))]

@@ -29,9 +29,8 @@ def check_mqtt() -> None:
 class MqttLink:
     """A connection to a broker by MQTT 5; the caller must acknowledge the received messages.
 
-    `broker`: settings of the connection; `will`: function that returns topic and payload of the last will. It is called
-    before each connection. The broker publishes this message when the connection is lost, and `close` publishes it,
-    too. `retain`: True if the broker is to retain the message. `client` is the client of the library paho.
+    `will`: function, called before each connection, that returns topic and payload of the last will, which the broker
+    publishes when the connection is lost, and `close`, too; `retain`: of this message; `client`: of the library paho.
     """
 
     def __init__(
@@ -66,10 +65,7 @@ class MqttLink:
             client.will_set(*self._last_will, qos=1, retain=self._retain)
 
     def open(self, **options: Any) -> None:
-        """Start a thread that connects to the broker, and reconnects whenever the connection is lost.
-
-        `options`: arguments of paho's `connect_async`.
-        """
+        """Start a thread that connects to the broker by paho's `connect_async`, and reconnects after a loss."""
         self.client.connect_async(self._broker.host, self._broker.port, KEEP_ALIVE_S, **options)
         self.client.loop_start()
         self.is_open = True
@@ -82,10 +78,7 @@ class MqttLink:
             raise RuntimeError("the thread of the connection to the broker has ended")
 
     def publish(self, topic: str, payload: bytes | str, **options: Any) -> bool:
-        """Publish `payload` as a message under `topic`; return True if it was sent within `_PUBLISH_TIMEOUT_S`.
-
-        `options`: arguments of paho's `publish`; with `qos` 1 the broker must also acknowledge the message in time.
-        """
+        """Publish a message; return True if it was sent, and with `qos` 1 acknowledged, within `_PUBLISH_TIMEOUT_S`."""
         message = self.client.publish(topic, payload, **options)
         try:
             message.wait_for_publish(_PUBLISH_TIMEOUT_S)

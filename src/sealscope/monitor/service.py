@@ -51,9 +51,8 @@ _Storable = TypeVar("_Storable", SourceBlock, RefusedMessage)
 class Service:
     """A running monitor: it takes blocks of samples from its sources, stores them, and sends the events of alarms.
 
-    It locks and opens the database, restores the actuators, and prepares the page if the settings state one. `once`:
-    True to end when standard input has ended and all files of the folders are stored; `stdin`, `stdout`: streams of
-    incoming blocks and of outgoing events; `sources`: additional sources, such as a simulated rig.
+    `once`: True to end when standard input has ended and all files of the folders are stored; `stdin`, `stdout`:
+    streams of incoming blocks and of outgoing events; `sources`: additional sources, such as a simulated rig.
     """
 
     def __init__(
@@ -97,8 +96,7 @@ class Service:
     def submit(self, block: SourceBlock | RefusedMessage) -> None:
         """Queue a block or a refused message for storage; wait while the queue is full.
 
-        A refused message, which has no valid block, is also counted and logged. The samples of a block are also passed
-        to the web page, which draws them before they are stored.
+        A refused message is also counted and logged; the web page draws the samples of a block before they are stored.
         """
         if isinstance(block, RefusedMessage):
             self.count(block.reason)
@@ -129,8 +127,7 @@ class Service:
     def run(self) -> None:
         """Store blocks of samples until `stop` is called or, if there is no web page, until all sources have ended.
 
-        Linear algebra runs in one thread: the matrices are small, and on a busy machine several threads spend most of
-        the time waiting for each other.
+        Linear algebra runs in one thread: the matrices are small, and on a busy machine several would mostly wait.
         """
         self._resources.enter_context(threadpool_limits(limits=1))
         sources, threads = self._all_sources(), list[threading.Thread]()
@@ -138,7 +135,10 @@ class Service:
         put_end = partial(self._queue.put, None, size=0, always=True)  # None in the queue: a source has ended
         self._n_sources = len(sources)
         try:
-            threads += self._start_outputs()
+            repeat, write_events = self.supervisor.repeat, self._write_events
+            threads.append(repeat("standard output", write_events, every_s=_POLL_S, last=write_events))
+            outputs = open_outputs(self.actuators, self.settings)
+            threads += [repeat(output.part, output.deliver, every_s=_POLL_S, last=output.end) for output in outputs]
             for name, source in sources:
                 work = partial(source, self)
                 threads.append(self.supervisor.start(name, work, restart=not self.once, on_end=put_end))
@@ -158,10 +158,7 @@ class Service:
             self.close()
 
     def _all_sources(self) -> list[tuple[str, Source]]:
-        """List all sources with their names: the additional ones, and those in the settings.
-
-        Raises InputError if a secret cannot be read.
-        """
+        """List all sources with their names, the additional ones first; raise InputError if a secret cannot be read."""
         sources = [(f"source {number}", source) for number, source in enumerate(self._extra_sources, 1)]
         if self.settings.lines:
             sources.append((_LINES, line_source(self._stdin)))
@@ -172,14 +169,6 @@ class Service:
         if self.settings.opcua is not None:
             sources.append(("OPC UA source", opcua_source(self.settings.opcua)))
         return sources
-
-    def _start_outputs(self) -> list[threading.Thread]:
-        """Start the threads that send events and states to the outputs in the settings, and return them."""
-        repeat = self.supervisor.repeat
-        threads = [repeat("standard output", self._write_events, every_s=_POLL_S, last=self._write_events)]
-        outputs = open_outputs(self.actuators, self.settings)
-        threads.extend(repeat(output.part, output.deliver, every_s=_POLL_S, last=output.end) for output in outputs)
-        return threads
 
     def _store_queued(self) -> None:
         """Store the next blocks of the queue; after an error the next call tries the same blocks again."""
@@ -200,15 +189,14 @@ class Service:
         self.stopping.set()
 
     def close(self) -> None:
-        """Release the lock of the database, which another monitor can then open; `run` calls this at its end."""
+        """Release the lock of the database, which another monitor can then open."""
         self._resources.close()
 
     def _store(self, blocks: list[_Storable], write: Callable[[list[_Storable]], object]) -> None:
         """Store blocks, or refused messages, in one transaction by the function `write`, and acknowledge them.
 
-        If the database has an outage, its error is raised. After any other error the blocks are stored one by one. A
-        block that fails alone is counted, dropped and acknowledged: a repetition would fail, too, and later blocks must
-        not wait.
+        The error of an outage of the database is raised. After any other the blocks are stored one by one, and a block
+        that fails alone is counted, dropped and acknowledged: it would fail again, and later blocks must not wait.
         """
         if not blocks:
             return
@@ -235,11 +223,7 @@ class Service:
             self.supervisor.part("acknowledgements").attempt(block.done, at_once=True)
 
     def _write_events(self) -> None:
-        """Write new events of alarms to the service's output stream, by default standard output.
-
-        The events are read from the database. If that succeeds, an outage of the database is marked as ended, unless
-        the database still refuses to store blocks.
-        """
+        """Write new events of alarms to the output stream; end the outage of the database, unless it refuses blocks."""
         self._lines.deliver()
         if not self._is_database_blocked:  # otherwise the database can be read, but not written
             self._database.end_outage()

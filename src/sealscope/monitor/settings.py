@@ -26,10 +26,9 @@ _LongText = Annotated[str, Field(min_length=1, max_length=1000)]
 
 
 def _resolve_in_folder(place: _PathLike, info: ValidationInfo) -> _PathLike:
-    """Resolve a path in the settings relative to the folder of their file.
+    """Resolve a path in the settings relative to the folder of their file, which is in the `context` of `info`.
 
-    `place`: path, URL or name of a packaged rig; `info`: name of the setting (`field_name`), and the folder of the file
-    (`context`). URLs and names are returned unchanged, and so are all paths if the settings do not come from a file.
+    URLs, names of packaged rigs, and all paths of settings that do not come from a file are returned unchanged.
     """
     is_name = isinstance(place, str) and ("://" in place or (info.field_name == "rig" and not place.endswith(".toml")))
     return place if is_name or not info.context else type(place)(Path(info.context["folder"]) / place)
@@ -47,13 +46,12 @@ class _Table(BaseModel):
 class WatchSettings(_Table):
     """Settings by which an actuator is watched.
 
-    `rig`: name of a packaged rig or path of a file; `false_alarms_per_1000_h`: upper limit of the false alarms in
-    1000 h of operation; `learn_hours`: time in which the leakage of the healthy machine, the baseline, is learned;
-    `warning_lpm`, `error_lpm` [L/min]: leaks at which an alarm is a warning or an error, None for no error;
-    `debounce_blocks`: number of successive blocks of the detector (some seconds each) beyond a threshold after which
-    the alarm changes; `return_share`: fraction of a threshold below which the leak counts as ended; `no_data_s` [s]:
-    time without samples after which the state of the actuator is "no data"; `not_comparable_s` [s]: time without a
-    judged block after which it is "not comparable".
+    `rig`: name of a packaged rig or path of a file; `false_alarms_per_1000_h`: most false alarms in 1000 h of
+    operation; `learn_hours`: time in which the leakage of the healthy machine is learned; `warning_lpm`, `error_lpm`
+    [L/min]: leaks at which an alarm is a warning or an error, None for no error; `debounce_blocks`: number of
+    successive blocks (some seconds each) beyond a threshold after which the alarm changes; `return_share`: fraction of
+    a threshold below which the leak counts as ended; `no_data_s`, `not_comparable_s` [s]: time without samples, or
+    without a judged block, after which the state of the actuator is "no data" or "not comparable".
     """
 
     rig: Annotated[_Text, AfterValidator(_resolve_in_folder)] = "thesis"
@@ -73,11 +71,7 @@ class WatchSettings(_Table):
 
 
 class SimulateSettings(_Table):
-    """A simulated rig that provides the samples of an actuator instead of a real machine.
-
-    The fields are those options of ``sealscope simulate`` that have the same names; `speed`: multiple of real time at
-    which it runs.
-    """
+    """A simulated rig as the source of samples, by options of ``sealscope simulate``, at `speed` times real time."""
 
     command: _LongText = "3 sin(4t)"
     load: _LongText | None = None
@@ -116,9 +110,9 @@ class ActuatorSettings(WatchSettings):
         """Complete the table of an actuator with the rate, columns, units and repair limit in its machine's file.
 
         `values`: the table, whose entries take precedence; `info`: its `context` has the folder of the settings. The
-        key `machine` of the table is another name of `rig`, but must name a file written by `sealscope commission`. The
-        limit becomes `error_lpm` [L/min]. The units are those in the column headings of the machine's logs. They are
-        used only for Sparkplug and OPC UA, whose values need not state units.
+        key `machine` is another name of `rig`, but must name a file written by `sealscope commission`. The limit
+        becomes `error_lpm` [L/min]. The units, those in the column headings of the machine's logs, are used only for
+        Sparkplug and OPC UA, whose values need not state units.
         """
         if not isinstance(values, dict):  # refused later, by the check of the types
             return values
@@ -146,8 +140,8 @@ class ActuatorSettings(WatchSettings):
 class PageSettings(_Table):
     """The settings of the web page.
 
-    `host`, `port`: address at which it is served; `token_file`: file with the token that a visitor must state, None
-    for none; `proxies`: addresses of proxies whose statement of the visitor's address is trusted.
+    `host`, `port`: address at which it is served; `token_file`: file with the token that a visitor must state;
+    `proxies`: addresses of proxies whose statement of the visitor's address is trusted.
     """
 
     host: str = "127.0.0.1"
@@ -159,8 +153,8 @@ class PageSettings(_Table):
 class BrokerSettings(_Table):
     """The settings of the connection to an MQTT broker.
 
-    `alarms_topic`: topic under which alarms and states are published, None to publish none; `host_id`: identity of
-    the monitor as a primary host of Sparkplug, None if it is not one.
+    `alarms_topic`: topic under which alarms and states are published, None to publish none; `host_id`: identity of the
+    monitor as a primary host of Sparkplug, None if it is not one.
     """
 
     host: _Text = "localhost"
@@ -177,8 +171,8 @@ class BrokerSettings(_Table):
 class OpcUaSettings(_Table):
     """The settings of the connection to an OPC UA server.
 
-    `security`: security string in the form of the library asyncua, None for no security; `block_s` [s]: length of the
-    blocks into which values are gathered; `timeout_s` [s]: longest time for an answer.
+    `security`: security string of the library asyncua, None for no security; `block_s` [s]: length of the blocks into
+    which values are gathered; `timeout_s` [s]: longest time for an answer.
     """
 
     url: Annotated[str, Field(pattern=r"^opc\.tcp://[^\s@]+$", max_length=2000)]
@@ -190,19 +184,13 @@ class OpcUaSettings(_Table):
 
 
 class OutputSettings(_Table):
-    """The settings of an output of alarms, which is switched on by its table in the settings (`MonitorSettings`).
-
-    `sender`: "module:class" of the `Output` in `monitor/outputs/` that they are for.
-    """
+    """The settings of an output of alarms; `sender`: "module:class" of the `Output` in `monitor/outputs/`."""
 
     sender: ClassVar[str]
 
 
 class SparkplugSettings(OutputSettings):
-    """The settings of the Sparkplug B edge node by which the monitor publishes alarms and values.
-
-    `every_s` [s]: interval at which changed values are published; alarms are published at once.
-    """
+    """The settings of the Sparkplug B node that publishes alarms and, every `every_s` [s], changed values."""
 
     sender: ClassVar[str] = "sparkplug_node:SparkplugNode"
     group: _Level = "Sealscope"
@@ -211,10 +199,7 @@ class SparkplugSettings(OutputSettings):
 
 
 class WebhookSettings(OutputSettings):
-    """The settings of a web address that receives the events of alarms by POST requests.
-
-    `token_file`: file with the token that is sent, None for none; `timeout_s` [s]: longest time of a request.
-    """
+    """The settings of a web address that gets the events of alarms by POST requests of at most `timeout_s` [s] each."""
 
     sender: ClassVar[str] = "events:Webhook"
     url: Annotated[str, Field(pattern=r"^https?://[^\s@]+$", max_length=2000)]
@@ -226,9 +211,8 @@ class MonitorSettings(_Table):
     """All settings of a monitor.
 
     `database`: file of SQLite or URL; `lines`: True to read blocks from standard input; `settle_s` [s]: time without
-    a change after which a file is read; `keep_days`: days of operation whose estimates are stored;
-    `fleet_false_alarms_per_1000_h`: upper limit of the false alarms of all actuators together, which they share;
-    `defaults`: settings of actuators that do not state them.
+    change before a file is read; `keep_days`: days of operation whose estimates are stored;
+    `fleet_false_alarms_per_1000_h`: most false alarms of all actuators; `defaults`: settings of each.
     """
 
     database: Annotated[str, AfterValidator(_resolve_in_folder)] = Field(default="monitor.db", validate_default=True)
@@ -249,8 +233,7 @@ class MonitorSettings(_Table):
     def _apply_defaults(cls, values: Any) -> Any:
         """Fill the defaults into the table of each actuator, with an equal part of the fleet's false-alarm rate.
 
-        `values`: the tables of all settings. Raises ValueError if the fleet has a false-alarm rate and an actuator or
-        the defaults state another.
+        `values`: the tables of all settings. Raises ValueError if an actuator or the defaults state another rate.
         """
         if not isinstance(values, dict):  # refused later, by the check of the types
             return values
@@ -268,11 +251,7 @@ class MonitorSettings(_Table):
 
     @model_validator(mode="after")
     def _check_consistency(self) -> MonitorSettings:
-        """Check the rules that concern several tables; raise ValueError or InputError if one is broken.
-
-        Names and topics must be unique, the tables that actuators need must exist, channels must have valid units and
-        nodes, and a page open to other machines needs a token.
-        """
+        """Check the rules that concern several tables; raise ValueError or InputError if one is broken."""
         actuators, mqtt, page = self.actuator, self.mqtt, self.page
         topics = [actuator.topic for actuator in actuators if actuator.topic is not None]
         paths = [actuator.sparkplug for actuator in actuators if actuator.sparkplug is not None]
@@ -300,10 +279,7 @@ class MonitorSettings(_Table):
 
 
 def _check_channels(actuator: ActuatorSettings, *, has_opcua: bool) -> None:
-    """Check the OPC UA nodes and the units of an actuator's channels; raise ValueError or InputError if they are wrong.
-
-    `has_opcua`: True if the settings have the table [opcua].
-    """
+    """Check the OPC UA nodes and the units of an actuator's channels; raise ValueError or InputError if not valid."""
     if actuator.nodes and (not has_opcua or actuator.rate is None):
         raise ValueError(f"an actuator with nodes needs the table [opcua] and its rate, got {actuator.name!r}")
     for table, channels in (("nodes", actuator.nodes), ("units", actuator.units)):
@@ -341,9 +317,7 @@ def read_settings(path: Path) -> MonitorSettings:
     values = read_toml(path, "the monitor's settings", os.fspath(path))
     context = {"folder": path.resolve().parent}
     # an error that concerns all settings has no entry: its message names the "settings"
-    return read_model(
-        values, MonitorSettings, os.fspath(path), entry_name=lambda entry: entry or "settings", context=context
-    )
+    return read_model(values, MonitorSettings, os.fspath(path), lambda entry: entry or "settings", context)
 
 
 def template() -> str:
@@ -354,7 +328,7 @@ def template() -> str:
 def read_secret(path: Path | None, name: str) -> str | None:
     """Read a secret, such as a password, from the first line of a file; return None if `path` is None.
 
-    `name`: name of the setting, for the error message. Raises InputError if the file cannot be read or is empty.
+    Raises InputError, which calls the setting `name`, if the file cannot be read or is empty.
     """
     if path is None:
         return None

@@ -42,10 +42,9 @@ _UNIT = "engUnit"
 class SparkplugMetric:
     """A metric of Sparkplug B, a named value.
 
-    `name`: None if the message has an alias (a number) instead; `value`: a number, text or bool, an array (n,) of
+    `name`: None if the message has the number `alias` instead; `value`: a number, text or bool, an array (n,) of
     numbers, or None for null; `datatype`: number of its Sparkplug type, 0 if only the birth message of its sender
-    states the type; `alias`: number that stands for the name, None for none; `timestamp` [ms since 1970]: its time,
-    None if not stated; `unit`: its property `engUnit`, None if not stated.
+    states it; `timestamp` [ms since 1970]: None if not stated; `unit`: its property `engUnit`, None if not stated.
     """
 
     name: str | None
@@ -59,8 +58,7 @@ class SparkplugMetric:
         """Convert the value from its transmitted form to a Sparkplug data type; return the metric with value and type.
 
         The bytes of an array become numbers (n,), or None if the type is not supported. Integers of a signed type are
-        converted from two's complement. Other values are unchanged. Raises ValueError if the bytes of an array are not
-        a whole number of values.
+        converted from two's complement. Raises ValueError if the bytes are not a whole number of values.
         """
         value = self.value
         if isinstance(value, bytes):
@@ -76,11 +74,7 @@ class SparkplugMetric:
 
 @dataclass(frozen=True)
 class SparkplugPayload:
-    """A message of Sparkplug B.
-
-    `timestamp` [ms since 1970]: time of sending, None if not stated; `metrics`: its named values; `seq`: sequence
-    number, 0 to 255, None if not stated.
-    """
+    """A message of Sparkplug B, sent at `timestamp` [ms since 1970], with sequence number `seq`, 0 to 255, or None."""
 
     timestamp: int | None
     metrics: tuple[SparkplugMetric, ...]
@@ -95,8 +89,7 @@ class SparkplugPayload:
 def payload_class() -> Any:
     """Build the protobuf class of payloads from `sparkplug.toml`; raise MissingExtra if protobuf is not installed.
 
-    In that file each field of a message has a number, a name and a type, and may have roles: ``R`` if it is repeated,
-    ``V`` if it is one of the alternatives of a value.
+    There each field has a number, a name and a type, and maybe roles: ``R`` (repeated), ``V`` (alternative of a value).
     """
     try:
         from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
@@ -124,10 +117,7 @@ def payload_class() -> Any:
 
 
 def encode_payload(payload: SparkplugPayload) -> bytes:
-    """Encode a payload as bytes.
-
-    The data type of each metric must be a constant of this module, or 31 for an array of doubles.
-    """
+    """Encode a payload as bytes; each data type must be a constant of this module, or 31 for an array of doubles."""
     message = payload_class()(timestamp=payload.timestamp, seq=payload.seq)  # protobuf omits fields that are None
     for metric in payload.metrics:
         fields: dict[str, Any] = {name: getattr(metric, name) for name in ("name", "alias", "timestamp", "datatype")}
@@ -149,7 +139,7 @@ def encode_payload(payload: SparkplugPayload) -> bytes:
 def decode_payload(data: bytes) -> SparkplugPayload:
     """Decode a payload from bytes; raise ValueError, with a message of one line, if they are invalid.
 
-    The value of a metric without a type is left as transmitted: `SparkplugMetric.with_datatype` converts it.
+    The value of a metric without a type is left as transmitted (`SparkplugMetric.with_datatype`).
     """
     from google.protobuf.message import DecodeError
 
@@ -185,8 +175,5 @@ def _decode_metric(entry: Any) -> SparkplugMetric:
 
 
 def topic_of(group: str, kind: str, node: str, device: str | None = None) -> str:
-    """Build the MQTT topic of a Sparkplug message of a node in a group, or of the node's device.
-
-    `kind`: type of the message, such as ``NBIRTH``; `device`: None for a message of the node itself.
-    """
+    """Build the MQTT topic of a Sparkplug message of a `kind` such as ``NBIRTH``, of a node or one of its devices."""
     return "/".join([NAMESPACE, group, kind, node, *([] if device is None else [device])])

@@ -34,18 +34,15 @@ _Work = Callable[[], object]
 
 
 class PartAway(Exception):  # noqa: N818 (says what happened)
-    """Raised by a part of the monitor that lacks something it needs, such as a folder.
-
-    The outage that this begins is logged without a traceback.
-    """
+    """Raised by a part of the monitor that lacks something it needs; its outage is logged without a traceback."""
 
 
 class SupervisedPart:
     """A part of a monitor, or a service that it uses, with its outages and the pause after an error.
 
-    `since` [s since 1970]: start of the present outage, None if there is none; `reason`: its reason; `count`: number
-    of outages so far; `seconds` [s]: total length of those that have ended. Several threads may report outages, but
-    only one at a time may call `attempt`.
+    `since` [s since 1970], `reason`: start of the present outage, None if there is none, and its reason; `count`:
+    number of outages so far; `seconds` [s]: length of those that have ended. Only one thread at a time may call
+    `attempt`.
     """
 
     def __init__(self, name: str, supervisor: Supervisor) -> None:
@@ -66,10 +63,7 @@ class SupervisedPart:
         self._supervisor.on_change()
 
     def end_outage(self) -> None:
-        """End the outage of the part, if there is one, and log that.
-
-        The pause after the next error is again the shortest.
-        """
+        """End the outage of the part, if there is one, and log that; the next pause is the shortest again."""
         with self._lock:
             self._pause = 0.0
             if self.since is None:
@@ -92,9 +86,8 @@ class SupervisedPart:
     def attempt(self, work: _Work, *, at_once: bool = False) -> bool:
         """Run the function `work` unless the part pauses after an error; return True if it ran without an error.
 
-        An error begins an outage and a pause, which is twice as long as the last pause, up to a limit. An error of the
-        database begins an outage of the database instead of the part. Success ends the outage of the part. `at_once`:
-        True to run `work` even during a pause.
+        An error begins an outage, of the database if it comes from there, and a pause, twice as long as the last one up
+        to a limit. Success ends the outage of the part. `at_once`: True to run `work` even during a pause.
         """
         if self.pause_s and not at_once:
             return False
@@ -120,8 +113,8 @@ class SupervisedPart:
 class Supervisor:
     """The parts of a monitor and their threads, which run until the event `stopping` is set.
 
-    `outage_reason`: function that returns the reason of an outage for an error of the database, and None for other
-    errors; `on_change`: function called when an outage begins or ends.
+    `outage_reason`: function that returns the reason of an outage for an error of the database, None for other errors;
+    `on_change`: function called when an outage begins or ends.
     """
 
     def __init__(
@@ -146,18 +139,12 @@ class Supervisor:
         return [{"part": part.name, "since": part.since, "reason": part.reason} for part in parts if part.since]
 
     def outage_totals(self) -> dict[str, tuple[bool, int, float]]:
-        """Summarise the outages of each part since the start, by name of the part.
-
-        Each value is (True if there is no outage now, number of outages, their total length [s]).
-        """
+        """Summarise outages by part: (True if there is none now, their number, their total length [s])."""
         parts = [*self._parts.values()]
         return {part.name: (part.since is None, part.count, part.seconds + part.outage_s) for part in parts}
 
     def start(self, name: str, work: _Work, *, restart: bool = True, on_end: _Work = lambda: None) -> threading.Thread:
-        """Start a thread that runs `work` as the part `name` and then calls `on_end`; return the thread.
-
-        `restart`: True to run `work` again after each error, until `stopping` is set.
-        """
+        """Start a thread that runs `work` as the part `name`, again after errors if `restart`, and then `on_end`."""
         part = self.part(name)
 
         def work_with_timer() -> None:
@@ -171,7 +158,6 @@ class Supervisor:
                 timer.cancel()
 
         def run_until_success() -> None:
-            """Run the part, with `restart` until it succeeds or the monitor stops; then call `on_end`."""
             while not part.attempt(work_with_timer) and restart and not self.stopping.wait(part.pause_s):
                 pass
             on_end()
@@ -179,14 +165,10 @@ class Supervisor:
         return _start_thread(run_until_success, name)
 
     def repeat(self, name: str, step: _Work, every_s: float, *, last: _Work | None = None) -> threading.Thread:
-        """Start a thread that runs `step` every `every_s` seconds as the part `name`; return the thread.
-
-        An error pauses the steps for a longer time. Once `stopping` is set, the thread runs `last`, if given, and ends.
-        """
+        """Start a thread that runs `step` every `every_s` [s] as the part `name`, and `last` when the monitor stops."""
         part = self.part(name)
 
         def run_steps() -> None:
-            """Run `step` again and again until the monitor stops, and then `last`."""
             while not self.stopping.wait(max(every_s, part.pause_s)):
                 part.attempt(step)
             if last is not None:
@@ -196,11 +178,7 @@ class Supervisor:
 
 
 class LimitedLines(logging.Filter):
-    """A log filter that limits the number of lines per minute from one place in the code.
-
-    The number of lines left out is logged later. Each message is made one printable line, because it may contain
-    names from outside.
-    """
+    """A log filter that limits the number of lines per minute from one place in the code, and makes each printable."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -8,20 +8,18 @@ present from the first sample on, which a watch that learns from the same sample
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from sealscope.diagnosis.commissioned.machine import CommissionedMachine
 from sealscope.diagnosis.live.estimates import BlockEstimate, Interval
 from sealscope.diagnosis.priors.decision import DECISION
+from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.evidence import CANNOT_TELL, LEAK, NO_LEAK
 from sealscope.diagnosis.verdict.states import state_of
+from sealscope.recordings.recording import Recording
 from sealscope.reporting.messages import how_much
-
-if TYPE_CHECKING:
-    from sealscope.diagnosis.commissioned.machine import CommissionedMachine
-    from sealscope.diagnosis.verdict.diagnosis import Diagnosis
-    from sealscope.recordings.recording import Recording
 
 _FALSE_ALARM = DECISION.false_alarm
 
@@ -34,10 +32,10 @@ class RecordingVerdict:
     - `summary`, `size`, `odds`: texts that state the verdict, the size or bound of the leak, and the fraction of
       healthy recordings that look like this one;
     - `cause`: cause of the leak or of another event, "" if not named; `state`: state of the machine by NAMUR NE 107;
-    - `start_s`, `end_s`: times of the first and last sample;
-    - `onset_s`, `onset_interval_s`: start of the leak, None if it leaks from the first sample on or not at all;
-    - `leak_lpm`, `total_lpm`: flows of the leak and of all leakage [L/min], with 95 % intervals, None if not stated;
-    - `bound_lpm`: upper bound of a leak that is not found [L/min], None if not stated;
+    - `start_s`, `end_s`: times of the first and last sample; `onset_s`, `onset_interval_s`: start of the leak, None if
+      it leaks from the first sample on or not at all;
+    - `leak_lpm`, `total_lpm`, `bound_lpm` [L/min]: flows of the leak and of all leakage, with 95 % intervals, and upper
+      bound of a leak that is not found, None if not stated;
     - `chance`: probability that a leak-free recording scores as high, None if not known;
     - `mark`: mark of a person that ended the alarm, else "".
     """
@@ -64,11 +62,7 @@ class RecordingVerdict:
 
     @classmethod
     def from_diagnosis(cls, diagnosis: Diagnosis, start_s: float, end_s: float, shift: float) -> RecordingVerdict:
-        """Convert a diagnosis, whose times are those of the recording, to a verdict with times in seconds since 1970.
-
-        `start_s`, `end_s` [s since 1970]: times of the first and last sample; `shift` [s]: added to the times in the
-        diagnosis.
-        """
+        """Convert a diagnosis, whose times plus `shift` [s] are in seconds since 1970, to a verdict with such times."""
         plain = diagnosis.as_dict()  # has None for numbers that are not finite
         onset, onset_ends = plain["onset_s"], _parse_interval(plain["onset_interval_s"])
         leaks = diagnosis.verdict == LEAK
@@ -108,19 +102,17 @@ class RecordingVerdict:
 
     @property
     def decides(self) -> bool:
-        """True if the condition of the machine follows from this verdict on a whole recording.
+        """True if the condition of the machine follows from this verdict, not from the estimates of single blocks.
 
-        Otherwise the condition follows from the estimates of the single blocks of samples. The verdicts `leak` and
-        `no leak` decide, and so does `cannot tell` after a person has marked the alarm.
+        The verdicts `leak` and `no leak` decide, and so does `cannot tell` after a person has marked the alarm.
         """
         return self.leaks or self.clears or self.mark != ""
 
     def is_rare(self, false_alarms_per_1000_h: float) -> bool:
         """Return True if leak-free recordings get such a verdict so rarely that it may raise an alarm by itself.
 
-        `chance`, the probability that a leak-free recording scores as high, must not exceed
-        `false_alarms_per_1000_h` times the length of the recording in units of 1000 h. The limit is never below
-        `rarest` of `priors.toml`, the smallest probability that can be known. Returns True if `chance` is None.
+        `chance`, unless it is None, must not exceed `false_alarms_per_1000_h` times the length of the recording in
+        units of 1000 h, or `rarest` of `priors.toml`, the smallest probability that can be known, if that is larger.
         """
         allowed_chance = false_alarms_per_1000_h * (self.end_s - self.start_s) / 3.6e6  # [s] in 1000 h
         return self.chance is None or self.chance <= max(_FALSE_ALARM.rarest, allowed_chance)
@@ -132,20 +124,15 @@ class RecordingVerdict:
         return None if self.chance is None or hours <= 0.0 else 1000.0 * self.chance / hours
 
     def neutral_after_mark(self, mark: str) -> RecordingVerdict:
-        """Build the verdict that is shown after a person has marked the alarm, until the next recording is judged.
-
-        This verdict is `cannot tell`, for the same file and times, and quotes the `mark` ("invalid" or "repaired").
-        """
-        state, start_s, end_s = state_of("watched").as_dict(), self.start_s, self.end_s
-        texts: dict[str, Any] = {"summary": f"marked {mark}", "reason": "the next recording is judged anew"}
-        texts |= {"size": "", "cause": "", "mark": mark}
-        return RecordingVerdict(self.file, CANNOT_TELL, state=state, start_s=start_s, end_s=end_s, **texts)
+        """Build the verdict `cannot tell`, shown after the `mark` "invalid" or "repaired" until the next recording."""
+        texts = {"summary": f"marked {mark}", "reason": "the next recording is judged anew", "size": "", "cause": ""}
+        values: dict[str, Any] = {**texts, "mark": mark, "start_s": self.start_s, "end_s": self.end_s}
+        return RecordingVerdict(self.file, CANNOT_TELL, state=state_of("watched").as_dict(), **values)
 
     def restate_block(self, block: BlockEstimate) -> BlockEstimate:
         """Replace the leak in the estimate of a block by the leak of the whole recording.
 
-        Before the onset, or if the recording has no leak, the block gets no leak. The interval of the leak is then from
-        0 to `bound_lpm`, the 95 % upper bound of a leak in the recording, or None if this bound is None.
+        Before the onset, or without a leak, the block gets no leak, and the interval from 0 to `bound_lpm` if known.
         """
         is_before_onset = self.onset_s is not None and block.t < self.onset_s
         if self.leaks and not is_before_onset:
@@ -164,8 +151,8 @@ def judge_recording(
 ) -> RecordingVerdict:
     """Judge a recording by comparison with its machine's healthy recordings, like `sealscope diagnose --machine`.
 
-    `file`: name of its file; `shift` [s]: added to the recording's times to give seconds since 1970; `limit_lpm`
-    [L/min]: leak that calls for a repair, None for the limit in the machine's file.
+    `file`: its name; `shift` [s]: added to its times to give seconds since 1970; `limit_lpm` [L/min]: leak that calls
+    for a repair, None for the limit in the machine's file.
     """
     if limit_lpm is not None:
         machine = replace(machine, limit=f"{limit_lpm:.12g} L/min")

@@ -62,14 +62,10 @@ class ChartLine(NamedTuple):
 class Chart(NamedTuple):
     """One chart of the page.
 
-    - `key`: identifier of the chart
-    - `group`: section of the page in which the chart is shown
-    - `base`: name of the time axis, which has the times of all samples, the centres of the RMS windows, or the times at
-      which the leak is estimated
-    - `height`: height in pixels
-    - `band`: True if the second and third line are the interval of the first
-    - `limits`: ends of the y axis, None to show all values
-    - `level`: repair limit, None if there is none
+    `key`: its identifier; `group`: section of the page that shows it; `base`: name of the time axis, which has the
+    times of all samples, the centres of the RMS windows, or the times at which the leak is estimated; `height`: in
+    pixels; `band`: True if the second and third line are the interval of the first; `limits`: ends of the y axis, None
+    to show all values; `level`: repair limit, None if there is none.
     """
 
     key: str
@@ -99,8 +95,7 @@ class Chart(NamedTuple):
 def display_values(recording: Recording, name: str, pressure_unit: str) -> tuple[str, Array]:
     """Convert a channel of a recording to its display unit; return the unit and the values (n,).
 
-    `name`: name of the channel. Pressures are in `pressure_unit`, and raw counts of a sensor in counts. Other
-    channels are in the unit of the log file. If the file states no unit, they are in degC, mm, rpm, L/min or SI.
+    Pressures are in `pressure_unit`, raw counts in counts, others as in the log, by default degC, mm, rpm, L/min or SI.
     """
     si_unit = recording.units[name]
     unit = None if si_unit in ("Pa", COUNTS) else recording.unit_in_log(name)
@@ -114,9 +109,7 @@ def display_values(recording: Recording, name: str, pressure_unit: str) -> tuple
 def display_unit(unit: str, pressure_unit: str, *, detail: bool = False) -> tuple[str, float]:
     """Choose the unit in which values in the SI unit `unit` are displayed; return this unit and its size in SI.
 
-    Values are divided by this size for display. `pressure_unit`: display unit of pressures; `detail`: True for a
-    wavelet detail of a pressure, whose unit may be smaller (`_DETAIL_UNITS`). Raises InputError for an unknown pressure
-    unit.
+    `detail`: True for a wavelet detail, whose unit may be smaller. Raises InputError for an unknown `pressure_unit`.
     """
     if pressure_unit not in _DETAIL_UNITS:
         raise InputError(f"pressure unit must be one of {', '.join(_DETAIL_UNITS)}, got {pressure_unit!r}")
@@ -128,11 +121,7 @@ def display_unit(unit: str, pressure_unit: str, *, detail: bool = False) -> tupl
 
 
 def detail_unit(unit: str, name: str, pressure_unit: str) -> tuple[str, float]:
-    """Choose the unit in which a wavelet detail is displayed; return this unit and its size in the values' unit.
-
-    Values are divided by this size for display. Unit and size are squared for d3d4, the product of two details.
-    `unit`: unit of the channel; `name`: name of the detail, such as "d3"; `pressure_unit`: display unit of pressures.
-    """
+    """Choose the display unit of a wavelet detail such as "d3" and its size in `unit`, both squared for d3d4."""
     display, scale = display_unit(unit, pressure_unit, detail=True)
     return (f"{display}²", scale**2) if name == PRODUCT else (display, scale)
 
@@ -145,8 +134,7 @@ def detail_label(name: str) -> str:
 def channel_charts(recording: Recording, pressure_unit: str) -> list[Chart]:
     """Build the charts of all channels with samples, over the time of the recording.
 
-    The two chamber pressures share a chart, and so do the two pressures at the pump's ports, unless their display units
-    differ. `pressure_unit`: display unit of pressures.
+    The two chamber pressures share a chart, and so do those at the pump's ports, unless their display units differ.
     """
     charts = []
     for key, title, height, members in _CHANNELS:
@@ -173,11 +161,7 @@ _CHANNELS = (
 
 
 def rms_charts(chambers: list[ChamberDetails], pressure_unit: str) -> list[Chart]:
-    """Build the charts of the RMS of wavelet details in windows.
-
-    `chambers`: wavelet details of the pressure of each cylinder chamber; `pressure_unit`: display unit of pressures.
-    The list has a chart of d1 to d4 for each chamber, then one of d3d4, the product of d3 and d4, for each.
-    """
+    """Build the charts of the windowed RMS of wavelet details: d1 to d4 of each chamber, then d3d4 (d3 times d4)."""
     charts = []
     for names, quantity, suffix, height in (
         (QUANTITIES[:-1], "the details", "", 230),
@@ -204,8 +188,7 @@ _MAX_LIMIT_RATIO = 4.0
 def course_charts(diagnosis: Diagnosis, *, height: int = 190) -> list[Chart]:
     """Build the chart of the leak flow [L/min] over the time of the recording, with its interval and the repair limit.
 
-    If only the total leakage of pump and piston is known over time, the chart shows this flow. Returns a list with the
-    chart, empty if neither flow is known. `height`: height of the chart in pixels.
+    It shows the total leakage of pump and piston if only that is known. The list is empty if neither is known.
     """
     course = diagnosis.course
     if course is None or not np.isfinite(course.lpm).any():
@@ -218,28 +201,15 @@ def course_charts(diagnosis: Diagnosis, *, height: int = 190) -> list[Chart]:
     if level is not None and top < level < _MAX_LIMIT_RATIO * top:
         top = 1.06 * level  # 6 % margin above the limit
     title = "Passed by pump and piston together" if course.whole else "Leak past the piston"
-    return [
-        Chart(
-            key=COURSE,
-            group=COURSE,
-            title=title,
-            unit="L/min",
-            lines=lines,
-            base=COURSE,
-            height=height,
-            band=True,
-            limits=(bottom, top),
-            level=level,
-        )
-    ]
+    options: dict[str, Any] = {"base": COURSE, "height": height, "band": True, "limits": (bottom, top), "level": level}
+    return [Chart(COURSE, COURSE, title, "L/min", lines, **options)]
 
 
 def _y_limits(values: Array, low: Array, high: Array) -> tuple[float, float]:
-    """Compute the limits of the y axis, which include zero, all estimates `values` and their intervals.
+    """Compute the limits of the y axis, which include zero, all estimates `values` and their intervals, with a margin.
 
     `low`, `high`: ends of the intervals, not finite if unknown. The lowest 10 % of the lower ends and the highest 10 %
-    of the upper ends are ignored if this more than halves the range, because a few wide intervals would flatten the
-    curve. A margin is added at both ends.
+    of the upper ends are ignored if they more than double the range, as they would flatten the curve.
     """
     required_values = [0.0, float(np.nanmin(values)), float(np.nanmax(values))]
     low_ends, high_ends = low[np.isfinite(low)], high[np.isfinite(high)]
@@ -255,10 +225,7 @@ def _y_limits(values: Array, low: Array, high: Array) -> tuple[float, float]:
 
 
 def detail_charts(chambers: list[ChamberDetails], pressure_unit: str) -> list[Chart]:
-    """Build a chart for each wavelet detail of each chamber, ordered by detail.
-
-    `chambers`: wavelet details of the pressure of each cylinder chamber; `pressure_unit`: display unit of pressures.
-    """
+    """Build a chart for each wavelet detail of each chamber, ordered by detail; `pressure_unit`: for display."""
     charts = []
     for name in QUANTITIES:
         for chamber in chambers:
@@ -299,8 +266,7 @@ def draw(
     """Reduce and encode the lines of all charts for the script of the page, and draw a still picture of each chart.
 
     Long channels are divided into groups of successive samples, of which only minimum and maximum are drawn, so that
-    peaks are preserved. `chambers`: wavelet details, which give the time axes of their RMS windows; `charts`: the
-    charts to draw; `marks`: moments to mark on every chart, besides the onset of the diagnosis.
+    peaks are preserved. `chambers`: give the time axes of the RMS windows; `marks`: moments besides the onset.
     """
     middle = float(recording.t[len(recording) // 2])
     near = diagnosis.onset_s if diagnosis.onset_s is not None and isfinite(diagnosis.onset_s) else middle
@@ -347,10 +313,7 @@ def _clip_values(values: Array) -> Array:
 
 
 def _clip_onset(diagnosis: Diagnosis, span: tuple[float, float]) -> tuple[float | None, tuple[float, float] | None]:
-    """Return the onset of the leak [s], and its confidence interval (low, high) cut off at the ends of `span` [s].
-
-    `span`: first and last time on the charts. The onset itself is not cut off. An unknown onset or interval is None.
-    """
+    """Return the onset of the leak [s], and its interval cut off at the ends of `span` [s], with None for unknown."""
     onset, interval = diagnosis.onset_s, diagnosis.onset_interval_s
     if onset is None or not isfinite(onset):
         return None, None
@@ -363,10 +326,9 @@ def _clip_onset(diagnosis: Diagnosis, span: tuple[float, float]) -> tuple[float 
 def render_still(
     chart: Chart, t: Array, lines: list[Array], span: tuple[float, float], moments: Sequence[Moment] = ()
 ) -> Picture:
-    """Draw the still picture of a chart, 860 pixels wide and `chart.height` pixels high.
+    """Draw the still picture of a chart, 860 pixels wide and `chart.height` pixels high, shown where no script runs.
 
-    A page shows it where no script runs, such as on paper. `lines`: values (n,) of each line, at the times `t` (n,)
-    [s]; `span` [s]: ends of the time axis; `moments`: moments and intervals to mark.
+    `lines`: values (n,) of each line at the times `t` (n,) [s]; `span` [s]: ends of the time axis; `moments`: to mark.
     """
     lines = [_clip_values(line) for line in lines]
     all_values = np.concatenate(lines)

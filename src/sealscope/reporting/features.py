@@ -21,10 +21,9 @@ HALF_WINDOWS = 10
 class ChamberDetails(NamedTuple):
     """Wavelet details d1..d4 of one chamber's pressure, and d3d4, the product of d3 and d4.
 
-    `values`: by name, each detail (n,) over the whole recording, NaN where it depends on samples beyond an end or on
-    a defect of the data; `window_t` (w,) [s]: centres of the windows over which the RMS is computed; `window_rms`: by
-    name, the RMS (w,) in each window, NaN between two usable parts of the recording. d1..d4 have the `unit` of the
-    channel, d3d4 has the square of this unit.
+    `values`: by name, each detail (n,) over the whole recording, NaN where it depends on samples beyond an end or on a
+    defect of the data; `window_t` (w,) [s]: centres of the windows of the RMS; `window_rms`: by name, the RMS (w,) in
+    each window, NaN between two usable parts of the recording. d1..d4 have the `unit` of the channel, d3d4 its square.
     """
 
     channel: str
@@ -35,11 +34,7 @@ class ChamberDetails(NamedTuple):
 
 
 class DetailChange(NamedTuple):
-    """The RMS of one wavelet detail in two parts of a recording.
-
-    `name`: name of the detail; `before`, `after`: RMS in the unit of the channel (of d3d4, in the square of this unit),
-    None if it cannot be computed.
-    """
+    """The RMS of the wavelet detail `name` in two parts of a recording, `before` and `after`, None if not known."""
 
     channel: str
     name: str
@@ -48,10 +43,7 @@ class DetailChange(NamedTuple):
 
     @property
     def percent(self) -> float | None:
-        """Relative change as the thesis defines it, ``100 (after - before) / before`` [%].
-
-        None if one of the two is missing, or `before` is 0.
-        """
+        """Relative change ``100 (after - before) / before`` [%], None if one is missing or `before` is 0."""
         if self.before is None or self.after is None or self.before <= 0:
             return None
         return 100 * (self.after - self.before) / self.before
@@ -60,9 +52,8 @@ class DetailChange(NamedTuple):
 def chamber_details(recording: Recording, channel: str) -> tuple[ChamberDetails | None, str]:
     """Compute the wavelet details of the pressure of one chamber; return them with a note on omitted samples.
 
-    `channel`: "p_A" or "p_B". Only parts of the recording that are long enough and without a defect are transformed. If
-    there are no such parts, or the transform fails, the details are None, and the note is the reason. The note is "" if
-    no samples are omitted and there is an RMS window.
+    Only parts of the recording that are long enough and without a defect are transformed. If there are none, or the
+    transform fails, the details are None, and the note is the reason. It is "" if nothing is missing.
     """
     if channel not in recording:
         return None, f"{channel} is not in this recording."
@@ -106,10 +97,9 @@ def chamber_details(recording: Recording, channel: str) -> tuple[ChamberDetails 
 
 
 class Parts(NamedTuple):
-    """Two parts of a recording that are compared on the page.
+    """Two parts of a recording that are compared on the page: until the time `end` [s], and from `start` [s] on.
 
-    `end` [s]: end of the first part; `start` [s]: start of the second part; `heads`: headings of both parts in the
-    table; `text`: sentence that explains the choice.
+    `heads`: their headings in the table; `text`: sentence that explains the choice.
     """
 
     end: float
@@ -119,11 +109,10 @@ class Parts(NamedTuple):
 
 
 def parts_to_compare(diagnosis: Diagnosis, recording: Recording) -> Parts:
-    """Choose the parts of a recording to compare: before and after the interval of the onset, or the two halves.
+    """Choose the parts of a recording to compare: before and after the interval of the onset or, without it, halves.
 
-    The halves are compared if no onset was found. If the halves are too short for `HALF_WINDOWS` RMS windows each, the
-    first part is the whole recording and the second is empty: a difference of such short halves would reflect the
-    motion of the piston and not the seal.
+    If the halves are too short for `HALF_WINDOWS` RMS windows each, the first part is the whole recording and the
+    second is empty: a difference would reflect the motion of the piston and not the seal.
     """
     t, _ = ordered_time(recording.t, recording.rate)
     if diagnosis.onset_s is not None:
@@ -142,11 +131,7 @@ def parts_to_compare(diagnosis: Diagnosis, recording: Recording) -> Parts:
 
 
 def changes(recording: Recording, chambers: list[ChamberDetails], parts: Parts) -> list[DetailChange]:
-    """Compute the RMS of each wavelet detail of each chamber in two parts of the recording.
-
-    `chambers`: wavelet details of each chamber's pressure; `parts`: end of the first part and start of the second.
-    The RMS is None for a part without finite values.
-    """
+    """Compute the RMS of each wavelet detail in two parts of the recording, None for a part without finite values."""
     t, _ = ordered_time(recording.t, recording.rate)
     first, second = t < parts.end, t >= parts.start
     series = ((chamber.channel, name, values) for chamber in chambers for name, values in chamber.values.items())

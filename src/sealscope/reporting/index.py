@@ -16,15 +16,7 @@ _ORDER = ("leak", "cannot tell", "no leak")
 
 
 def severity_key(diagnosis: Diagnosis) -> tuple[int, float, float, str]:
-    """Compute a sort key that puts the most severe diagnosis first.
-
-    Diagnoses are ordered by the first of these entries in which they differ; unknown numbers are 0:
-
-    - verdict: 0 for leak, 1 for cannot tell, 2 for no leak
-    - negative ratio of the leak to the repair limit, so that larger ratios come first
-    - negative flow [L/min] of the leak or, if this flow is unknown, of the total leakage
-    - name of the file
-    """
+    """Compute a sort key by verdict, ratio of leak to limit, flow (0 if unknown) and file, the most severe first."""
     severity = diagnosis.severity
     # `of_limit` is the ratio of leak to limit, and the ends of the ratio's interval
     limit_ratio = 0.0 if severity is None or severity.of_limit is None else severity.of_limit[0]
@@ -34,10 +26,7 @@ def severity_key(diagnosis: Diagnosis) -> tuple[int, float, float, str]:
 
 
 def write_index(path: str | os.PathLike[str], pages: Sequence[tuple[Path, Diagnosis]]) -> Path:
-    """Write the index page of a folder, with a row for each of its pages; return its path.
-
-    `path`: the index page; `pages`: path and diagnosis of each page, in the same folder.
-    """
+    """Write the index page of a folder, with a row for each of its `pages` and their diagnoses; return its path."""
     ordered_pages = sorted(pages, key=lambda page: severity_key(page[1]))
     counts = {verdict: sum(diagnosis.verdict == verdict for _, diagnosis in pages) for verdict in _ORDER}
     summary = ", ".join(f"{count} {verdict}" for verdict, count in counts.items() if count)

@@ -31,10 +31,7 @@ def _texts() -> dict[str, dict[str, str]]:
 
 
 def say(name: str, /, **values: Any) -> str:
-    """Format a text of `messages.toml` with `values` in its placeholders.
-
-    `name`: section and key of the text, such as "since.whole".
-    """
+    """Format the text `name` ("section.key") of `messages.toml` with `values` in its placeholders."""
     section, _, key = name.partition(".")
     return _texts()[section][key].format(**values)
 
@@ -68,10 +65,7 @@ def clock(seconds: float | None) -> str:
 
 
 def headline(diagnosis: Diagnosis) -> str:
-    """Format the verdict as a sentence for the heading of the page, or of the card, a picture of the diagnosis.
-
-    The summary of the verdict is used if `messages.toml` has no sentence for the verdict or its cause.
-    """
+    """Format the verdict as a heading: the text of `messages.toml` for the verdict or its cause, else the summary."""
     texts = _texts()["headline"]
     key = diagnosis.summary
     if diagnosis.verdict == "leak" and diagnosis.cause in texts:
@@ -82,20 +76,14 @@ def headline(diagnosis: Diagnosis) -> str:
 
 
 def cause(diagnosis: Diagnosis) -> str | None:
-    """Return the named cause of the change in a recording, or None if no cause is named.
-
-    A leak of `LEAKS`, such as "piston leak", is returned only if the verdict is "leak".
-    """
+    """Return the named cause of the change in a recording, or None; a leak counts only with the verdict "leak"."""
     if diagnosis.cause in LEAKS and diagnosis.verdict != "leak":
         return None
     return diagnosis.cause
 
 
 def shows_reason(diagnosis: Diagnosis) -> bool:
-    """Return True if the short text of a diagnosis must show the reason of its verdict.
-
-    This is the case for the verdict `cannot tell`, and for a change whose named cause is not a leak.
-    """
+    """Return True for `cannot tell` or a named cause that is no leak, whose reason the short text must show."""
     return diagnosis.verdict == "cannot tell" or (diagnosis.verdict != "leak" and cause(diagnosis) is not None)
 
 
@@ -106,11 +94,7 @@ def state_text(machine_state: MachineState) -> str:
 
 
 def since(diagnosis: Diagnosis) -> str | None:
-    """Format the onset of the leak with its interval.
-
-    If the onset is not known, the text says that the leak is older than the recording or that it rises within the
-    recording. Returns None if the verdict is not "leak".
-    """
+    """Format the onset of the leak with its interval, or a remark if unknown; None if the verdict is not "leak"."""
     if diagnosis.verdict != "leak":
         return None
     if diagnosis.onset_s is None:
@@ -185,11 +169,9 @@ def machine_text(machine: AssumedMachine) -> str:
 
 
 def how_bad(diagnosis: Diagnosis) -> str | None:
-    """Format the severity of the leak: its size as a percentage or multiple of the repair limit.
+    """Format the severity of the leak as a percentage or multiple of the repair limit, or None if it is not known.
 
-    If this size is not known but the user stated a limit, the text says that the comparison needs the piston area.
-    Without a stated limit, the text is the leak as a fraction of the pump's flow. Returns None if the severity is not
-    known, or if the leak has neither such a size nor a flow in L/min.
+    Without this size, the text says that a stated limit needs the piston area, or gives a fraction of the pump's flow.
     """
     severity, limit = diagnosis.severity, diagnosis.limit
     if severity is None:
@@ -210,10 +192,7 @@ def _format_range(low: float, high: float) -> str:
 
 
 def other_sizes(diagnosis: Diagnosis) -> str | None:
-    """Format the leak in mL/min, as a fraction of the pump's flow, and as a creep speed of the piston in mm/min.
-
-    Unknown quantities are left out; None is returned if all are unknown.
-    """
+    """Format the leak in mL/min, as a fraction of the pump's flow, and as a creep of the piston, or None if unknown."""
     severity = diagnosis.severity
     if severity is None:
         return None
@@ -228,10 +207,9 @@ def other_sizes(diagnosis: Diagnosis) -> str | None:
 
 
 def total_leakage(diagnosis: Diagnosis, *, basis: bool = True) -> str | None:
-    """Format the total leakage past pump and piston, and the smallest change of this leakage that could be detected.
+    """Format the total leakage past pump and piston, if known, and its smallest change that could be detected.
 
-    `basis`: True to add the piston area and pump displacement on which flows are based, unless the verdict is "leak".
-    Returns None if the total leakage is not known.
+    `basis`: True to add the piston area and pump displacement of the flows, unless the verdict is "leak".
     """
     leakage = diagnosis.total_leakage
     if leakage is None:
@@ -253,10 +231,7 @@ def total_leakage(diagnosis: Diagnosis, *, basis: bool = True) -> str | None:
 
 
 def _leakage_fraction(leakage: TotalLeakage, pressure: str) -> str:
-    """Format a total leakage as a fraction of the pump's flow, with the smallest change that could be detected.
-
-    An unknown fraction is called "not measured". `pressure`: text of the pressure at which the leakage is stated.
-    """
+    """Format a total leakage at a `pressure` as a fraction of the pump's flow, with the smallest detectable change."""
     is_known = leakage.pump_share is not None
     key = "share" if is_known else "not_measured"
     text = say(f"leakage.{key}", share=_format_percent(leakage.pump_share), pressure=pressure)
@@ -292,11 +267,7 @@ def _format_percent(fraction: float | None) -> str:
 
 
 def how_sure(diagnosis: Diagnosis) -> str:
-    """Format the strength of the evidence for the verdict.
-
-    The text states the odds that a healthy recording looks like this recording, the score and threshold of the deciding
-    detector, and the false-alarm probability. If there is no score or threshold, the text says only that.
-    """
+    """Format the evidence: odds that a healthy recording looks so, score, threshold, and false-alarm probability."""
     if diagnosis.score is None or diagnosis.threshold is None:
         return say("how_sure.no_score")
     odds, found_cause = diagnosis.odds, cause(diagnosis)
@@ -376,10 +347,7 @@ def raw_counts(diagnosis: Diagnosis) -> str | None:
 
 
 def format_unused_columns(diagnosis: Diagnosis) -> str | None:
-    """Format a note on unused columns of the file that could be channels; None if there are no such columns.
-
-    The note has the options --map by which the first four of them would be used.
-    """
+    """Format a note on unused columns that could be channels, and options --map for four of them; None without such."""
     if not diagnosis.unused:
         return None
     lines = " ".join(f"--map '{suggest_map_entry(Label.parse(name))}'" for name in diagnosis.unused[:4])
@@ -444,10 +412,7 @@ def _format_lines(diagnosis: Diagnosis, rows: list[tuple[str, str | None]], widt
 
 
 def format_leak_flow(diagnosis: Diagnosis) -> str:
-    """Format the leak flow with its interval or, if the verdict is not "leak", the upper bound of a leak.
-
-    If the flow or the bound is not known, the text says that no flow is stated.
-    """
+    """Format the leak flow with its interval or, if the verdict is not "leak", its bound, or that none is stated."""
     if diagnosis.verdict == "leak" and diagnosis.leak_lpm is not None:
         low, high = diagnosis.leak_interval_lpm or (diagnosis.leak_lpm, diagnosis.leak_lpm)
         return f"{number(diagnosis.leak_lpm, 2)} L/min ({number(low, 2)} to {number(high, 2)})"
@@ -466,11 +431,9 @@ _FILE_COLUMNS = 22
 
 
 def table_line(diagnosis: Diagnosis, start_s: float | None = None) -> str:
-    """Format a diagnosis as a line of a table: file, date, verdict and leak flow in L/min.
+    """Format a diagnosis as a line of a table (file, date, verdict and leak flow in L/min), and lines on what to do.
 
-    Further lines state the next step or, for `cannot tell`, the reason. Unless the verdict is `leak`, a named cause
-    stands before this text. There are no further lines for `no leak` without a cause. A file name that is longer than
-    its column stands on a separate line. `start_s` [s since 1970]: start of the recording, None for a blank date.
+    `start_s` [s since 1970]: start of the recording, None for a blank date.
     """
     file = PurePath(diagnosis.file).name
     date = "" if start_s is None else datetime.fromtimestamp(start_s, UTC).date().isoformat()

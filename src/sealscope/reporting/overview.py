@@ -21,8 +21,7 @@ CURVE_WIDTH = 20
 def draw_curve(values: Array, width: int = CURVE_WIDTH) -> str:
     """Draw values (n,) as a line of at most `width` bar characters, scaled between minimum and maximum.
 
-    The values are divided into as many parts as there are characters, and each character shows the middle one of the
-    finite values in its part. A blank stands for a part without finite values.
+    Each character shows the middle one of the finite values in its part of the values, or is blank without any.
     """
     finite = values[np.isfinite(values)]
     if not finite.size:
@@ -48,10 +47,7 @@ def _format_short(value: float) -> str:
 
 
 def overview_text(name: str, recording: Recording, findings: Sequence[Finding]) -> str:
-    """Format an overview of a recording: length, channels with range and small curve, remarks, notes and findings.
-
-    `name`: name of the recording; `findings`: defects of its data. The text also lists unused columns of the file.
-    """
+    """Format an overview of a recording: length, channels with range and small curve, notes and findings."""
     provenance = recording.provenance
     start = f", from {provenance['start']}" if "start" in provenance else ""
     kind = f"{provenance['format']}; " if "format" in provenance else ""

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from math import ceil
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from sealscope.calls import checked_call
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.machine import states_rig
 from sealscope.errors import InputError
+from sealscope.parameters import Rig, load_rig, rig_names
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Recording
 from sealscope.reporting import charts, features, messages, printing, template
@@ -23,9 +24,6 @@ from sealscope.reporting.charts import Mark
 from sealscope.reporting.particulars import collect_particulars
 from sealscope.reporting.schematic import build_circuit, channel_columns, schematic
 from sealscope.signals.windows import WINDOW_SIZE, WINDOW_STEP
-
-if TYPE_CHECKING:
-    from sealscope.parameters import Rig
 
 #: Width and height of a card (a picture that sums up a diagnosis), and height of the curve on it, in pixels.
 WIDTH, HEIGHT, _CURVE_HEIGHT = 1200, 630, 190
@@ -51,21 +49,20 @@ def report(
     recording : Recording
         The recording that was judged.
     path : str or path-like
-        The page, ending in .html, .htm or .pdf, or its card, ending in .png. The file is written atomically. A PDF is
-        printed by a browser of Chromium's family or by WeasyPrint, whichever is installed. The card is a picture of
-        1200 x 630 pixels with machine, date, verdict, leak flow and its curve; a browser draws it.
+        The page (.html, .htm, or .pdf, which a browser of Chromium's family or WeasyPrint prints), or its card (.png),
+        a picture of 1200 x 630 pixels that a browser draws. The file is written atomically.
     diagnosis : Diagnosis, optional
-        The diagnosis of the recording; by default the result of `sealscope.diagnose` with the `rig`.
+        By default the result of `sealscope.diagnose` with the `rig`.
     rig : Rig, str or path-like, optional
         A Rig, the name of a packaged rig or the path of a TOML file; its values label the schematic.
     marks : sequence of Mark, optional
         Further moments that are marked on every chart.
     truth_onset_s, truth_leak_lpm : float, optional
-        True onset [s] and leak [L/min], if known, to be shown next to the verdict.
+        True onset [s] and leak [L/min], shown next to the verdict.
     title : str, optional
-        Title of the page; by default the name of the recording.
+        By default the name of the recording.
     pressure_unit : {"bar", "MPa", "kPa", "psi"}, optional
-        Unit of the pressures on the page; by default the unit of the log, or bar if the log states none.
+        By default the unit of the log, or bar if the log states none.
 
     Returns
     -------
@@ -101,22 +98,15 @@ def report(
 
 
 def write_page(path: str | os.PathLike[str], recording: Recording, diagnosis: Diagnosis, **options: Any) -> Path:
-    """Write the page of a diagnosis as `report` does; deprecated, and `path` stands before `recording`.
-
-    `options`: further arguments of `report`.
-    """
+    """Write the page of a diagnosis as `report` does; deprecated, and `path` stands before `recording`."""
     return report(recording, path, diagnosis, **options)
 
 
 def _choose_rig(diagnosis: Diagnosis, rig: Rig | str | os.PathLike[str] | None) -> Rig | None:
     """Choose the rig whose values the page shows: `rig` if given, else the packaged rig stated for the diagnosis.
 
-    `rig`: a Rig, the name of a packaged rig or the path of a TOML file. Returns None if the values of `rig` are
-    only assumed, because it is the default rig (`states_rig`). If `rig` is None, returns None if nobody stated the rig
-    of the diagnosis, or if that rig is not packaged.
+    Returns None if `rig` has only the assumed values of the default rig, or if nobody stated a packaged rig.
     """
-    from sealscope.parameters import load_rig, rig_names
-
     if rig is not None:
         loaded_rig = load_rig(rig)
         return loaded_rig if states_rig(loaded_rig) else None
@@ -127,10 +117,7 @@ def _choose_rig(diagnosis: Diagnosis, rig: Rig | str | os.PathLike[str] | None) 
 
 
 def _all_marks(recording: Recording, marks: Sequence[Mark], truth_onset_s: float | None) -> list[Mark]:
-    """Collect the moments to mark on all charts: `marks`, and the true onset [s] unless that is None.
-
-    Raises InputError if the recording is empty, since it cannot have a page.
-    """
+    """Collect the moments to mark on all charts; raise InputError if the recording is empty and has no page."""
     if len(recording) == 0:
         raise InputError("recording must have at least 1 sample to be reported, got 0")
     return [*marks, *([] if truth_onset_s is None else [Mark(float(truth_onset_s), "true onset", known=True)])]
@@ -147,9 +134,8 @@ def render_card(
 ) -> str:
     """Render the card, a picture of the diagnosis, as HTML of `WIDTH` x `HEIGHT` pixels.
 
-    `rig`: rig, name or file, whose title names the machine if the recording does not; `marks`, `truth_onset_s` [s]:
-    moments that are marked on the curve of the leak; `title`: by default the name of the machine or of the file. Raises
-    InputError if the recording is empty.
+    `rig`: names the machine if the recording does not; `marks`, `truth_onset_s` [s]: moments marked on the curve of the
+    leak; `title`: by default the name of the machine or file. Raises InputError if the recording is empty.
     """
     card_charts = charts.course_charts(diagnosis, height=_CURVE_HEIGHT)
     all_marks = _all_marks(recording, marks, truth_onset_s)
@@ -182,12 +168,9 @@ def render_page(
     title: str | None = None,
     pressure_unit: str | None = None,
 ) -> str:
-    """Render the page of a diagnosis as HTML.
+    """Render the page of a diagnosis as HTML, with the arguments of `report`.
 
-    `rig`: rig, name or file, whose values label the schematic; `marks`: moments that are marked on every chart;
-    `truth_onset_s` [s], `truth_leak_lpm` [L/min]: true onset and leak, None if unknown; `title`: by default the name of
-    the file; `pressure_unit`: unit of pressures, by default that of the log. Raises InputError if the recording is
-    empty, or if the unit or the rig is not known.
+    Raises InputError if the recording is empty, or if the unit or the rig is not known.
     """
     from markupsafe import Markup
 
@@ -234,13 +217,10 @@ def render_page(
 def _change_rows(
     recording: Recording, diagnosis: Diagnosis, chambers: list[features.ChamberDetails], pressure_unit: str
 ) -> dict[str, Any]:
-    """Build the template's values for the table that compares the details' RMS in two parts of the recording.
+    """Build the values for the template's table that compares the details' RMS in two parts of the recording.
 
-    `chambers`: wavelet details of each chamber's pressure. Returns a dictionary:
-
-    - `changes`: rows (channel, detail, unit, RMS in the first part, RMS in the second part, change [%])
-    - `bar_limit`: largest change [%] that the table's bars show
-    - `parts`: the two parts
+    They are `changes`, rows (channel, detail, unit, RMS in the first part, in the second, change [%]); `bar_limit`, the
+    largest change [%] that the table's bars show; and the two `parts`.
     """
     parts = features.parts_to_compare(diagnosis, recording)
     rows = []
@@ -255,11 +235,7 @@ def _change_rows(
 
 
 def _summarise_channel(recording: Recording, name: str, pressure_unit: str) -> dict[str, Any]:
-    """Compute minimum, mean and maximum of a channel in its display unit, and the number of missing samples.
-
-    Returns them as `low`, `mean`, `high` and `missing`, with the channel's `name` and `unit`. The first three are
-    None if the channel has no finite sample.
-    """
+    """Compute minimum, mean and maximum of a channel in its display unit, or None, and count missing samples."""
     unit, values = charts.display_values(recording, name, pressure_unit)
     finite = values[np.isfinite(values)]
     statistics = (np.min, np.mean, np.max)
@@ -268,10 +244,7 @@ def _summarise_channel(recording: Recording, name: str, pressure_unit: str) -> d
 
 
 def _flatten(value: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
-    """Yield the entries of nested mappings as pairs of dotted name and text, such as ("rig.name", "thesis").
-
-    `prefix`: beginning of each name.
-    """
+    """Yield the entries of nested mappings as pairs of dotted name and text, such as ("rig.name", "thesis")."""
     for key, inner in value.items():
         if isinstance(inner, Mapping):
             yield from _flatten(inner, f"{prefix}{key}.")

@@ -13,9 +13,8 @@ from sealscope.recordings.recording import Recording
 def collect_particulars(recording: Recording, rig: Rig | None = None) -> dict[str, str]:
     """Collect the facts about a recording for the head of its page, as texts by label, such as "Date" or "Operator".
 
-    The facts are taken from the remarks in the recording's file. Without such a remark, the machine is named by the
-    title or name of `rig`, and the date is the start of the recording. Labels and their order are those of
-    `particulars.toml`; unknown facts are left out.
+    They come from remarks in its file, else the machine from `rig`, the date from its start. Labels are in the order of
+    `particulars.toml`.
     """
     remarks = recording.remarks
     patterns_by_label = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))

@@ -30,9 +30,9 @@ class SvgPath(NamedTuple):
 
 
 class SvgText(NamedTuple):
-    """A text of a picture at the position `x`, `y`, in pixels from the top left corner of the frame.
+    """A text of a picture at `x`, `y`, in pixels from the top left corner of the frame; it reads upwards if `turned`.
 
-    `anchor`: the "start", "middle" or "end" of the text is at this position; `turned`: True if the text reads upwards.
+    `anchor`: the "start", "middle" or "end" of the text is at this position.
     """
 
     x: float
@@ -44,12 +44,11 @@ class SvgText(NamedTuple):
 
 @dataclass(frozen=True)
 class Picture:
-    """A chart as SVG shapes and texts, in a frame of `width` x `height` pixels.
+    """A chart as SVG shapes and texts, in a frame of `width` x `height` pixels, in styles of the page's style sheet.
 
-    - `x_ends`, `y_ends`: values at the ends of the axes
-    - `log`: True for a logarithmic x axis, whose `x_ends` are decimal logarithms, such as (-2, 1) for 0.01 to 10
-    - `margins`: space outside the frame in pixels: left, above, right, below
-    - `shapes`, `labels`: shapes, drawn in this order, and texts, drawn over them
+    `x_ends`, `y_ends`: values at the ends of the axes; `log`: True for a logarithmic x axis, whose `x_ends` are decimal
+    logarithms, such as (-2, 1) for 0.01 to 10; `margins`: space outside the frame in pixels: left, above, right, below;
+    `shapes`, `labels`: shapes, drawn in this order, and texts, drawn over them.
     """
 
     width: float
@@ -84,36 +83,25 @@ class Picture:
         return np.asarray(self.height * (high - np.asarray(values)) / (high - low))
 
     def draw(self, style: str, path: str, title: str = "") -> None:
-        """Add an SVG path to the picture, with coordinates in pixels from the frame's top left corner.
-
-        `style`: name of the shape's style in the style sheet; `title`: tooltip, "" for none.
-        """
+        """Add an SVG path, in pixels from the frame's top left corner; `title`: tooltip, "" for none."""
         self.shapes.append(SvgPath(style, path, title))
 
     def line(self, style: str, x: Array, y: Array, title: str = "", digits: int = 1) -> None:
         """Draw a line through points (n,), given as values of the axes; a missing y (NaN) interrupts the line.
 
-        `style`: name of the line's style in the style sheet; `title`: tooltip, "" for none; `digits`: decimals of the
-        coordinates in the SVG path.
+        `title`: tooltip, "" for none; `digits`: decimals of the coordinates.
         """
         self.draw(style, self._path(x, y, digits), title)
 
     def _path(self, x: Array, y: Array, digits: int = 1) -> str:
-        """Format the line through points (n,) as an SVG path; a missing y (NaN) interrupts the line.
-
-        `x`, `y`: values of the axes; `digits`: decimals of the coordinates in pixels.
-        """
+        """Format the line through points (n,) of the axes as an SVG path; a missing y (NaN) interrupts the line."""
         is_drawn = np.isfinite(y)
         is_first = is_drawn & ~np.append(False, is_drawn[:-1])  # the point before is not drawn: a new piece begins
         points = zip(is_first[is_drawn], self.x(x[is_drawn]), self.y(y[is_drawn]), strict=True)
         return "".join(f"{'M' if first else 'L'}{left:.{digits}f} {top:.{digits}f}" for first, left, top in points)
 
     def area(self, style: str, x: Array, low: Array, high: Array) -> None:
-        """Draw the area between two lines, which are given as values of the axes.
-
-        `x`, `low`, `high` (n,): points of both lines; a point is left out if either line is NaN there. `style`:
-        name of the area's style in the style sheet.
-        """
+        """Draw the area between the lines `low` and `high` (n,), without the points at which either is NaN."""
         is_known = np.isfinite(low) & np.isfinite(high)
         if is_known.any():
             # along the upper line, and back along the lower one
@@ -121,37 +109,26 @@ class Picture:
             self.draw(style, self._path(*outline) + "z")
 
     def box(self, style: str, begin: float, end: float, low: float | None = None, high: float | None = None) -> None:
-        """Draw a box from x = `begin` to `end` and from y = `low` to `high`, but at least `_MIN_BOX` pixels in size.
-
-        `low`, `high`: None to extend the box to the bottom or the top of the frame; `style`: name of the box's style in
-        the style sheet.
-        """
+        """Draw a box between x and y values, at least `_MIN_BOX` pixels in size; None is an end of the frame."""
         left, top = float(self.x(begin)), 0.0 if high is None else float(self.y(high))
         bottom = self.height if low is None else float(self.y(low))
         right, bottom = max(float(self.x(end)), left + _MIN_BOX), max(bottom, top + _MIN_BOX)
         self.draw(style, f"M{left:.1f} {top:.1f}H{right:.1f}V{bottom:.1f}H{left:.1f}z")
 
     def mark(self, style: str, x: float) -> None:
-        """Draw a vertical line at the value `x` across the frame; `style`: name of its style in the style sheet."""
+        """Draw a vertical line at the value `x` across the frame."""
         self.draw(style, f"M{self.x(x):.1f} 0V{self.height:g}")
 
     def level(self, style: str, y: float) -> None:
-        """Draw a horizontal line at the value `y` across the frame; `style`: name of its style in the style sheet."""
+        """Draw a horizontal line at the value `y` across the frame."""
         self.draw(style, f"M0 {self.y(y):.1f}H{self.width:g}")
 
     def symbol(self, style: str, x: float, down: float, title: str = "") -> None:
-        """Draw a symbol, such as a dot or a cross, at the value `x` of the x axis.
-
-        `style`: name of the symbol's style in the style sheet, which begins with the name of one of the `SYMBOLS`;
-        `down`: distance from the top of the frame in pixels; `title`: tooltip, "" for none.
-        """
+        """Draw the symbol that the first word of `style` names, at the value `x` and `down` pixels below the top."""
         self.draw(style, f"M{self.x(x):.1f} {down:.1f}{SYMBOLS[style.split(maxsplit=1)[0]]}", title)
 
     def point(self, style: str, x: float, y: float, ends: tuple[float, float], title: str = "") -> None:
-        """Draw a point at the values `x` and `y`, and a vertical line between the two y values `ends`, its interval.
-
-        `style`: name of the point's style in the style sheet; `title`: tooltip, "" for none.
-        """
+        """Draw a point at the values `x` and `y`, and a vertical line between the two y values `ends`, its interval."""
         self.draw("whisker", f"M{self.x(x):.1f} {self.y(ends[0]):.1f}V{self.y(ends[1]):.1f}")
         self.symbol(style, x, float(self.y(y)), title)
 
@@ -164,10 +141,7 @@ class Picture:
         self.draw("frame", f"M0 0H{self.width:g}V{self.height:g}H0z")
 
     def below(self, x: float, text: str, anchor: str = "middle") -> None:
-        """Write a text below the frame at the value `x` of the x axis.
-
-        `anchor`: the "start", "middle" or "end" of the text is placed at `x`.
-        """
+        """Write a text below the frame, with its "start", "middle" or "end" (`anchor`) at the value `x`."""
         self.labels.append(SvgText(float(self.x(x)), self.height + 16.0, text, anchor))
 
 

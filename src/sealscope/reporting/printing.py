@@ -68,10 +68,9 @@ def draw_page(page: str, path: str | os.PathLike[str], width: int, height: int) 
 
 
 def _inline_styles(page: str) -> str:
-    """Change the styles of a page (HTML) so that WeasyPrint can print the page; return the changed page.
+    """Copy the style sheet of a page (HTML) into each drawing, with each CSS variable replaced by its value for print.
 
-    WeasyPrint neither applies the style sheet of a page to drawings nor supports CSS variables in drawings. The style
-    sheet is therefore copied into each drawing, and each variable is replaced by its value for print.
+    WeasyPrint neither applies the page's style sheet to drawings nor knows CSS variables there.
     """
     sheet = re.search(r"<style>(.*?)</style>", page, re.DOTALL)
     if sheet is None:
@@ -90,10 +89,7 @@ def _find_browser() -> str | None:
 
 
 def _is_complete_pdf(data: bytes) -> bool:
-    """Return True if the bytes of a PDF are complete: the offset at the end must lead to a cross-reference table.
-
-    Source: ISO 32000-1, 7.5.5.
-    """
+    """Return True if the offset at the end of a PDF leads to a cross-reference table (ISO 32000-1, 7.5.5)."""
     end = re.search(rb"startxref\s+(\d+)\s+%%EOF\s*$", data[-1024:])
     if end is None:
         return False
@@ -113,10 +109,9 @@ def _is_complete_png(data: bytes, width: int, height: int) -> bool:
 def _write_by_browser(
     browser: str, page: str, target: Path, options: list[str], kind: str, is_complete: Callable[[bytes], bool]
 ) -> None:
-    """Run a browser that converts the page (HTML) to a file; raise InputError unless the file is complete.
+    """Run a browser, with `options`, that converts a page (HTML) to the file `target`; raise InputError if that fails.
 
-    `target`: the file that the browser writes; `options`: command-line options by which the browser writes this file;
-    `kind`: description of the file for the error message; `is_complete`: function that tests the bytes of the file.
+    `kind`: description of the file for the message; `is_complete`: function that tests the bytes of the file.
     """
     with tempfile.TemporaryDirectory(prefix="sealscope-", ignore_cleanup_errors=True) as folder:
         source = Path(folder) / "page.html"

@@ -30,13 +30,9 @@ _BORE, _ROD = 78.0, 18.0
 class Circuit(NamedTuple):
     """The parts of a machine that the schematic shows.
 
-    - `cylinder`: name of the cylinder's type, such as "double-rod cylinder"
-    - `rods`: sides of the piston with a rod, "A", "B" or "AB"
-    - `rod`: height of the rod in the drawing
-    - `throttles`, `make_up`: True if the machine has throttles in its lines, or make-up valves
-    - `bypass`: True if the machine has a bypass with a flow meter, which measures the leak
-    - `valve`: True if a servo valve drives the cylinder
-    - `values`: by label, the value with its unit, "" if it is not known
+    `cylinder`: name of its type; `rods`: sides of the piston with a rod, "A", "B" or "AB"; `rod`: its drawn height;
+    `throttles`, `make_up`, `bypass`, `valve`: True if there are throttles in the lines, make-up valves, a bypass with a
+    flow meter, or a servo valve; `values`: by label, the value with its unit, "" if unknown.
     """
 
     cylinder: str
@@ -52,9 +48,8 @@ class Circuit(NamedTuple):
 def build_circuit(rig: Rig | None, recorded: Container[str], machine: AssumedMachine | None = None) -> Circuit:
     """Choose the parts of a machine to draw in the schematic.
 
-    - `rig`: the rig; if it is None, only the parts that every pump-controlled actuator has are drawn
-    - `recorded`: recorded channels; a bypass is drawn if `q_leak` is among them
-    - `machine`: areas and displacement that may be stated without a rig, None if they are not known
+    Without `rig`, only the parts of every pump-controlled actuator are drawn, with areas and displacement that
+    `machine` may state; a bypass is if `q_leak` is among the `recorded` channels.
     """
     bypass = "q_leak" in recorded
     values = dict.fromkeys(_VALUES, "")
@@ -79,8 +74,7 @@ def build_circuit(rig: Rig | None, recorded: Container[str], machine: AssumedMac
 def _cylinder_parts(areas: tuple[float, float]) -> tuple[str, str, float]:
     """Determine the type of a cylinder, its sides with a rod ("A", "B" or "AB"), and the drawn height of the rod.
 
-    `areas`: piston areas of the sides A and B, in any common unit. The drawn height of a single rod is the rod's
-    diameter over the bore's, sqrt(1 - smaller area / larger area), times the height of the drawn bore.
+    `areas`: of the piston's sides A and B. A single rod's height over the bore's is sqrt(1 - smaller / larger area).
     """
     ratio = min(areas) / max(areas)
     if ratio > _MIN_DOUBLE_ROD_RATIO:
@@ -90,7 +84,7 @@ def _cylinder_parts(areas: tuple[float, float]) -> tuple[str, str, float]:
 
 
 def _value_text(value: float, unit: str, scale: float) -> str:
-    """Format a value in SI as a number with four significant digits and `unit`; `scale`: size of this unit in SI."""
+    """Format a value in SI as a number with four significant digits and `unit`, whose size in SI is `scale`."""
     return f"{messages.number(value / scale, 4)} {unit}"
 
 

@@ -20,15 +20,10 @@ class DrawnTimes:
     """The times at which the channels of a recording are drawn.
 
     Samples are divided into buckets, groups of successive samples of which only the minimum and the maximum are drawn.
-
-    - `t` (m,) [s]: times of the drawn points, never decreasing
-    - `starts`, `stops` (k,): samples [start, stop) of each bucket
-    - `width`: number of samples in a full bucket, 1 if all samples are drawn
-    - `fine`: range of samples that are all drawn, whatever the width
-    - `breaks`: indices of the points before which NaN is inserted to interrupt the line at gaps in time, counted
-      without the inserted points
-    - `by_sample`: True if the time stamps do not increase; the times are then the numbers of the samples over the
-      sampling rate
+    `t` (m,) [s]: times of the drawn points, never decreasing; `starts`, `stops` (k,): samples [start, stop) of each
+    bucket; `width`: number of samples in a full one, 1 if all are drawn; `fine`: range of samples that are all drawn;
+    `breaks`: indices of the points, counted without NaN, before which NaN interrupts the line at gaps in time;
+    `by_sample`: True if the time stamps do not increase, and `t` is the number of the sample over the sampling rate.
     """
 
     t: Array
@@ -42,9 +37,8 @@ class DrawnTimes:
     def reduce(self, values: Array) -> Array:
         """Reduce the values (n,) of a channel to the points (m,) that are drawn at the times `t`.
 
-        Each bucket, a group of successive samples, gives two points: its minimum and its maximum. The minimum is first
-        if the last value is not below the first value of the bucket. A bucket of one sample gives one point; without
-        finite samples the points are NaN. A NaN, which interrupts the line, is also inserted at each gap in time.
+        Each bucket, a group of successive samples, gives its minimum and maximum, the minimum first if the last value
+        is not below the first. A bucket of one sample gives one point. A NaN at each gap in time is inserted.
         """
         values = np.where(np.isfinite(values), values, np.nan)
         low = np.fmin.reduceat(values, self.starts)
@@ -55,10 +49,7 @@ class DrawnTimes:
 
 
 def _interleave(first: Array, second: Array, sizes: NDArray[np.int64]) -> Array:
-    """Arrange the first and second points (k,) of k buckets, groups of samples, in their order along the line.
-
-    `sizes` (k,): number of samples in each bucket; a bucket of one sample has no second point.
-    """
+    """Arrange the first and second points (k,) of buckets in order; one with a single sample has no second point."""
     pairs = np.stack([first, second], axis=1)
     is_point = np.stack([np.ones(sizes.size, dtype=bool), sizes > 1], axis=1)
     return np.asarray(pairs[is_point])  # row by row
@@ -67,8 +58,7 @@ def _interleave(first: Array, second: Array, sizes: NDArray[np.int64]) -> Array:
 def ordered_time(t: Array, rate: float) -> tuple[Array, bool]:
     """Choose an increasing time axis (n,) [s] for a recording with the time stamps `t` (n,) [s].
 
-    If the time stamps increase, they are the axis, and the second result is False. Otherwise the axis is the number
-    of the sample over the sampling rate [Hz], and the second result is True.
+    It is `t` and False or, if `t` does not increase, the number of the sample over the `rate` [Hz] and True.
     """
     by_sample = not (np.all(np.isfinite(t)) and np.all(np.diff(t) > 0))
     return (np.arange(t.size) / rate, True) if by_sample else (t, False)
@@ -79,11 +69,11 @@ def choose_drawn_times(
 ) -> DrawnTimes:
     """Choose the times at which a chart draws a recording: about `points`, and all samples around the time `near`.
 
-    There are two times for each bucket, a group of successive samples of which only minimum and maximum are drawn.
-    Full buckets have equal numbers of samples, so a drawn peak is at most one bucket away from its true time. At a gap
-    in time a new bucket starts, and an additional point interrupts the line. If there are more gaps than a twentieth of
-    `points`, this is done only for the longest gaps. `t` (n,) [s]: time stamps; `rate` [Hz]: nominal sampling rate;
-    `near` [s]: time around which `near_samples` samples are all drawn, None for the start of the recording.
+    There are two times for each bucket, a group of successive samples of which only minimum and maximum are drawn. Full
+    buckets have equal numbers of samples, so a drawn peak is at most one bucket away from its true time. At a gap in
+    time, or only at the longest if they exceed a twentieth of `points`, a new bucket starts, and an additional point
+    interrupts the line. `t` (n,) [s]: time stamps; `rate` [Hz]: nominal sampling rate; `near` [s]: time around which
+    `near_samples` samples are all drawn, None for the start of the recording.
     """
     n = t.size
     t, by_sample = ordered_time(t, rate)
@@ -110,9 +100,8 @@ def choose_drawn_times(
 def encode_values(values: Array) -> dict[str, Any]:
     """Encode values as base64 text of 16-bit integers, for the script of the page.
 
-    The range from the minimum `low` to the maximum is divided into 65 534 equal steps. An integer q is decoded as
-    `low + (q + 32767) * step`; q = -32768 stands for a value that is not finite. Returns the numbers `low` and `step`,
-    and the integers as the text `q`.
+    An integer of the text `q` is decoded as `low + (q + 32767) * step`, where `low` is the minimum and `step` is
+    1/65534 of the range; -32768 stands for a value that is not finite.
     """
     is_finite = np.isfinite(values)
     low, high = 0.0, 0.0

@@ -30,10 +30,7 @@ _SUFFIXES = (".html", ".htm", ".pdf", ".png")
 
 @cache
 def _environment(package: str) -> jinja2.Environment:
-    """Build the jinja2 environment for the templates of a package.
-
-    The templates may include others of `sealscope.reporting`.
-    """
+    """Build the jinja2 environment for the templates of a package; they may include those of `sealscope.reporting`."""
     import jinja2
 
     environment = jinja2.Environment(
@@ -53,9 +50,8 @@ def render(
 ) -> str:
     """Render the template called `template` as the text of a page, with the values `context`.
 
-    `package`: package of the template; `scripts`: names of the package's files with scripts that the page runs;
-    `chart_data`: plain JSON values of charts, None for a page without charts; scripts that draw the charts are added.
-    Control characters, which may come from names and descriptions in files, are replaced.
+    `package`: of the template; `scripts`: names of its files with scripts that the page runs; `chart_data`: plain JSON
+    values of charts, or None; scripts that draw them are added. Control characters, as in names, are replaced.
     """
     names = scripts if chart_data is None else ("vendor/uPlot.iife.min.js", "templates/charts.js", *scripts)
     page = _environment(package).get_template(template)
@@ -87,10 +83,7 @@ def _script_json(value: Any) -> Markup:
 
 
 def parse_page_path(path: str | os.PathLike[str], *, card: bool = True) -> Path:
-    """Convert the path of a page to a Path, and check its suffix; raise InputError for any other suffix.
-
-    Pages end in .html, .htm or .pdf. If `card` is True, .png is accepted, too, for a picture that sums up the page.
-    """
+    """Convert the path of a page to a Path; raise InputError unless it ends in .html, .htm, .pdf or (`card`) .png."""
     suffixes = _SUFFIXES if card else _SUFFIXES[:-1]  # the last one is .png
     if Path(path).suffix.lower() not in suffixes:
         raise InputError(f"a page must be a file {', '.join(suffixes)}, got {os.fspath(path)}")
@@ -98,7 +91,7 @@ def parse_page_path(path: str | os.PathLike[str], *, card: bool = True) -> Path:
 
 
 def write(path: str | os.PathLike[str], page: str) -> Path:
-    """Write a page (HTML) to a file atomically, as UTF-8, or as a PDF if the name ends in .pdf; return the path.
+    """Write a page (HTML) atomically, as UTF-8, or as a PDF if the name ends in .pdf; return the path.
 
     Raises InputError if the file cannot be written, MissingExtra if no program for printing a PDF is installed.
     """

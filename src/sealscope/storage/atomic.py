@@ -39,9 +39,9 @@ def check_folder(file: Path) -> None:
 def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Write a file atomically: the `with` block fills a temporary file, which then replaces the file `path`.
 
-    The path of the temporary file is yielded. This file is in the folder of `path`, and is removed if the block raises
-    an error. File and folder are synced to the disk: a power loss leaves either the old or the new file. A replaced
-    file keeps its permissions. Raises InputError if the folder does not exist or cannot be written.
+    The path of the temporary file, in the same folder, is yielded; the file is removed if the block raises an error.
+    File and folder are synced to the disk: a power loss leaves either the old or the new file. A replaced file keeps
+    its permissions. Raises InputError if the folder does not exist or cannot be written.
     """
     target = Path(path)
     try:
@@ -49,9 +49,8 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
         if target.is_dir():
             raise InputError(f"a file to write must not be a folder, got {target}")
         # the name tells `remove_temporaries` which process of which computer fills the file
-        handle, name = tempfile.mkstemp(
-            prefix=f".{target.name[:_MAX_NAME]}.{_computer_hash()}-{os.getpid()}.", suffix=".part", dir=target.parent
-        )
+        prefix = f".{target.name[:_MAX_NAME]}.{_computer_hash()}-{os.getpid()}."
+        handle, name = tempfile.mkstemp(prefix=prefix, suffix=".part", dir=target.parent)
         os.close(handle)
     except OSError as error:
         raise InputError(f"cannot write {target}: {error.strerror or error}") from error
@@ -79,10 +78,7 @@ def _file_mode(target: Path) -> int:
 
 
 def _sync(path: Path, flags: int) -> None:
-    """Force the system to write the content of a file, or the list of files of a folder, from its memory to the disk.
-
-    `flags`: flags of `os.open` with which the file or folder `path` is opened.
-    """
+    """Force the system to write a file, or the list of files of a folder, opened with `flags`, to the disk."""
     descriptor = os.open(path, flags)
     try:
         os.fsync(descriptor)
@@ -93,9 +89,9 @@ def _sync(path: Path, flags: int) -> None:
 def remove_temporaries(folder: Path, target: str | None = None) -> None:
     """Remove the temporary files that killed processes have left in a folder.
 
-    If `target` is given, only the temporary files of the file with this name are removed. Otherwise those of all
-    files are removed, in subfolders, too. A file is removed if its process ran on this computer and has ended, or if
-    it was last changed more than a day ago. Links to folders are not followed.
+    With `target` those of the file of this name are removed, otherwise all, in subfolders, too. A file is removed if
+    its process ran on this computer and has ended, or if it was last changed more than a day ago. Links to folders are
+    not followed.
     """
     paths = folder.rglob(".*.part") if target is None else folder.glob(".*.part")
     for path in paths:
@@ -109,10 +105,7 @@ def remove_temporaries(folder: Path, target: str | None = None) -> None:
 
 
 def _is_alive(process: int) -> bool:
-    """Return True if a process of this computer is running, or if this cannot be found out.
-
-    `process`: number of the process.
-    """
+    """Return True if the process with this number runs on this computer, or if this cannot be found out."""
     if os.name == "nt":  # signal 0 would end the process
         return True
     try:

@@ -19,9 +19,8 @@ _NUMBER = re.compile(r"[+-]?[\d.]+(?:e[+-]?\d+)?|-")
 def guard_cell(value: Any) -> Any:
     """Escape a text that a spreadsheet would execute like a formula, or a terminal like a command.
 
-    Names and comments may come from other people's files. A text that begins like a formula and is not a number gets
-    an apostrophe in front. Unprintable characters except line feeds are escaped. A value that is not a text is returned
-    unchanged.
+    A text that begins like a formula and is not a number gets an apostrophe in front; unprintable characters except
+    line feeds are escaped. Other values are returned unchanged.
     """
     if not isinstance(value, str):
         return value
@@ -32,10 +31,9 @@ def guard_cell(value: Any) -> Any:
 
 
 def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> None:
-    """Write rows, each a mapping from column to value, as a CSV file with the given columns.
+    """Write rows, mappings from column to value, as a CSV file, with texts escaped by `guard_cell`.
 
-    Texts are escaped with `guard_cell`. Raises ValueError if a row has another column, and InputError if the file
-    cannot be written.
+    Raises ValueError if a row has another column, and InputError if the file cannot be written.
     """
     with (
         atomic_write(path) as temporary,

@@ -23,11 +23,7 @@ def make_folder(folder: Path) -> None:
 
 
 def make_inner_folder(folder: Path, *names: str) -> Path:
-    """Create the nested folders `names[0]/names[1]/...` within `folder`, and return the innermost one.
-
-    Other users may write to `folder`, and a link within it could lead elsewhere. Raises InputError if one of these
-    nested folders is a link, or if a folder cannot be created.
-    """
+    """Create the nested folders `names` within `folder`; return the innermost, or raise InputError for a link."""
     make_folder(folder)
     for name in names:
         folder /= name
@@ -38,11 +34,7 @@ def make_inner_folder(folder: Path, *names: str) -> Path:
 
 
 def iter_inner_files(folder: Path, paths: Iterable[Path]) -> Iterator[Path]:
-    """Yield those of `paths` that are files in `folder`; skip links that lead out of the folder.
-
-    A folder that comes from other people may have links to any file of this computer. A skipped link is logged as a
-    warning. Links to files within the folder are followed, and the folder may itself be a link.
-    """
+    """Yield those of `paths` that are files in `folder`, itself perhaps a link; skip links out of it, and log them."""
     root = folder.resolve()
     for path in paths:
         try:
@@ -64,9 +56,8 @@ def numeric_sort_key(name: str) -> list[str | int]:
 def lock_file(file: Path, busy: str | None, wait: float = 0.0) -> Iterator[None]:
     """Hold the lock `file` against other processes while the block runs; the lock also ends with the process.
 
-    If another process still holds the lock after `wait` [s], InputError with the message `busy` is raised; if `busy` is
-    None, the wait has no limit. The file is created if necessary, and never emptied. Raises InputError if the file is a
-    link or cannot be created.
+    If another process still holds it after `wait` [s], InputError with the message `busy` is raised; if `busy` is None,
+    the wait has no limit. The file is created if necessary, and never emptied. Raises InputError for a link.
     """
     from filelock import FileLock, Timeout
 

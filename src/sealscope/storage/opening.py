@@ -28,17 +28,11 @@ def is_file_path(text: str | os.PathLike[str]) -> bool:
     return os.path.isfile(text)  # noqa: PTH113 - pathlib raises for texts that cannot be paths until Python 3.14
 
 
-def special_kind(mode: int) -> str | None:
-    """Return the kind of a file, such as "a folder", by its `st_mode`; return None for a regular file."""
-    return next((name for is_kind, name in _KINDS if is_kind(mode)), None)
-
-
 def open_regular(path: str | os.PathLike[str], what: str) -> BinaryIO:
     """Open a regular file for reading, in binary mode.
 
     `what` names the file in error messages, such as "a recording". Raises InputError for a folder, pipe, socket or
-    device, and for an empty file. This includes files in /proc, which have size 0 but may never end. Raises OSError if
-    the file cannot be opened.
+    device, and for an empty file, which includes endless files in /proc. Raises OSError if it cannot be opened.
     """
     file = _open_checked(path, what, "rb", _NO_WAITING)
     if not os.fstat(file.fileno()).st_size:
@@ -50,9 +44,8 @@ def open_regular(path: str | os.PathLike[str], what: str) -> BinaryIO:
 def open_inner(path: str | os.PathLike[str], what: str, mode: Literal["rb", "ab+"] = "rb") -> BinaryIO:
     """Open a file in a folder of results that may come from others, in binary mode.
 
-    `mode`: `rb` to read, `ab+` to append or create; `what` names the file in error messages. Raises InputError for
-    a link, for other files that are not regular and, when writing, for a file with several hard links. Raises
-    OSError if it cannot be opened.
+    `mode`: `rb` to read, `ab+` to append or create; `what`: name in messages. Raises InputError for a link, another
+    file that is not regular or, to write, several hard links; else OSError.
     """
     if Path(path).is_symlink():
         raise InputError(f"{what} must be a file, got a link ({path})")
@@ -60,21 +53,15 @@ def open_inner(path: str | os.PathLike[str], what: str, mode: Literal["rb", "ab+
 
 
 def _open_checked(path: str | os.PathLike[str], what: str, mode: Literal["rb", "ab+"], extra_flags: int) -> BinaryIO:
-    """Open a regular file in binary mode.
-
-    `mode`: `rb` to read, `ab+` to append or create; `what` names the file in error messages; `extra_flags`: additional
-    flags of `os.open`. Raises InputError for a file that is not regular and, when writing, for a file with several hard
-    links; raises OSError if the file cannot be opened.
-    """
+    """Open a regular file with `extra_flags` of `os.open`; raise InputError for any other file."""
     flags = os.O_RDONLY if mode == "rb" else os.O_RDWR | os.O_CREAT | os.O_APPEND
+    flags |= extra_flags | getattr(os, "O_BINARY", 0) | getattr(os, "O_CLOEXEC", 0)
     try:
-        descriptor = os.open(
-            path, flags | extra_flags | getattr(os, "O_BINARY", 0) | getattr(os, "O_CLOEXEC", 0), 0o666
-        )
+        descriptor = os.open(path, flags, 0o666)
     except IsADirectoryError:
         raise InputError(f"{what} must be a file, got a folder ({path})") from None
     status = os.fstat(descriptor)
-    wrong_kind = special_kind(status.st_mode)
+    wrong_kind = next((name for is_kind, name in _KINDS if is_kind(status.st_mode)), None)
     if wrong_kind is None and mode != "rb" and status.st_nlink > 1:
         wrong_kind = f"one of {status.st_nlink} hard links"
     if wrong_kind is not None:
@@ -87,8 +74,7 @@ def _open_checked(path: str | os.PathLike[str], what: str, mode: Literal["rb", "
 def raising_unreadable(what: str, place: str | os.PathLike[str]) -> Iterator[None]:
     """Convert any error that a damaged file causes in the block to an UnreadableFile with a message of one line.
 
-    `what`, such as "a rig", and the path `place` appear in the message. MissingExtra and UnreadableFile are not
-    changed. Unexpected errors are also logged.
+    `what` ("a rig") and `place` appear in it. MissingExtra is not changed; unexpected errors are also logged.
     """
     try:
         yield

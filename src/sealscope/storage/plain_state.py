@@ -20,37 +20,22 @@ _MAX_SIZE = 50_000_000
 
 
 def plain_array(values: NDArray[Any]) -> dict[str, Any]:
-    """Convert an array of numbers to a mapping for JSON; its entries are the array's `shape` and its values, `f8`.
+    """Convert an array of numbers to a mapping for JSON: its `shape`, and its values `f8`.
 
-    The values are stored as 64-bit floats, little endian, in base64 text. The columns of a structured array become the
-    last axis, without names.
+    The values are 64-bit floats, little endian, in base64 text. The columns of a structured array become the last axis.
     """
     values = np.ascontiguousarray(_as_plain_array(values), dtype="<f8")
     return {"shape": list(values.shape), "f8": b64encode(values.tobytes()).decode("ascii")}
 
 
 def _as_plain_array(values: NDArray[Any]) -> NDArray[Any]:
-    """Convert a structured array of floats to a plain array whose last axis holds the columns.
-
-    A plain array is returned unchanged.
-    """
+    """Convert a structured array of floats to a plain array whose last axis holds the columns."""
     names = values.dtype.names
     return values if names is None else values.view(float).reshape(*values.shape, len(names))
 
 
-def plain_fields(values: Any) -> dict[str, Any]:
-    """Convert a dataclass whose fields are plain values to a dict from field to value.
-
-    Lists are copied, as the original ones may grow.
-    """
-    return {name: list(value) if isinstance(value, list) else value for name, value in vars(values).items()}
-
-
 def restore(kind: type[_T], state: Any, name: str) -> _T:
-    """Convert one entry of a saved state to the type `kind`.
-
-    Raises InputError, which names the entry by `name`, if it does not fit the type.
-    """
+    """Convert the entry `name` of a saved state to the type `kind`; raise InputError if it does not fit."""
     try:
         return convert_type(kind, state)
     except ValueError as error:
@@ -58,10 +43,7 @@ def restore(kind: type[_T], state: Any, name: str) -> _T:
 
 
 def restore_array(value: Any, name: str) -> NDArray[np.float64]:
-    """Restore an array of doubles from the mapping that `plain_array` made.
-
-    Raises InputError, which names the entry of the saved state by `name`, for any other value.
-    """
+    """Restore an array of doubles from the mapping that `plain_array` made; raise InputError for any other value."""
     try:
         shape = tuple(int(size) for size in value["shape"])
         if min(shape, default=0) < 0 or np.prod(shape, dtype=float) > _MAX_SIZE:
@@ -73,10 +55,7 @@ def restore_array(value: Any, name: str) -> NDArray[np.float64]:
 
 
 def require_part(state: Any, name: str, kind: type | tuple[type, ...]) -> Any:
-    """Return the entry `name` of a saved state, which is a mapping.
-
-    Raises InputError if the entry is missing or not of the type `kind`.
-    """
+    """Return an entry of a saved state; raise InputError if it is missing or not of the type `kind`."""
     if not isinstance(state, Mapping) or name not in state:
         raise InputError(f"saved state must have {name!r}, got {type(state).__name__} without")
     value = state[name]
@@ -86,10 +65,7 @@ def require_part(state: Any, name: str, kind: type | tuple[type, ...]) -> Any:
 
 
 def require_count(state: Any, name: str) -> int:
-    """Return the entry `name` of a saved state, which must be a whole number of 0 or more.
-
-    Raises InputError otherwise.
-    """
+    """Return an entry of a saved state; raise InputError if it is not a whole number of 0 or more."""
     value = require_part(state, name, object)
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 0:
         raise InputError(f"saved state's {name} must be a whole number >= 0, got {value!r}")
@@ -112,8 +88,8 @@ def require_numbers(state: Any, name: str, shape: tuple[int, ...]) -> NDArray[np
 def save_attributes(owner: Any, names: Iterable[str]) -> dict[str, Any]:
     """Convert the attributes of `owner` called `names` to plain values, which `restore_attributes` reads.
 
-    Attributes are numbers, texts, lists, dicts, arrays, dataclasses, or objects with a method `state`. A float
-    attribute that is not finite becomes None. Keys of the result are the names without leading underscores.
+    Attributes are numbers, texts, lists, dicts, arrays, dataclasses, or objects with a method `state`. A float that is
+    not finite becomes None. Keys of the result are the names without leading underscores.
     """
     return {name.lstrip("_"): _to_plain_value(getattr(owner, name)) for name in names}
 
@@ -122,8 +98,8 @@ def _to_plain_value(value: Any) -> Any:
     """Convert one attribute of an object to a value that JSON can store, as `save_attributes` describes."""
     if callable(getattr(value, "state", None)):
         return value.state()
-    if is_dataclass(value):
-        return plain_fields(value)
+    if is_dataclass(value):  # its lists are copied, as they may grow
+        return {name: list(item) if isinstance(item, list) else item for name, item in vars(value).items()}
     if isinstance(value, np.ndarray):
         return plain_array(value)
     if isinstance(value, float) and not np.isfinite(value):

@@ -19,10 +19,7 @@ MAX_WHOLE = 2**53
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Parse a JSON text; raise ValueError if it is not valid, or has a number that is too large or not finite.
-
-    Whole numbers may be at most 2^53.
-    """
+    """Parse JSON; raise ValueError if it is not valid, or has a number that is not finite or a whole one over 2^53."""
     try:
         return json.loads(text, parse_float=_parse_finite, parse_int=_parse_whole, parse_constant=_parse_finite)
     except RecursionError:
@@ -55,8 +52,7 @@ def _type_adapter(kind: Any) -> Any:
 def convert_type(kind: type[_T], value: Any, entry_name: Callable[[str], str] = str, context: Any = None) -> _T:
     """Convert plain values to the dataclass, model or other type `kind`; raise ValueError if they do not fit.
 
-    The error is one line and names no file. `entry_name` converts the name of an entry of `value` to its name in
-    the error. `context` is passed to the validators of `kind`.
+    The error is one line, in which `entry_name` converts the name of an entry; `context`: for the validators of `kind`.
     """
     from pydantic import ValidationError
 
@@ -74,11 +70,10 @@ _PLAIN_RULES = {
 
 
 def format_error(error: ValidationError, entry_name: Callable[[str], str] = str, unit: str = "") -> str:
-    """Format one of pydantic's errors as a line such as "ENTRY must be ..., got ...".
+    """Format the first of pydantic's errors, or the first about an unknown entry, as "ENTRY must be ..., got ...".
 
-    Of several errors, the first about an unknown entry is chosen, else the first. The line starts with the path to the
-    wrong entry, such as `line.V_1`; `entry_name` converts the first name of this path ("" if the whole value is wrong).
-    `unit`: text that is appended to the broken rule.
+    ENTRY is the path to the wrong entry, such as `line.V_1`; `entry_name` converts its first name ("" if the whole
+    value is wrong). `unit`: text that is appended to the broken rule.
     """
     errors = error.errors(include_url=False)
     chosen = next((detail for detail in errors if _PLAIN_RULES.get(detail["type"]) == "is not known"), errors[0])

@@ -39,9 +39,9 @@ def read_rows(
 ) -> dict[str, Row]:
     """Read the results of jobs that `store_rows` stored in a folder; return the last row of each job by its id.
 
-    `parse` parses the JSON of a line, and `row_of` makes a row from the result, or None to ignore the line. `what`
-    names the folder in errors. A last line that was cut off is ignored, and a missing file has no rows. Raises
-    UnreadableFile if the file cannot be read or a line is not a row, and InputError if the file is a link.
+    `row_of` makes a row from a parsed line, or None to ignore it; `what` names the folder in errors. A last line that
+    was cut off is ignored, and a missing file has no rows. Raises UnreadableFile if the file cannot be read or a line
+    is not a row, and InputError if the file is a link.
     """
     path = folder / ROWS
     rows: dict[str, Row] = {}
@@ -69,10 +69,9 @@ def read_rows(
 def store_rows(folder: Path, rows: Generator[Row, None, None], what: str, allow_nan: bool = False) -> Iterator[Row]:
     """Append each row that the generator `rows` yields to the file `rows.jsonl` in a folder, then yield the row.
 
-    The generator runs a job for each row. A row is on the disk before the next job starts. An incomplete last line,
-    which an interrupted run has left, is removed first. `rows` is closed at the end; `what` names the folder in errors.
-    Raises ValueError for a row with a number that is not finite, unless `allow_nan`, and InputError if the file
-    cannot be written.
+    The generator runs a job for each row; a row is on the disk before the next job starts. An incomplete last line of
+    an interrupted run is removed first. `rows` is closed at the end; `what` names the folder in errors. Raises
+    ValueError for a row with a number that is not finite, unless `allow_nan`, and InputError if writing fails.
     """
     with closing(rows), open_inner(folder / ROWS, f"{what}'s file of rows", "ab+") as file:
         size = file.seek(0, os.SEEK_END)
@@ -92,11 +91,7 @@ def store_rows(folder: Path, rows: Generator[Row, None, None], what: str, allow_
 
 @contextmanager
 def lock_rows(folder: Path, what: str) -> Iterator[None]:
-    """Lock the stored rows of a folder against other processes while the block runs, and remove old temporary files.
-
-    The lock also ends with the process. Raises InputError if another process holds it; `what` names the folder in
-    the message.
-    """
+    """Lock the rows of a folder against other processes, or raise InputError; remove old temporary files."""
     busy = f"{what} must be run by one process at a time, got another at work ({folder})"
     with folders.lock_file(folder / LOCK, busy):
         remove_temporaries(folder)

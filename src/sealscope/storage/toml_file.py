@@ -48,10 +48,7 @@ def read_toml(path: Path, what: str, place: str, max_size: int = MAX_SIZE) -> di
 
 
 def parse_toml(data: bytes, what: str, place: str, max_size: int = MAX_SIZE) -> dict[str, Any]:
-    """Parse the content `data` of a TOML file; errors and limits are those of `read_toml`.
-
-    `what` ("a rig file") and `place` name the file in error messages; `max_size` [bytes] is the largest permitted size.
-    """
+    """Parse the content `data` of a TOML file; arguments, errors and limits are those of `read_toml`."""
     if len(data) > max_size:
         raise InputError(f"{what} must be at most {max_size} bytes, got more ({place})")
     try:
@@ -72,11 +69,9 @@ def parse_toml(data: bytes, what: str, place: str, max_size: int = MAX_SIZE) -> 
 def read_model(
     tree: Mapping[str, Any], kind: type[_T], place: str, entry_name: Callable[[str], str] = str, context: Any = None
 ) -> _T:
-    """Convert the tables `tree` of a TOML file to the model or dataclass `kind` (`plain_values.convert_type`).
+    """Convert the tables `tree` of a TOML file to the model or dataclass `kind`; raise InputError if they do not fit.
 
-    `place`: file, for error messages; `entry_name`: converts the name of an entry to its name in error messages;
-    `context`: passed to the validators of `kind`. Raises InputError if a value does not fit; the message names the
-    entry, the rule, the value and the place.
+    `entry_name`: converts the name of an entry for the message; `context`: for the validators.
     """
     try:
         return convert_type(kind, tree, entry_name, context)
@@ -89,7 +84,7 @@ class PriorTable:
     """A read-only table of priors, the assumed or published numbers that a `priors.toml` states with their sources.
 
     A subclass annotates its keys, and gives a default for each optional one. Type checkers treat it as a frozen
-    dataclass. A real dataclass would take ten times longer to create at import.
+    dataclass; a real one would take ten times longer to create at import.
     """
 
     def __init__(self, **values: Any) -> None:
@@ -105,8 +100,8 @@ def read_priors(package: str, kind: type[_T]) -> _T:
     """Read the `priors.toml` of a package, its assumed numbers, as an object of the class `kind`.
 
     The fields of `kind` are the tables of the file. Each is a `PriorTable` or a mapping, with numbers and tuples of
-    numbers as values. In the file each key of a table must have value, unit and source. A value is returned as the
-    file states it, in the stated unit. Raises InputError that names file, table, key and rule.
+    numbers as values. In the file each key must have value, unit and source; the value is returned in that unit. Raises
+    InputError that names file, table, key and rule.
     """
     place = f"{package.replace('.', '/')}/priors.toml"
     tables = tomllib.loads((files(package) / "priors.toml").read_text("utf-8"))
@@ -116,10 +111,7 @@ def read_priors(package: str, kind: type[_T]) -> _T:
 
 
 def _parse_table(rows: Mapping[str, Any], kind: Any, place: str) -> Any:
-    """Convert a table of a file of priors to the type `kind`, a `PriorTable` or a mapping.
-
-    `rows`: mapping from key to {value, unit, source}; `place` names the table in errors.
-    """
+    """Convert a table of priors, from key to {value, unit, source}, to the type `kind`, a `PriorTable` or a mapping."""
     is_mapping = get_origin(kind) is not None  # such as Mapping[str, float]
     optional: tuple[str, ...] = ()
     if is_mapping:
@@ -135,12 +127,7 @@ def _parse_table(rows: Mapping[str, Any], kind: Any, place: str) -> Any:
 
 
 def _parse_value(row: Any, kind: Any, place: str) -> Any:
-    """Return the value of a prior as `kind`: an int, a tuple of numbers, or else a float.
-
-    `row`: entry {value, unit, source} of the prior in the file; `place` names the prior in errors. The value stays in
-    the unit that the row states. Raises InputError if the row lacks value, unit or source, or if the value does not fit
-    `kind`.
-    """
+    """Return the value of a prior, the entry {value, unit, source}, as `kind`: int, tuple of numbers, or else float."""
     if not isinstance(row, dict) or set(row) != {"value", "unit", "source"} or not (row["unit"] and row["source"]):
         raise InputError(f"{place} must have value, unit and source, got {row!r}")
     if get_origin(kind) is tuple:
@@ -153,20 +140,14 @@ def _parse_value(row: Any, kind: Any, place: str) -> Any:
 
 
 def _parse_number(value: Any, kind: type, place: str) -> Any:
-    """Convert a number of a file of priors to `kind`, int or float; raise InputError for any other value.
-
-    `place`: file, table and key, for the error message.
-    """
+    """Convert a number of a file of priors to `kind`, int or float; raise InputError for any other value."""
     if isinstance(value, bool) or not isinstance(value, int if kind is int else (int, float)):
         raise InputError(f"{place} must be {'a whole number' if kind is int else 'a number'}, got {value!r}")
     return kind(value)
 
 
 def _check_keys(rows: Collection[str], names: Collection[str], optional: Collection[str], place: str) -> None:
-    """Check that a table has all keys in `names`, except perhaps those in `optional`, and no other keys.
-
-    Raises InputError otherwise. `rows`: keys of the table; `place`: name of the table in the message.
-    """
+    """Check that a table has all keys in `names`, except perhaps the `optional`, and no others, or raise InputError."""
     for name in rows:
         if name not in names:
             raise InputError(f"{place} must be {', '.join(names)}, got {name!r}")
@@ -178,8 +159,7 @@ def _check_keys(rows: Collection[str], names: Collection[str], optional: Collect
 def _estimate_memory(text: str) -> int:
     """Estimate an upper limit of the memory [bytes] that a TOML text will take once it is parsed.
 
-    Tables, elements of arrays of tables (`n_rows`), keys and values are counted without parsing the text, and each
-    count is multiplied by the memory that one of them takes.
+    Tables, elements of arrays of tables (`n_rows`), keys and values are counted without parsing the text.
     """
     n_tables = n_rows = 0  # a dotted key makes a table for each dot
     for line in StringIO(text):
@@ -194,10 +174,7 @@ def _estimate_memory(text: str) -> int:
 
 
 def _check_whole_numbers(value: Any) -> None:
-    """Check that no whole number in a value, or in its tables and arrays, exceeds 2^53.
-
-    Raises ValueError otherwise.
-    """
+    """Check that no whole number in a value, or in its tables and arrays, exceeds 2^53; raise ValueError otherwise."""
     if isinstance(value, int) and abs(value) > MAX_WHOLE:
         raise ValueError("a whole number must be at most 2^53 in size")
     items = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()

@@ -24,9 +24,8 @@ _LABELS = {"valid": "leak", "repaired": "leak", "invalid": "healthy"}
 def export_labels(store: MonitorStore, folder: Path) -> tuple[int, int]:
     """Write all alarms and estimates of a monitor to `alarms.csv` and `estimates.csv`; return how many of each.
 
-    `store`: database of the monitor; `folder`: folder of the two files. The estimates from the start of an alarm's
-    onset interval until its last mark are labelled: `leak` if the mark is `repaired` or `valid`, `healthy` if it is
-    `invalid`. Other estimates have no label.
+    The estimates from the start of an alarm's onset interval until its last mark are labelled: `leak` if the mark is
+    `repaired` or `valid`, `healthy` if it is `invalid`. Other estimates have no label.
     """
     events = _events_by_alarm(store)
     rows = []
@@ -35,13 +34,13 @@ def export_labels(store: MonitorStore, folder: Path) -> tuple[int, int]:
     # in order of time, at equal times in order of number: the label of the latest alarm is the last
     for alarm in sorted(reversed(store.alarms()), key=lambda alarm: float(alarm["raised_s"])):
         history = events[alarm["id"]]
-        last_mark = next((event for event in reversed(history) if event["event"] in _LABELS), None)
+        last_mark: dict[str, Any] = next((event for event in reversed(history) if event["event"] in _LABELS), {})
         onset_low, onset_high = alarm["onset_interval_s"] or (None, None)
         leak_low, leak_high = alarm["leak_interval_lpm"] or (None, None)
         comments = (f"{event['by']}: {event['text']}" for event in history if event["by"] and event["text"])
         row = {
-            "marked_by": None if last_mark is None else last_mark["by"],
-            "marked_s": None if last_mark is None else last_mark["t"],
+            "marked_by": last_mark.get("by"),
+            "marked_s": last_mark.get("t"),
             "comments": "; ".join(comments),
             "onset_low_s": onset_low,
             "onset_high_s": onset_high,
@@ -49,7 +48,7 @@ def export_labels(store: MonitorStore, folder: Path) -> tuple[int, int]:
             "leak_high_lpm": leak_high,
         }
         rows.append({**alarm, **row})
-        if last_mark is not None:
+        if last_mark:
             start = alarm["onset_s"] if onset_low is None else onset_low
             labels = {"label": _LABELS[last_mark["event"]], "alarm": alarm["id"]}
             intervals[alarm["actuator"]].append((start, last_mark["t"], labels))
@@ -57,11 +56,7 @@ def export_labels(store: MonitorStore, folder: Path) -> tuple[int, int]:
     n_estimates = 0
 
     def estimates() -> Iterator[dict[str, Any]]:
-        """Yield the rows of `estimates.csv`, and count them.
-
-        An estimate within the interval of a marked alarm also has the columns `label` ("leak" or "healthy") and `alarm`
-        (the alarm's `id`).
-        """
+        """Yield and count the rows of `estimates.csv`, with label and id of the marked alarm in which they lie."""
         nonlocal n_estimates
         for row in store.estimates():
             n_estimates += 1

@@ -23,8 +23,7 @@ def record_mark(rig: str, alarm: Alarm, mark: str, samples: Sequence[Recording])
 
     `rig`: path of the file; `samples`: the last samples before the mark. With the mark `invalid` these samples are
     added as a healthy recording, unless the machine judges that they leak. After a `valid` mark no recording from the
-    onset on becomes healthy until a repair. Returns "" if a machine's file does not store this mark, or if `rig` is
-    not a machine's file.
+    onset on becomes healthy until a repair. Returns "" if `rig` is not a machine's file, or does not store this mark.
     """
     path = Path(rig)
     if mark not in JUDGEMENTS or path.suffix.lower() != ".toml":
@@ -36,10 +35,8 @@ def record_mark(rig: str, alarm: Alarm, mark: str, samples: Sequence[Recording])
         # a machine's file has times since 1970; the samples' clock may start anywhere
         shift = 0.0 if counts_from_1970(alarm.onset_s) else time.time() - alarm.updated_s
         leak_lpm = None if mark == "invalid" else alarm.leak_lpm
-        onset_s = alarm.onset_s + shift
-        judgement = JudgedAlarm(
-            alarm=name, mark=mark, date_s=time.time(), onset_s=onset_s, leak_lpm=leak_lpm, reason=reason
-        )
+        times = {"date_s": time.time(), "onset_s": alarm.onset_s + shift}
+        judgement = JudgedAlarm(alarm=name, mark=mark, leak_lpm=leak_lpm, reason=reason, **times)
         outcome = "written down"
 
         def add_mark(machine: CommissionedMachine) -> CommissionedMachine:
@@ -61,10 +58,9 @@ def record_mark(rig: str, alarm: Alarm, mark: str, samples: Sequence[Recording])
 
 
 def _combine_samples(samples: Sequence[Recording], shift: float) -> Recording:
-    """Join samples to one recording whose times start at 0 s.
+    """Join samples to one recording whose times start at 0 s; raise SealscopeError if there are none.
 
-    `shift` [s]: added to the first time to give the date of the recording, in seconds since 1970. Raises
-    SealscopeError if there are no samples.
+    `shift` [s]: added to the first time to give the date of the recording, in seconds since 1970.
     """
     if not samples:
         raise SealscopeError("no samples of the alarm are kept: add its recording by sealscope commission --add")

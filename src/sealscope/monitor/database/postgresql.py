@@ -21,10 +21,7 @@ _DRIVERS = ("postgresql", "postgresql+psycopg", "postgresql+psycopg2")
 
 
 def engine_options(url: URL) -> dict[str, Any]:
-    """Build the options of SQLAlchemy's `create_engine` that limit the waiting times of a PostgreSQL database.
-
-    Returns {} for another database. Options in the URL take precedence.
-    """
+    """Build SQLAlchemy's options that limit PostgreSQL's waiting times, unless the URL has them; {} for others."""
     if url.drivername not in _DRIVERS:
         return {}
     keepalive = {"keepalives_idle": 5, "keepalives_interval": 2, "keepalives_count": 3}
@@ -41,10 +38,7 @@ def engine_options(url: URL) -> dict[str, Any]:
 
 
 def limit_answers(engine: Engine) -> None:
-    """Make an engine's connections raise an error if the server does not answer within `ANSWER_S`.
-
-    Only the driver psycopg 3 is supported; with others nothing is done.
-    """
+    """Make an engine's connections raise an error if the server does not answer within `ANSWER_S` (psycopg 3 only)."""
     if engine.dialect.driver != "psycopg":
         return
     from psycopg import Connection, OperationalError
@@ -57,10 +51,9 @@ def limit_answers(engine: Engine) -> None:
             return super().wait(self._with_time_limit(gen), *arguments, **options)
 
         def _with_time_limit(self, gen: Generator[Any, Any, Any]) -> Generator[Any, Any, Any]:
-            """Run psycopg's generator `gen`, which waits for answers of the server, each for up to `ANSWER_S`.
+            """Run psycopg's generator `gen`; end the connection by OperationalError if an answer takes too long.
 
-            If an answer takes longer, the connection is closed and OperationalError raised. Psycopg resumes this
-            generator several times a second; `ready` is false while there is no answer.
+            Psycopg resumes this generator several times a second; `ready` is false while there is no answer.
             """
             last_answer = time.monotonic()
             ready: Any = None

@@ -57,10 +57,7 @@ class StoredRows:
     old_estimates: dict[str, int] = field(default_factory=dict)
 
     def add_estimates(self, actuator: str, estimates: Iterable[BlockEstimate], oil_celsius: float | None) -> None:
-        """Add the leakage estimates of blocks of samples, each with the oil temperature [deg C], None if unknown.
-
-        `actuator`: name of the actuator of these blocks.
-        """
+        """Add an actuator's leakage estimates of blocks, with the oil temperature [deg C], None if unknown."""
         for estimate in estimates:
             total_ends = estimate.total_interval_lpm or (None, None)
             leak_ends = estimate.leak_interval_lpm or (None, None)
@@ -72,21 +69,18 @@ class StoredRows:
     def add_pending(
         self, actuator: str, number: int, samples: Recording, follows: bool, verdict: RecordingVerdict | None = None
     ) -> None:
-        """Add a block of samples, which a restarted monitor judges again to recover the actuator's state.
+        """Add a block of samples, which a restarted monitor judges again until the next checkpoint.
 
-        `number`: running number of the block since the actuator's last checkpoint, from 1; `follows`: False if there is
-        a gap between these samples and those before; `verdict`: verdict on the samples as a whole recording, None for
-        none. The stored samples are deleted at the next checkpoint.
+        `number`: running number of the block since the last checkpoint, from 1; `follows`: False if there is a gap
+        before these samples; `verdict`: verdict on the samples as a whole recording, None for none.
         """
-        self.pending.append(
-            {"actuator": actuator, "number": number, "samples": _pack_samples(samples, follows, verdict)}
-        )
+        packed_samples = _pack_samples(samples, follows, verdict)
+        self.pending.append({"actuator": actuator, "number": number, "samples": packed_samples})
 
     def add_alarm(self, alarm: Alarm, kind: str, t: float, by_whom: str = "", text: str = "") -> None:
-        """Add an alarm in its present state, and the event that changed it at the time `t` [s].
+        """Add an alarm in its present state, and the event `kind`, "" for none, that changed it at the time `t` [s].
 
-        `kind`: name of the event, "" to add the alarm only; `by_whom`, `text`: the person who caused the event and
-        their comment, "" for none.
+        `by_whom`, `text`: person who caused the event, and their comment, or "".
         """
         plain = json.dumps(alarm.as_dict())
         self.alarms[alarm.id] = {"actuator": alarm.actuator, "id": alarm.id, "state": alarm.state, "alarm": plain}
@@ -95,10 +89,7 @@ class StoredRows:
             self.events.append({**event, "t": t, "alarm_id": alarm.id, "alarm": plain})
 
     def add_checkpoint(self, actuator: str, settings: str, state: dict[str, Any]) -> None:
-        """Add a checkpoint, that is the settings (JSON) and the state of an actuator.
-
-        Samples of the actuator that were added before are dropped, because the state includes their effect.
-        """
+        """Add settings (JSON) and state of an actuator; drop its samples, whose effect the state includes."""
         self.pending = [row for row in self.pending if row["actuator"] != actuator]
         plain = json.dumps(state, allow_nan=False)
         self.actuators[actuator] = {"actuator": actuator, "settings": settings, "checkpoint": plain}
@@ -112,11 +103,7 @@ class StoredRows:
 
 
 class StoredSamples(NamedTuple):
-    """The stored samples of a block.
-
-    `follows`: False if there is a gap between these samples and those before; `verdict`: verdict on the samples as a
-    whole recording, None if they are not a whole recording.
-    """
+    """The stored samples of a block; `follows`: False after a gap; `verdict`: on them as a whole recording, or None."""
 
     samples: Recording
     follows: bool
@@ -124,10 +111,7 @@ class StoredSamples(NamedTuple):
 
 
 class StoredCheckpoint(NamedTuple):
-    """The stored checkpoint of an actuator.
-
-    `settings`: its settings as JSON; `state`: its state as plain values; `pending`: samples that arrived after it.
-    """
+    """The stored checkpoint of an actuator: its settings as JSON, its state, and the samples that arrived after it."""
 
     settings: str
     state: dict[str, Any]
@@ -135,10 +119,7 @@ class StoredCheckpoint(NamedTuple):
 
 
 class MonitorStore:
-    """The database of a monitor.
-
-    `database`: a file of SQLite, or a URL. Raises InputError if it cannot be opened.
-    """
+    """The database of a monitor: a file of SQLite, or a URL. Raises InputError if it cannot be opened."""
 
     def __init__(self, database: str) -> None:
         self.tables = tables
@@ -161,7 +142,7 @@ class MonitorStore:
     def _prepare_tables(self, attempts: int) -> str:
         """Create missing tables, and return the version of the database's schema, which the table `facts` stores.
 
-        An attempt fails if another monitor creates the tables at the same time; `attempts`: largest number of attempts.
+        An attempt fails if another monitor creates the tables at the same time.
         """
         facts = tables.facts
         try:
@@ -231,8 +212,7 @@ class MonitorStore:
     def insert_blocks(self, connection: sa.Connection, blocks: Iterable[tuple[str, str, int]]) -> None:
         """Store the identities of blocks, each given as (actuator, identity, running number in the actuator's blocks).
 
-        `connection`: has an open transaction. Raises IntegrityError, which ends the transaction, if one of the blocks
-        is stored already.
+        Raises IntegrityError, which ends the open transaction of `connection`, if one of the blocks is stored already.
         """
         names = ("actuator", "identity", "number")
         connection.execute(tables.blocks.insert(), [dict(zip(names, block, strict=True)) for block in blocks])
@@ -240,8 +220,7 @@ class MonitorStore:
     def write_rows(self, connection: sa.Connection, rows: StoredRows) -> None:
         """Write rows to their tables within the transaction of `connection`, and delete rows that are no longer needed.
 
-        Deleted are the samples before a new checkpoint, and the blocks and estimates up to the running numbers in
-        `rows.old_blocks` and `rows.old_estimates`.
+        Deleted are the samples before a new checkpoint, and the rows up to `rows.old_blocks` and `rows.old_estimates`.
         """
         actuator = bindparam("name", type_=sa.String)
         if rows.actuators:  # a checkpoint replaces the samples before it
@@ -267,10 +246,7 @@ class MonitorStore:
             self.write_rows(connection, rows)
 
     def upsert(self, connection: sa.Connection, table: sa.Table, rows: list[dict[str, Any]]) -> None:
-        """Write rows to a table: update the stored rows with the same primary keys, and insert the missing ones.
-
-        `connection`: has an open transaction, in which the rows are written.
-        """
+        """Write rows to a table: update the stored rows with the same primary keys, and insert the missing ones."""
         if not rows:
             return
         key = table.primary_key.columns.keys()
@@ -298,10 +274,9 @@ class MonitorStore:
         return [dict(row._mapping) for row in rows]
 
     def begin_decoding(self, reader: str, digest: str) -> int:
-        """Store that a reader starts to decode a message; return the number of earlier attempts that never finished.
+        """Store that a `reader` (MQTT client) begins to decode a message; return the number of earlier attempts.
 
-        After a restart, a message whose decoding crashed the process can thus be refused. `reader`: id of the MQTT
-        client that decodes; `digest`: hash of the message.
+        These never ended: after a crash of the process the message can thus be refused. `digest`: its hash.
         """
         table, columns = tables.decodings, tables.decodings.c
         query = select(columns.attempts).where(columns.reader == reader, columns.digest == digest)
@@ -311,10 +286,7 @@ class MonitorStore:
         return n_before
 
     def end_decoding(self, reader: str, digest: str) -> None:
-        """Delete the record that a message is being decoded (`begin_decoding`), after the decoding has ended.
-
-        `reader`: id of the MQTT client that decoded the message; `digest`: hash of the message.
-        """
+        """Delete the record that `reader` is decoding the message with the hash `digest` (`begin_decoding`)."""
         columns = tables.decodings.c
         with self._begin_relaxed_transaction() as connection:
             connection.execute(tables.decodings.delete().where(columns.reader == reader, columns.digest == digest))
@@ -372,9 +344,8 @@ class MonitorStore:
     def history(self, actuator: str, max_rows: int = 600, seconds: float | None = None) -> list[dict[str, Any]]:
         """Read the history of an actuator's estimates in order of time, averaged to at most about `max_rows` rows.
 
-        Each row averages a group of successive estimates. It has the mean time `t` [s], flows and interval ends
-        [L/min], and oil temperature [deg C], with None for unknown ones. `seconds` [s]: length of the history before
-        the newest estimate, None for all of it.
+        Each row has the mean time `t` [s], flows and interval ends [L/min], and oil temperature [deg C] of a group of
+        successive estimates, with None for unknown ones. `seconds` [s]: length of the history, None for all.
         """
         columns = tables.estimates.c
         is_chosen = columns.actuator == actuator
@@ -395,10 +366,7 @@ class MonitorStore:
                 yield dict(row._mapping)
 
     def position(self, name: str) -> int:
-        """Read the number of the last alarm event that the output `name` has delivered, 0 for none.
-
-        The Sparkplug node also stores the number of its last birth message in this way.
-        """
+        """Read the number that `write_position` stored under a name, such as an output's last event, 0 for none."""
         return self._value(select(tables.facts.c.value).where(tables.facts.c.name == name))
 
     def write_position(self, name: str, number: int) -> None:
@@ -407,10 +375,9 @@ class MonitorStore:
             self.upsert(connection, tables.facts, [{"name": name, "value": str(number)}])
 
     def deliver(self, output: str, send: Callable[[dict[str, Any]], bool]) -> None:
-        """Send the events of alarms that an output has not sent yet, in order and at most 1000 of them.
+        """Send the events that an output has not sent yet, in order and at most 1000, and store how far it came.
 
-        `output`: name of the output; `send`: function that sends an event, and returns False if the next call must try
-        this event again. The number of each sent event is stored, so the next call continues with the following event.
+        `send`: sends an event, and returns False if the next call must try this event again.
         """
         for number, event in self.events_since(self.position(output)):
             if not send(event):
@@ -443,11 +410,7 @@ def _pack_samples(samples: Recording, follows: bool, verdict: RecordingVerdict |
 
 @lru_cache(maxsize=64)
 def _format_header(units: tuple[tuple[str, str], ...], rate: float, follows: bool) -> bytes:
-    """Format the first line of packed samples as JSON; `_pack_samples` adds the verdict of a block that has one.
-
-    `units`: (channel, unit) of each channel; `rate`: sampling rate [Hz]; `follows`: True if the samples follow the
-    stored ones without a gap.
-    """
+    """Format the first line of packed samples, but for a verdict, as JSON; `units`: pairs (channel, unit)."""
     return json.dumps({"units": dict(units), "rate": rate, "follows": follows}).encode() + b"\n"
 
 
@@ -464,20 +427,13 @@ def _unpack_samples(data: bytes) -> StoredSamples:
 
 
 def _event_from_row(row: Any) -> dict[str, Any]:
-    """Convert a row of the table `events` to the plain values that outputs send.
-
-    They are `number`, `event` (its kind), `t` [s], `by` (a person), `text` (their comment), and `alarm`, the alarm
-    after the event.
-    """
+    """Convert a row of `events` to the plain values that outputs send: the event, and the alarm after it."""
     values = {"number": row.number, "event": row.kind, "t": row._mapping["t"], "by": row.by_whom, "text": row.text}
     return {**values, "alarm": json.loads(row.alarm)}
 
 
 def _prepare_sqlite(connection: Any, record: object) -> None:
-    """Set the options of a new connection to SQLite: sizes, waiting time for locks, WAL mode, full synchronisation.
-
-    SQLAlchemy calls this for each connection of the driver; `record`: its record of the connection, not used.
-    """
+    """Set the options of a new connection to SQLite, for which SQLAlchemy calls this with its `record`, not used."""
     # a page has room for a second of samples, the cache for all pages of a transaction
     settings = "page_size=16384", "cache_size=-32000", "busy_timeout=5000", "foreign_keys=ON"
     for setting in (*settings, "journal_mode=WAL", "synchronous=FULL"):

@@ -19,11 +19,10 @@ _TYPES: dict[str, TypeEngine[Any]] = {"text": Text(), "int": Integer(), "double"
 
 
 def _table(name: str, columns: str, *indexes: Index) -> Table:
-    """Define a table of the database from a text that lists its columns, separated by commas.
+    """Define a table from a text that lists its columns, separated by commas.
 
-    Each column is written as its name, its type (``text``, ``int``, ``double``, ``bytes``, or a number for a text of
-    at most that length), and its roles: ``key`` (primary key), ``counted`` (a running number as the key),
-    ``indexed``, ``null`` (may be null).
+    Each column is written as its name, its type (``text``, ``int``, ``double``, ``bytes``, or the length of a text),
+    and its roles: ``key`` (primary key), ``counted`` (a running number as the key), ``indexed``, ``null``.
     """
     table_columns: list[Column[Any]] = []
     for column, kind, *roles in map(str.split, columns.split(",")):

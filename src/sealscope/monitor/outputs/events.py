@@ -1,7 +1,6 @@
 """Send the events of alarms as JSON lines to a stream and as POST requests to a web address, in order.
 
-Each event is sent at least once. The database stores how far each output has come; an event sent just before a crash
-is sent again, with the same number.
+The database stores how far each output has come. Only after a crash an event may be sent again, with its number.
 """
 
 from __future__ import annotations
@@ -26,10 +25,7 @@ logging.getLogger("httpx").setLevel(logging.WARNING)  # it logs every request
 
 
 class EventLines:
-    """Writes the events in the database `store` to a text stream, as one line of JSON each.
-
-    If the stream accepts only a part of a line, the rest is written later: no line is cut off or written twice.
-    """
+    """Writes the events in the database `store` to a text stream, each as a line of JSON, never cut off or repeated."""
 
     def __init__(self, store: MonitorStore, stream: TextIO | None) -> None:
         self._store, self._stream = store, stream
@@ -42,8 +38,8 @@ class EventLines:
     def _write_line(self, event: dict[str, Any]) -> bool:
         """Write an event as one line of JSON if it is to be announced (`is_announced`), and return True.
 
-        Raises PartAway if the stream refuses the line or a part of it; the next call with the same event writes the
-        rest. The line is not buffered, because a buffer would keep lines that a full disk refuses.
+        Raises PartAway if the stream refuses the line or a part of it; the next call writes the rest. The line is not
+        buffered, because a buffer would keep lines that a full disk refuses.
         """
         if event["number"] != self._number:
             self._unwritten, self._number = (json.dumps(event) + "\n").encode(), event["number"]
@@ -68,9 +64,8 @@ class EventLines:
 class Webhook:
     """Posts the events in the database `store` to a web address, each as a JSON object.
 
-    An answer with status 200 to 299 confirms an event. The header `Idempotency-Key` has its number. The token, if
-    any, is sent as `Authorization: Bearer`; it is never logged, and redirects are not followed. `timeout` [s]:
-    longest time of a request with its answer.
+    A status of 200 to 299 confirms an event. The header `Idempotency-Key` has its number. The token, if any, is sent as
+    `Authorization: Bearer`; it is never logged. Redirects are not followed. `timeout` [s]: limit of a request.
     """
 
     part = "webhook"
@@ -83,20 +78,15 @@ class Webhook:
 
     @classmethod
     def from_settings(cls, actuators: WatchedActuators, table: WebhookSettings, settings: MonitorSettings) -> Self:
-        """Build the output from its `table` of the settings; raise InputError if the token cannot be read.
-
-        `actuators`: source of the events (their `store`).
-        """
+        """Build the output from its `table` of the settings; raise InputError if the token cannot be read."""
         token = read_secret(table.token_file, "webhook.token_file")
         return cls(actuators.store, table.url, token, table.timeout_s)
-
-    def end(self) -> None:
-        """Post the remaining alarm events; raise PartAway if one is not confirmed."""
-        self.deliver()
 
     def deliver(self) -> None:
         """Post the new alarm events to the web address; raise PartAway if one is not confirmed."""
         self._store.deliver("webhook", self._send_post)
+
+    end = deliver
 
     def _send_post(self, event: dict[str, Any]) -> bool:
         """Post an event if it is to be announced (`is_announced`); return True, or raise PartAway if not confirmed."""

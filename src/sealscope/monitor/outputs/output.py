@@ -17,7 +17,6 @@ from sealscope.monitor.settings import MonitorSettings, OutputSettings
 if TYPE_CHECKING:
     from sealscope.monitor.actuators import WatchedActuators
 
-
 #: Events that the detector causes; they are not announced while an alarm is shelved.
 _DETECTOR_EVENTS = ("raised", "error", "warning", "returned")
 
@@ -28,21 +27,17 @@ def is_announced(event: Mapping[str, Any]) -> bool:
 
 
 class Output(Protocol):
-    """An output of alarms.
+    """An output of alarms, whose outages page, log and metrics show under the name `part`.
 
-    `part`: name under which page, log and metrics show its outages. `deliver` is called again and again; `end` is
-    called once, at the end. Both send the new events by `MonitorStore.deliver`, which stores how far the output has
-    come, and raise PartAway if the receiver does not accept them.
+    `deliver` is called again and again; `end` is called once, at the end. Both send the new events by
+    `MonitorStore.deliver`, which stores how far the output has come, and raise PartAway if that fails.
     """
 
     part: str
 
     @classmethod
     def from_settings(cls, actuators: WatchedActuators, table: Any, settings: MonitorSettings) -> Self:
-        """Build the output from its `table` of the `settings`; raise InputError if a secret cannot be read.
-
-        `actuators`: source of the events (their `store`) and of the summaries.
-        """
+        """Build the output from its `table` of the `settings`; raise InputError if a secret cannot be read."""
 
     def deliver(self) -> None:
         """Send the new events."""

@@ -47,14 +47,13 @@ def format_metrics(
 ) -> str:
     """Format the metrics of all actuators and of the monitor in the text format of Prometheus.
 
-    `summaries`: summary of each actuator by name; `counters`: numbers of dropped messages and blocks, by reason;
-    `parts`: for each part, such as the database, (True if it works now, number of outages, their total length [s]);
-    `queue_load`: blocks that wait to be stored.
+    `summaries`: by actuator; `counters`: numbers of dropped messages and blocks, by reason; `parts`: for each part,
+    such as the database, (True if it works now, number of outages, their total length [s]).
     """
     families: dict[str, Any] = {}
 
     def add(name: str, text: str, value: float | None, **labels: str) -> None:
-        """Add `value` with its labels to the metric `name`; do nothing for None. `text`: help text of the metric."""
+        """Add `value` with its labels to the metric `name`, which has the help `text`; do nothing for None."""
         if value is not None:
             kind = CounterMetricFamily if name.endswith("_total") else GaugeMetricFamily
             families.setdefault(name, kind(name, text, labels=[*labels])).add_metric([*labels.values()], float(value))

@@ -1,9 +1,8 @@
 """Publish alarms and values as an edge node of Sparkplug B with one device per actuator.
 
-Birth messages state all metrics. Data messages state each event of an alarm at once and in order, and every few
-seconds the other metrics that have changed. The death message is the last will of the connection. Its number bdSeq
-increases with each connection, also after a restart. Messages have QoS 0: a host that misses a sequence number
-requests a birth.
+Birth messages state all metrics. Data messages state each event of an alarm at once and in order, and every few seconds
+the other metrics that have changed. The death message is the last will of the connection. Its number bdSeq increases
+with each connection, also after a restart. Messages have QoS 0: a host that misses one requests a birth.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ class SparkplugNode:
     """The Sparkplug B edge node by which a monitor publishes its alarms and values.
 
     `store`: database with the events; `summaries`: function that returns the summary of each actuator; `count`:
-    function called with the reason for each received message that is dropped; `password`: password for the broker.
+    function called with the reason for each dropped message; `password`: of the `broker`.
     """
 
     part = "Sparkplug node"
@@ -65,21 +64,16 @@ class SparkplugNode:
 
     @classmethod
     def from_settings(cls, actuators: WatchedActuators, table: SparkplugSettings, settings: MonitorSettings) -> Self:
-        """Build the node from a monitor's `settings`, whose table for Sparkplug is `table`.
-
-        `actuators`: the watched actuators, with their database (`store`), the `summaries` to publish and the function
-        `count`, which counts dropped messages. Raises InputError if the broker's password cannot be read.
-        """
+        """Build the node from its `table` of the `settings`; raise InputError if a password cannot be read."""
         broker = settings.mqtt
         assert broker is not None  # `MonitorSettings` refuses Sparkplug without a broker
         password = read_secret(broker.password_file, "mqtt.password_file")
         return cls(actuators.store, actuators.summaries, actuators.count, broker, table, password)
 
     def deliver(self) -> None:
-        """Send new events of alarms and, every few seconds, changed values to the Sparkplug host.
+        """Send births that are due, new events of alarms and, every few seconds, changed values to the Sparkplug host.
 
-        If birth messages, which state all metrics, are due, they are sent first. The first call connects to the broker.
-        While there is no connection, nothing is sent.
+        A birth message states all metrics. The first call connects to the broker; without a connection nothing is sent.
         """
         if not self._link.is_open:
             self._sent_birth_number = self._store.position(_BIRTHS)
@@ -125,21 +119,16 @@ class SparkplugNode:
         return spb.SparkplugMetric(spb.BIRTH_SEQUENCE, self._connection_birth_number, spb.INT64)
 
     def _death_message(self) -> tuple[str, bytes]:
-        """Build topic and payload of the node's death message, which is the last will of the next connection.
+        """Build topic and payload of the death message, which the broker publishes when the next connection is lost.
 
-        The broker publishes this message when that connection is lost. The death and birth messages of a connection
-        have the same number bdSeq (0 to 255), one more than that of the last birth message.
+        Death and birth of a connection have the same number bdSeq (0 to 255), one more than the last birth's.
         """
         self._connection_birth_number = (self._sent_birth_number + 1) % 256
         payload = spb.SparkplugPayload(_milliseconds(None), (self._birth_number_metric(),))
         return self._topic("NDEATH"), spb.encode_payload(payload)
 
     def _on_connect(self, client: Any, userdata: Any, flags: Any, reason: Any, properties: Any) -> None:
-        """Handle the broker's answer to an attempt to connect; called by the library paho.
-
-        After a connection the node subscribes to commands, and its birth messages, which state all metrics, become due.
-        If the broker refuses the connection, that is only logged.
-        """
+        """Subscribe to commands, and let the birth messages become due; paho calls this after an attempt to connect."""
         if reason.is_failure:
             _log.error("the broker %s refuses the Sparkplug node: %s", self._broker.host, reason)
             return
@@ -147,10 +136,9 @@ class SparkplugNode:
         self._birth_due.set()
 
     def _on_message(self, client: Any, userdata: Any, message: Any) -> None:
-        """Handle a message with a command to the node; called by the library paho.
+        """Acknowledge a command, and let the birth messages become due if it requests them; paho calls this.
 
-        The message is acknowledged. If the command requests the birth messages, which state all metrics, these become
-        due. A message that is not a valid Sparkplug payload is counted and logged.
+        A message that is not a valid Sparkplug payload is counted and logged.
         """
         if message.qos:
             client.ack(message.mid, message.qos)
@@ -164,10 +152,7 @@ class SparkplugNode:
             self._birth_due.set()
 
     def _send_event(self, event: dict[str, Any]) -> bool:
-        """Send an event and its alarm as a data message of the actuator's device; return True if it was sent.
-
-        An event of an actuator that is no longer in the settings is skipped, and True is returned.
-        """
+        """Send an event and its alarm as a data message of the actuator's device; return False if that fails."""
         alarm, timestamp = event["alarm"], _milliseconds(event["t"])
         if alarm["actuator"] not in self._sent_values:  # no birth was sent: it is not in the settings
             return True
@@ -188,10 +173,7 @@ class SparkplugNode:
             self._send_device_birth(actuator, summary, latest.get(actuator, {}))
 
     def _send_device_birth(self, actuator: str, summary: dict[str, Any], alarm: dict[str, Any]) -> None:
-        """Send the birth message of an actuator's device, which states all its metrics.
-
-        `summary`: summary of the actuator; `alarm`: its latest alarm as plain values, {} if there is none.
-        """
+        """Send the birth message of an actuator's device, with all metrics of its `summary` and its latest `alarm`."""
         values = _metric_values("summary", summary)
         metrics = _build_metrics("summary", values, _milliseconds(summary["t"]))
         metrics += _build_metrics("alarm", _metric_values("alarm", alarm), _milliseconds(alarm.get("updated_s")))
@@ -200,11 +182,7 @@ class SparkplugNode:
         self._sent_values[actuator] = values
 
     def _send(self, kind: str, metrics: list[spb.SparkplugMetric], actuator: str | None = None) -> bool:
-        """Send a message with `metrics` of the node, or of an actuator's device, with the next sequence number.
-
-        `kind`: type of the message, such as "DDATA"; `actuator`: None for a message of the node. Returns True if the
-        message was sent.
-        """
+        """Send a message of a `kind` such as "DDATA" of the node, or of a device; return True if it was sent."""
         self._seq = (self._seq + 1) % 256
         topic = self._topic(kind, None if actuator is None else topic_level(actuator))
         payload = spb.SparkplugPayload(_milliseconds(None), tuple(metrics), self._seq)
@@ -213,10 +191,7 @@ class SparkplugNode:
 
 @cache
 def _load_table(name: str) -> Mapping[str, Mapping[str, str]]:
-    """Load a table of `sparkplug_node.toml`, which describes metrics by their names.
-
-    Each metric has a data type (`type`), the path of its value among the published data (`at`) and possibly a `unit`.
-    """
+    """Load a table of `sparkplug_node.toml`: by metric, its data type, the path of its value (`at`), and any unit."""
     file = files("sealscope.monitor.outputs") / "sparkplug_node.toml"
     table: dict[str, dict[str, str]] = tomllib.loads(file.read_text("utf-8"))[name]
     return table
@@ -228,11 +203,7 @@ def _milliseconds(t: float | None) -> int:
 
 
 def _metric_values(table: str, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Look up the value of each metric in nested values, such as an actuator's summary.
-
-    `table`: table of `sparkplug_node.toml`, which states the path of each metric's value. Returns the values by name
-    of the metric, with None for a missing one.
-    """
+    """Look up the value of each metric of a `table` (`sparkplug_node.toml`) in nested values; None if it is missing."""
     result: dict[str, Any] = {}
     for name, row in _load_table(table).items():
         value: Any = values
@@ -244,11 +215,7 @@ def _metric_values(table: str, values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _build_metrics(table: str, values: Mapping[str, Any], timestamp: int) -> list[spb.SparkplugMetric]:
-    """Build Sparkplug metrics from their values by name.
-
-    `table`: table of `sparkplug_node.toml`, which states the type and unit of each metric; `timestamp` [ms since
-    1970]: time of all of them.
-    """
+    """Build Sparkplug metrics from values by name, with type and unit by the `table`; `timestamp`: ms since 1970."""
     rows = {name: _load_table(table)[name] for name in values}
     return [
         spb.SparkplugMetric(name, values[name], getattr(spb, row["type"]), timestamp=timestamp, unit=row.get("unit"))

@@ -29,10 +29,9 @@ BACKLOG = 64
 class Admission:
     """The check of the token by which a page admits visitors; it delays a client's IP address after wrong tokens.
 
-    `token`: the valid token; `now`: function that returns a monotonic time [s].
-
-    After five wrong tokens the next token from the same address, right or wrong, is checked only after a pause of 1 s.
-    Each further wrong token doubles the pause, up to a minute. An IPv6 network (/64) counts as one address.
+    After `_FREE_ATTEMPTS` wrong tokens the next token from the same address, right or wrong, is checked only after a
+    pause of `_FIRST_PAUSE_S`. Each further wrong token doubles the pause, up to `_MAX_PAUSE_S`. An IPv6 network (/64)
+    counts as one address. `token`: the valid token; `now`: function that returns a monotonic time [s].
     """
 
     def __init__(self, token: str, now: Callable[[], float] = time.monotonic) -> None:
@@ -43,11 +42,7 @@ class Admission:
         self.session = hmac.new(token.encode(), b"sealscope session", hashlib.sha256).hexdigest()
 
     def pause_s(self, address: str) -> float:
-        """Compute the time [s] that a client's IP address must wait until its next token is checked, 0 for no wait.
-
-        After `_FREE_ATTEMPTS` wrong tokens from the network of the address the pause is `_FIRST_PAUSE_S`. Each further
-        wrong token doubles the pause, up to `_MAX_PAUSE_S`.
-        """
+        """Compute the time [s] that a client's IP address must wait until its next token is checked, 0 for no wait."""
         n_failures, last = self._failures.get(_network(address), (0, 0.0))
         if n_failures < _FREE_ATTEMPTS:
             return 0.0
@@ -58,8 +53,7 @@ class Admission:
     def admits(self, address: str, token: str, *, session: bool = False) -> bool:
         """Return True if a token is right; count a wrong token for the client's IP `address`, and return False.
 
-        A right token clears the count of the address. `session`: True if `token` is the cookie of a browser that has
-        stated the right token before.
+        `session`: True if `token` is the cookie of a browser that has stated the right token, which clears the count.
         """
         expected, network = self.session if session else self._token, _network(address)
         if hmac.compare_digest(token.encode("utf-8", "replace"), expected.encode()):
@@ -83,10 +77,7 @@ def _network(address: str) -> str:
 
 
 def connection_limit() -> int:
-    """Compute the largest number of connections: `_MAX_CONNECTIONS`, or fewer (at least 8) if file descriptors are few.
-
-    At most the fraction `_DESCRIPTOR_FRACTION` of the file descriptors of this process is used for connections.
-    """
+    """Compute the largest number of connections: `_MAX_CONNECTIONS`, or fewer if file descriptors are few."""
     with suppress(ImportError, OSError, ValueError):
         import resource
 
@@ -100,20 +91,17 @@ def limit_protocol(max_connections: int, silent_s: float = SILENT_S) -> type[asy
     """Build a subclass of uvicorn's HTTP protocol that limits the number of connections and their idle time.
 
     A connection is closed after `silent_s` seconds without activity. If there are more than `max_connections`, the
-    connection that has been silent for longest is closed, or the new connection if all others are being answered.
+    connection that has been silent for longest is closed, or the new one if all others are being answered.
     """
     from uvicorn.protocols.http.auto import AutoHTTPProtocol
 
     base: Any = AutoHTTPProtocol
 
     class LimitedProtocol(base):  # type: ignore[misc]
-        """A connection to the page that is closed after a long silence, or if there are too many connections.
-
-        `last_activity` [s]: time at which it last sent a request or read a part of an answer.
-        """
+        """A limited connection; `last_activity` [s]: time of its last request, or of reading an answer."""
 
         def connection_made(self, transport: Any) -> None:
-            """Accept the connection; if there are too many, close the surplus one as `limit_protocol` describes."""
+            """Accept the connection; if there are too many, close the surplus one."""
             super().connection_made(transport)
             self.last_activity = self.loop.time()
             if len(self.connections) > max_connections:

@@ -9,19 +9,18 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from sealscope.diagnosis.commissioned.watched import load_watched
 from sealscope.diagnosis.live.joining import CHANNELS, are_successive, is_same_rate
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array, Recording
+from sealscope.reporting.schematic import build_circuit
 from sealscope.signals.details import Details, details, min_samples
 from sealscope.signals.windows import WINDOW_SIZE, windowed_rms
 from sealscope.units import LITRE_PER_MINUTE
-
-if TYPE_CHECKING:
-    from sealscope.parameters import Rig
 
 #: Samples kept of a viewed actuator: those of the last `SPAN_S` seconds, but at least `MIN_SAMPLES`, which the wavelet
 #: details need, and at most `MAX_SAMPLES`.
@@ -43,7 +42,7 @@ class _Window:
     """The last samples of an actuator without a gap.
 
     `rate` [Hz]: sampling rate; `t` (n,) [s]: times; `channels`: samples (n,) by channel; `version`: number of blocks
-    added so far. An array is never changed after it is set, so readers need no copy.
+    added. An array is never changed after it is set, so readers need no copy.
     """
 
     rate: float = 0.0
@@ -76,10 +75,7 @@ class _Window:
 
 
 class LiveSamples:
-    """The last seconds of samples of the actuators that somebody views; other samples are not kept.
-
-    `recall`: function that returns the last stored samples of an actuator, which are shown first.
-    """
+    """The last samples of the actuators that somebody views, first the stored ones, which `recall` returns by name."""
 
     def __init__(self, recall: Callable[[str], Sequence[Recording]] = lambda name: ()) -> None:
         self._recall = recall
@@ -89,10 +85,9 @@ class LiveSamples:
 
     @contextmanager
     def viewing(self, name: str) -> Iterator[bool]:
-        """Keep the samples of the actuator `name` while the context lasts, and yield True.
+        """Keep the samples of the actuator `name` while the context lasts; yield False if too many others are viewed.
 
-        The last stored samples are shown until new ones arrive. If `MAX_ACTUATORS` others are viewed already, nothing
-        is kept, and False is yielded.
+        The last stored samples are shown until new ones arrive.
         """
         with self._lock:
             is_first = name not in self._windows
@@ -140,12 +135,11 @@ class LiveSamples:
     def curves(self, name: str, pressure: str = "p_A", detail_form: str = "rms") -> dict[str, Any]:
         """Compute the curves that the page draws of a viewed actuator, as plain values with None for a missing one.
 
-        `pressure`: channel whose wavelet details are computed; `detail_form`: "rms" for the RMS of the details in
-        windows of `WINDOW_SIZE` samples, "details" for the details themselves. Among the returned values are:
+        `pressure`: channel whose wavelet details are computed; `detail_form`: "details", or "rms" for their RMS in
+        windows of `WINDOW_SIZE` samples. Among the returned values are:
 
         - `t`: time of the last sample [s], None if there are no samples; the times of the curves are relative to it;
-        - `pressures`: the chamber pressures [bar];
-        - `details`: the wavelet details d1 to d4 of one pressure [kPa], or their RMS;
+        - `pressures`: the chamber pressures [bar]; `details`: the wavelet details d1 to d4 [kPa], or their RMS;
         - `motion`: position [mm], pressures [bar], and speeds of piston [mm/s] and pump [rpm].
         """
         with self._lock:
@@ -174,12 +168,11 @@ def _round_to_json(values: Array, digits: int = 3) -> list[float | None]:
 
 
 def _envelope(t: Array, series: dict[str, Array]) -> dict[str, list[float | None]]:
-    """Reduce long series to the minimum and maximum in each bin, in the order in which they occur.
+    """Reduce series of samples (n,) to the minimum and maximum in each bin, in the order in which they occur.
 
-    A bin is a group of successive samples; there are at most `_BINS` bins of equal size. The last bin ends with the
-    last sample, and the first samples are left out if they do not fill a bin. Series with at most two samples per bin
-    are not reduced. `series`: values (n,) by name, at the times `t` (n,) [s]. Returns the times of the bins' first and
-    middle samples as "t", and the reduced series by name, rounded.
+    A bin is a group of successive samples; there are at most `_BINS` bins of equal size, and the first samples are left
+    out if they do not fill a bin. Series with at most two samples per bin are not reduced. `t` (n,) [s]: times. Returns
+    the times of the bins' first and middle samples as "t", and the reduced series by name, rounded.
     """
     bin_size = -(-t.size // _BINS)  # rounded up
     if bin_size <= 2:
@@ -200,10 +193,9 @@ def _envelope(t: Array, series: dict[str, Array]) -> dict[str, list[float | None
 def _detail_curves(t: Array, signal: Array | None, pressure: str, detail_form: str) -> dict[str, Any]:
     """Compute the curves of the wavelet details [kPa] of a pressure, or of their RMS, as plain values.
 
-    `signal` [Pa]: the pressure over the times `t` [s], None if it is not recorded; `pressure`: its name;
-    `detail_form`: "details" or "rms". Only the samples after the last missing sample are used. If there are fewer of
-    these than the wavelet transform needs, the curves are empty. The entry `needs` is the needed number of samples,
-    and `has` the present one.
+    `signal` [Pa]: the pressure over the times `t` [s], None if it is not recorded; `pressure`: its name; `detail_form`:
+    "details" or "rms". Only the samples after the last missing one are used. If there are fewer (`has`) than the
+    wavelet transform needs (`needs`), the curves are empty.
     """
     samples = np.empty(0) if signal is None else signal / _KILOPASCAL
     missing_indices = np.flatnonzero(~np.isfinite(samples))
@@ -230,9 +222,9 @@ def _detail_curves(t: Array, signal: Array | None, pressure: str, detail_form: s
 def _motion_curves(t: Array, channels: dict[str, Array], rate: float) -> dict[str, Any]:
     """Compute the curves of motion: pressures [bar], position [mm], speeds of piston [mm/s] and pump [rpm].
 
-    The last `_MOTION_S` seconds of the channels (n,), sampled at the times `t` (n,) [s], are averaged over bins, i.e.
-    groups of successive samples 1/`_MOTION_HZ` s long. The speeds are computed from the means. `rate` [Hz]: sampling
-    rate. Returns plain values by name, with only an empty "t" if there are fewer than two bins.
+    The last `_MOTION_S` seconds of the channels (n,), sampled at the times `t` (n,) [s] with the `rate` [Hz], are
+    averaged over bins, groups of successive samples 1/`_MOTION_HZ` s long. The speeds are computed from the means.
+    Returns plain values by name, with only an empty "t" if there are fewer than two bins.
     """
     bin_size = max(1, round(rate / _MOTION_HZ))
     n_bins = min(t.size // bin_size, round(_MOTION_S * rate / bin_size))
@@ -246,9 +238,8 @@ def _motion_curves(t: Array, channels: dict[str, Array], rate: float) -> dict[st
     times = bin_means(t)
     averages = {name: bin_means(channels[name]) for name in channels}
     curves: dict[str, Any] = {"t": _round_to_json(times, 4)}
-    for name in ("p_A", "p_B", "p_1", "p_2"):
-        if name in averages:
-            curves[name] = _round_to_json(averages[name] / _BAR)
+    pressures = ("p_A", "p_B", "p_1", "p_2")
+    curves |= {name: _round_to_json(averages[name] / _BAR) for name in pressures if name in averages}
     if "x" in averages:
         curves["x"] = _round_to_json(averages["x"] / _MILLIMETRE)
         curves["v"] = _round_to_json(np.gradient(averages["x"], times) / _MILLIMETRE)
@@ -262,16 +253,11 @@ def _motion_curves(t: Array, channels: dict[str, Array], rate: float) -> dict[st
 def describe_rig(rig: str) -> dict[str, Any]:
     """Describe the parts of a rig that the page draws, as plain values by name.
 
-    `rig`: name of a packaged rig, or path of a rig's or machine's file. The values are:
-
-    - `title`; `stroke` of the cylinder [mm]; `rods`: sides of the cylinder at which a rod leaves it;
-    - `valve`: True if a servo valve drives the cylinder; `displacement` of the pump [L/rev];
-    - `area`: mean piston area, expressed as flow per speed [L/min per mm/s].
+    `rig`: name of a packaged rig, or path of a rig's or machine's file. The values are: `title`; `stroke` of the
+    cylinder [mm]; `rods`: sides of the cylinder at which a rod leaves it; `valve`: True if a servo valve drives the
+    cylinder; `displacement` of the pump [L/rev]; `area`: mean piston area, as flow per speed [L/min per mm/s].
     """
-    from sealscope.diagnosis.commissioned.watched import load_watched
-    from sealscope.reporting.schematic import build_circuit
-
-    loaded_rig: Rig = load_watched(rig).rig
+    loaded_rig = load_watched(rig).rig
     circuit = build_circuit(loaded_rig, ())
     return {
         "title": loaded_rig.title,

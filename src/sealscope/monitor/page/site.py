@@ -12,7 +12,6 @@ import re
 import socket
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import ExitStack, suppress
-from importlib import resources
 from typing import Any
 from urllib.parse import parse_qs
 
@@ -56,6 +55,7 @@ _RETRY_HEADERS = {"Retry-After": "5"}
 #: Name of the login's cookie, and its lifetime [s].
 _COOKIE, _COOKIE_S = "sealscope", 30 * 86_400
 _LOCAL = ("127.0.0.1", "localhost", "::1")
+_PACKAGE = "sealscope.monitor.page"
 #: By address: static file and its media type.
 _FILES = {
     "/": ("page.html", "text/html"),
@@ -63,16 +63,6 @@ _FILES = {
     **dict.fromkeys(("/page.css", "/login.css"), ("page.css", "text/css")),
     "/uPlot.js": ("vendor/uPlot.iife.min.js", "text/javascript"),
     "/uPlot.css": ("vendor/uPlot.min.css", "text/css"),
-}
-#: By address: name of the method of `_Pages` that answers, and its HTTP methods.
-_ROUTES = {
-    **{path: ("file", "GET") for path in _FILES},
-    "/login": ("login", "GET POST"),
-    "/api/fleet": ("fleet", "GET"),
-    "/api/actuator": ("actuator", "GET"),
-    "/api/mark": ("mark", "POST"),
-    "/api/changes": ("changes", "GET"),
-    "/metrics": ("metrics", "GET"),
 }
 
 
@@ -85,12 +75,19 @@ def site(
 ) -> Starlette:
     """Build the web application that serves the page of a monitor.
 
-    `token`: token that a visitor must state for all but the login form, None to admit everybody; `queue_load`:
-    function that returns the load of the queue of blocks; `live`: the last samples of the service; by default only
-    stored samples are shown.
+    `token`: needed for all but the login form, None to admit everybody; `queue_load`: function that returns the load of
+    the queue of blocks; `live`: the last samples of the service, by default only the stored ones.
     """
     pages = _Pages(actuators, token, queue_load, live or LiveSamples(actuators.store.last_samples))
-    routes = [Route(path, getattr(pages, name), methods=methods.split()) for path, (name, methods) in _ROUTES.items()]
+    routes = [
+        *(Route(path, pages.file) for path in _FILES),
+        Route("/login", pages.login, methods=["GET", "POST"]),
+        Route("/api/fleet", pages.fleet),
+        Route("/api/actuator", pages.actuator),
+        Route("/api/mark", pages.mark, methods=["POST"]),
+        Route("/api/changes", pages.changes),
+        Route("/metrics", pages.metrics),
+    ]
     middleware = [Middleware(BaseHTTPMiddleware, dispatch=pages.guard)]
     if settings.host in _LOCAL:  # against DNS rebinding: refuse host names of other sites
         middleware.append(Middleware(TrustedHostMiddleware, allowed_hosts=[*_LOCAL, "[::1]"]))
@@ -99,7 +96,7 @@ def site(
 
 
 class _Pages:
-    """The request handlers of the page; `_ROUTES` states which method serves which URL path."""
+    """The request handlers of the page, by which `site` serves its URL paths."""
 
     def __init__(
         self, actuators: WatchedActuators, token: str | None, queue_load: Callable[[], QueueLoad], live: LiveSamples
@@ -115,8 +112,7 @@ class _Pages:
     def file(self, request: Request) -> Response:
         """Answer with the static file of the request's URL path."""
         name, media_type = _FILES[request.url.path]
-        text = str(read_package_file(name)) if name.startswith("vendor/") else _read_packaged(name)
-        return Response(text, media_type=media_type)
+        return Response(read_package_file(name, _PACKAGE), media_type=media_type)
 
     def _counters_and_outages(self) -> dict[str, Any]:
         """Collect the counters, the number of queued blocks and the outages, which are known without the database."""
@@ -178,13 +174,10 @@ class _Pages:
     async def changes(self, request: Request) -> Response:
         """Answer with a stream of server-sent events that keeps the page up to date.
 
-        - An event without a name is sent after each change of results, alarms or outages: the page then loads them
-          again. Its data is the number of changes so far. It is repeated after `_KEEP_ALIVE_S` [s] without a change.
-        - An event "live" is sent when the actuator in the query has new samples. Its data are the curves of the last
-          samples as JSON (`LiveSamples.curves`).
-
-        Query: `actuator`: name of the actuator, without which there are no curves; `pressure`: "p_A" or "p_B", whose
-        wavelet details are drawn; `drawn`: "rms" for the RMS of the details, "details" for the details themselves.
+        An event without a name, whose data is the number of changes of results, alarms or outages so far, is sent after
+        each, for the page to load them again, and after `_KEEP_ALIVE_S` [s] without one. An event "live" has the curves
+        of the last samples (`LiveSamples.curves`) of the query's `actuator`. Query, besides: `pressure`, "p_A" or
+        "p_B", whose wavelet details are drawn; `drawn`, "details", or "rms" for their RMS.
         """
         if self._n_listeners >= self._max_listeners:
             return _make_refusal("too many listeners", 503)
@@ -204,9 +197,8 @@ class _Pages:
     async def _events(self, request: Request, name: str, pressure: str, detail_form: str) -> AsyncIterator[str]:
         """Yield the server-sent events of `changes`, as text, until the client disconnects or the monitor ends.
 
-        `name`: actuator whose curves are sent, "" for no curves; `pressure`: pressure whose wavelet details are drawn;
-        `detail_form`: "rms" or "details". If too many actuators are viewed already, an event "live" states this error
-        instead of the curves.
+        `name`: actuator whose curves are sent, "" for none; `pressure`: pressure whose wavelet details are drawn;
+        `detail_form`: "rms" or "details". If too many actuators are viewed already, an event "live" states this error.
         """
         live, actuators = self._live, self._actuators
         with ExitStack() as contexts:
@@ -236,26 +228,21 @@ class _Pages:
         return format_metrics(summaries, self._actuators.counters, totals, load)
 
     async def answer_outage(self, request: Request, error: Exception) -> Response:
-        """Answer with status 503 in an outage of the database; raise any other error again.
-
-        The answer has the counters, queue and outages, which are known without the database. The outage is also
-        reported to the supervisor.
-        """
+        """Answer with status 503 in an outage of the database and report the outage; raise any other error again."""
         reason = outage_reason(error)
         if reason is None:
             raise error
         self._supervisor.part(DATABASE).begin_outage(reason)
         text = f"the database does not answer: {reason}"
         if request.url.path == "/metrics":
-            return Response(
-                f"# {text}\n{self._render_metrics({})}", 503, {**_RETRY_HEADERS, "Content-Type": CONTENT_TYPE}
-            )
+            headers = {**_RETRY_HEADERS, "Content-Type": CONTENT_TYPE}
+            return Response(f"# {text}\n{self._render_metrics({})}", 503, headers)
         return JSONResponse({"error": text, **self._counters_and_outages()}, 503, _RETRY_HEADERS)
 
     async def login(self, request: Request) -> Response:
         """Answer with the login form; if the right token is posted, set a cookie and redirect to the page.
 
-        The form has status 401 after a wrong token. A client that must wait after several wrong tokens gets status 429.
+        The status is 401 after a wrong token, and 429 for a client that must wait after several wrong tokens.
         """
         status = 200
         admission, address = self._admission, _client_address(request)
@@ -272,7 +259,7 @@ class _Pages:
                 answer.set_cookie(_COOKIE, admission.session, httponly=True, **options)
                 return answer
             status = 401
-        return Response(_read_packaged("login.html"), status, media_type="text/html")
+        return Response(read_package_file("login.html", _PACKAGE), status, media_type="text/html")
 
     def _find_refusal(self, request: Request) -> Response | None:
         """Check the token or cookie of a request; return the answer that refuses the request, or None to admit it."""
@@ -309,15 +296,11 @@ class _EventStream(StreamingResponse):
         self._on_end = on_end
 
     async def __call__(self, *connection: Any) -> None:
-        """Send the response to the client, and then call `on_end`; called by starlette."""
+        """Send the response to the client, and then call `on_end`."""
         try:
             await super().__call__(*connection)
         finally:
             self._on_end()
-
-
-def _read_packaged(name: str) -> str:
-    return (resources.files("sealscope.monitor.page") / name).read_text("utf-8")
 
 
 def _make_refusal(error: str, status: int, headers: dict[str, str] | None = None) -> JSONResponse:
@@ -354,8 +337,8 @@ async def _read_body(request: Request) -> bytes:
 class PageServer:
     """The web server of the page, which runs in a separate thread until `close`.
 
-    `queue_load`: function that returns the load of the queue of blocks; `live`: the last samples of the service; by
-    default only stored samples are shown. Raises InputError if the port is taken or the token cannot be read.
+    `queue_load`: function that returns the load of the queue of blocks; `live`: the last samples of the service, by
+    default only the stored ones. Raises InputError if the port is taken or the token cannot be read.
     """
 
     def __init__(

@@ -6,8 +6,7 @@ connection only queues messages; another thread decodes them and waits for the s
 
 The start of decoding a large or repeated message is stored until decoding ends. A message whose decoding has crashed
 the process twice is refused unread. Messages of QoS 0 that find the queue full are dropped and counted. If a broker
-sends more messages of QoS 1 than agreed (mosquitto 2.0.11 does), the surplus is not acknowledged; the broker sends it
-again, in order, over a new connection.
+sends more messages of QoS 1 than agreed (mosquitto 2.0.11 does), the surplus is not acknowledged, and sent again later.
 """
 
 from __future__ import annotations
@@ -33,7 +32,6 @@ from sealscope.monitor.sources.source_block import (
     UNENDED,
     BlockReceiver,
     RefusedMessage,
-    SourceBlock,
     compute_digest,
     decode_message,
 )
@@ -65,8 +63,7 @@ _ASKED_AGAIN = "messages of QoS 1 that found no room and were asked for again"
 def broker_source(settings: BrokerSettings) -> Callable[[BlockReceiver], None]:
     """Build a source that submits the messages of a broker as blocks, and publishes alarms to it.
 
-    Returns a function that takes the receiver of the blocks, and runs until the receiver stops. Raises InputError if a
-    secret cannot be read, and MissingExtra if the MQTT library is not installed.
+    Raises InputError if a secret cannot be read, and MissingExtra if the MQTT library is not installed.
     """
     password = read_secret(settings.password_file, "mqtt.password_file")
     check_mqtt()
@@ -125,11 +122,9 @@ class _Connection:
             self._link.close()
 
     def _on_connect(self, client: Any, userdata: Any, flags: Any, reason: Any, properties: Any) -> None:
-        """Handle the broker's answer to an attempt to connect; called by the library paho.
+        """Subscribe to all topics, or begin an outage if the broker refuses the connection; called by the library paho.
 
-        If the broker refuses the connection, an outage begins. Otherwise an outage ends, and all topics are subscribed;
-        a Sparkplug primary host first publishes that it is online. The decoder is told of the connection, so that it
-        requests the births of Sparkplug nodes.
+        A Sparkplug primary host first publishes that it is online; the decoder then requests births of Sparkplug nodes.
         """
         self._connection += 1
         if reason.is_failure:
@@ -144,16 +139,12 @@ class _Connection:
         self._received.put((self._connection, None), size=0, always=True)  # no message: a new connection
 
     def _offline_message(self) -> tuple[str, str]:
-        """Build topic and payload of the last will, by which a Sparkplug primary host states that it is offline.
-
-        Its timestamp is the present time, at which the connection is about to start. The message that the host is
-        online repeats this timestamp.
-        """
+        """Build the last will, by which a Sparkplug primary host states that it is offline, with the present time."""
         self._connected_ms = round(1000.0 * time.time())
         return self._state_message(online=False)
 
     def _state_message(self, *, online: bool) -> tuple[str, str]:
-        """Build topic and payload of the message STATE, which tells whether a Sparkplug primary host is `online`."""
+        """Build topic and payload of the message that a Sparkplug primary host is `online`, or offline."""
         state = json.dumps({"online": online, "timestamp": self._connected_ms})
         return f"{NAMESPACE}/STATE/{self._settings.host_id}", state
 
@@ -174,8 +165,8 @@ class _Connection:
     def _on_message(self, client: Any, userdata: Any, message: Any) -> None:
         """Queue a received message; called by the library paho, whose connection would time out if this call waited.
 
-        If the queue is full, a message of QoS 0 is dropped. A message of QoS 1 is left unacknowledged, and so are all
-        later ones of QoS 1 on this connection; the broker sends them again over the next. All of these are counted.
+        If the queue is full, a message of QoS 0 is dropped. One of QoS 1, and all later ones on this connection, are
+        left unacknowledged; the broker sends them again over the next. All of these are counted.
         """
         queue_entry, size = (self._connection, message), len(message.payload)
         if message.qos == 0:
@@ -194,8 +185,7 @@ class _Connection:
     def _submit_received(self) -> None:
         """Decode and submit the queued messages in their order until the service stops.
 
-        If a connection left messages unacknowledged because the queue was full, the connection is closed once the queue
-        is empty; the broker then sends these messages again.
+        A connection with unacknowledged messages is closed once the queue is empty; the broker then sends them again.
         """
         while not (self._service.stopping.is_set() or self._ended.is_set()):
             queue_entries = self._received.pop(max_items=1, timeout=0.5)
@@ -210,15 +200,13 @@ class _Connection:
                     overfull_socket.shutdown(socket.SHUT_RDWR)
 
     def _submit(self, connection: int, message: Any) -> None:
-        """Decode a message, and submit its block or the reason to refuse the message.
+        """Decode a message of a `connection` (its number), and submit its block or the reason to refuse the message.
 
         The message is acknowledged once the block or the refusal is stored, and at once if there is neither.
-        `connection`: number of the connection by which the message came.
         """
         number, qos = message.mid, message.qos
 
         def acknowledge() -> None:
-            """Acknowledge the message on the connection by which it came."""
             # on a new connection the number may be that of another message, and the broker sends this one again
             if qos and connection == self._connection:
                 self._client.ack(number, qos)
@@ -228,7 +216,10 @@ class _Connection:
             with suppress(UnicodeDecodeError):
                 topic = message.topic
             with self._note_decoding(message):
-                block = self._decode(topic, message.payload)
+                if self._host is not None and topic.startswith(f"{NAMESPACE}/"):
+                    block = self._host.receive(topic, message.payload)  # None for a message without samples
+                else:
+                    block = decode_message(message.payload, self._names.get(topic), self._units_of)
         except RefusedMessage as error:  # stored and acknowledged, as it would fail again
             self._service.submit(RefusedMessage(error.reason, f"{topic[:100]}: {error}", message.payload, acknowledge))
             return
@@ -237,21 +228,11 @@ class _Connection:
         else:
             self._service.submit(replace(block, done=acknowledge))
 
-    def _decode(self, topic: str, payload: bytes) -> SourceBlock | None:
-        """Decode a message to its block; return None for a Sparkplug message without samples.
-
-        `topic`: MQTT topic of the message; `payload`: its contents. Raises RefusedMessage if the message is invalid.
-        """
-        if self._host is not None and topic.startswith(f"{NAMESPACE}/"):
-            return self._host.receive(topic, payload)
-        return decode_message(payload, self._names.get(topic), self._units_of)
-
     @contextmanager
     def _note_decoding(self, message: Any) -> Iterator[None]:
-        """Store in the database, until the context ends, that a large or repeated message is being decoded.
+        """Store in the database, until the context ends, that a large or repeated message of QoS 1 is being decoded.
 
-        Raises RefusedMessage if the decoding of this message has begun twice and never ended, because the process died
-        both times. Nothing is stored for a message of QoS 0, or for a small message that is sent for the first time.
+        Raises RefusedMessage if that began `_MAX_ATTEMPTS` times and never ended, because the process died each time.
         """
         if not message.qos or not (message.dup or len(message.payload) > _NOTED_BYTES):
             yield
@@ -274,11 +255,9 @@ class _Connection:
         if self._settings.alarms_topic is None or not self._client.is_connected():
             return
 
-        def publish_alarm(event: dict[str, Any]) -> bool:
-            """Publish the alarm that an event concerns; return True if the broker acknowledges it."""
-            return self._publish(event["alarm"]["actuator"], "alarm", json.dumps(event["alarm"]))
-
-        self._service.store.deliver(_NAME, publish_alarm)
+        self._service.store.deliver(
+            _NAME, lambda event: self._publish(event["alarm"]["actuator"], "alarm", json.dumps(event["alarm"]))
+        )
         if time.monotonic() >= self._states_due:
             self._states_due = time.monotonic() + _STATES_S
             for name, summary in self._service.summaries().items():
@@ -287,9 +266,6 @@ class _Connection:
                     self._published_states[name] = state
 
     def _publish(self, actuator: str, kind: str, message: str) -> bool:
-        """Publish a retained message about an actuator; return True if the broker acknowledges it.
-
-        `kind`: "alarm" or "state", the last level of its topic; `message`: its payload, as JSON.
-        """
+        """Publish a retained message of a `kind`, "alarm" or "state"; return True if the broker acknowledges it."""
         topic = f"{self._settings.alarms_topic}/{topic_level(actuator)}/{kind}"
         return self._link.publish(topic, message, qos=1, retain=True)

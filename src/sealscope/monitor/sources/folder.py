@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.commissioned.machine import CommissionedMachine, read_by_map
+from sealscope.diagnosis.commissioned.machine import read_by_map
 from sealscope.diagnosis.commissioned.watched import load_watched
 from sealscope.errors import SealscopeError
 from sealscope.monitor.settings import ActuatorSettings
@@ -27,8 +27,8 @@ from sealscope.monitor.sources.source_block import (
     SourceBlock,
     count_bytes,
 )
-from sealscope.monitor.supervisor import DATABASE, PartAway, describe_error
-from sealscope.monitor.verdicts import RecordingVerdict, judge_recording
+from sealscope.monitor.supervisor import DATABASE, PartAway, SupervisedPart, describe_error
+from sealscope.monitor.verdicts import judge_recording
 from sealscope.recordings import Recording
 from sealscope.recordings.corrections.samples import correct_samples, remove_holes
 from sealscope.recordings.joining import file_seconds
@@ -51,10 +51,7 @@ _GAP_S = 1.0
 
 
 class _FoundFile(NamedTuple):
-    """A file in a watched folder.
-
-    `modified_s` [s since 1970]: time of its last change; `identity`: text from its name, size and time of change.
-    """
+    """A file in a watched folder: time of its last change [s since 1970], path, and a text of name, size and time."""
 
     modified_s: float
     path: Path
@@ -64,8 +61,8 @@ class _FoundFile(NamedTuple):
 class WatchedFolder:
     """The folder with the recordings of one actuator, read file by file as they arrive.
 
-    `settle_s` [s]: time without a change after which a file is read; `is_stored`: function that returns True if the
-    block of an actuator with an identity is stored; `newest_s` [s since 1970]: time of the newest stored sample.
+    `settle_s` [s]: time without a change after which a file is read; `is_stored`: returns True if the block of an
+    actuator with an identity is stored; `newest_s` [s since 1970]: time of the newest stored sample.
     """
 
     def __init__(
@@ -94,10 +91,9 @@ class WatchedFolder:
     def blocks(self) -> Iterator[SourceBlock | RefusedMessage]:
         """Yield the blocks of all files that are complete and not stored yet, in the order of their recording.
 
-        A file is complete when it has not changed for `settle_s`. An unreadable file is tried again when it has not
-        changed for `_PATIENCE_FACTOR` times as long. If it fails again, it is refused: a block without samples is
-        stored, and the file is not read again. A recording that is older than the samples watched so far is refused
-        too. Raises PartAway if the folder cannot be read.
+        A file is complete when it has not changed for `settle_s`. An unreadable one is tried again when it has not
+        changed for `_PATIENCE_FACTOR` times as long, and then refused: a block without samples is stored. A recording
+        older than the watched samples is refused, too. Raises PartAway if the folder cannot be read.
         """
         files = sorted(self._files())  # by the time of their last change
         self._first_found = {file.identity: self._first_found.get(file.identity, time.monotonic()) for file in files}
@@ -115,9 +111,7 @@ class WatchedFolder:
             if reason and self._may_be_incomplete(file):
                 self._unreadable.add(identity)  # tried again later
                 continue
-            if not reason:
-                reason = self._find_refusal_reason(samples, file)
-            if reason:
+            if reason := reason or self._find_refusal_reason(samples, file):
                 yield RefusedMessage(UNREADABLE_FILE, f"{self.actuator}: {reason}")
                 samples = None
             block = SourceBlock(self.actuator, identity, None, follows=False)
@@ -131,14 +125,9 @@ class WatchedFolder:
         return max(time.time() - file.modified_s, time.monotonic() - self._first_found[file.identity])
 
     def _is_due(self, file: _FoundFile) -> bool:
-        """Return True if a file is to be read now: it has not changed for `settle_s` and is not stored yet.
-
-        An unreadable file is due again only when it has not changed for `_PATIENCE_FACTOR` times as long. A file that
-        is stored already is marked as submitted.
-        """
-        if file.identity in self._unreadable and self._may_be_incomplete(file):
-            return False
-        if self._unchanged_s(file) < self.settle_s:
+        """Return True if a file has not changed for a while and is not stored; mark a stored file as submitted."""
+        is_incomplete = file.identity in self._unreadable and self._may_be_incomplete(file)
+        if is_incomplete or self._unchanged_s(file) < self.settle_s:
             return False
         if self._is_stored(self.actuator, file.identity):
             self._submitted.add(file.identity)
@@ -152,8 +141,7 @@ class WatchedFolder:
     def _start_time(self, file: _FoundFile) -> float:
         """Find the time of a file's first sample [s since 1970], or the time of its last change if it is unreadable.
 
-        The file is read to find the time. The recording is kept for `blocks` if there is room in `_READ_AHEAD_BYTES`;
-        otherwise `blocks` reads the file again.
+        The recording that is read for this is kept for `blocks` if there is room in `_READ_AHEAD_BYTES`.
         """
         modified_s, path, identity = file
         if identity not in self._starts:
@@ -179,8 +167,7 @@ class WatchedFolder:
         """Return the reason to refuse a recording that starts before the newest recording so far, or "" to accept it.
 
         After a restart the last stored sample stands for the start of the newest recording. A recording of the same day
-        that states no time of day is accepted. If the newest recording is dated in the future, all are accepted. A file
-        that is dated in the future is logged. `samples`: the recording, None if it has no samples; `file`: its file.
+        without a time of day is accepted, and so are all if the newest is dated in the future.
         """
         if samples is None:
             return ""
@@ -198,58 +185,38 @@ class WatchedFolder:
         """Add a recording's samples to a block, and the verdict on the recording if its machine is commissioned.
 
         The samples are corrected for the defects of loggers, and their times converted to seconds since 1970. A
-        recording with a date only, without a time of day, begins `_GAP_S` after the previous recording of this day.
-        An oil temperature in the file's header becomes the channel `T_oil`. If no samples remain, there is no verdict.
-        `path`: file of the recording. Raises PartAway if the file of the machine cannot be read; the recording is then
-        tried again later.
+        recording without a time of day begins `_GAP_S` after the previous one of its day. An oil temperature in the
+        file's header becomes the channel `T_oil`. Raises PartAway if the file of the machine cannot be read.
         """
         start = file_seconds(recording, path)
         # long gaps, which the correction fills in, become NaN again
         corrected_samples = remove_holes(correct_samples(recording).recording)
         if not len(corrected_samples):
             return replace(block, samples=corrected_samples)
-        machine = self._read_machine()
+        try:
+            machine = load_watched(self._rig).machine  # read anew, as the file may have changed
+        except (SealscopeError, OSError) as error:
+            raise PartAway(_printable(str(error))) from None
         if _is_midnight_before(start, self._newest_s):
             start = max(start, self._end_s + _GAP_S)
         finite_t = recording.t[np.isfinite(recording.t)]
         shift = start - float(finite_t[0]) if finite_t.size else 0.0
         times = corrected_samples.t + shift
-        verdict = None if machine is None else self._judge(machine, recording, path, shift)
+        verdict = None
+        if machine is not None:
+            try:
+                verdict = judge_recording(machine, recording, _printable(path.name), shift, limit_lpm=self._limit_lpm)
+            except Exception as error:
+                reason = describe_error(error)
+                _log.warning("%s: %s is not judged as a whole: %s", self.actuator, _printable(path.name), reason)
         self._newest_s, self._end_s = start, float(np.nanmax(times, initial=start))
         channels, units = dict(corrected_samples.channels), dict(corrected_samples.units)
         if "T_oil" not in channels and (celsius := oil_temperature(corrected_samples)) is not None:
             channels["T_oil"], units["T_oil"] = np.full(len(corrected_samples), celsius + 273.15), "K"
         return replace(block, samples=Recording(times, channels, units, corrected_samples.rate), verdict=verdict)
 
-    def _judge(
-        self, machine: CommissionedMachine, recording: Recording, path: Path, shift: float
-    ) -> RecordingVerdict | None:
-        """Judge a whole recording by its machine's healthy recordings; log any error, and then return None.
-
-        `path`: file of the recording; `shift` [s]: added to the recording's times to give seconds since 1970.
-        """
-        try:
-            return judge_recording(machine, recording, _printable(path.name), shift, limit_lpm=self._limit_lpm)
-        except Exception as error:
-            reason = describe_error(error)
-            _log.warning("%s: %s is not judged as a whole: %s", self.actuator, _printable(path.name), reason)
-            return None
-
-    def _read_machine(self) -> CommissionedMachine | None:
-        """Read the file of the commissioned machine, which may have changed; return None if there is no such file.
-
-        Raises PartAway if the file cannot be read.
-        """
-        try:
-            return load_watched(self._rig).machine
-        except (SealscopeError, OSError) as error:
-            raise PartAway(_printable(str(error))) from None
-
     def _files(self) -> Iterator[_FoundFile]:
-        """Yield the files of the folder that match the pattern; raise PartAway if the folder cannot be read.
-
-        Hidden files, files whose ending shows that they are still written, and links out of the folder are left out.
-        """
+        """Yield the files that match the pattern, except hidden or unfinished ones, and links out of the folder."""
         try:
             root = self.folder.resolve()
             entries = list(self.folder.iterdir())
@@ -273,25 +240,16 @@ class WatchedFolder:
 
 
 def watch_folders(service: BlockReceiver, *, once: bool) -> None:
-    """Submit the new files in the folders of a service's actuators as blocks until the service stops.
-
-    `once`: True to submit only the present files.
-    """
+    """Submit new files of the actuators' folders as blocks until the service stops, with `once` those present."""
     settle_s = 0.0 if once else service.settings.settle_s
     part, summaries = service.supervisor.part, service.summaries()
-
-    def newest_time(name: str) -> float:
-        """Return the time of an actuator's newest stored sample [s since 1970], -inf if there is none."""
-        t = summaries.get(name, {}).get("t")
-        return -math.inf if t is None else float(t)
-
-    folders = {
-        part(f"folder of {actuator.name}"): WatchedFolder(
-            actuator, settle_s, service.store.is_known, newest_time(actuator.name)
-        )
-        for actuator in service.settings.actuator
-        if actuator.folder is not None
-    }
+    folders: dict[SupervisedPart, WatchedFolder] = {}
+    for actuator in service.settings.actuator:
+        if actuator.folder is not None:
+            folder_part = part(f"folder of {actuator.name}")
+            t = summaries.get(actuator.name, {}).get("t")  # of the newest stored sample [s since 1970], or None
+            newest_s = -math.inf if t is None else float(t)
+            folders[folder_part] = WatchedFolder(actuator, settle_s, service.store.is_known, newest_s)
 
     def submit_blocks(folder: WatchedFolder) -> None:
         """Submit the blocks of a folder's new files until the service stops."""
@@ -314,8 +272,5 @@ def _printable(name: str) -> str:
 
 
 def _is_midnight_before(start: float, newest: float) -> bool:
-    """Return True if `start` is the midnight (UTC) at which the day of `newest` begins.
-
-    Both are starts of recordings [s since 1970]. A recording that is dated without a time of day starts at midnight.
-    """
+    """Return True if `start` [s] is the midnight (UTC) before `newest` [s], as of a recording without a time of day."""
     return start % DAY == 0.0 and start <= newest < start + DAY

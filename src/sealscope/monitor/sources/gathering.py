@@ -1,8 +1,7 @@
 """Gather values of single channels, each with its own time, into blocks of samples on one time axis.
 
-A source that reports changes (OPC UA) sends nothing while a channel is constant, so a missing sample repeats the
-value before it. A block is complete when every channel has values up to its end; a channel without a value for
-`SILENT_S` counts as constant.
+A source that reports changes (OPC UA) sends nothing while a channel is constant, so a missing sample repeats the value
+before it. A block is complete when every channel has values up to its end, or is silent for `SILENT_S`.
 """
 
 from __future__ import annotations
@@ -28,9 +27,8 @@ LATE = "values that came after their block"
 class _Channel:
     """The values of one channel that are not in a block yet.
 
-    `values`: by index on the time axis, i.e. by number of the sample; `previous`: the last value before `values`;
-    `arrival` [s]: time at which the last value arrived; `newest`: index of the newest value so far. `previous` and
-    `newest` are None if there is no such value.
+    `values`: by number of the sample on the time axis; `previous`: the last value before them; `arrival` [s]: time at
+    which the last value arrived; `newest`: number of the newest value so far.
     """
 
     values: dict[int, float] = field(default_factory=dict)
@@ -59,8 +57,7 @@ class _Channel:
 class ValueGatherer:
     """Gathers the values of one actuator's channels into blocks of `block_s` seconds at `rate` [Hz].
 
-    `count`: function called with the reason for each dropped value; `now`: function that returns a monotonic time
-    [s].
+    `count`: function called with the reason for each dropped value; `now`: returns a monotonic time [s].
     """
 
     def __init__(
@@ -81,10 +78,9 @@ class ValueGatherer:
         """Add successive samples of a channel, in SI units; return the blocks of all channels that are then complete.
 
         `t` [s]: time of the first sample, rounded to the sampling interval; the others follow at the sampling rate. NaN
-        is an unknown value. Values without a finite time, and too many values at once, are dropped. If the time jumps
-        forward by more than `_AHEAD_S`, the blocks continue after the pause with each channel's last value. If it jumps
-        back by more than `_AHEAD_S`, all earlier values are discarded. But if the first value of a channel is so old,
-        nothing is discarded: the channel counts as constant since the time of this value.
+        is an unknown value. Values without a finite time, and too many at once, are dropped. If the time jumps forward
+        by more than `_AHEAD_S`, the blocks continue after the pause with each channel's last value. If it jumps back by
+        as much, all earlier values are discarded, unless the channel has no valueand is constant since then.
         """
         # a double resolves the number of a sample up to 2^52
         if not math.isfinite(t) or abs(t * self.rate) > 2**52 or not 0 < len(values) <= MAX_SAMPLES:
@@ -97,26 +93,19 @@ class ValueGatherer:
             # the channel's first value, dated by its last change long ago: it has not changed since
             target.previous, target.arrival = values[-1], self._now()
         else:
-            if lead > self._max_lead:
-                self._continue_after_pause()
-            elif lead < -self._max_lead:  # the clock was set back: start again
+            old_channels = self._channels
+            if abs(lead) > self._max_lead:  # a pause, or the clock was set back: start again
                 self.discard_values()
+            if lead > self._max_lead:  # after a pause each channel starts from its last value
+                for name, old_channel in old_channels.items():
+                    self._channels[name] = _Channel(previous=old_channel.last_value(), arrival=old_channel.arrival)
             self._add_values(self._channels[channel], first, values)
         return self._pop_blocks()
-
-    def _continue_after_pause(self) -> None:
-        """Restart the time axis after a pause in the values; each channel starts from its last value."""
-        old_channels = self._channels
-        self.discard_values()
-        for name, old_channel in old_channels.items():
-            self._channels[name] = _Channel(previous=old_channel.last_value(), arrival=old_channel.arrival)
 
     def _add_values(self, target: _Channel, first: int, values: Sequence[float]) -> None:
         """Add values to the channel `target` from index `first` of the time axis on; drop those before the next block.
 
-        `_start` is the index at which the next block begins. It is None until every channel has values, and the first
-        block begins. Until then a channel keeps only its newest `_max_lead` values, so that memory stays bounded if
-        another channel never sends any.
+        Before the first block, only the newest `_max_lead` values are kept: another channel may never send any.
         """
         for k, value in enumerate(values, first):
             if self._start is not None and k < self._start:
@@ -131,19 +120,12 @@ class ValueGatherer:
         target.arrival = self._now()
 
     def discard_values(self) -> None:
-        """Discard the values of all channels that are in no block yet, and the last value of each.
-
-        The time axis begins anew with the next value, as after a lost connection or if the clock was set back.
-        """
+        """Discard all values that are in no block yet; the time axis begins anew, as after a lost connection."""
         self._channels = {name: _Channel() for name in self._channels}
         self._start = self._newest = None
 
     def _pop_blocks(self) -> list[Recording]:
-        """Remove and return the blocks that are complete.
-
-        A block is complete if every channel has a value at its last sample or later. A channel that has been silent for
-        `SILENT_S` seconds is not waited for: its last value is repeated.
-        """
+        """Remove and return the blocks at whose end each channel has a value or has been silent for `SILENT_S`."""
         channels = self._channels.values()
         if self._start is None:
             has_new_values = any(channel.values for channel in channels)

@@ -15,10 +15,7 @@ from sealscope.monitor.sources.source_block import (
 
 
 def line_source(stream: BinaryIO) -> Callable[[BlockReceiver], None]:
-    """Build a source that decodes the lines of a stream and submits their blocks; empty lines are skipped.
-
-    Returns a function that takes the receiver of the blocks and runs until the stream ends.
-    """
+    """Build a source that submits the blocks in the lines of a stream until it ends; empty lines are skipped."""
 
     def submit_lines(service: BlockReceiver) -> None:
         """Submit the block of each line, or the reason to refuse it, until the stream ends or the service stops."""

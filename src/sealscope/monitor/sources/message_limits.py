@@ -44,10 +44,7 @@ _RULES = (
 
 
 class MessageLimit(ValueError):  # noqa: N818 (names what is exceeded)
-    """Raised if a message has too many, too long or too deep items.
-
-    `oversized`: True if the cause is a list with too many samples.
-    """
+    """Raised if a message has too many, too long or too deep items; `oversized`: True for too many samples."""
 
     def __init__(self, rule: str, *, oversized: bool = False) -> None:
         super().__init__(rule)
@@ -57,8 +54,7 @@ class MessageLimit(ValueError):  # noqa: N818 (names what is exceeded)
 def check_cbor(payload: bytes) -> int:
     """Check how many and how deeply nested the items of a CBOR message are; return the number of key-value pairs.
 
-    Raises MessageLimit if lists, containers, pairs or texts are too many, too long or too deep, if an item is of a
-    type that is not allowed, or if the message is incomplete.
+    Raises MessageLimit also for an item of a type that is not allowed, or an incomplete message.
     """
     code, position, n_pairs = _scan_items(np.frombuffer(payload, dtype=np.uint8))
     if code != _NO_FAULT:
@@ -69,8 +65,7 @@ def check_cbor(payload: bytes) -> int:
 def check_json(payload: bytes) -> int:
     """Check that a JSON message does not have too many quotation marks or brackets; return the number of colons.
 
-    `check_json_keys` needs this number, which includes colons within texts, to find repeated keys. Raises MessageLimit
-    if there are more than `_MAX_QUOTES` quotation marks or `_MAX_BRACKETS` opening brackets and braces.
+    The number, with colons within texts, is for `check_json_keys`. Raises MessageLimit above a limit.
     """
     n_quotes, n_brackets, n_colons = _count_marks(np.frombuffer(payload, dtype=np.uint8))
     if n_quotes > _MAX_QUOTES:
@@ -83,8 +78,8 @@ def check_json(payload: bytes) -> int:
 def check_json_keys(values: Any, payload: bytes, n_colons: int) -> None:
     """Check that no mapping of a JSON message repeats a key; raise MessageLimit otherwise.
 
-    `values`: the decoded message; `payload`: its bytes; `n_colons`: number of colons that `check_json` counted. Each
-    pair has a colon outside texts; if a key is repeated, `values` has fewer pairs than there are such colons.
+    `values`: the decoded message, whose pairs are fewer than the colons outside texts of its bytes `payload` if a key
+    is repeated; `n_colons`: number of all colons, by `check_json`.
     """
     if _count_shallow_pairs(values) != n_colons:  # a quick test, which a colon within a text also fails
         unquoted = payload.replace(b"\\\\", b"").replace(b'\\"', b"").split(b'"')[::2]  # the parts outside texts
@@ -92,10 +87,7 @@ def check_json_keys(values: Any, payload: bytes, n_colons: int) -> None:
 
 
 def check_keys(values: Any, n_pairs: int) -> None:
-    """Check that no mapping of a message repeats a key; raise MessageLimit otherwise.
-
-    `values`: the decoded message, which has fewer pairs if a key is repeated; `n_pairs`: number of pairs in its bytes.
-    """
+    """Check that a decoded message has all `n_pairs` of its bytes; raise MessageLimit if a key is repeated."""
     if _count_shallow_pairs(values) == n_pairs:  # a quick test
         return
     n_decoded = _count_pairs(values)
@@ -130,11 +122,10 @@ def _count_marks(data: Any) -> tuple[int, int, int]:
 
 @law
 def _read_argument(data: Any, position: int, info: int) -> tuple[int, int]:
-    """Read the argument of a CBOR item, a number, and return it with the position after it.
+    """Read the argument of a CBOR item, a number, and return it with the position after it, -1 if the data end.
 
-    `data` (n,): bytes of the message; `position`: index after the item's initial byte; `info`: low 5 bits of the
-    initial byte. Below 24, `info` is the argument itself; 24 to 27 mean that the next 1, 2, 4 or 8 bytes contain it.
-    The returned position is -1 if the data end too early.
+    `data` (n,): bytes of the message; `position`: index after the item's initial byte; `info`: low 5 bits of that byte,
+    the argument itself if below 24; 24 to 27 mean that the next 1, 2, 4 or 8 bytes contain it.
     """
     if info < 24:
         return info, position
@@ -152,8 +143,8 @@ def _skip_pieces(data: Any, start: int, position: int, major: int, n_texts: int)
     """Skip a CBOR text or byte string of unknown length, which consists of pieces with the same major type `major`.
 
     `data` (n,): bytes of the message; `start`, `position`: index of the item's first byte, and of its first piece;
-    `n_texts`: number of pieces of text or bytes so far. Returns the code of the broken rule (0 for none), the
-    position of the fault or, without a fault, after the item, and the new `n_texts`.
+    `n_texts`: number of pieces so far. Returns the code of the broken rule (0 for none), the position of the fault or,
+    without a fault, after the item, and the new `n_texts`.
     """
     while True:
         n_texts += 1
@@ -174,8 +165,7 @@ def _skip_pieces(data: Any, start: int, position: int, major: int, n_texts: int)
 def _scan_items(data: Any) -> tuple[int, int, int]:
     """Check number, depth and types of the items of a CBOR message, given as bytes (n,), in one pass.
 
-    Returns the code of the broken rule (0 for none, an index into `_RULES`), the position of the fault or the end, and
-    the number of key-value pairs so far.
+    Returns the index in `_RULES` of the broken rule (0 for none), position of fault or end, and number of pairs.
     """
     # arrays by depth: `n_left` is the number of items that a container still needs, negative if its length is
     # unknown; `role` is 0 in a list, in a mapping 1 before a key and 2 before a value; `n_items` counts the items so

@@ -37,11 +37,7 @@ _NO_NUMBER = "OPC UA values that are no number"
 
 
 def opcua_source(settings: OpcUaSettings) -> Callable[[BlockReceiver], None]:
-    """Build a source that submits the values of an OPC UA server as blocks.
-
-    Returns a function that takes the receiver of the blocks, and runs until the receiver stops. Raises MissingExtra if
-    the library asyncua is not installed, and InputError if a secret cannot be read.
-    """
+    """Build a source that submits the values of an OPC UA server as blocks; raise MissingExtra without asyncua."""
     if find_spec("asyncua") is None:  # before the service starts
         raise MissingExtra("OPC UA needs asyncua: pip install 'sealscope[opcua]'")
     password = read_secret(settings.password_file, "opcua.password_file")
@@ -49,10 +45,7 @@ def opcua_source(settings: OpcUaSettings) -> Callable[[BlockReceiver], None]:
 
 
 class _OpcUaSession:
-    """The connection of a service to an OPC UA server, with its subscriptions.
-
-    The library asyncua calls `datachange_notification` for each value.
-    """
+    """The connection of a service to an OPC UA server, with its subscriptions."""
 
     def __init__(self, settings: OpcUaSettings, password: str | None, service: BlockReceiver) -> None:
         self._settings, self._password, self._service = settings, password, service
@@ -90,10 +83,7 @@ class _OpcUaSession:
             raise PartAway(f"{self._settings.url}: {reason}") from None
 
     async def _run_connection(self) -> None:
-        """Connect, subscribe to all nodes, and wait until the service ends.
-
-        Raises errors of many types if the connection fails or is lost, or a node does not exist.
-        """
+        """Connect, subscribe to all nodes, and wait until the service ends, or an error of any type is raised."""
         from asyncua import Client
 
         client = Client(self._settings.url, timeout=self._settings.timeout_s)
@@ -126,9 +116,8 @@ class _OpcUaSession:
     def datachange_notification(self, node: Any, value: Any, data: Any) -> None:
         """Add a value of a subscription, and queue the blocks that are then complete; called by the library asyncua.
 
-        `node`: the node of a channel; `value`: number or array of samples; `data`: time and quality of the value.
-        Samples that are not finite or not of good quality count as unknown (NaN). Any other value is dropped and
-        counted.
+        `value`: number or array of samples; those not finite or not of good quality count as unknown (NaN), and any
+        other value is dropped and counted. `data`: time and quality of the value.
         """
         name, channel = self._channels[node.nodeid]
         data_value = data.monitored_item.Value
@@ -151,10 +140,7 @@ class _OpcUaSession:
                 self._service.count(_NO_ROOM)
 
     def _submit(self) -> None:
-        """Submit the queued blocks until the service stops.
-
-        This runs in a separate thread, because the service's `submit` waits while its queue is full.
-        """
+        """Submit the queued blocks in a separate thread, as the service's `submit` waits while its queue is full."""
         while not self._service.stopping.is_set():
             for block in self._waiting.pop(max_items=1, timeout=_POLL_S):
                 self._service.submit(block)

@@ -1,7 +1,6 @@
 """Blocks of samples of an actuator, and how they are decoded from JSON or CBOR messages.
 
-If a message has no valid block, RefusedMessage is raised. Its reason is one of `REASONS`, by which such messages are
-counted.
+If a message has no valid block, RefusedMessage is raised. It is counted by its reason, one of `REASONS`.
 """
 
 from __future__ import annotations
@@ -69,19 +68,15 @@ class BlockReceiver(Protocol):
         """Return the last summary of each actuator, by name."""
 
 
-def do_nothing() -> None:
-    """Do nothing; the default of functions that are called when a block is stored."""
-
-
 class RefusedMessage(InputError):  # noqa: N818 (says what happened)
     """Raised if a message or a file does not contain a valid block.
 
-    `reason`: one of `REASONS`; `size`: length of its `contents` [bytes]; `beginning`: the first bytes, which are
-    stored; `bytes`: number of the stored bytes; `done`: function called when they are stored.
+    `reason`: one of `REASONS`; `size`: length of its `contents` [bytes]; `beginning`: its first bytes, which are
+    stored; `bytes`: number of these; `done`: function called when they are stored.
     """
 
     def __init__(
-        self, reason: str, message: object, contents: bytes = b"", done: Callable[[], None] = do_nothing
+        self, reason: str, message: object, contents: bytes = b"", done: Callable[[], None] = lambda: None
     ) -> None:
         super().__init__(message)
         self.reason, self.done = reason, done
@@ -128,16 +123,16 @@ def raising_refused_message() -> Iterator[None]:
 class SourceBlock:
     """A block of samples of one actuator.
 
-    `identity`: text that no other block of the actuator has, even after a restart; `samples`: None if only the
-    identity is to be stored; `follows`: False if there is a gap between these samples and those before; `done`:
-    function called when the block is stored; `verdict`: verdict on the samples as a whole recording, None for none.
+    `identity`: text that no other block of the actuator has, even after a restart; `samples`: None if only the identity
+    is to be stored; `follows`: False if there is a gap before these samples; `done`: function called when the block is
+    stored; `verdict`: verdict on the samples as a whole recording, None for none.
     """
 
     actuator: str
     identity: str
     samples: Recording | None
     follows: bool = True
-    done: Callable[[], None] = do_nothing
+    done: Callable[[], None] = lambda: None
     verdict: RecordingVerdict | None = None
 
     @property
@@ -157,12 +152,11 @@ def decode_message(
     - ``t``: time of the first sample [s]; ``rate``: sampling rate [Hz];
     - for each channel a list of numbers, with null for a missing sample, or in CBOR a typed array of floats (RFC 8746),
       with NaN for a missing sample. A slow channel (``T_oil``) may be a single number;
-    - ``units``: by channel, unless the values are in SI units;
-    - ``actuator``: name of the actuator, needed if the source does not state it;
-    - ``id``: identity of the block, by default a digest of the message.
+    - ``units``: by channel, unless the values are in SI units; ``actuator``: its name, needed if the source does not
+      state it; ``id``: identity of the block, by default a digest of the message.
 
-    `actuator`: name of the actuator that the source states, None for none; `units_of`: default units of channels, by
-    actuator. Raises RefusedMessage if a rule is broken.
+    `actuator`: name that the source states, or None; `units_of`: default units by actuator and channel. Raises
+    RefusedMessage if a rule is broken.
     """
     if len(payload) > MAX_MESSAGE_BYTES:
         raise RefusedMessage(OVERSIZED, f"a message must have at most {MAX_MESSAGE_BYTES} bytes, got {len(payload)}")
@@ -232,11 +226,7 @@ def _abbreviate(value: Any) -> str:
 
 
 def _parse_mapping(payload: bytes) -> Mapping[str, Any]:
-    """Parse a message of JSON or CBOR to a mapping.
-
-    Size, depth and number of entries are checked before (`message_limits`). Raises RefusedMessage if the message
-    exceeds a limit, cannot be parsed, or is not a mapping.
-    """
+    """Parse a message of JSON or CBOR, within the limits of `message_limits`, to a mapping, or raise RefusedMessage."""
     try:
         if payload.lstrip()[:1] == b"{":
             import orjson
@@ -265,10 +255,7 @@ def _parse_mapping(payload: bytes) -> Mapping[str, Any]:
 
 
 def _parse_number(values: Mapping[str, Any], name: str) -> float:
-    """Read the time "t" or the sampling rate "rate" of a message as a finite number.
-
-    `values`: all entries of the message; `name`: "t" or "rate". Raises RefusedMessage if the entry is anything else.
-    """
+    """Read the time "t" or the sampling rate "rate" of a message as a finite number, or raise RefusedMessage."""
     value = values.get(name)
     try:
         number = math.nan if isinstance(value, bool) or not isinstance(value, (int, float)) else float(value)
@@ -280,10 +267,9 @@ def _parse_number(values: Mapping[str, Any], name: str) -> float:
 
 
 def _parse_channel(values: Any, name: str, units: Mapping[str, Any]) -> np.ndarray[Any, Any]:
-    """Convert the list or typed array of a channel to an array (n,) in SI units.
+    """Convert the list or typed array of a channel to an array (n,) in SI units; raise RefusedMessage if it is neither.
 
-    `values`: the list or array, or a single number for a slow channel; `name`: the channel; `units`: units by channel.
-    Raises RefusedMessage for anything else, and for infinite values.
+    A slow channel may be a single number; infinite values are refused. `units`: by channel.
     """
     if name in SLOW and isinstance(values, (int, float)) and not isinstance(values, bool):
         values = [values]  # a slow channel may be a single number
@@ -303,10 +289,7 @@ def _parse_channel(values: Any, name: str, units: Mapping[str, Any]) -> np.ndarr
 
 
 def convert_to_si(values: Any, unit: object, channel: str) -> Any:
-    """Convert values of a channel from `unit` to SI units; None means that they are in SI units already.
-
-    Raises RefusedMessage if the unit has another dimension.
-    """
+    """Convert values of a channel from `unit`, None for SI; raise RefusedMessage if it has another dimension."""
     try:
         return values if unit is None else to_si(values, _abbreviate(unit), CHANNEL_UNITS[channel], name=channel)
     except InputError as error:

@@ -1,11 +1,10 @@
 """Read blocks of samples from edge nodes of Sparkplug B.
 
 Birth messages of a node name its metrics, data messages bring samples, and death messages end the session. A node or
-one of its devices is an actuator, and its metrics are the channels. The value of a metric is an array of samples
-that begins at its timestamp, or a single sample; a single value that is left out has not changed. Timestamps are whole
+one of its devices is an actuator, and its metrics are the channels. The value of a metric is an array of samples that
+begins at its timestamp, or a single sample; a single value that is left out has not changed. Timestamps are whole
 milliseconds; a block that follows the block before within that resolution is joined to it. After a missing sequence
-number an alias may stand for another metric, so messages with aliases are refused until the node has sent
-the birth that is then requested.
+number an alias may stand for another metric, so messages with aliases are refused until a new birth.
 """
 
 from __future__ import annotations
@@ -53,8 +52,8 @@ _BRACKETED = re.compile(r"(?P<name>.*?)\s*\[(?P<unit>[^\]]*)\]")
 class _Birth:
     """The channels of an actuator in the birth message of its Sparkplug node, which states all metrics.
 
-    `names`: name of the metric of each channel and of the sampling rate; `aliases`: name of the metric of each alias,
-    a number; `metrics`: by name, the metric with its last value.
+    `names`: name of the metric of each channel and of the sampling rate; `aliases`: name of the metric of each alias, a
+    number; `metrics`: by name, the metric with its last value.
     """
 
     names: dict[str, str] = field(default_factory=dict)
@@ -63,10 +62,7 @@ class _Birth:
 
     @classmethod
     def from_metrics(cls, metrics: Iterable[spb.SparkplugMetric], actuator: ActuatorSettings) -> _Birth:
-        """Select the metrics of a birth message that are channels of an actuator, or its sampling rate.
-
-        The name of a metric may be followed by a unit in brackets, such as "pressure [bar]".
-        """
+        """Select the metrics of a birth that are channels of an actuator, or its rate; "[unit]" may follow a name."""
         birth = cls()
         # channel by name of its metric
         channel_of = {actuator.map.get(channel, channel): channel for channel in (*CHANNELS, _RATE)}
@@ -85,11 +81,10 @@ class _Birth:
         return birth
 
     def complete_metric(self, metric: spb.SparkplugMetric, *, is_complete: bool) -> spb.SparkplugMetric | None:
-        """Add the name, type and unit that the birth states to a metric of a data message.
+        """Add name, type and unit of the birth to a metric of a data message; return None if it has no such metric.
 
-        Returns None if the metric is neither a channel nor the sampling rate. `is_complete`: True if no message since
-        the birth is missing. Raises RefusedMessage if a message is missing and the metric has an alias instead of a
-        name, or if its value does not fit its type.
+        `is_complete`: True if no message since the birth is missing. Raises RefusedMessage if one is, and the metric
+        has an alias instead of a name, or if its value does not fit its type.
         """
         if metric.name is None and not is_complete:
             raise RefusedMessage(blocks.OUT_OF_SEQUENCE, "after a missing message an alias must wait for a birth")
@@ -104,10 +99,7 @@ class _Birth:
         return replace(metric, name=name, unit=metric.unit or birth_metric.unit)
 
     def rate(self, actuator: ActuatorSettings) -> float:
-        """Find the sampling rate [Hz] in the settings or else in the metric `rate`.
-
-        Raises RefusedMessage if it is missing or not > 0.
-        """
+        """Find the sampling rate [Hz] in the settings or else in the metric `rate`; raise RefusedMessage if not > 0."""
         metric = self.metrics.get(self.names.get(_RATE))
         rate = actuator.rate or (math.nan if metric is None else metric.value)
         if not isinstance(rate, (int, float)) or not 0.0 < rate < math.inf:
@@ -118,11 +110,10 @@ class _Birth:
 
 @dataclass
 class _EdgeState:
-    """The state of the session of a Sparkplug edge node.
+    """The state of the session of a Sparkplug edge node, which begins with a birth message that states all metrics.
 
-    A birth message, which states all metrics, begins the session. `births`: births by device, "" for the node itself;
-    `birth_sequence`: number bdSeq of the last birth; `seq`: last sequence number, None before a birth; `is_complete`:
-    True if no sequence number since the birth is missing.
+    `births`: by device, "" for the node itself; `birth_sequence`: number bdSeq of the last birth; `seq`: last sequence
+    number, None before a birth; `is_complete`: True if no sequence number since the birth is missing.
     """
 
     births: dict[str, _Birth] = field(default_factory=dict)
@@ -134,9 +125,8 @@ class _EdgeState:
 class SparkplugHost:
     """Receives the messages of Sparkplug B nodes and devices that are actuators, and converts them to blocks.
 
-    `actuators`: settings of all actuators; those without `sparkplug` are ignored; `publish`: function that sends a
-    payload to a topic; `count_event`: function that increments the counter with a given name, such as `GAPS`. Raises
-    MissingExtra if protobuf is not installed.
+    `publish`: function that sends a payload to a topic; `count_event`: function that increments the counter with a
+    given name, such as `GAPS`. Raises MissingExtra if protobuf is not installed.
     """
 
     def __init__(
@@ -160,10 +150,7 @@ class SparkplugHost:
         return [f"{spb.topic_of(group, '+', node)}/#" for group, node in self._nodes]
 
     def request_all_births(self) -> None:
-        """Request from every node a birth message, which states all its metrics.
-
-        The request is needed after a new connection, because messages before the connection may have been missed.
-        """
+        """Request a birth, which states all metrics, from each node, as a new connection may have missed messages."""
         for (group, node), state in self._nodes.items():
             state.is_complete = False
             self._request_birth(group, node)
@@ -182,8 +169,7 @@ class SparkplugHost:
     def receive(self, topic: str, data: bytes) -> SourceBlock | None:
         """Process a message of a node; return the block of its samples, or None if it has no samples.
 
-        `topic`: MQTT topic of the message; `data`: its payload. Raises RefusedMessage if the message breaks the
-        protocol or its samples cannot be used.
+        `data`: its payload. Raises RefusedMessage if it breaks the protocol or its samples cannot be used.
         """
         match topic.split("/"):
             case [_, _, "NCMD" | "DCMD", *_]:
@@ -224,10 +210,9 @@ class SparkplugHost:
     def _follow_session(self, group: str, node: str, kind: str, payload: spb.SparkplugPayload) -> None:
         """Update the state of a node with the birth, death or sequence number of a message of `kind`.
 
-        The birth of a node (NBIRTH) begins its session, and the death (NDEATH) ends it; both discard the births of its
-        devices. A gap in the sequence is counted and the birth requested. `group`, `node`: names of the group and the
-        node; `payload`: contents of the message. Raises RefusedMessage if the message has no sequence number, comes
-        before the birth, or is the death of an earlier connection.
+        A birth of a node (NBIRTH) begins its session, and a death (NDEATH) ends it; both discard the births of its
+        devices. A gap in the sequence is counted and the birth requested. Raises RefusedMessage for a message without a
+        sequence number or before the birth, and for the death of an earlier connection.
         """
         state = self._nodes[group, node]
         if kind in ("NBIRTH", "NDEATH"):
@@ -255,9 +240,9 @@ class SparkplugHost:
     ) -> Recording | None:
         """Build a recording in SI units from the samples in a message's metrics; return None if there are none.
 
-        `birth`: the birth of the actuator; `sent_ms` [ms since 1970]: time of sending, used for metrics without a
-        time. A single value of a slow channel, such as the oil temperature, is not a sample: `birth` stores it, and all
-        recordings repeat it until the next value. Raises RefusedMessage if the samples cannot be used.
+        `sent_ms` [ms since 1970]: time of sending, used for metrics without a time. A single value of a slow channel,
+        such as the oil temperature, is not a sample: the `birth` of the actuator stores it, and all recordings repeat
+        it until the next value. Raises RefusedMessage if the samples cannot be used.
         """
         channel_of = {name: channel for channel, name in birth.names.items() if channel != _RATE}
         groups: dict[int, dict[str, spb.SparkplugMetric]] = defaultdict(dict)
@@ -296,10 +281,9 @@ class SparkplugHost:
     def _sample_times(self, actuator: str, t: float, size: int, rate: float) -> Array:
         """Compute the times [s] of `size` samples at `rate` [Hz], the first at or near its stated time `t` [s].
 
-        `t` is truncated or rounded to whole milliseconds. The expected start is one sampling interval after the
-        previous sample of the actuator. If `t` is within 3 ms of it, the times begin at the expected start. If the
-        rounding of `t` cannot explain their difference, the times are shifted towards `t`, by at most `_MAX_SHIFT`
-        samples.
+        `t` is truncated or rounded to whole milliseconds. If it is near the expected start, one sampling interval after
+        the actuator's previous sample, the times begin there. If rounding cannot explain the difference, they are
+        shifted towards `t`, by at most `_MAX_SHIFT` samples.
         """
         start, expected_start = t, self._next_starts.get(actuator, math.nan)
         if abs(expected_start - t) < 3.0 * _LATE_S:  # else samples are missing, or the clock was set
@@ -316,13 +300,10 @@ def _simultaneous_samples(
 ) -> dict[str, Array]:
     """Collect the samples (n,) of the metrics that have the same timestamp, by channel.
 
-    `group`: the metrics by channel; `channel_of`: channel by name of its metric; `birth`: last value of each metric.
-
-    - If a value is an array, only the channels with a value are returned, all of one length n.
-    - If no value is an array, n is 1. `birth` is updated with the values, and a fast channel that is left out repeats
-      its last value, unless that is an array. A value None becomes NaN.
-
-    Raises RefusedMessage if the values are not numbers, or arrays of different lengths.
+    If a value of the `group` (metrics by channel) is an array, only channels with a value are returned, all of one
+    length n. Otherwise n is 1, and a fast channel that is left out repeats its last value in `birth`, which is updated,
+    unless that is an array; None becomes NaN. `channel_of`: channel by name of its metric. Raises RefusedMessage if the
+    values are not numbers, or arrays of different lengths.
     """
     if any(isinstance(metric.value, np.ndarray) for metric in group.values()):
         piece = {channel: np.atleast_1d(metric.value) for channel, metric in group.items() if metric.value is not None}

@@ -44,10 +44,7 @@ def _format_area(area: Area) -> str:
 
 
 def column_sizes(judgement: Judgement) -> list[float]:
-    """List the leak sizes that have a column in the main table, in the unit of the plan.
-
-    If there are no sizes, or more than `_MAX_SIZES`, the list is [nan], which stands for all sizes together.
-    """
+    """List the leak sizes with a column in the main table; [nan] (all sizes together) if they are none or too many."""
     sizes = sorted({row.leak_lpm for row in judgement.table if row.leak_lpm > 0})
     return sizes if 0 < len(sizes) <= _MAX_SIZES else [math.nan]
 
@@ -55,15 +52,10 @@ def column_sizes(judgement: Judgement) -> list[float]:
 def main_table(result: CampaignResult) -> tuple[list[str], list[list[str]]]:
     """Build the main table of a campaign as text: the headings of its columns, and a row of cells for each detector.
 
-    The detectors of the plan come first, then two for comparison that always or never raise an alarm. The columns are:
-
-    - name of the detector
-    - information that the detector was given; without this column if the campaign states none
-    - fraction of false alarms
-    - fraction of detected leaks, with a column for each size of leak (`column_sizes`)
-    - area under the ROC curve of all leaks
-    - a90, the leak size that is detected with a probability of 90 %
-    - a90/95, the upper 95 % confidence bound of a90
+    The columns are: the detector; the information it was given, if stated; fraction of false alarms; fraction of
+    detected leaks for each size (`column_sizes`); area under the ROC curve of all leaks; a90, the leak size detected
+    with a probability of 90 %; and a90/95, its upper 95 % confidence bound. Two detectors for comparison, which always
+    or never raise an alarm, come last.
     """
     judgement = result.judgement
     sizes = column_sizes(judgement)
@@ -96,11 +88,9 @@ def _format_knowledge(known: PriorKnowledge | None) -> str:
 
 
 def _format_a90(pod: DetectorPod | None) -> tuple[str, str]:
-    """Format the leak sizes a90 and a90/95 of a detector.
+    """Format the leak size a90 of a detector, detected with a probability of 90 %, and its upper 95 % bound a90/95.
 
-    The size a90 is detected with a probability of 90 %, and a90/95 is its upper 95 % confidence bound. `pod`: the
-    probability of detection (POD) over the leak size, None if unknown. A size above the largest tested size is written
-    "> LARGEST"; a dash stands for an unknown size.
+    `pod`: probability of detection (POD) over the size. A size above all tested ones is written "> LARGEST".
     """
     if pod is None or pod.curve is None:
         return "–", "–"
@@ -116,8 +106,7 @@ def result_text(result: CampaignResult) -> str:
     """Summarise in a few sentences the leaks that the best detectors of a campaign find, and their false alarms.
 
     At most `_MAX_NAMED` detectors are described, in the order of a90, the leak size that is detected with a probability
-    of 90 %. Detectors whose a90 is unknown or above the largest tested size come last, in the order of the fraction of
-    the largest leaks that they find.
+    of 90 %. Those without an a90 within the tested sizes follow by the fraction of the largest leaks found.
     """
     judgement, unit = result.judgement, result.plan.unit
     ranked_findings: list[tuple[float, float, str]] = []
@@ -179,10 +168,7 @@ def _say(name: str, **values: Any) -> str:
 
 
 def _prior_knowledge_notes(result: CampaignResult) -> list[str]:
-    """Format notes on the channels and the rigs that detectors were given, with the names of these detectors.
-
-    There is a note for each different set of channels, and for each different rig.
-    """
+    """Format a note on each set of channels, and on each rig, that detectors were given, with their names."""
     by_channels: dict[str, list[str]] = defaultdict(list)
     by_rig: dict[str, list[str]] = defaultdict(list)
     for name, known in result.known.items():
@@ -199,18 +185,12 @@ def _is_batched(result: CampaignResult) -> bool:
 
 
 def write_campaign_page(result: CampaignResult, path: Path, files: Sequence[str] = ()) -> Path:
-    """Write the page of a campaign's result as HTML, and return its path; raise InputError if that fails.
-
-    `files`: names of the files with tables in the same folder, to which the page links.
-    """
+    """Write the page of a campaign's result as HTML, with links to `files` in its folder, and return its path."""
     return template.write(path, render_campaign_page(result, files))
 
 
 def render_campaign_page(result: CampaignResult, files: Sequence[str] = ()) -> str:
-    """Render the page of a campaign's result as HTML.
-
-    `files`: names of the files with tables in the same folder; the page links to nothing else.
-    """
+    """Render the page of a campaign's result as HTML, with links to the `files` with tables in the same folder."""
     judgement, plan = result.judgement, result.plan
     heads, rows = main_table(result)
     failed = [
@@ -240,15 +220,8 @@ def render_campaign_page(result: CampaignResult, files: Sequence[str] = ()) -> s
 def _facts(result: CampaignResult) -> list[tuple[str, str]]:
     """List the conditions of a campaign for its page, as pairs of label and text.
 
-    For recordings of machines there is a pair for each set, with its use and leak size. For simulated records there are
-
-    - the rig, and the profile from which machines are drawn
-    - length and sampling rate of the records, and onset of the leaks
-    - the levels of each factor
-    - the base seed, and a mode other than "run by run"
-    - the channels of each view, a set of channels that detectors are given
-    - the rig that detectors assume, if any of them states verdicts of its own
-    - for each planned leak flow, the simulated flow
+    For recordings of machines there is a pair for each set. For simulated records they are rig, records, factors, seed,
+    mode, the channels of each view that detectors are given, any assumed rig, and the simulated leak flows.
     """
     plan, judgement = result.plan, result.judgement
     if isinstance(plan, RecordedPlan):
@@ -272,10 +245,7 @@ def _facts(result: CampaignResult) -> list[tuple[str, str]]:
 
 
 def _describe_assumed_machine(plan: SimulatedPlan) -> str:
-    """Describe the rig that the detectors assume, with the first parameters in which it differs from the simulated rig.
-
-    If both rigs are equal, the text says that.
-    """
+    """Describe the rig that the detectors assume, with the first parameters that differ from the simulated rig's."""
     if plan.assumed == plan.rig:
         return f"the rig {plan.rig.name} as it stands, not the machine that was drawn"
     simulated_values = {row.name: row.value for row in plan.rig.table()}
@@ -289,10 +259,8 @@ def _describe_assumed_machine(plan: SimulatedPlan) -> str:
 def _detector_section(pod: DetectorPod, judgement: Judgement, unit: str) -> dict[str, Any]:
     """Build the template's values for the section of one detector on a campaign's page.
 
-    The section has the detector's plots, the areas under its ROC curves, and a table of its fractions of alarms, with a
-    row for each combination of the factors' levels and a column for each leak size. The table is empty without factors,
-    or if there are too many sizes. `pod`: the detector's probability of detection (POD) over the leak size;
-    `judgement`: the results of all detectors; `unit`: unit of the leak sizes.
+    It has plots, the areas under the ROC curves, and a table of the fractions of alarms by the factors' levels and the
+    leak size, empty without factors or with too many sizes. `pod`: probability of detection over the size.
     """
     name = pod.detector
     rocs = [roc for roc in judgement.rocs if roc.detector == name]
@@ -324,10 +292,7 @@ def _size_text(roc: SizeRoc, unit: str) -> str:
 
 
 def _describe_score(name: str) -> str:
-    """Describe the score from which the ROC curve of a detector is computed; "" if the detector is not installed.
-
-    `name`: name of the detector in the plan, such as "diagnose @ pressures".
-    """
+    """Describe the score from which the ROC curve of a detector is computed; "" if the detector is not installed."""
     detector = parse_detector_name(name)
     through = f", given the channels of {detector.view} alone" if detector.view else ""
     if detector.scorer is not None:
@@ -338,7 +303,7 @@ def _describe_score(name: str) -> str:
 
 
 class _PlotCurve(NamedTuple):
-    """A curve y(x) with a label; `band`: lower and upper end of its confidence band, None for a curve without band."""
+    """A curve y(x) with a label; `band`: lower and upper end of its confidence band, None for none."""
 
     label: str
     x: Array
@@ -347,11 +312,10 @@ class _PlotCurve(NamedTuple):
 
 
 def _pod_plot(pod: DetectorPod, unit: str) -> dict[str, Any] | None:
-    """Draw a detector's fraction of detections over the size of the leak, on a logarithmic axis.
+    """Draw a detector's fraction of detections over the leak size, logarithmic; None if there are fewer than two sizes.
 
     The picture has the fractions with their intervals, the fitted curve with its band, and the sizes a90 (detected with
-    a probability of 90 %) and a90/95 (upper bound of a90). `pod`: the probability of detection (POD) over the leak
-    size; `unit`: unit of the sizes. Returns `title` and `picture`, or None if there are fewer than two sizes.
+    a probability of 90 %) and a90/95 (upper bound of a90).
     """
     if len(pod.sizes) < 2:
         return None
@@ -378,11 +342,7 @@ def _pod_plot(pod: DetectorPod, unit: str) -> dict[str, Any] | None:
 
 
 def _roc_plot(rocs: Sequence[SizeRoc], unit: str) -> dict[str, Any] | None:
-    """Draw ROC curves, detections over false alarms, with a line for each size of leak.
-
-    A single line is drawn with its confidence band. Returns the `title` and the `picture`, or None if there are no
-    curves. `unit`: unit of the sizes.
-    """
+    """Draw ROC curves (detections over false alarms), one for each leak size; return None if there are none."""
     if not rocs:
         return None
     curves = []
@@ -395,10 +355,7 @@ def _roc_plot(rocs: Sequence[SizeRoc], unit: str) -> dict[str, Any] | None:
 
 
 def _draw_detection_curves(picture: Picture, x_label: str, curves: Sequence[_PlotCurve]) -> None:
-    """Draw curves of the detected fraction into a picture, with frame and axes; `x_label`: label of the x axis.
-
-    Each curve is reduced to at most `_MAX_CURVE_POINTS` points.
-    """
+    """Draw curves of the detected fraction, each of at most `_MAX_CURVE_POINTS` points, with frame and axes."""
     thinned_curves = []
     for label, x, y, band in curves:
         indices = np.unique(np.linspace(0, x.size - 1, min(x.size, _MAX_CURVE_POINTS)).round().astype(np.int64))

@@ -22,11 +22,7 @@ def percent(proportion: Proportion | None) -> str:
 
 
 def _format_percent(fraction: float) -> str:
-    """Format a fraction as a percentage without the sign %.
-
-    Percentages below 9.95 have two decimals. Larger percentages have one decimal, but none if they are whole numbers or
-    above 99.95.
-    """
+    """Format a fraction as a percentage: two decimals below 9.95, none if it is whole or above 99.95, else one."""
     value = 100.0 * fraction
     digits = 2 if value < 9.95 else 0 if value > 99.95 or value == round(value) else 1
     return f"{value:.{digits}f}"
@@ -35,8 +31,8 @@ def _format_percent(fraction: float) -> str:
 class PageTable(NamedTuple):
     """A table of the campaign's page.
 
-    `id`: identifier of the table in the HTML; `about`: description of the content; `heads`: headings of the columns;
-    `rows`: cells as text; `words`: number of columns with text, which stand left of the columns with numbers.
+    `id`: identifier in the HTML; `about`: description; `heads`: of the columns; `rows`: cells as text; `words`: number
+    of columns with text, which stand left of the columns with numbers.
     """
 
     id: str
@@ -48,10 +44,7 @@ class PageTable(NamedTuple):
 
 
 def page_tables(judgement: Judgement, unit: str, part: str = "") -> dict[str, PageTable]:
-    """Build the tables that `page_tables.toml` lists, by name; empty ones are left out.
-
-    `unit`: unit of the leak sizes; `part`: purpose of the campaign, such as "development", for the titles, "" for none.
-    """
+    """Build the tables of `page_tables.toml` by name, without empty ones, for a campaign's `part` ("development")."""
     tables = {}
     for name, layout in tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8")).items():
         columns = layout["columns"]
@@ -64,11 +57,9 @@ def page_tables(judgement: Judgement, unit: str, part: str = "") -> dict[str, Pa
 
 
 def _format_cell(row: Any, content: str) -> str:
-    """Format one cell of a table as text.
+    """Format one cell: `content` is a format, a space, and the dotted path of the value in the attributes of `row`.
 
-    `row`: object whose attributes are the values of a row; `content`: name of a format, a space, and the dotted path of
-    the value in `row`. The format is an entry of `_FORMATS`, such as "percent", or a format specification of Python;
-    without a format, `str` is used.
+    The format is an entry of `_FORMATS`, such as "percent", or a format specification of Python, or missing.
     """
     format_name, _, path = content.rpartition(" ")
     value = resolve_attribute(row, path)
@@ -78,9 +69,9 @@ def _format_cell(row: Any, content: str) -> str:
 class CauseTable(NamedTuple):
     """The table of the causes that one detector names, as text.
 
-    `columns`: causes that are named; `rows`: for each true cause, its name, its number of records, and for each column
-    the fraction of these records for which the column's cause is named; `right`: fraction of all records for which
-    exactly the true cause is named; `covered`: the same if an ambiguous cause that includes the true one counts, too.
+    `columns`: named causes; `rows`: true cause, number of its records, and for each column the fraction of them for
+    which that cause is named; `right`: fraction of all records for which exactly the true cause is named; `covered`:
+    the same if an ambiguous cause that includes the true one counts, too.
     """
 
     detector: str
@@ -97,18 +88,13 @@ def cause_tables(judgement: Judgement) -> list[CauseTable]:
         confusion = causes.confusion
         confusion_rows = zip(confusion.rows, confusion.counts, confusion.shares, strict=True)
         rows = [
-            (name, int(counts.sum()), [*map(_format_fraction, shares)])
+            (name, int(counts.sum()), [f"{100 * share.value:.0f} %" if share.count else "·" for share in shares])
             for name, counts, shares in confusion_rows
             if counts.any()  # else no record has this cause
         ]
         right, covered = percent(confusion.accuracy), percent(causes.covered)
         tables.append(CauseTable(causes.detector, confusion.columns, rows, right, covered))
     return tables
-
-
-def _format_fraction(proportion: Proportion) -> str:
-    """Format a proportion as a whole percentage, without its interval; a dot for a proportion of zero."""
-    return f"{100 * proportion.value:.0f} %" if proportion.count else "·"
 
 
 def _format_quantile(quantile: IntervalEstimate) -> str:

@@ -22,10 +22,7 @@ from sealscope.units import DAY
 
 
 class Judged(NamedTuple):
-    """A diagnosed recording: its diagnosis, its start, and a function that reads it.
-
-    `start_s` [s since 1970]: start of the recording, None if it is not known.
-    """
+    """A diagnosed recording: diagnosis, start [s since 1970], None if not known, and a function that reads it."""
 
     diagnosis: Diagnosis
     start_s: float | None
@@ -39,26 +36,22 @@ _Level = tuple[float, float | None, float]
 def write_history_page(
     path: str | os.PathLike[str], judged: Sequence[Judged], *, title: str, left_out: int = 0
 ) -> Path:
-    """Write the page of a machine as .html, .htm or .pdf, and return its path.
+    """Write the page of a machine as .html, .htm or .pdf, and return its path; raise InputError if that fails.
 
-    `judged`: the machine's recordings with their diagnoses; `title`: name of the machine; `left_out`: number of files
-    that could not be read. Raises InputError if `judged` is empty, or if the page cannot be written.
+    `title`: name of the machine; `left_out`: number of files that could not be read.
     """
     return template.write(template.parse_page_path(path, card=False), render_history_page(judged, title, left_out))
 
 
 def render_history_page(judged: Sequence[Judged], title: str, left_out: int = 0) -> str:
-    """Render the page of a machine as HTML from its recordings and their diagnoses, in any order.
+    """Render the page of a machine from its recordings, in any order; raise InputError if there are none.
 
-    `title`: name of the machine; `left_out`: number of files that could not be read. Raises InputError if `judged` is
-    empty.
+    `title`: name of the machine; `left_out`: number of files that could not be read.
     """
     if not judged:
         raise InputError("the page of a machine must have at least 1 recording, got 0")
     first = -math.inf  # recordings without a date come first
-    ordered = sorted(
-        judged, key=lambda entry: (first if entry.start_s is None else entry.start_s, entry.diagnosis.file)
-    )
+    ordered = sorted(judged, key=lambda item: (first if item.start_s is None else item.start_s, item.diagnosis.file))
     newest = ordered[-1].diagnosis
     dates = _dates(ordered)
     page_charts, drawn, files = _draw_comparison(ordered)
@@ -83,9 +76,8 @@ def render_history_page(judged: Sequence[Judged], title: str, left_out: int = 0)
 def history_pictures(ordered: Sequence[Judged]) -> dict[str, Picture] | None:
     """Draw each recording's leak flow [L/min] over time, as a picture for each of the `SIZES`, "wide" and "narrow".
 
-    `ordered`: recordings in order of their starts; if one has no date, all are drawn over their numbers, from 1. A
-    diagnosis without the verdict `leak` is drawn with the upper bound of a leak. Returns None if no recording has a
-    leak flow or a bound.
+    `ordered`: by start; if one has no date, all are drawn over their numbers, from 1. A diagnosis without the verdict
+    `leak` is drawn with the upper bound of a leak. Returns None without any flow or bound.
     """
     levels = [_leak_level(entry.diagnosis) for entry in ordered]
     known_levels = [level for level in levels if level is not None]
@@ -102,20 +94,13 @@ def history_pictures(ordered: Sequence[Judged]) -> dict[str, Picture] | None:
     top = 1.08 * max(shown_values, default=0.0) or 1.0  # 8 % margin
 
     def format_day(day: float) -> str:
-        """Format a value of the time axis as a date, or if there are no dates, as the number of a recording.
-
-        `day`: time in days since 1970 or, without dates, the number of a recording. Returns "" for a number that is not
-        whole, since no recording has it.
-        """
+        """Format a value of the time axis as a date or, without dates, as a recording's number, "" if not whole."""
         if has_dates:
             return stamp(day * DAY, days[-1] - days[0])
         return f"{day:g}" if day.is_integer() else ""
 
     def draw_levels(picture: Picture) -> None:
-        """Draw the leak of each recording into the picture as a point with its interval.
-
-        A bound, a value above the frame and a missing value each have a symbol of their own.
-        """
+        """Draw each recording as a point with interval, or as a symbol for a bound, a too large or a missing value."""
         for entry, day, level in zip(ordered, days, levels, strict=True):
             if level is None:
                 picture.symbol("absent", day, down=picture.height - 4.0)
@@ -134,10 +119,7 @@ def history_pictures(ordered: Sequence[Judged]) -> dict[str, Picture] | None:
 
 
 def _leak_level(diagnosis: Diagnosis) -> _Level | None:
-    """Return the leak of a diagnosis as (estimate, low, high), or a leak's upper bound as (bound, None, bound) [L/min].
-
-    Returns None if the diagnosis states neither a leak flow nor a bound.
-    """
+    """Return the leak of a diagnosis as (estimate, low, high), its bound as (bound, None, bound), or None [L/min]."""
     leak, bound = diagnosis.leak_lpm, diagnosis.bound_lpm
     if diagnosis.verdict != "leak":
         return None if bound is None or not math.isfinite(bound) else (bound, None, bound)
@@ -148,10 +130,7 @@ def _leak_level(diagnosis: Diagnosis) -> _Level | None:
 
 
 def _dates(ordered: Sequence[Judged]) -> list[str]:
-    """Format the start of each recording as a date, with a dash for an unknown start.
-
-    The time of day is added if all recordings start within less than three days.
-    """
+    """Format the start of each recording as a date, with the time of day if all are near each other, or a dash."""
     starts = [entry.start_s for entry in ordered if entry.start_s is not None]
     span_days = (max(starts) - min(starts)) / DAY if starts else 0.0
     return [messages.ABSENT if entry.start_s is None else stamp(entry.start_s, span_days) for entry in ordered]
@@ -160,9 +139,9 @@ def _dates(ordered: Sequence[Judged]) -> list[str]:
 def _draw_comparison(ordered: Sequence[Judged]) -> tuple[list[charts.Chart], charts.DrawnCharts | None, list[str]]:
     """Draw the channels of the newest and of an earlier recording in the same charts, from a common start.
 
-    `ordered`: recordings in order of their starts. The earlier recording is the last one with the verdict `no leak` or,
-    if there is none, the last but one. Returns the charts, the charts as drawn, and the names of the two files. Returns
-    ([], None, []) if there is no earlier recording, no common channel, or a clock that does not increase.
+    The earlier is the last one with the verdict `no leak` or else the last but one; `ordered`: by start. Returns the
+    charts, as drawn, too, and the names of the two files, or ([], None, []) without a common channel or increasing
+    clocks.
     """
     *earlier, newest = ordered
     healthy = [entry for entry in earlier if entry.diagnosis.verdict == "no leak"]

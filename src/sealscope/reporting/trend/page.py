@@ -27,11 +27,7 @@ _STEPS = (*(m / 1440 for m in (1, 5, 15, 60, 180, 360)), 1, 2, 7, 14, 30, 61, 91
 
 
 def write_trend_page(path: str | os.PathLike[str], trend: Trend, *, title: str = "") -> Path:
-    """Write the page of a trend as .html, .htm or .pdf, and return its path.
-
-    `title`: title of the page, "" for "Trend of a machine". Raises InputError for another suffix, or if the page
-    cannot be written.
-    """
+    """Write the page of a trend as .html, .htm or .pdf, and return its path; raise InputError if that fails."""
     return template.write(template.parse_page_path(path, card=False), render_trend_page(trend, title=title))
 
 
@@ -57,10 +53,8 @@ def level_pictures(
 ) -> dict[str, Picture]:
     """Draw the leakage of a machine over time, as one picture for each of the `SIZES`, "wide" and "narrow".
 
-    - `days` [d]: times of the first and last recording
-    - `levels`: ends of the leakage axis; `limit`: repair limit, drawn unless it lies above this axis, None for none
-    - `format_day`: function that formats a time [d] for the labels of the time axis
-    - `draw`: function that draws the recordings into a picture
+    `days` [d]: times of the first and last recording; `levels`: ends of the leakage axis; `limit`: repair limit, drawn
+    unless it lies above; `format_day`: formats a time [d] for the axis; `draw`: draws the recordings into a picture.
     """
     margin = 0.02 * (days[1] - days[0]) or 0.5  # half a day if there is one time only
     first, last = days[0] - margin, days[1] + margin
@@ -82,24 +76,19 @@ def level_pictures(
 
 
 def trend_pictures(trend: Trend) -> dict[str, Picture] | None:
-    """Draw the leakage in a trend's recordings over time, as a picture for each of the `SIZES`, "wide" and "narrow".
-
-    Returns None if the leakage could not be estimated from any recording.
-    """
+    """Draw the leakage in a trend's recordings over time, as a picture for each of the `SIZES`, or None if unknown."""
     if trend.wear is None or all(point.value is None for point in trend.points):
         return None
     days = trend.points[0].day, trend.points[-1].day
-    return level_pictures(
-        days, _y_limits(trend), trend.limit, format_day=partial(text.moment, trend), draw=partial(_draw_trend, trend)
-    )
+    format_day, draw = partial(text.moment, trend), partial(_draw_trend, trend)
+    return level_pictures(days, _y_limits(trend), trend.limit, format_day, draw)
 
 
 def _draw_trend(trend: Trend, picture: Picture) -> None:
     """Draw a trend into a picture, in the trend's unit of leakage over days since the first recording.
 
-    - each episode (the recordings from one repair to the next): the range of healthy recordings, and the fitted line
-    - each recording: a point with its interval, or a symbol at the bottom if its leakage could not be estimated
-    - each alarm and repair: a vertical line
+    Each episode (recordings from one repair to the next) has the range of healthy recordings and the fitted line; each
+    recording a point with its interval, or a symbol at the bottom; each alarm and repair a vertical line.
     """
     days = [trend.points[row].day for row in trend.rows]
     for episode in trend.episodes:
@@ -125,10 +114,10 @@ def _draw_trend(trend: Trend, picture: Picture) -> None:
 
 
 def _y_limits(trend: Trend) -> tuple[float, float]:
-    """Compute the limits (low, high) of the leakage axis in a trend's picture, in the trend's unit.
+    """Compute the limits (low, high) of the leakage axis in a trend's picture, in the trend's unit, with a margin.
 
-    The limits include the intervals of all recordings, the healthy ranges and, if the unit is L/min, zero. The repair
-    limit is included if it is below 2.5 times the largest of these values. A margin is added at both ends.
+    They include the intervals of all recordings, the healthy ranges and, in L/min, zero; the repair limit if below 2.5
+    times the largest.
     """
     ends = [value for point in trend.points for value in (point.low, point.high) if value is not None]
     ends += [end for episode in trend.episodes for end in (episode.wear.healthy.low, episode.wear.healthy.high)]
@@ -144,10 +133,9 @@ def _y_limits(trend: Trend) -> tuple[float, float]:
 def _fitted_line(days: list[float], episode: Episode) -> list[tuple[float, float]]:
     """Compute the vertices (day, leakage) of the line fitted to an episode, the recordings from one repair to the next.
 
-    The leakage is in the unit of the trend. Without an alarm or an onset, the line is straight, has the fitted growth,
-    and ends at the present leakage. Otherwise the line stays at the healthy level until the onset, and then rises to
-    the present leakage: linearly up to the last recording, or at once if the change is a step. `days` [d]: times of the
-    compared recordings (`Trend.rows`).
+    Without an alarm or an onset, the line is straight, has the fitted growth, and ends at the present leakage.
+    Otherwise it stays at the healthy level until the onset, and then rises to the present leakage, linearly or in a
+    step. `days` [d]: times of the compared recordings (`Trend.rows`).
     """
     first, last, wear = days[episode.begin], days[episode.end - 1], episode.wear
     if episode.alarm is None or wear.onset is None:

@@ -19,11 +19,7 @@ from sealscope.units import BAR, DAY, DAYS_PER_YEAR
 
 
 def level_name(trend: Trend) -> str:
-    """Return the label of a trend's present level: "total" or "now".
-
-    The label is "total" if the trend follows the leakage of pump and piston together, and "now" if it follows the
-    ringing of the pressures instead, which is measured by the RMS of their wavelet details.
-    """
+    """Return the label of a trend's present level: "total" leakage or, if it follows the pressures' ringing, "now"."""
     return "now" if trend.basis == "ringing" else "total"
 
 
@@ -36,10 +32,7 @@ def moment(trend: Trend, day: float) -> str:
 
 
 def stamp(seconds: float, span_days: float) -> str:
-    """Format a time [s since 1970] as a date, with the time of day if all times span less than three days.
-
-    `span_days` [d]: time between the first and the last of all times that are shown together.
-    """
+    """Format a time [s since 1970] as a date, with the time of day if all shown times span less than three days."""
     text = str(np.datetime64(round(seconds * 1e3), "ms"))  # such as 2026-11-25T09:30:00.000
     return text[:16].replace("T", " ") if span_days < 3.0 else text[:10]
 
@@ -54,10 +47,7 @@ def recordings_text(trend: Trend) -> str:
 
 
 def headline(trend: Trend) -> str:
-    """Format a trend in one line: the verdict, the onset of the leak, and the number and dates of the recordings.
-
-    If a repair ended an earlier leak and the verdict is `no leak`, the date of the last repair replaces the onset.
-    """
+    """Format a trend in one line: verdict, onset of the leak or, without a leak, last repair, and the recordings."""
     key, since = "trend", ""  # neither an onset nor a repair
     if trend.verdict == "no leak" and trend.repairs:  # a repair ended the earlier leak
         key = "trend_fell"
@@ -86,12 +76,9 @@ def verdict_sentence(trend: Trend) -> str:
 def figures(trend: Trend) -> dict[str, str]:
     """Format the numbers of a trend as text, by name; the text is "" or a remark if a number is not known.
 
-    - `total`: present leakage of pump and piston together
-    - `leak`: rise of the leakage above the healthy level, if the verdict is `leak`
-    - `healthy`: range of 95 % of the healthy recordings
-    - `since`: onset of the rise
-    - `growth`: rise in a month, or in a sudden step
-    - `limit`: repair limit, and the date at which the leakage reaches it
+    They are `total`, the present leakage of pump and piston together; `leak`, its rise above the healthy level, if the
+    verdict is `leak`; `healthy`, the range of 95 % of the healthy recordings; `since`, the onset of the rise; `growth`,
+    the rise in a month, or in a sudden step; `limit`, the repair limit, and the date at which the leakage reaches it.
     """
     wear = trend.wear
     if wear is None:
@@ -122,19 +109,13 @@ def figures(trend: Trend) -> dict[str, str]:
 
 
 def healthy_end(wear: Wear) -> float:
-    """Compute the upper end of the healthy range for display, cut off at the repair limit.
-
-    `wear.healthy`: mean and range of healthy recordings. If their mean exceeds the limit, the range ends at the mean.
-    """
+    """Compute the upper end of the healthy range for display, cut off at the repair limit but not below its mean."""
     high = wear.healthy.high
     return high if wear.limit is None else min(high, max(wear.limit, wear.healthy.value))
 
 
 def _format_estimate(interval: Interval, unit: str) -> str:
-    """Format an estimate with its interval and unit; "not known" if the estimate is not finite.
-
-    The word "open" stands for an infinite end of the interval.
-    """
+    """Format an estimate with unit and interval, "open" for an infinite end; "not known" if it is not finite."""
     if not math.isfinite(interval.value):
         return "not known"
     ends = (number(end, 2) if math.isfinite(end) else "open" for end in (interval.low, interval.high))
@@ -144,14 +125,8 @@ def _format_estimate(interval: Interval, unit: str) -> str:
 def _format_reach(trend: Trend, limit: float, reach: Interval) -> str:
     """Format the repair limit, and the predicted date at which the leakage reaches it.
 
-    `limit`: repair limit in the unit of the trend; `reach` [d]: time from the last recording until this date, with the
-    interval of this time. The text states, in this order of precedence,
-
-    - that the limit is reached,
-    - after an alarm the date with its interval, unless it is too far away,
-    - that the limit is not reached within the next years,
-    - that the recordings are too few to state a date,
-    - the earliest date (95 %).
+    `limit`: in the unit of the trend; `reach` [d]: time from the last recording until then. No date is stated if the
+    limit is reached, the date too far away, or the recordings too few; without an alarm only the earliest (95 %).
     """
     limit_text = f"{number(limit, 2)} {trend.unit} in all"
     first, last = trend.points[0].day, trend.points[-1].day
@@ -229,11 +204,7 @@ def trend_text(trend: Trend, *, whole: bool = False) -> str:
 
 
 def trend_csv(trend: Trend) -> str:
-    """Format a trend as CSV text, with a row for each recording.
-
-    The columns are file, time, days since the first recording, leakage with its interval in the unit of the trend,
-    number of the group of comparable recordings, oil temperature [degC] and note.
-    """
+    """Format a trend as CSV text, with a row for each recording, in the unit of the trend."""
     unit, time = trend.unit, "time" if trend.dated else "time [d]"
     levels = (f"level [{unit}]", f"low [{unit}]", f"high [{unit}]")
     with io.StringIO(newline="") as text:
