@@ -38,10 +38,7 @@ FALSE_ALARM_PROBABILITY: float = DECISION.false_alarm.probability
 
 
 def check_probability(probability: float) -> None:
-    """Check that a false-alarm probability is a number from 1e-4 to 0.2; raise InputError otherwise.
-
-    The limits are `rarest` and `largest` of `[false_alarm]` in `decision/priors.toml`.
-    """
+    """Check that a false-alarm probability is 1e-4 to 0.2 (`priors.toml`); raise InputError otherwise."""
     min_probability, max_probability = DECISION.false_alarm.rarest, DECISION.false_alarm.largest
     if not (isinstance(probability, float | int) and min_probability <= probability <= max_probability):
         rule = f"false-alarm probability must be {min_probability:g} to {max_probability:g}"
@@ -66,10 +63,8 @@ class Examination:
         Reason why the pressures cannot be trusted, in which case no detector runs.
     refusal : str or None
         Reason why none of the given healthy recordings can be compared; None if one can, or if none was given.
-    share : float
-        Fraction of the original samples that `recording` contains.
-    judged_until : float
-        Fraction of the original samples up to the last time of `recording`.
+    share, judged_until : float
+        Fractions of the original samples that `recording` contains, and up to its last time.
     """
 
     recording: Recording
@@ -84,25 +79,17 @@ class Examination:
     _reports: dict[str, Observed] = field(default_factory=dict, init=False)
 
     def with_channels(self, channels: Iterable[str]) -> Examination:
-        """Return a copy of this examination in which all recordings have only the given channels.
-
-        Healthy recordings stored as summaries are dropped, as channels cannot be removed from a summary.
-        """
+        """Return a copy in which all recordings have only the given channels; healthy summaries are dropped."""
         names = set(channels)
 
         def select_channels(recording: Recording) -> Recording:
-            """Return the recording with only those of its channels that are in `names`."""
             return recording.only(name for name in recording.channels if name in names)
 
         baseline = [select_channels(healthy) for healthy in self.baseline if isinstance(healthy, Recording)]
         return replace(self, recording=select_channels(self.recording), baseline=baseline)
 
     def report(self, name: str) -> Observed:
-        """Run the detector called `name` on the recording, and return its observations.
-
-        Later calls return the same result without running the detector again. Raises KeyError if no detector of this
-        name is registered.
-        """
+        """Run the detector called `name` once, and return its observations; raise KeyError if there is none."""
         if name not in self._reports:
             rig = load_rig(self.rig)
             self._reports[name] = run_detector(name, self.recording, self.baseline, rig, distrust=self.distrust)
@@ -110,19 +97,14 @@ class Examination:
 
     @cached_property
     def signals(self) -> Observed:
-        """Report on changes of duty (motion and load), noise, hum and mean pressures, which may explain an alarm.
-
-        If there is a reason not to trust the pressures (`distrust`), the report states only this reason.
-        """
+        """Report on changes of duty, noise, hum and mean pressures, which may explain an alarm (`observe_rivals`)."""
         return observe_rivals(self.recording, self.baseline, distrust=self.distrust)
 
     @cached_property
     def null(self) -> HealthyNull:
         """Distribution of the detectors' test results in the healthy recordings (`baseline`).
 
-        The test results of the judged recording are compared with this distribution. If the volume balance found that
-        valves cut the pump off while the machine rests, this is assumed for the healthy recordings, too, even if the
-        pump never rests in the judged one.
+        If valves cut the pump off at rest by the volume balance, this is assumed for the healthy recordings, too.
         """
         leak = self.report(VOLUME_BALANCE).leak if VOLUME_BALANCE in detectors() else None
         # `shut`: the valves cut the pump off at rest; `locked`: they also hold the load then
@@ -130,20 +112,17 @@ class Examination:
         return healthy_null(self.baseline, load_rig(self.rig), shut=is_shut_at_rest)
 
     def evidence(self, name: str) -> Evidence:
-        """Decide from the observations of one detector if the machine leaks; other detectors are not asked.
+        """Decide from the observations of the detector called `name` alone if the machine leaks.
 
-        `name`: name of the detector. A change may have other causes than a leak, such as a change of duty (motion and
-        load). `self.signals` reports tests for these causes, which compete with a leak as explanations. For the
-        detector `rms change` they do not compete: its alarms always count as leaks.
+        Changes in `signals` compete with a leak, except for the detector `rms change`, whose alarms are always leaks.
         """
         return self._decide_by(name, [self.signals], weigh_rivals=name != RMS_CHANGE)
 
     def decide_by_all(self) -> Evidence:
         """Decide from the observations of all registered detectors if the machine leaks.
 
-        The detectors that measure the size of a leak (`ORDER`) run one after the other until one of them reaches a
-        decision; all other detectors always run. The verdict cannot be "no leak" if a measuring detector failed, or if
-        no recording of the given baseline can be compared (`refusal`).
+        Detectors that measure the leak (`ORDER`) run one after the other until one of them decides; all others always
+        run. The verdict cannot be "no leak" if a measuring detector failed, or if there is a `refusal`.
         """
         names = sorted(detectors(), key=rank)  # the detectors of `ORDER` first
         # whichever detector decides, the test results in these reports may show another cause of a change than a leak
@@ -159,8 +138,7 @@ class Examination:
     def _decide_by(self, name: str, reports: Sequence[Observed], *, weigh_rivals: bool = True) -> Evidence:
         """Decide from the observations of the detector called `name` if the machine leaks.
 
-        `reports` are the observations of other detectors, which may show another cause of an alarm than a leak. With
-        `weigh_rivals`, such causes compete with a leak.
+        `reports` of other detectors may show another cause of an alarm, which competes with a leak (`weigh_rivals`).
         """
         probability = self.false_alarm_probability
         with np.errstate(all="ignore"):
@@ -199,7 +177,7 @@ def diagnose(
     rig : Rig, str or path-like, optional
         Sizes of the machine: a Rig, the name of a packaged rig or the path of a TOML file. By default the rig of the
         thesis is used. It counts as stated for a recording that was simulated with the same sizes. For any other
-        recording the default rig is a mere assumption, and L/min are stated only if a flow meter was recorded.
+        recording it is a mere assumption, and L/min are stated only if a flow meter was recorded.
     limit : str, optional
         Leak from which the machine must be repaired: a flow (``"5 mL/min"``) or a creep speed of the piston
         (``"8 mm/min"``, the default).
@@ -209,8 +187,7 @@ def diagnose(
     Returns
     -------
     Diagnosis
-        Verdict, onset and leak in L/min with their intervals, score and threshold, the evidence of each detector, and
-        findings on the data.
+        Verdict, onset and leak in L/min with their intervals, the evidence of each detector, and findings on the data.
 
     Raises
     ------
@@ -256,10 +233,7 @@ def diagnose(
 
 
 def _list_baseline(recording: object, baseline: Recording | Sequence[Healthy]) -> list[Healthy]:
-    """Return the baseline as a list of recordings; a single Recording becomes a list of one.
-
-    Raises InputError if the judged `recording` or an entry of the baseline is of another type, such as a path.
-    """
+    """Return the baseline as a list; raise InputError if `recording` or an entry is of a wrong type, such as a path."""
     is_single = isinstance(baseline, Recording | str | os.PathLike)  # a path is refused below, with a hint
     if not is_single and not isinstance(baseline, Iterable):
         raise InputError(f"baseline must be a Recording or a sequence of Recordings, got {type(baseline).__name__}")

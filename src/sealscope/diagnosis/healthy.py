@@ -14,40 +14,17 @@ Summary = Mapping[str, Any]
 
 @dataclass(frozen=True, eq=False)
 class SummarisedRecording:
-    """A healthy recording reduced to the detectors' summaries, without its samples.
+    """A healthy recording reduced to the detectors' summaries, without its samples."""
 
-    Attributes
-    ----------
-    file : str
-        Name of the recording.
-    digest : str
-        SHA-256 of its chamber pressures in hexadecimal digits, equal for copies of a recording.
-    units : mapping of str to str
-        Unit of each channel.
-    rate : float
-        Sampling rate [Hz].
-    seconds : float
-        Duration [s].
-    start_s : float or None
-        Time of its first sample [s since 1970], None if unknown.
-    summaries : mapping of str to mapping
-        Summary by each detector, by the detector's name.
-    about : mapping
-        Pressure, oil temperature, noise and problems of the recording, for display.
-    statistics : mapping of str to float or ndarray
-        Surprisals, -log(p-value), of the changes within the recording, by the key of the change
-        (`observation.healthy_surprisals`).
-    """
-
-    file: str
-    digest: str
-    units: Mapping[str, str]
-    rate: float
-    seconds: float
-    start_s: float | None
-    summaries: Mapping[str, Summary]
-    about: Mapping[str, Any] = field(default_factory=dict)
-    statistics: Mapping[str, float | Array] = field(default_factory=dict)
+    file: str  # name of the recording
+    digest: str  # SHA-256 of its chamber pressures in hexadecimal digits, equal for copies of a recording
+    units: Mapping[str, str]  # unit of each channel
+    rate: float  # sampling rate [Hz]
+    seconds: float  # duration [s]
+    start_s: float | None  # time of its first sample [s since 1970], None if unknown
+    summaries: Mapping[str, Summary]  # summary by each detector, by the detector's name
+    about: Mapping[str, Any] = field(default_factory=dict)  # pressure, oil, noise and problems, for display
+    statistics: Mapping[str, float | Array] = field(default_factory=dict)  # surprisals (`healthy_surprisals`)
 
 
 #: A healthy recording, as samples or as summaries.
@@ -55,11 +32,7 @@ Healthy = Recording | SummarisedRecording
 
 
 def healthy_summaries(detector: Any, baseline: Sequence[Healthy]) -> list[Summary]:
-    """Collect one detector's summaries of healthy recordings, either stored or computed now.
-
-    `detector` has a `name` and a method `learn`, which summarises a recording or returns None. Recordings without a
-    summary are skipped.
-    """
+    """Collect summaries of healthy recordings, stored ones or by the `detector`'s method `learn`; None is skipped."""
     summaries = (
         recording.summaries.get(detector.name)
         if isinstance(recording, SummarisedRecording)

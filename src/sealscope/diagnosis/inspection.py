@@ -25,28 +25,14 @@ from sealscope.recordings.recording import Recording, compute_once
 
 @dataclass(frozen=True, eq=False)
 class Inspection:
-    """A recording that was corrected and checked before the detectors use it.
+    """A recording that was corrected and checked before the detectors use it."""
 
-    Attributes
-    ----------
-    part : Recording
-        Its samples at equal time steps, from the first to the last at which all chamber pressures and the command are
-        present (`recordings.corrections`).
-    findings : tuple of Finding
-        Defects found in the whole recording.
-    distrust : str or None
-        Reason why the chamber pressures cannot be trusted; None if they can.
-    share : float
-        Fraction of the recording's samples that `part` contains.
-    judged_until : float
-        Fraction of the recording's samples up to the last time of `part`.
-    """
-
+    # samples at equal steps, from the first to the last with all chamber pressures and the command
     part: Recording
-    findings: tuple[Finding, ...]
-    distrust: str | None
-    share: float
-    judged_until: float = 1.0
+    findings: tuple[Finding, ...]  # defects found in the whole recording
+    distrust: str | None  # reason why the chamber pressures cannot be trusted; None if they can
+    share: float  # fraction of the recording's samples that `part` contains
+    judged_until: float = 1.0  # fraction of the recording's samples up to the last time of `part`
 
     @property
     def defect(self) -> str | None:
@@ -75,19 +61,15 @@ class Inspection:
 
 
 def inspect_recording(recording: Recording, channels: Iterable[str] | None = None) -> Inspection:
-    """Correct and check a recording; the result is cached with the recording.
-
-    `channels` are the channels to check for findings, by default all.
-    """
+    """Correct a recording and check its `channels`, by default all; the result is cached with the recording."""
     names = tuple(name for name in recording.channels if channels is None or name in channels)
     return compute_once(recording, ("inspection", names), lambda samples: _inspect(samples, names))
 
 
 def _inspect(recording: Recording, names: Sequence[str]) -> Inspection:
-    """Correct the samples of a recording, find the defects of its channels, and test if the pressures can be trusted.
+    """Correct the samples of a recording, find the defects of the channels `names`, and test if it can be trusted.
 
-    `names` are the channels to search for defects. The pressures cannot be trusted if a chamber pressure is constant or
-    stuck, if all of them are mostly clipped, or if they are implausible for a hydraulic machine.
+    It cannot if a chamber pressure is constant or stuck, or if all are mostly clipped or implausible for hydraulics.
     """
     chambers = chambers_of(recording)
     part, corrections, stuck, share = correct_samples(recording)  # `stuck`: names of channels that repeat one value
@@ -108,32 +90,18 @@ def _inspect(recording: Recording, names: Sequence[str]) -> Inspection:
 
 
 class Baselines(NamedTuple):
-    """Leak-free recordings that can be compared with the judged one, and reasons for those that cannot.
+    """Leak-free recordings that can be compared with the judged one, and reasons for those that cannot."""
 
-    Attributes
-    ----------
-    parts : tuple of Recording or SummarisedRecording
-        The comparable recordings: samples that can be analysed, or stored summaries.
-    findings : tuple of Finding
-        Baselines that were left out, with the reasons.
-    refusal : str or None
-        If all given baselines were left out, the most frequent reason; None if one remains or none was given.
-    """
-
-    parts: tuple[Healthy, ...]
-    findings: tuple[Finding, ...]
-    refusal: str | None
+    parts: tuple[Healthy, ...]  # the comparable recordings: samples that can be analysed, or stored summaries
+    findings: tuple[Finding, ...]  # baselines that were left out, with the reasons
+    refusal: str | None  # if all given baselines were left out, the most frequent reason
 
 
 def select_comparable(judged: Inspection, baseline: Sequence[Healthy]) -> Baselines:
     """Inspect the baselines of a judged recording and choose those that can be compared with it.
 
-    A baseline is left out if
-
-    - it cannot be trusted,
-    - it lacks a chamber pressure of the judged recording, or has it in another unit,
-    - it has the same samples as the judged recording, or as another baseline with at least as many channels.
-
+    A baseline is left out if it cannot be trusted, if it lacks a chamber pressure of the judged recording or has it in
+    another unit, or if it has the samples of the judged recording, or of a baseline with at least as many channels.
     Differences of speed, load and temperature are accepted, as the detectors allow for them.
     """
     healthy = [entry if isinstance(entry, SummarisedRecording) else inspect_recording(entry) for entry in baseline]
@@ -166,10 +134,7 @@ def select_comparable(judged: Inspection, baseline: Sequence[Healthy]) -> Baseli
 
 
 def _find_obstacle(entry: Inspection | SummarisedRecording, judged: Inspection) -> tuple[Severity, str] | None:
-    """Find the reason why the baseline `entry` cannot be compared with the `judged` recording; None if it can.
-
-    Returns the severity of the finding about this baseline, and the reason as text.
-    """
+    """Find why the baseline `entry` cannot be compared with `judged`: severity and text of a finding, or None."""
     if isinstance(entry, Inspection) and entry.defect is not None:
         return "warning", entry.defect
     if entry.digest == judged.digest:

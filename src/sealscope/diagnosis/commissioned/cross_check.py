@@ -26,11 +26,9 @@ def cross_check(
     """Diagnose each healthy recording against all others, and leave out those that seem to leak.
 
     `judge(recording, reference)` diagnoses a recording against the healthy recordings `reference`. No recording is left
-    out with `keep`, or if at least half of the recordings seem to leak, as there is then no healthy majority. Fewer
-    than `MIN_RECORDINGS` recordings are not judged.
-
-    Returns the remaining recordings, and for each recording left out a line with the reason. If a remaining recording
-    shows a leak or another event, the event is added to the problems that this recording lists.
+    out with `keep`, or if at least half of them seem to leak, as there is then no healthy majority. Fewer than
+    `MIN_RECORDINGS` recordings are not judged. Returns the remaining recordings, with a leak or another event that they
+    show among their problems, and a line with the reason for each recording left out.
     """
     problems, leaking = dict[str, str](), dict[str, str]()  # texts by the name of the recording's file
     for recording in healthy if len(healthy) >= MIN_RECORDINGS else ():
@@ -41,13 +39,9 @@ def cross_check(
             leaking[recording.file] = f"{recording.file}: {problems[recording.file]}"
     if keep or 2 * len(leaking) >= len(healthy):
         leaking = {}
-    remaining = (recording for recording in healthy if recording.file not in leaking)
-    checked = tuple(_add_problem(recording, problems.get(recording.file)) for recording in remaining)
-    return checked, tuple(leaking.values())
-
-
-def _add_problem(recording: SummarisedRecording, problem: str | None) -> SummarisedRecording:
-    """Return a copy of a healthy recording with `problem` added to its list of problems; None adds nothing."""
-    if problem is None:
-        return recording
-    return replace(recording, about={**recording.about, "wrong": [*recording.about.get("wrong", ()), problem]})
+    remaining = [recording for recording in healthy if recording.file not in leaking]
+    for k, recording in enumerate(remaining):
+        if recording.file in problems:
+            wrong = [*recording.about.get("wrong", ()), problems[recording.file]]
+            remaining[k] = replace(recording, about={**recording.about, "wrong": wrong})
+    return tuple(remaining), tuple(leaking.values())

@@ -58,20 +58,16 @@ _DIGITS = 64
 
 
 class Line(NamedTuple):
-    """One line of a file of summaries of healthy recordings.
-
-    `checksum` is the SHA-256 that the line states, and `data` the JSON of a summary, not yet parsed.
-    """
+    """One line of a file of summaries: the SHA-256 that it states, and the JSON of a summary, not yet parsed."""
 
     checksum: str
     data: bytes
 
 
 def table_type(extra: Literal["allow", "ignore"] = "ignore", **value_types: Any) -> Any:
-    """Make a pydantic type for a table whose keys and value types are given as keyword arguments.
+    """Make a pydantic type for a table with these keys and value types; (type, None) marks a value that may be absent.
 
-    A tuple (type, None) marks a value that may be absent. `extra` tells whether unknown keys are kept ("allow") or
-    dropped ("ignore").
+    Unknown keys are kept or dropped, depending on `extra`.
     """
     config = ConfigDict(strict=True, allow_inf_nan=False, extra=extra)
     # pydantic's `...` marks a value that must be present
@@ -80,13 +76,9 @@ def table_type(extra: Literal["allow", "ignore"] = "ignore", **value_types: Any)
 
 
 def uniform_table_type(value_type: Any) -> Any:
-    """Make a pydantic type for a table with any keys, whose values all have one type.
-
-    Validation stops at the first value of another type, which the error names.
-    """
+    """Make a pydantic type for a table of any keys and one type of values; the error names the first other value."""
 
     def check_values(table: Any) -> Any:
-        """Return the table unchanged; raise ValueError if it is not a table, or at the first value of another type."""
         if not isinstance(table, dict):
             raise ValueError(f"must be a table, got {table!r:.60}")
         for name, value in table.items():
@@ -100,10 +92,7 @@ def uniform_table_type(value_type: Any) -> Any:
 
 
 def list_type(value_type: Any, min_length: int = 0) -> Any:
-    """Make a pydantic type for a list of at least `min_length` values of one type.
-
-    Validation stops at the first value of another type, which the error names.
-    """
+    """Make a pydantic type for a list of values of one type; validation stops at the first other value and names it."""
     return Annotated[list[value_type], FailFast(), Field(min_length=min_length)]
 
 
@@ -117,25 +106,20 @@ def _check_array(value: Any) -> Any:
 
 
 def _check_statistic(value: Any) -> Any:
-    """Return the value if it is a float, or an array of numbers; raise ValueError otherwise.
-
-    The numbers must be below 1e100 in magnitude.
-    """
-    array = np.array(value) if isinstance(value, float) else value
-    _check_array(array)
+    """Return the value if it is a float or an array of finite numbers below 1e100; raise ValueError otherwise."""
+    _check_array(np.array(value) if isinstance(value, float) else value)
     return value
 
 
 def _check_sums(summary: Any) -> Any:
     """Return the summary of a recording's volume balance if it is consistent; raise ValueError otherwise.
 
-    `sums` (E, m, m) holds for each of E balances the sums of products of its columns over the recording. The m columns
-    are the `terms` and, as the last one, the left side, which is a flow. `terms` must include the leak. The leak's
-    column and the left side must have positive sums of squares, and their sum of products must obey Cauchy's
-    inequality. The other arrays of the summary are checked, too: `shut_sums` (1, m + 2, m + 2) are the sums for a pump
-    that valves cut off at rest, which needs two more columns; `held` are the leaks while valves hold the load;
-    `held_pump` are the pump's leakage just before these times and its standard deviation; `stroke` are the ends of the
-    recorded motion; and `resistance` is what resists the motion (`recording_sums.Resistance`).
+    `sums` (E, m, m) holds for each of E balances the sums of products of its m columns: the `terms`, which must include
+    the leak, and the left side, a flow. Leak and left side must have positive sums of squares, and obey Cauchy's
+    inequality. `shut_sums` (1, m + 2, m + 2) are the sums for a pump that valves cut off at rest, which needs two more
+    columns; `held` are the leaks while valves hold the load; `held_pump` are the pump's leakage just before these times
+    and its standard deviation; `stroke` are the ends of the recorded motion; and `resistance` is what resists the
+    motion (`recording_sums.Resistance`).
     """
     size = len(summary.terms) + 1
     if summary.sums.ndim != 3 or not len(summary.sums) or summary.sums.shape[1:] != (size, size):
@@ -167,11 +151,9 @@ def _check_sums(summary: Any) -> Any:
 
 
 def _check_levels(summary: Any) -> Any:
-    """Return a recording's summary of wavelet details if its `levels` and `duty` are valid; else raise ValueError.
+    """Return a summary of wavelet details if its `levels` (5 per chamber,) and `duty` (4,) are valid; else ValueError.
 
-    `levels` (5 per chamber,) are logarithms of the RMS of the pressures' wavelet details. `duty` (4,) describes how the
-    machine is moved and loaded (`RmsBlocks`). At least one chamber must be named, and all numbers must be below 750 in
-    magnitude.
+    They are logarithms, below 750 in magnitude, as in `RmsBlocks`.
     """
     expected = (len(QUANTITIES) * len(summary.chambers),)
     if not summary.chambers or summary.levels.shape != expected or summary.duty.shape != (len(DUTY),):
@@ -185,9 +167,8 @@ def _check_levels(summary: Any) -> Any:
 def _check_octaves(values: Any) -> Any:
     """Return the spectra of a pair of channels in octaves if they are valid; raise ValueError otherwise.
 
-    `values` (4, k) has one column for each of k octaves. Its rows are the fields of `Octaves`: the logarithms of the
-    RMS of both channels, their phase [rad], and the variance of the phase's error [rad^2], which must not be negative.
-    All numbers must be below 750 in magnitude.
+    `values` (4, k) has a column for each of k octaves, with the fields of `Octaves`: logarithms of the RMS of both
+    channels, their phase [rad], and the variance of the phase's error [rad^2]. All must be below 750 in magnitude.
     """
     if values.ndim != 2 or len(values) != len(Octaves._fields) or values.shape[1] < MIN_OCTAVES:
         shape = f"({len(Octaves._fields)}, k), k >= {MIN_OCTAVES}"
@@ -267,11 +248,7 @@ _ABOUT = {
 
 
 def _restore_arrays(value: Any, name: str) -> Any:
-    """Convert packed arrays in a parsed JSON value, in tables at any depth, to numpy arrays.
-
-    A packed array is a table with the keys "shape" and "f8", where "f8" holds the bytes. `name` is the name of the
-    value. Raises ValueError with the name of an array that cannot be restored.
-    """
+    """Convert packed arrays (tables of "shape" and "f8") at any depth of a JSON value; ValueError names a wrong one."""
     if isinstance(value, dict):
         if value.keys() == {"shape", "f8"}:
             try:
@@ -282,9 +259,8 @@ def _restore_arrays(value: Any, name: str) -> Any:
     return value
 
 
-_BY_METHOD: Any = Annotated[
-    table_type("allow", **_SUMMARIES), BeforeValidator(lambda value: _restore_arrays(value, ""))
-]
+_RESTORED = BeforeValidator(lambda value: _restore_arrays(value, ""))
+_BY_METHOD: Any = Annotated[table_type("allow", **_SUMMARIES), _RESTORED]
 _RECORDING = table_type(
     digest=Annotated[str, Field(min_length=1, max_length=200)],
     units=uniform_table_type(str),
@@ -293,18 +269,15 @@ _RECORDING = table_type(
     start_s=(_Time, None),
     about=(table_type("allow", **{name: (kind, None) for name, kind in _ABOUT.items()}), None),
     summaries=_BY_METHOD,
-    statistics=(
-        Annotated[uniform_table_type(_Statistic), BeforeValidator(lambda value: _restore_arrays(value, ""))],
-        None,
-    ),
+    statistics=(Annotated[uniform_table_type(_Statistic), _RESTORED], None),
 )
 
 
 def _pack_arrays(value: Any) -> Any:
-    """Convert a value for JSON: drop entries of mappings that are None, and pack arrays compactly, at any depth.
+    """Convert a value for JSON: drop entries of mappings that are None, and pack arrays (`plain_array`), at any depth.
 
-    Arrays of numbers, and lists that begin with a float or a list, are packed by `plain_state.plain_array`. Lists with
-    rows of unequal lengths are packed row by row, and arrays of other types become lists.
+    Lists that begin with a float or a list are packed, too, row by row if their rows have unequal lengths. Arrays of
+    other types than numbers become lists.
     """
     if isinstance(value, Mapping):
         return {str(name): _pack_arrays(member) for name, member in value.items() if member is not None}
@@ -322,18 +295,14 @@ def _pack_arrays(value: Any) -> Any:
 
 
 def _format_json(value: Any) -> bytes:
-    """Convert a value to JSON bytes, with arrays packed.
-
-    Raises ValueError for numbers that are not finite, and TypeError for values that JSON cannot represent.
-    """
+    """Convert a value to JSON with packed arrays; raise ValueError if not finite, TypeError if not for JSON."""
     return json.dumps(_pack_arrays(value), allow_nan=False, sort_keys=True, separators=(",", ":")).encode("ascii")
 
 
 def check_summary(method: str, summary: Summary) -> None:
-    """Raise ArithmeticError unless a detector's summary can be stored and read back.
+    """Raise ArithmeticError unless a detector's summary can be stored and read back, e.g. for infinite numbers.
 
-    For example, infinite numbers cannot be stored. An ArithmeticError tells that the recording is the cause, and not a
-    defect of a built-in detector (`log_failure`). `method` is the name of the detector.
+    This error tells that the recording is the cause, not a defect of the detector called `method` (`log_failure`).
     """
     try:
         convert_type(_BY_METHOD, parse_json(_format_json({method: summary})))
@@ -342,10 +311,7 @@ def check_summary(method: str, summary: Summary) -> None:
 
 
 def format_summary(recording: SummarisedRecording) -> Line:
-    """Convert a healthy recording's summaries to a line of the file of summaries.
-
-    Raises InputError if the line could not be read back.
-    """
+    """Convert a healthy recording's summaries to a line of their file; raise InputError if it cannot be read back."""
     fields = {name: value for name, value in vars(recording).items() if name != "file"}
     try:
         data = _format_json(fields)
@@ -359,9 +325,8 @@ def format_summary(recording: SummarisedRecording) -> Line:
 def parse_summary(line: Line, file: str, place: str) -> SummarisedRecording:
     """Parse a line of a file of summaries to the summary of a healthy recording.
 
-    `file` is the name of the recording, and `place` the path of the file of summaries, for error messages. Raises
-    InputError if the checksum does not match, if a value is not valid, or if the line holds too many single values
-    instead of packed arrays.
+    `file` is the recording's name, and `place` the path of the file of summaries, for messages. Raises InputError if
+    the checksum does not match, a value is not valid, or the line holds too many single values instead of arrays.
     """
     if sha256(line.data).hexdigest() != line.checksum:
         rule = f"must have the SHA-256 {line.checksum[:12]}..., got another"
@@ -385,10 +350,9 @@ _REMEDY = "take its [[healthy]] out of the machine's file, or commission it anew
 
 
 def read_summaries(path: Path, files: Mapping[str, str]) -> list[SummarisedRecording]:
-    """Read the summaries of certain recordings, in the order of `files`.
+    """Read the summaries of the recordings in `files`, a mapping of line checksum to recording name, in its order.
 
-    `files` maps the checksum of each recording's line to the recording's name. Raises InputError if the file is
-    missing, of another format or too large, or if a line is missing, damaged or not valid.
+    Raises InputError if the file is missing, of another kind or too large, or if a line is missing or not valid.
     """
     recordings: dict[str, SummarisedRecording] = {}
     for line in _iter_lines(path):
@@ -425,10 +389,7 @@ def write_lines(lines: Collection[Line], path: Path) -> None:
 
 
 def _iter_lines(path: Path) -> Iterator[Line]:
-    """Yield the lines of a file of summaries, without the first line and without incomplete ones.
-
-    Raises InputError if the file cannot be read, is too large or of another format.
-    """
+    """Yield the complete lines of a file of summaries after the first; raise InputError for a file of another kind."""
     noun = "a file of healthy summaries"
     try:
         with open_regular(path, noun) as file:

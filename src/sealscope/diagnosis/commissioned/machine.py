@@ -62,10 +62,8 @@ class JudgedAlarm(NamedTuple):
         Name of the alarm, "" for a repair without an alarm.
     mark : str
         "valid", "invalid" or "repaired".
-    date_s : float
-        Time of the judgement [s since 1970].
-    onset_s : float
-        Time at which the leak began [s since 1970].
+    date_s, onset_s : float
+        Times of the judgement and of the onset of the leak [s since 1970].
     leak_lpm : float or None
         Flow of the leak [L/min], None if unknown.
     reason : str
@@ -87,10 +85,7 @@ class JudgedAlarm(NamedTuple):
 
 
 class Origin(NamedTuple):
-    """Path of the file that a machine was loaded from, and hashes of the parts of its content.
-
-    The hashes reveal if another process has changed the file since.
-    """
+    """Path of the file that a machine was loaded from, and hashes of its parts, to detect changes by others."""
 
     path: Path
     parts: frozenset[bytes]
@@ -151,17 +146,11 @@ class CommissionedMachine:
         return summarise_machine(self.healthy, self.rig, self.left_out)
 
     def read(self, path: str | os.PathLike[str]) -> Recording:
-        """Read a log of the machine with the channel map or, if the log does not fit the map, without a map.
-
-        Raises UnreadableFile if both attempts fail.
-        """
+        """Read a log with the channel map or, if it does not fit, without; raise UnreadableFile if both fail."""
         return read_by_map(path, self.channel_map, self.rate)
 
     def diagnose(
-        self,
-        recording: Recording | str | os.PathLike[str],
-        *,
-        false_alarm_probability: float = FALSE_ALARM_PROBABILITY,
+        self, recording: Recording | str | os.PathLike[str], *, false_alarm_probability: float = FALSE_ALARM_PROBABILITY
     ) -> Diagnosis:
         """Decide whether a recording, or the log at a path, shows a leak, given the machine's healthy recordings.
 
@@ -181,8 +170,7 @@ class CommissionedMachine:
         """Return a copy of the machine with one more healthy recording.
 
         `file` is the name of the recording and `checksum` the SHA-256 of its file. Raises InputError if the recording
-        is judged leaking, overlaps in time with a confirmed leak, is a copy of a known recording, or cannot be
-        trusted.
+        is judged leaking, overlaps in time with a confirmed leak, is a copy of a known recording, or cannot be trusted.
         """
         extended = self._with_recording(recording, file, checksum)
         if self.healthy:
@@ -195,11 +183,7 @@ class CommissionedMachine:
         return extended
 
     def _with_recording(self, recording: Recording, file: str, checksum: str) -> CommissionedMachine:
-        """Return a copy of the machine with one more healthy recording, without testing it for a leak.
-
-        `file`, `checksum`: name and SHA-256 of the log. Raises InputError if the recording cannot be used or is a copy
-        of a known recording.
-        """
+        """Return a copy as `with_healthy` does, without testing the new recording for a leak."""
         rig, _ = assumed_rig(self.rig, recording)
         summarised = summarise_healthy(recording, rig, file, checksum)
         if copy := next((earlier for earlier in self.healthy if earlier.digest == summarised.digest), None):
@@ -211,15 +195,13 @@ class CommissionedMachine:
     def _find_confirmed_leak(self, start_s: float, end_s: float) -> JudgedAlarm | None:
         """Find a confirmed leak that was open between `start_s` and `end_s` [s since 1970]; None if there was none.
 
-        An alarm that was judged "valid" or "repaired" is a confirmed leak, which is open from its onset until the next
-        repair. A later judgement "invalid" of an alarm with the same name revokes the confirmation, unless the later
-        alarm has its onset after the confirmation and is therefore a different one.
+        An alarm judged "valid" or "repaired" is a confirmed leak, open from its onset until the next repair. A later
+        judgement "invalid" of its name revokes it, unless the onset is after the confirmation: then it is another one.
         """
         for k, leak in enumerate(self.alarms):
-            later_judgements = self.alarms[k + 1 :]
             is_revoked = any(
                 later.mark == "invalid" and later.alarm == leak.alarm and later.onset_s <= leak.date_s
-                for later in later_judgements
+                for later in self.alarms[k + 1 :]
             )
             is_repaired = any(
                 alarm.mark == "repaired" and leak.onset_s <= alarm.date_s <= start_s for alarm in self.alarms
@@ -252,8 +234,7 @@ class CommissionedMachine:
 def read_by_map(path: str | os.PathLike[str], channel_map: ChannelMap, rate: float | None) -> Recording:
     """Read a log with the channel map of its machine or, if the log does not fit the map, without a map.
 
-    `rate` is the sampling rate [Hz] of a log without a time column. If both attempts fail, the UnreadableFile of the
-    first attempt is raised.
+    `rate` is the sampling rate [Hz] without a time column. If both fail, the first UnreadableFile is raised.
     """
     if not channel_map:
         return read(path, rate=rate)
@@ -307,50 +288,41 @@ def summarise_healthy(recording: Recording, rig: Rig, file: str, checksum: str =
     the SHA-256 of its file. A detector that fails is left out, and its error is logged. Raises InputError if the
     recording cannot be trusted, or if no detector can use it.
     """
-    with limit_threads():
-        return _summarise(recording, rig, file, checksum)
-
-
-def _summarise(recording: Recording, rig: Rig, file: str, checksum: str) -> SummarisedRecording:
-    """Compute the summaries of a healthy recording by all detectors, without a limit on the number of threads.
-
-    Arguments, result and errors are those of `summarise_healthy`: `rig` states the assumed sizes of the machine, `file`
-    is the name of the recording, and `checksum` the SHA-256 of its file.
-    """
     from sealscope.diagnosis.commissioned.healthy_file import check_summary
     from sealscope.diagnosis.commissioned.summary import describe_recording
 
-    inspection = inspect_recording(recording)
-    part = inspection.part
-    if inspection.defect is not None:
-        raise InputError(f"a healthy recording must be whole, got one that is not: {inspection.defect} ({file})")
-    summaries: dict[str, Summary] = {}
-    with np.errstate(all="ignore"):
-        for name, factory in detectors().items():
-            try:
-                detector = factory(rig)
-                can_learn = hasattr(detector, "learn") and unusable_reason(detector, part) is None
-                if can_learn and (summary := detector.learn(part)) is not None:  # type: ignore[attr-defined]
-                    check_summary(name, summary)
-                    summaries[name] = summary
-            except Exception as error:  # as in a diagnosis, a method that fails is left out
-                distribution = getattr(factory, "distribution", None)  # package of a plug-in, None if built in
-                log_failure(name, distribution, error)
-    if not summaries:
-        raise InputError(f"a healthy recording must hold channels that a method reads, got none such ({file})")
-    if (levels := HealthyLevels().learn(part)) is not None:  # friction, drifts and spectra, beside the detectors
-        summaries[HealthyLevels.name] = levels
-    return SummarisedRecording(
-        file,
-        digest=inspection.digest,
-        units={name: part.units[name] for name in part.channels},
-        rate=part.rate,
-        seconds=recording.duration,
-        start_s=start_seconds(recording, file),
-        summaries=summaries,
-        about={"sha256": checksum, **describe_recording(recording, inspection)},
-        statistics=dict(healthy_surprisals(part, rig)),
-    )
+    with limit_threads():
+        inspection = inspect_recording(recording)
+        part = inspection.part
+        if inspection.defect is not None:
+            raise InputError(f"a healthy recording must be whole, got one that is not: {inspection.defect} ({file})")
+        summaries: dict[str, Summary] = {}
+        with np.errstate(all="ignore"):
+            for name, factory in detectors().items():
+                try:
+                    detector = factory(rig)
+                    can_learn = hasattr(detector, "learn") and unusable_reason(detector, part) is None
+                    if can_learn and (summary := detector.learn(part)) is not None:  # type: ignore[attr-defined]
+                        check_summary(name, summary)
+                        summaries[name] = summary
+                except Exception as error:  # as in a diagnosis, a method that fails is left out
+                    distribution = getattr(factory, "distribution", None)  # package of a plug-in, None if built in
+                    log_failure(name, distribution, error)
+        if not summaries:
+            raise InputError(f"a healthy recording must hold channels that a method reads, got none such ({file})")
+        if (levels := HealthyLevels().learn(part)) is not None:  # friction, drifts and spectra, beside the detectors
+            summaries[HealthyLevels.name] = levels
+        return SummarisedRecording(
+            file,
+            digest=inspection.digest,
+            units={name: part.units[name] for name in part.channels},
+            rate=part.rate,
+            seconds=recording.duration,
+            start_s=start_seconds(recording, file),
+            summaries=summaries,
+            about={"sha256": checksum, **describe_recording(recording, inspection)},
+            statistics=dict(healthy_surprisals(part, rig)),
+        )
 
 
 @checked_call
@@ -433,7 +405,6 @@ def commission(
         raise InputError(f"a machine must have a healthy recording that can be used, got none: {problems[0]}")
 
     def judge(healthy: SummarisedRecording, reference: tuple[SummarisedRecording, ...]) -> Diagnosis:
-        """Diagnose one healthy recording, with the other healthy recordings `reference` as its baseline."""
         recording = recording_of.get(healthy.file) or machine.read(path_of[healthy.file])
         return replace(machine, healthy=reference).diagnose(recording)
 

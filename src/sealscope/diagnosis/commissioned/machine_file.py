@@ -70,10 +70,7 @@ _HEAD = """\
 
 
 def parse_moment(text: Any) -> float:
-    """Parse a time in ISO 8601 format to seconds since 1970; it is in UTC unless it states a time zone.
-
-    Raises ValueError for any other value.
-    """
+    """Parse an ISO 8601 time, in UTC unless it states a zone, to seconds since 1970; raise ValueError if not valid."""
     try:
         moment = datetime.fromisoformat(text)
         seconds = (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
@@ -172,8 +169,8 @@ def update_machine(
     """Apply a change to a machine's file without losing changes that another process makes at the same time.
 
     `change` converts the machine that was read to the machine to write. If another process has written the file
-    meanwhile, `change` is called a second time, with the machine of the new file. Returns the changed machine. Raises
-    InputError as `read_machine`, `write_machine` and `change` do; the file then stays as it was.
+    meanwhile, it is called a second time, with the new file's machine. Returns the changed machine. Raises InputError
+    as `read_machine`, `write_machine` and `change` do; the file then stays as it was.
     """
     target = _resolve_target(path)
     machine = read_machine(target)
@@ -186,10 +183,7 @@ def update_machine(
 
 
 def _resolve_target(path: str | os.PathLike[str]) -> Path:
-    """Follow the links of a path to the file to write.
-
-    Raises InputError if this file's name does not end in .toml, or if its folder does not exist.
-    """
+    """Follow the links of a path to the file to write; raise InputError unless it ends in .toml and has a folder."""
     target = _follow_links(path)
     if target.suffix.lower() != ".toml":
         raise InputError(f"a machine's file must end in .toml, got {target}")
@@ -207,20 +201,16 @@ def _follow_links(path: str | os.PathLike[str]) -> Path:
 
 
 def _lock(target: Path) -> AbstractContextManager[object]:
-    """Lock the machine's file `target` against other processes that write it.
-
-    Entering the returned context raises InputError if another process holds the lock for more than 60 s.
-    """
+    """Lock the file `target` against other writers; entering raises InputError if one holds the lock for over 60 s."""
     return lock_file(target.with_name(f".{target.name}.lock"), _BUSY.format(target), _LONGEST_WAIT)
 
 
 def _write_files(machine: CommissionedMachine, target: Path) -> None:
     """Write the files of a machine: first its summaries, then a backup of the present text, then the new text.
 
-    The text is the TOML file at `target`. In this order an interruption at any time leaves a complete text with all its
-    summaries. The new file of summaries contains those of the machine, and those that the present text or its backup
-    names. Other present summaries are kept while the total size stays below 5 MB (`_SPARE`). Raises InputError if the
-    new text could not be read back.
+    The text is the TOML file at `target`. In this order an interruption leaves a complete text with all its summaries.
+    The file of summaries contains those of the machine, those that the present text or its backup names, and other
+    present ones while the total size stays below 5 MB (`_SPARE`). Raises InputError if the text could not be read back.
     """
     data = _format_text(machine, target)
     _convert_tree(parse_toml(data, "a machine's file", str(target)), str(target))  # raises InputError
@@ -252,11 +242,7 @@ def _format_text(machine: CommissionedMachine, target: Path) -> bytes:
 
 
 def _parse_alarms(rows: Any) -> tuple[JudgedAlarm, ...]:
-    """Parse the tables `[[alarms]]` of a machine's file, in which persons judged alarms.
-
-    The tables are parsed one at a time, which saves memory. Raises ValueError with the number of the first table that
-    is not valid.
-    """
+    """Parse the tables `[[alarms]]` one at a time, to save memory; ValueError states the number of a wrong one."""
     if not isinstance(rows, list):
         raise ValueError(f"alarms must be tables, got {rows!r:.60}")
     alarms = []
@@ -271,12 +257,10 @@ def _parse_alarms(rows: Any) -> tuple[JudgedAlarm, ...]:
 def _hash_parts(tree: Mapping[str, Any]) -> dict[bytes, str]:
     """Hash each part of a machine's file; return a mapping from hash to the description of a change of that part.
 
-    `tree` holds the tables of the file. A part is anything that another process may change: the statements about the
-    machine, one healthy recording, or one judged alarm.
+    Parts are the statements about the machine, each healthy recording, and each judged alarm.
     """
 
     def hash_value(value: Any) -> bytes:
-        """Return the first 16 bytes of the SHA-256 of a plain value."""
         return sha256(json.dumps(value, sort_keys=True, default=str).encode()).digest()[:16]
 
     statements = {name: value for name, value in tree["machine"].items() if name not in _REWRITTEN}
@@ -289,10 +273,9 @@ def _hash_parts(tree: Mapping[str, Any]) -> dict[bytes, str]:
 def _find_change(origin: Origin, present: Mapping[bytes, str], written: Mapping[bytes, str]) -> str | None:
     """Find a change of a machine's file by another process, which writing would undo; None if there is none.
 
-    `origin` holds the hashes of the file's parts at loading, `present` those of the file now, and `written` those of
-    the file to be written; the last two map a hash to the description of a change (`_hash_parts`). A change is an
-    added part, which is present but neither in `origin` nor in `written`, or a removed part, which is in both of these
-    but no longer present. Returns the description of the first change.
+    `origin` has the hashes of the file's parts at loading; `present` and `written` map those of the file now and of the
+    file to be written to the description of a change (`_hash_parts`). A part was added if it is present but in neither
+    of the others, and removed if it is in both of them but no longer present. Returns the first description.
     """
     changes = [text for part, text in present.items() if part not in origin.parts and part not in written]
     changes += [text for part, text in written.items() if part in origin.parts and part not in present]
@@ -307,15 +290,10 @@ def _read_checked(path: Path) -> dict[str, Any]:
 
 
 def _read_tree(path: Path, place: str) -> dict[str, Any]:
-    """Read the tables of a machine's file without checking them.
-
-    `place` is the file's path as stated in error messages. Keys from before version 0.1 get their present names. Raises
-    InputError if the file cannot be read.
-    """
+    """Read the tables of a machine's file, with present names for old keys; raise InputError with the path `place`."""
     tree = read_toml(path, "a machine's file", place)
     rows = tree.get("healthy")
-    tables = [tree.get("machine"), *(rows if isinstance(rows, list) else [])]
-    for table in tables:
+    for table in (tree.get("machine"), *(rows if isinstance(rows, list) else [])):
         for old_name, name in _RENAMED.items():
             if isinstance(table, dict) and old_name in table:
                 table[name] = table.pop(old_name)
@@ -331,21 +309,17 @@ def _read_if_valid(path: Path) -> dict[str, Any]:
 
 
 def _named_summaries(tree: Mapping[str, Any]) -> list[str]:
-    """List the checksums of summaries that a machine's file names.
-
-    `tree` holds the tables of the file. Tables and checksums that are not valid are skipped.
-    """
+    """List the valid checksums of summaries that the tables of a machine's file name."""
     rows = tree.get("healthy")
     checksums = [row.get("summary") for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
     return [checksum for checksum in checksums if isinstance(checksum, str)]
 
 
 def _summaries_path(path: Path, tree: Mapping[str, Any]) -> Path:
-    """Return the path of the file with the summaries of a machine's healthy recordings.
+    """Return the path of the file with the summaries of the healthy recordings of the machine's file at `path`.
 
-    It lies at the `path` of the machine's file, but with the suffix `.healthy` or, before version 0.1, `.lessons`. If
-    neither exists, it is the file that the machine's file states as `summaries` of `[machine]`. `tree` holds the tables
-    of the machine's file.
+    It differs in the suffix, `.healthy` or, before version 0.1, `.lessons`. If neither exists, it is the file that
+    `summaries` of the table `[machine]` names. `tree` holds the tables of the machine's file.
     """
     machine_table = tree.get("machine")
     name = machine_table.get("summaries") if isinstance(machine_table, dict) else None
@@ -397,9 +371,8 @@ def _build_tree(machine: CommissionedMachine, path: Path) -> dict[str, Any]:
 def _format_table(tree: Mapping[str, Any], path: str = "", heading: str = "") -> list[str]:
     """Format a table as lines of TOML: first plain values, then inner tables.
 
-    An inner table of plain values only is formatted as one of the values, on one line, except in the outermost table.
-    `path` is the dotted name of the table, or "" for the whole file, in which a list becomes an array of tables.
-    `heading` is the first line of the table; it is left out for a table without plain values.
+    An inner table of plain values only is a value on one line, except in the outermost table. `path` is the table's
+    dotted name, "" for the file, in which a list becomes an array of tables; `heading` is the line before its values.
     """
     lines, inner_lines = list[str](), list[str]()
     for name, value in tree.items():
@@ -486,11 +459,9 @@ def read_machine(path: str | os.PathLike[str]) -> CommissionedMachine:
 
 
 def _convert_tree(tree: dict[str, Any], place: str) -> dict[str, Any]:
-    """Check the tables of a machine's file and convert their values, for example times to seconds.
+    """Check the tables of a machine's file, raising InputError with the path `place`, and convert their values.
 
-    `tree` holds all tables as read, and `place` is the path of the file for error messages. Returns the converted
-    tables `machine`, `map`, `healthy` and `alarms`; the rig's tables are left out. `map` is absent if the file has no
-    such table. Raises InputError if a value is not valid.
+    Returns the tables `machine`, `map` (if any), `healthy` and `alarms`, with times in seconds, not the rig's.
     """
     try:
         tables: dict[str, Any] = convert_type(_FILE, tree).model_dump(exclude_unset=True)

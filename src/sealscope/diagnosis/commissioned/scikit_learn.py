@@ -65,10 +65,7 @@ class LeakDetector(OutlierMixin, BaseEstimator):  # type: ignore[misc]
         return self
 
     def score_samples(self, X: Paths) -> Array:
-        """Compute minus the leak score of each of n files, shape (n,), as scikit-learn expects low scores of outliers.
-
-        The result is nan for a file that cannot be judged.
-        """
+        """Compute minus the leak score of each of n files, shape (n,), low for outliers; nan if not judged."""
         return -np.array([diagnosis.score for diagnosis in self._diagnoses(X)], dtype=float)
 
     def decision_function(self, X: Paths) -> Array:

@@ -35,10 +35,9 @@ _PRIORS = COMMISSIONED.smallest
 
 
 class TermEstimate(NamedTuple):
-    """Estimated coefficient of one term of the volume balance, such as leakage or compressed oil.
+    """Estimated coefficient of one term of the volume balance, such as leakage or compressed oil, in `unit`.
 
-    `value` is the estimate and `deviation` its standard error. `scatter` is the standard deviation of the estimates
-    from single recordings, None if there is only one recording. `unit` is the unit of all three numbers.
+    `deviation` is its standard error, and `scatter` the standard deviation over recordings, None for a single one.
     """
 
     value: float
@@ -48,22 +47,11 @@ class TermEstimate(NamedTuple):
 
 
 class SmallestLeak(NamedTuple):
-    """The smallest leak that the next recording shows with a stated probability (`power` of `priors.toml`).
+    """The smallest leak that the next recording shows with a stated probability (`power` of `priors.toml`)."""
 
-    Attributes
-    ----------
-    lpm : float or None
-        Flow of the leak [L/min], None if the machine's sizes are not stated.
-    share : float
-        Flow of the leak as a fraction of the pump's mean flow; nan if the pump does not move.
-    halved_by : int or None
-        Factor by which the number of healthy recordings and days must grow to halve this leak. None if no factor that
-        was tried is enough.
-    """
-
-    lpm: float | None
-    share: float
-    halved_by: int | None
+    lpm: float | None  # flow of the leak [L/min], None if the machine's sizes are not stated
+    share: float  # flow of the leak as a fraction of the pump's mean flow; nan if the pump does not move
+    halved_by: int | None  # factor on healthy recordings and days that halves this leak, None if none is enough
 
     def __str__(self) -> str:
         share = f"{100.0 * self.share:.2g} % of the pump's flow"
@@ -72,32 +60,20 @@ class SmallestLeak(NamedTuple):
 
 @dataclass(frozen=True)
 class MachineSummary:
-    """Figures of a machine, estimated from its healthy recordings.
+    """Figures of a machine, estimated from its healthy recordings."""
 
-    Attributes
-    ----------
-    terms : mapping of str to TermEstimate
-        Coefficients of the volume balance by the name of the term.
-    noise : mapping of str to float
-        Standard deviation of the noise of each channel, in the channel's unit.
-    smallest : SmallestLeak or None
-        Smallest detectable leak, None if no volume balance can state one.
-    problems : list of str
-        Problems of the recordings, one line each.
-    """
-
-    terms: Mapping[str, TermEstimate]
-    noise: Mapping[str, float]
-    smallest: SmallestLeak | None
-    problems: list[str] = field(default_factory=list)
+    terms: Mapping[str, TermEstimate]  # coefficients of the volume balance by the name of the term
+    noise: Mapping[str, float]  # standard deviation of the noise of each channel, in the channel's unit
+    smallest: SmallestLeak | None  # smallest detectable leak, None if no volume balance can state one
+    problems: list[str] = field(default_factory=list)  # problems of the recordings, one line each
 
     def text(self, healthy: Sequence[SummarisedRecording], rig: Rig | None) -> str:
-        """Format the summary of a machine as a table of about ten lines of text.
-
-        `healthy` are the summarised recordings, and `rig` the stated sizes of the machine, None if none are stated.
-        """
+        """Format the summary as a table of about ten lines; `rig` states the machine's sizes, if any."""
         units = dict(healthy[0].units) if healthy else {}
-        display_units = {name: _display_unit(healthy, name, unit) for name, unit in units.items()}
+        # units in the log of the first recording, or else the usual ones
+        log_units = healthy[0].about.get("log_units", {}) if healthy else {}
+        usual_units = {"Pa": "bar", "m": "mm"}
+        display_units = {name: str(log_units.get(name) or usual_units.get(unit, unit)) for name, unit in units.items()}
         starts = [recording.start_s for recording in healthy if recording.start_s is not None]
         dates = sorted(datetime.fromtimestamp(start, UTC).date().isoformat() for start in starts)
         span = f", {' to '.join(dict.fromkeys((dates[0], dates[-1])))}" if dates else ""  # equal dates once
@@ -124,11 +100,7 @@ class MachineSummary:
         return "\n".join(paragraphs(rows, columns=16))
 
     def _smallest_leak_rows(self, n_healthy: int, are_dated: bool) -> list[tuple[str, str]]:
-        """Build the table rows on the smallest detectable leak and on the recordings needed to halve it.
-
-        Each row is (heading, text). `n_healthy` is the number of healthy recordings. If `are_dated`, their dates are
-        known, and the number of days is mentioned, too.
-        """
+        """Build the rows (heading, text) on the smallest leak and what halves it; `are_dated`: dates are known."""
         if self.smallest is None:
             needs = "speed or angle of the pump, flow or command, and two recordings"
             return [("smallest leak", f"not known, that needs {needs}; the ringing alone judges")]
@@ -141,11 +113,7 @@ class MachineSummary:
 
 
 def _describe_rig(rig: Rig | None) -> str:
-    """Describe in one line the rig that is stated for a machine.
-
-    The text is the title of the rig or, if only sizes are stated, lists the piston areas and the pump displacement that
-    are stated. If neither is stated, or `rig` is None, the text says that the size is not stated.
-    """
+    """Describe a stated rig in one line: its title or, if only sizes are stated, piston areas and pump displacement."""
     rig = rig or unstated_rig()
     if rig.states("cylinder.M_eq"):  # a whole rig is stated, not sizes alone
         return rig.title or rig.name
@@ -159,21 +127,10 @@ def _describe_rig(rig: Rig | None) -> str:
     return ", ".join(parts) or "size not stated: L/min needs a rig, an area or a displacement"
 
 
-def _display_unit(healthy: Sequence[SummarisedRecording], name: str, unit: str) -> str:
-    """Return the unit in which to display the channel `name`.
-
-    This is its unit in the log of the first healthy recording or, if that is not known, bar for Pa, mm for m and
-    otherwise its SI `unit`.
-    """
-    log_unit = healthy[0].about.get("log_units", {}).get(name)
-    return str(log_unit or {"Pa": "bar", "m": "mm"}.get(unit, unit))
-
-
 def _format_duty(healthy: Sequence[SummarisedRecording], pressure_unit: str) -> str:
     """Format the ranges of pump flow, pressure difference and oil temperature over the healthy recordings.
 
-    Unknown quantities are left out. The flow is known only if displacement or piston areas are stated or a flow meter
-    is recorded. `pressure_unit`: unit in which the pressure difference is displayed.
+    Unknown quantities are left out: the flow is known only with a stated displacement or area, or from a flow meter.
     """
     summaries = [recording.summaries.get(VOLUME_BALANCE, {}) for recording in healthy]
     # "scale": factor from the flow of the balance to the true flow, 0 if unknown
@@ -203,8 +160,6 @@ def describe_recording(recording: Recording, inspection: Inspection) -> dict[str
     - `noise`: standard deviation of the noise of each channel, in the channel's unit.
     - `log_units`: unit of each channel in the log.
     - `wrong`: list of problems as texts.
-
-    `inspection` is the result of `inspect_recording` for the same `recording`.
     """
     part, description = inspection.part, dict[str, Any]()
     if {"p_A", "p_B"} <= set(part.channels) and part.units["p_A"] == "Pa":
@@ -232,11 +187,9 @@ def summarise_machine(
 ) -> MachineSummary:
     """Estimate the figures of a machine from the summaries of its `healthy` recordings.
 
-    The noise of a channel is the median over the recordings. The coefficients of the volume balance are estimated from
-    the recordings with a summary by the volume balance. If a recording has other terms than the first of them, it is
-    not used, and is listed as a problem. The smallest detectable leak is estimated from the same recordings, if there
-    are two or more. `left_out` are texts on recordings that could not be used at all; they become the first problems.
-    `rig` states the machine's sizes; None if nothing is stated.
+    The noise of a channel is the median over the recordings. The coefficients of the volume balance and the smallest
+    detectable leak are estimated from the recordings whose balance has the same terms as the first one; others are
+    listed as problems, and so is each text in `left_out`. `rig` states the machine's sizes; None if nothing is stated.
     """
     problems = [*left_out, *_collect_problems(healthy)]
     noises = defaultdict[str, list[float]](list)
@@ -263,12 +216,11 @@ def summarise_machine(
 
 
 def _estimate_terms(sums: Sequence[Array], rig: Rig, channels: frozenset[str]) -> dict[str, TermEstimate]:
-    """Estimate the coefficients of a volume balance from all recordings together, and their scatter.
+    """Estimate the coefficients of a volume balance from all recordings together, by the name of the term.
 
-    `sums` holds for each recording the Gram matrix (m, m): the products of the balance's columns, summed over rows that
-    are scaled to unit noise. The m columns are the terms and, as the last one, the left side. `rig` and the recorded
-    `channels` determine the terms. The scatter is the standard deviation of the estimates from single recordings.
-    Returns an estimate for each term with an unknown coefficient, by the name of the term.
+    `sums` holds for each recording the Gram matrix (m, m): the products of the balance's columns (the terms and, as the
+    last one, the left side), summed over rows that are scaled to unit noise. `rig` and the recorded `channels`
+    determine the terms; those with a known coefficient are left out. The scatter is that between single recordings.
     """
     equation = equations(rig, channels)[0]  # a rig with a servo valve has several; the first one is used
     roles = ColumnRoles(equation)
@@ -288,8 +240,8 @@ def _estimate_terms(sums: Sequence[Array], rig: Rig, channels: frozenset[str]) -
 def fit_columns(gram: Array, roles: ColumnRoles, columns: Sequence[int]) -> Array:
     """Fit the coefficients x of a volume balance X x = y by least squares, as x = (X'X)^-1 X'y.
 
-    `gram` (m, m): Gram matrix of the balance, i.e. the products of its m columns with each other, summed over the rows;
-    `columns`: indices of the c columns that X consists of; `roles.left`: index of the column y. Returns x (c,).
+    `gram` (m, m) is the balance's Gram matrix, i.e. the products of its m columns summed over the rows, and `columns`
+    are the indices of the c columns in X. Returns x (c,).
     """
     return solve(gram[np.ix_(columns, columns)], gram[columns, roles.left])
 
@@ -297,9 +249,9 @@ def fit_columns(gram: Array, roles: ColumnRoles, columns: Sequence[int]) -> Arra
 def _smallest_leak(balance: VolumeBalance, summaries: Sequence[Summary], channels: frozenset[str]) -> SmallestLeak:
     """Estimate the smallest leak that a recording of a later day will show if the machine moves and is loaded as usual.
 
-    `balance`: detector that made the `summaries` of the healthy recordings; `channels`: names of the recorded channels.
-    The leakage of a recording is compared with the healthy mean by Student's t test. A leak that is detected with the
-    probability `power` (`priors.toml`) raises the leakage by
+    `balance` is the detector that made the `summaries` of the healthy recordings, with these channels. The leakage of a
+    recording is compared with the healthy mean by Student's t test. A leak that is detected with the probability
+    `power` (`priors.toml`) raises the leakage by
 
         rise = (threshold of the test + normal quantile of `power`) * deviation,
 
@@ -308,12 +260,7 @@ def _smallest_leak(balance: VolumeBalance, summaries: Sequence[Summary], channel
     """
     from scipy.special import ndtri
 
-    def smallest_rise(n_repeats: int) -> float:
-        """Estimate the smallest detectable rise of the conductance [m^3/(s Pa)], after more days of healthy recordings.
-
-        `n_repeats`: multiple of the present number of healthy days. The rise is detected with the probability `power`
-        of `priors.toml`. It is the test's threshold plus the normal quantile of `power`, in standard deviations.
-        """
+    def smallest_rise(n_repeats: int) -> float:  # conductance [m^3/(s Pa)] with `n_repeats` times the healthy days
         rise = balance.predict_rise(summaries, channels, n_repeats)
         return float((rise.threshold(FALSE_ALARM_PROBABILITY) + ndtri(_PRIORS.power)) * rise.deviation)
 
@@ -328,10 +275,9 @@ def _smallest_leak(balance: VolumeBalance, summaries: Sequence[Summary], channel
 
 
 def _collect_problems(healthy: Sequence[SummarisedRecording]) -> list[str]:
-    """List the problems of all healthy recordings, one line for each kind of problem.
+    """List the problems of all healthy recordings, one line for each kind: those of equal text before the first colon.
 
-    Problems with the same text before the first colon are of one kind. The line shows the alphabetically last of these
-    texts. It ends with the name of the recording, or with the number of recordings if several have such a problem.
+    A line shows the alphabetically last text of its kind, and the recording's name or the number of recordings.
     """
     by_kind = defaultdict[str, list[tuple[str, str]]](list)
     for recording in healthy:
@@ -348,12 +294,8 @@ def _estimate_noise(values: Array) -> float:
     """Estimate the standard deviation of white noise in a channel from second differences of its samples.
 
     Second differences of white noise have sqrt(6) times its standard deviation, and the median absolute value of a
-    standard normal number is 0.6745:
-
-        noise = median(abs(second differences)) / (0.6745 sqrt(6)).
-
-    The estimate is at least the standard deviation of a rounding error, the channel's resolution / sqrt(12). Returns 0
-    for fewer than three finite values.
+    standard normal number is 0.6745. The estimate is at least the standard deviation of a rounding error, the
+    channel's resolution / sqrt(12), and 0 for fewer than three finite values.
     """
     known = values[np.isfinite(values)]
     if known.size < 3:
@@ -363,10 +305,7 @@ def _estimate_noise(values: Array) -> float:
 
 
 def _describe_vacuum(part: Recording, name: str) -> str:
-    """Describe a pressure sensor that reads below vacuum in about 1 % of the samples or more; else return "".
-
-    `name` is the channel of the recording `part`, a gauge pressure. A channel in another unit than Pa is not tested.
-    """
+    """Describe a gauge pressure, in Pa, that is below vacuum in about 1 % of the samples or more; else return ""."""
     if part.units[name] != "Pa" or not (low_pressure := float(np.quantile(part[name], 0.01))) < -P_ATM:
         return ""
     offset = (-P_ATM - low_pressure) / BAR
@@ -374,11 +313,7 @@ def _describe_vacuum(part: Recording, name: str) -> str:
 
 
 def _describe_glitches(part: Recording, name: str) -> str:
-    """Describe a channel in which single samples stand out from both neighbours by more than the channel's range.
-
-    `name` is the channel of the recording `part`. The result is "" if no sample stands out. The range is the 99 %
-    quantile of the channel minus its 1 % quantile.
-    """
+    """Describe a channel whose single samples stand out by over its range (1 to 99 % quantile); else return ""."""
     values = part[name]
     if len(values) < 3:
         return ""

@@ -37,10 +37,8 @@ class WatchedMachine:
     rig : Rig
         Sizes of the machine. If only the areas are stated, the pump's displacement is measured from the healthy
         recordings.
-    channel_map : mapping of str to str
-        Column of the actuator's logs for each channel.
-    rate : float or None
-        Sampling rate [Hz] of logs without a time column.
+    channel_map, rate : mapping of str to str, float or None
+        Column of the actuator's logs for each channel, and sampling rate [Hz] of logs without a time column.
     limit_lpm : float or None
         Leak at which the machine must be repaired [L/min], None if that needs a piston area that is not stated.
     machine : CommissionedMachine or None
@@ -58,10 +56,9 @@ class WatchedMachine:
 
 
 def load_watched(rig: str) -> WatchedMachine:
-    """Load what the monitor needs of an actuator: rig, channel map, repair limit and healthy recordings.
+    """Load what the monitor needs of an actuator from a rig's name or file, or from a machine's file.
 
-    `rig` is a packaged rig's name, or the path of a rig's or machine's file, ending in ".toml". Only a machine's file
-    gives repair limit, sampling rate and healthy recordings. Raises InputError if the rig or file cannot be read.
+    Only the latter states repair limit and healthy recordings. Raises InputError if it cannot be read.
     """
     if not rig.endswith(".toml") or "machine" not in read_toml(Path(rig), "a rig file", rig):
         named_rig = load_rig(rig)
@@ -81,10 +78,7 @@ def load_watched(rig: str) -> WatchedMachine:
 
 
 def is_remeasured(rig: Rig, rig_before: Rig) -> bool:
-    """Return True if two rigs are equal, except for pump displacements that differ by at most 5 %.
-
-    Two measurements of the displacement of one pump may differ by this much.
-    """
+    """Return True if two rigs differ at most in the pump displacement, and by 5 %, as two measurements of it may."""
     values, values_before = rig.model_dump(), rig_before.model_dump()
     for tree in (values, values_before):
         tree.get("pump", {}).pop("q_b", None)
@@ -92,11 +86,7 @@ def is_remeasured(rig: Rig, rig_before: Rig) -> bool:
 
 
 def _with_measured_displacement(rig: Rig, healthy: tuple[SummarisedRecording, ...]) -> Rig:
-    """Replace the pump's displacement in a rig that states only the piston areas by a measured displacement.
-
-    The new value is the median over the `healthy` recordings in which the displacement was measured. Without such
-    recordings the rig is returned unchanged.
-    """
+    """Give a rig that states only the piston areas the pump displacement measured by the healthy recordings, if any."""
     if rig.states(_DISPLACEMENT) or not rig.states(*_AREAS):
         return rig
     summaries = (recording.summaries.get(VOLUME_BALANCE, {}) for recording in healthy)
@@ -109,18 +99,15 @@ def _with_measured_displacement(rig: Rig, healthy: tuple[SummarisedRecording, ..
 
 
 def _healthy_level(healthy: tuple[SummarisedRecording, ...], rig: Rig) -> HealthyLevel | None:
-    """Estimate the leakage conductance of pump and piston together in the healthy recordings.
+    """Estimate mean, range and deviation of the leakage conductance of pump and piston over healthy recordings.
 
-    Mean, standard deviation and range are over the recordings. The lower end of the range is at least the largest
-    conductance divided by `oil.warmest` of `priors.toml`, the factor by which the warmest oil raises the leakage. The
-    result is None if fewer than two recordings have an estimate.
+    The lower end of the range is at least the largest conductance divided by `oil.warmest` of `priors.toml`, the factor
+    by which the warmest oil raises the leakage. The result is None if fewer than two recordings have an estimate.
     """
     levels = [level for recording in healthy if (level := _leak_conductance(recording, rig)) is not None]
     if len(levels) < _MIN_RECORDINGS:
         return None
-    # the highest level may be due to the warmest oil, which limits how far the lowest one is below it
     low = max(min(levels), max(levels) / INFERENCE.oil.warmest)
-    # the machine is known to be healthy until the start of the last recording
     known_s = max((recording.start_s for recording in healthy if recording.start_s is not None), default=0.0)
     mean, deviation = float(np.mean(levels)), float(np.std(levels, ddof=1))
     return HealthyLevel(mean, low, high=max(levels), deviation=deviation, known_s=known_s, count=len(levels))
@@ -129,9 +116,8 @@ def _healthy_level(healthy: tuple[SummarisedRecording, ...], rig: Rig) -> Health
 def _leak_conductance(recording: SummarisedRecording, rig: Rig) -> float | None:
     """Estimate the leakage conductance of pump and piston together in a recording [m^3/(s Pa)] from its summary.
 
-    The conductance is fitted by least squares to the Gram matrix in the summary by the volume balance, together with
-    the other coefficients of the balance. The result is None without such a summary, for a rig with no or several
-    volume balances (servo valve), or if the fit fails.
+    It is fitted by least squares with the other coefficients of the volume balance. The result is None without a
+    summary by the balance, for a rig with no or several balances (servo valve), or if the fit fails.
     """
     summary, balances = recording.summaries.get(VOLUME_BALANCE), equations(rig, frozenset(recording.units))
     if summary is None or len(balances) != 1:

@@ -30,55 +30,34 @@ LEVEL = "against the rig's file"
 
 
 class LeakTest(NamedTuple):
-    """Result of a test for a leak.
+    """Result of a test for a leak."""
 
-    - `name`: WITHIN (change within the recording), AGAINST (against healthy recordings) or LEVEL (against the limit in
-      the rig's file).
-    - `score`: statistic of the test, which grows with the evidence of a leak.
-    - `threshold`: score that is exceeded without a leak with the `probability` allowed for a false alarm.
-    - `chance`: p-value, i.e. probability of at least this score without a leak.
-    """
-
-    name: str
-    score: float
-    threshold: float
-    chance: float
+    name: str  # WITHIN the recording, AGAINST healthy recordings, or LEVEL: against the limit in the rig's file
+    score: float  # statistic of the test, which grows with the evidence of a leak
+    threshold: float  # score that is exceeded without a leak with the `probability` allowed for a false alarm
+    chance: float  # p-value, i.e. probability of at least this score without a leak
     probability: float
 
 
 class OtherEvent(NamedTuple):
-    """Event other than a leak that explains a rare change in a recording.
+    """Event other than a leak that explains a rare change in a recording."""
 
-    - `cause`: cause of the event, such as "sensor fault".
-    - `description`: the quantities that the event changes, in words.
-    - `probability`: posterior probability of an event with this cause, against other causes and chance.
-    - `observable`: the rarest change that the event explains, as the result of a detector's test.
-    - `chance`: probability that a healthy recording has at least the score of the `observable`.
-    """
-
-    cause: str
-    description: str
-    probability: float
-    observable: Observable
-    chance: float
+    cause: str  # cause of the event, such as "sensor fault"
+    description: str  # the quantities that the event changes, in words
+    probability: float  # posterior probability of an event with this cause, against other causes and chance
+    observable: Observable  # the rarest change that the event explains, as the result of a detector's test
+    chance: float  # probability that a healthy recording has at least the score of the `observable`
 
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """Everything that a decision on one recording depends on.
+    """Everything that a decision on one recording depends on."""
 
-    - `judge`: report of the detector that judges.
-    - `observables`: test results of all detectors that are considered.
-    - `null`: distribution of the test results in healthy recordings.
-    - `false_alarm_probability`: allowed probability of the verdict `leak` on a leak-free recording.
-    - `weigh_rivals`: true if other causes (rivals) compete with a leak; false for a method that decides alone.
-    """
-
-    judge: Observed
-    observables: Sequence[Observable]
-    null: HealthyNull
-    false_alarm_probability: float
-    weigh_rivals: bool = True
+    judge: Observed  # report of the detector that judges
+    observables: Sequence[Observable]  # test results of all detectors that are considered
+    null: HealthyNull  # distribution of the test results in healthy recordings
+    false_alarm_probability: float  # allowed probability of the verdict `leak` on a leak-free recording
+    weigh_rivals: bool = True  # False for a method that decides alone, without other causes (rivals)
 
     @property
     def leak(self) -> LeakMeasure | None:
@@ -92,20 +71,15 @@ class Case:
 
     @cached_property
     def explanations(self) -> tuple[Explanation, ...]:
-        """Sets of events that explain the test results of the recording, each with its posterior probability.
-
-        The most probable set comes first. An event is a change of the machine, its sensors or its motion, such as a
-        leak.
-        """
+        """Sets of events that explain the test results, with posterior probabilities, the most probable first."""
         rise = None if self.leak is None else self.leak.step_rise  # leakage above that of healthy recordings
         return explain(self.observables, self.null.chance, rise)
 
     def leak_probability(self, alarm: LeakTest) -> float:
-        """Compute the probability that a leak past piston or pump, rather than another event, caused an alarm.
+        """Compute the probability that a leak past piston or pump, rather than another event, caused the `alarm`.
 
-        `alarm`: the test that raised the alarm. The result is 1 if other causes are not weighed (`weigh_rivals`). For
-        the test against the limit in the rig's file (LEVEL), it is the probability for the alarm by the test for a
-        change within the recording (WITHIN), or 1 if that test raised no alarm.
+        It is 1 if other causes are not weighed. An alarm by the limit in the rig's file (LEVEL) has the probability of
+        the alarm by the test WITHIN, or 1 if that test raised no alarm.
         """
         if not self.weigh_rivals:
             return 1.0
@@ -115,10 +89,7 @@ class Case:
         return probability_of(self.explanations, *LEAK_EVENTS, data_kind=self._data_kind(alarm))
 
     def external_probability(self, alarm: LeakTest) -> float:
-        """Compute the probability that oil leaks out of the circuit (external leak), given the data of an alarm.
-
-        `alarm`: the test that raised the alarm. The result is 0 if other causes are not weighed (`weigh_rivals`).
-        """
+        """Compute the probability that oil leaks out of the circuit, given the data of an `alarm`; 0 if not weighed."""
         if not self.weigh_rivals:
             return 0.0
         return probability_of(self.explanations, causes=["external leak"], data_kind=self._data_kind(alarm))
@@ -142,8 +113,7 @@ class Case:
     def _data_kind(self, alarm: LeakTest) -> str:
         """Return the kind of data (`Observable.data`) by which the test `alarm` raised its alarm.
 
-        It is `RISE` if measured leakage was compared with healthy recordings. Otherwise it is the kind of data of the
-        judging detector's first test result.
+        It is `RISE` for a comparison with healthy recordings, else that of the judging detector's first test result.
         """
         if alarm.name == AGAINST and self.leak is not None:
             return RISE
@@ -151,18 +121,14 @@ class Case:
 
     @cached_property
     def tests(self) -> tuple[LeakTest, ...]:
-        """The tests for a leak that the detector's report allows.
-
-        Each test has its own allowed probability of a false alarm. Their sum is `false_alarm_probability`.
-        """
+        """The tests that the report allows; their false-alarm probabilities add up to `false_alarm_probability`."""
         return _leak_tests(self, self.leak) if self.leak is not None else _change_tests(self)
 
     @property
     def alarms(self) -> tuple[LeakTest, ...]:
-        """Tests that raise an alarm, i.e. whose p-value is below their allowed false-alarm probability.
+        """Tests whose p-value is below their allowed false-alarm probability.
 
-        They have the order of `tests`, in which the test for a leak that began within the recording is the first. If
-        the leak seems older than the recording, the order is reversed.
+        They have the order of `tests`, WITHIN first, which is reversed if the leak seems older than the recording.
         """
         alarms = [test for test in self.tests if test.chance < test.probability]
         return tuple(alarms if self._has_onset_within else reversed(alarms))
@@ -171,10 +137,9 @@ class Case:
     def _has_onset_within(self) -> bool:
         """True if a leak that began within the recording is a better explanation than an older leak.
 
-        An older leak explains only the rise, i.e. leakage above that of healthy recordings. A leak that began within
-        the recording explains a step (a sudden increase of the leakage) and the rise that this step causes. Without
-        measured leakage or healthy recordings, the result is True. It is also True if the times in which valves hold
-        the load show when the rise began (`rise_onset`).
+        An older leak explains only the rise over healthy recordings. One that began within the recording explains a
+        step (a sudden increase) and the rise that this step causes. The result is True without measured leakage or
+        healthy recordings, or if the times in which valves hold the load show when the rise began (`rise_onset`).
         """
         leak = self.leak
         if leak is None or leak.step_rise is None or leak.rise_onset is not None:
@@ -187,9 +152,8 @@ class Case:
     def other_event(self) -> OtherEvent | None:
         """Event other than a leak that explains a rare change with sufficient probability; None if there is none.
 
-        The changes are tried in the order of their p-values in healthy recordings, the smallest first. The search ends
-        at the first change with a p-value of at least the allowed probability of naming an event by mistake. For each
-        change, single causes are tried first, then groups of causes that the data cannot separate (`joint_causes`).
+        The changes are tried from the smallest p-value up to the allowed probability of naming an event by mistake,
+        first for single causes, then for groups of causes that the data cannot separate (`joint_causes`).
         """
         named_events = [event for event in load_events() if event.cause and event.name not in LEAK_EVENTS]
         candidates_of = {
@@ -216,12 +180,8 @@ class Case:
     def _probability_of_causes(self, causes: Sequence[str], data_kind: str) -> float | None:
         """Compute the probability that one of the causes changed a kind of data, against other causes and chance.
 
-        The result is None, as the causes must not be named, unless three limits (`[explanation]` of `priors.toml`) are
-        exceeded:
-
-        - the probability against other causes and chance must be above `happened`,
-        - the probability against other causes alone must be above `named`,
-        - for each cause alone, the probability against other causes must be above 1 - `sure`.
+        The result is None, as the causes must not be named, unless it is above `happened` (`priors.toml`), that against
+        other causes alone is above `named`, and for each cause alone it is above 1 - `sure`.
         """
         limits = DECISION.explanation
         by_cause = [probability_of(self.explanations, causes=[cause], data_kind=data_kind) for cause in causes]
@@ -236,7 +196,6 @@ class Case:
         events = [event for event in load_events() if event.cause == cause and any(map(event.affects, tests))]
 
         def probability(event: Event) -> float:
-            """Return the probability that the event changed this kind of data."""
             return probability_of(self.explanations, event.name, data_kind=data_kind)
 
         return max(events, key=probability).description
@@ -249,8 +208,8 @@ def _leak_tests(case: Case, leak: LeakMeasure) -> tuple[LeakTest, ...]:
     - AGAINST: a rise over healthy recordings.
     - LEVEL: without healthy recordings, a level above the limit in the rig's file.
 
-    Two tests share the allowed false-alarm probability. The fraction `questions.within` of `priors.toml` goes to WITHIN
-    if the other test is AGAINST, and to LEVEL if that is the other test. The rest goes to the other test of the two.
+    Of the allowed false-alarm probability, the fraction `questions.within` of `priors.toml` goes to WITHIN if the other
+    test is AGAINST, and to LEVEL if that is the other test. The rest goes to the other test of the two.
     """
     from scipy.special import ndtr, ndtri  # standard normal distribution and its inverse
 
@@ -278,21 +237,17 @@ def _leak_tests(case: Case, leak: LeakMeasure) -> tuple[LeakTest, ...]:
 
 
 def step_key(provider: str) -> str:
-    """Return the key under which `HealthyNull` stores a detector's test for a step of the leak within a recording.
-
-    It is the name of the detector, `provider`, and the word "step", such as "volume balance: step".
-    """
+    """Return the key under which `HealthyNull` stores a detector's test for a step, such as "volume balance: step"."""
     return f"{provider}: step"
 
 
 def _change_tests(case: Case) -> tuple[LeakTest, ...]:
     """Make the test for a leak from the report of a detector that does not measure leakage.
 
-    Of the detector's test results (observables) that a leak changes, the one with the smallest p-value gives the score
-    and the calibrated p-value (`HealthyNull.chance`). The result is empty if a leak changes none of them.
-
-    As the detector states no threshold, it is estimated: the score for which the calibrated p-value equals the allowed
-    false-alarm probability, if scores are proportional to the logarithm of the p-value that the detector states.
+    Of the test results that a leak changes, the one with the smallest p-value gives the score and the calibrated
+    p-value (`HealthyNull.chance`). The result is empty if a leak changes none. As the detector states no threshold, it
+    is the score at which the calibrated p-value equals the allowed false-alarm probability, if scores are proportional
+    to the logarithm of the p-value that the detector states.
     """
     leak = next(event for event in load_events() if event.name == LEAK_EVENTS[0])
     affected = [observable for observable in case.judge.observables if leak.affects(observable)]

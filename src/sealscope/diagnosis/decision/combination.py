@@ -27,10 +27,9 @@ ORDER = (VOLUME_BALANCE, PRESSURE_RESPONSE)
 
 
 def rank(detector: str) -> int:
-    """Return the rank of a detector, given its name; the detector of the lowest rank that decides gives the verdict.
+    """Return the rank of the `detector` with this name; the first by rank that decides gives the verdict.
 
-    Detectors that measure the leak have the ranks 0, 1, ... in the sequence of `ORDER`. All plug-ins share the next
-    rank, and the change of RMS has the highest.
+    Detectors in `ORDER` come first, then plug-ins, which share a rank, and last the change of RMS.
     """
     if detector == RMS_CHANGE:
         return len(ORDER) + 1
@@ -38,11 +37,7 @@ def rank(detector: str) -> int:
 
 
 def is_decided(evidence: Evidence) -> bool:
-    """Return True if a detector could use the recording and has decided.
-
-    A detector has decided if its verdict is `leak` or `no leak`, if it states the cause of a change, or if its score is
-    above the threshold (an alarm).
-    """
+    """Return True if a detector could use the recording, and states a verdict, the cause of a change, or an alarm."""
     return evidence.usable and not evidence.abstains
 
 
@@ -50,9 +45,8 @@ def combine(decisions: Sequence[Evidence], refusal: str | None) -> Evidence:
     """Combine the decisions of several detectors into the decision of the first one, by rank, that decides.
 
     All decisions become the `parts` of the result. The change of RMS decides only if no detector that measures the leak
-    can use the recording. The verdict is `cannot tell` if no detector decides. It is `cannot tell` instead of `no leak`
-    if the end of the recording is not judged, or if `refusal` states a reason: a measuring detector failed, or no
-    recording of the given baseline can be compared. Without such a reason, `refusal` is None.
+    can use the recording. The verdict is `cannot tell` if none decides, and instead of `no leak` if the recording's end
+    is not judged or there is a `refusal`: a measuring detector failed, or no recording of the baseline is comparable.
     """
     ranked = sorted(decisions, key=lambda decision: rank(decision.detector))
     usable = [decision for decision in ranked if decision.usable]
@@ -80,9 +74,8 @@ def combine(decisions: Sequence[Evidence], refusal: str | None) -> Evidence:
 def _explain_undecided(ranked: Sequence[Evidence], usable: Sequence[Evidence]) -> Evidence:
     """Make the verdict `cannot tell` with a reason, as no detector decides.
 
-    `ranked`: decisions of all detectors by rank; `usable`: those of detectors that could use the recording. The reason
-    is that of the first usable detector; if this is the change of RMS, the reason of the volume balance comes before.
-    If no detector is usable, the reason is that of the last built-in one, which needs the fewest channels.
+    It is that of the first of the `usable` detectors; that of the volume balance comes before one of the change of RMS.
+    If none is usable, it is the reason of the last built-in one in `ranked`, which needs the fewest channels.
     """
     if usable:
         undecided = usable[0]

@@ -3,11 +3,10 @@
 The verdict is `leak` if both conditions hold for one test of the leakage:
 
 - An alarm: `chance` < `probability` (`Case.alarms`). `chance` is the probability that a healthy recording scores as
-  high, calibrated by healthy recordings. `probability` is the test's share of the allowed probability of a false alarm,
-  which the caller states, by default 0.01. With healthy recordings, the test for a change within the recording gets a
-  quarter, and the comparison with them the rest. Without them, the former gets three quarters if there is a limit in
-  the rig's file to test, which gets the rest, else all (`case._leak_tests`). Score and threshold are the same
-  comparison, for display.
+  high, calibrated by healthy recordings. `probability` is the test's share (`case._leak_tests`) of the allowed
+  probability of a false alarm, by default 0.01. The test for a change within the recording gets a quarter, and the
+  comparison with healthy recordings the rest. Without them, the former gets three quarters if there is a limit in the
+  rig's file to test, which gets the rest, else all. Score and threshold are the same comparison, for display.
 - No better explanation: the probability that a leak caused the alarm (`Case.leak_probability`) is above 0.5, or the
   recording tells only that oil leaks, inside or outside (`Case.shows_leak`). An alarm by the limit in the rig's file is
   judged by the alarm for a change within the recording; without one it is a leak.
@@ -17,7 +16,7 @@ A detector that measures no leakage has a single test, with the whole probabilit
 These three numbers are `[false_alarm] probability`, `[questions] within` and `[explanation] leak` of `priors.toml`.
 
 Otherwise the verdict is `no leak` if the 95 % upper bound of a leak is small enough, i.e. at most the fraction `[worth]
-share` of the pump's flow (`_bound_worth_stating`). It is `cannot tell` if the bound is larger, and the reason
+share` of the pump's flow (`_bound_and_limit`). It is `cannot tell` if the bound is larger, and the reason
 states the bound and the most probable other explanation. No other module states a verdict; `combination.combine`
 chooses among the decisions of several detectors.
 """
@@ -59,25 +58,11 @@ def decide(
     false_alarm_probability: float,
     weigh_rivals: bool = True,
 ) -> Evidence:
-    """Decide on a recording by the report of one detector: leak, no leak, or cannot tell.
+    """Decide on a recording by the report `judge` of one detector: leak, no leak, or cannot tell.
 
-    Parameters
-    ----------
-    judge : Observed
-        Report of the detector that judges.
-    reports : sequence of Observed
-        Reports of all detectors, with or without that of `judge`; their observables may show other causes.
-    null : HealthyNull
-        Distribution of the observables in healthy recordings of the machine.
-    false_alarm_probability : float
-        Allowed probability of the verdict `leak` on a leak-free recording.
-    weigh_rivals : bool, optional
-        True if other causes compete with a leak; False for a method that decides alone.
-
-    Returns
-    -------
-    Evidence
-        The verdict with its reason, the leak's size or bound, and the tests.
+    `reports` are those of all detectors, with or without that of `judge`; their observables may show other causes,
+    which compete with a leak unless `weigh_rivals` is False. `null` is the distribution of the observables in healthy
+    recordings of the machine, and `false_alarm_probability` the allowed probability of `leak` on a leak-free recording.
     """
     if judge.lack:
         return Evidence(CANNOT_TELL, judge.lack, detector=judge.provider, usable=False)
@@ -88,21 +73,20 @@ def decide(
         observables += [observable for report in rivals for observable in report.observables]
     case = Case(judge, observables, null, false_alarm_probability, weigh_rivals)
     alarm = next((alarm for alarm in case.alarms if case.shows_leak(alarm)), None)
-    return _evidence_without_leak(case) if alarm is None else _leak_evidence(case, alarm)
+    return _decide_without_leak(case) if alarm is None else _leak_evidence(case, alarm)
 
 
-def _evidence_without_leak(case: Case) -> Evidence:
-    """Make the evidence of a recording in which no test found a leak, with the verdict `no leak` or `cannot tell`.
+def _decide_without_leak(case: Case) -> Evidence:
+    """Decide, where no test found a leak, on `no leak` if its bound is small enough, else on `cannot tell`.
 
-    The verdict is `no leak` if the upper bound of an undetected leak is small enough (`_decide_without_leak`). If
-    leakage is measured, the evidence states this bound. If another event than a leak explains a rare change, the
-    evidence states the cause of this event.
+    The evidence states the cause of another event that explains a rare change and, if leakage is measured, the bound of
+    an undetected leak.
     """
     alarm = next(iter(case.alarms), None)  # an alarm that has a better explanation than a leak
     leak, other = case.leak, case.other_event
     bound = _leak_bound(case, alarm)
     judged_bound, max_bound = _bound_and_limit(case, bound)
-    verdict = _decide_without_leak(judged_bound, max_bound)
+    verdict: Verdict = NO_LEAK if math.isfinite(judged_bound) and judged_bound <= max_bound else CANNOT_TELL
     evidence = Evidence(verdict, reason="", cause=None if other is None else other.cause)
     evidence = _add_tests(case, evidence, case.tests[0] if case.tests else None)
     if leak is not None:
@@ -116,10 +100,7 @@ def _evidence_without_leak(case: Case) -> Evidence:
 
 
 def _leak_evidence(case: Case, alarm: LeakTest) -> Evidence:
-    """Make the verdict `leak`, with cause and onset of the leak and, if leakage is measured, with its flow.
-
-    `alarm`: test that detected the leak.
-    """
+    """Make the verdict `leak`, detected by the test `alarm`, with cause, onset and, if measured, flow of the leak."""
     leak = case.leak
     if leak is None:
         fields: dict[str, Any] = {"cause": "piston leak"}
@@ -142,11 +123,10 @@ def _leak_evidence(case: Case, alarm: LeakTest) -> Evidence:
 
 
 def _leak_cause(case: Case, leak: LeakMeasure, alarm: LeakTest) -> Cause:
-    """Return the cause of a detected leak, such as "piston or pump leak".
+    """Return the cause of a leak that the test `alarm` detected, such as "piston or pump leak".
 
-    `alarm`: the test that raised the alarm. The cause is "internal or external leak" if the data of this test do not
-    exclude that oil leaves the circuit. Otherwise it is the cause that the detector states (`leak.cause`), except that
-    "piston or pump leak" becomes "piston leak" if a separate test of the pump makes a pump leak improbable.
+    It is "internal or external leak" if this test does not exclude that oil leaves the circuit, else the detector's
+    cause. A "piston or pump leak" becomes a "piston leak" if a separate test makes a pump leak improbable.
     """
     if case.external_probability(alarm) > 1.0 - DECISION.explanation.sure:
         return "internal or external leak"
@@ -156,12 +136,10 @@ def _leak_cause(case: Case, leak: LeakMeasure, alarm: LeakTest) -> Cause:
 
 
 def _size_fields(leak: LeakMeasure, flow: Flow | None) -> dict[str, Any]:
-    """Compute the fields of `Evidence` that state how large a leak is, by their names.
+    """Compute the fields of `Evidence` that state how large a leak is, by their names; none without a `flow`.
 
-    `flow`: mean flow of the leak; without a flow (None) there are no fields; `leak`: measured leakage, with the factors
-    that convert the flow. The flow is stated relative to the machine (`relative`) and, if a factor to L/min is known,
-    in L/min with a 95 % interval, which allows for the smallest and largest ratio of true to stated flow
-    (`leak.flow_factors`). Otherwise the field `refuses` says that L/min are not stated.
+    The mean `flow` is stated relative to the machine and, if `leak` has a factor to L/min, in L/min with a 95 %
+    interval, which allows for the ratio of true to stated flow (`flow_factors`). Otherwise L/min are refused.
     """
     if flow is None:
         return {}
@@ -179,9 +157,8 @@ def _size_fields(leak: LeakMeasure, flow: Flow | None) -> dict[str, Any]:
 def _leak_bound(case: Case, alarm: LeakTest | None) -> float:
     """Compute the 95 % upper bound of a leak's mean flow [m^3/s].
 
-    `alarm`: the first test that raised an alarm, None if no test did. If a leak may have caused the alarm, the bound is
-    at least the upper end of this leak's 95 % interval. The result is infinite if the leakage was not measured, or if
-    the bound is not below the pump's mean flow, provided that the pump moves.
+    If a leak may have caused the first `alarm`, it is at least the upper end of this leak's 95 % interval. The result
+    is infinite if leakage was not measured, or if the bound is not below the mean flow of a pump that moves.
     """
     leak = case.leak
     if leak is None:
@@ -196,36 +173,16 @@ def _leak_bound(case: Case, alarm: LeakTest | None) -> float:
     return np.inf if mean_pump_flow > 0.0 and not bound < mean_pump_flow else bound
 
 
-def _decide_without_leak(bound: float, max_bound: float) -> Verdict:
-    """Return the verdict on a recording in which no test found a leak: `no leak` or `cannot tell`.
-
-    It is `no leak` if `bound`, the 95 % upper bound of an undetected leak, is finite and at most `max_bound`. Both are
-    in the same unit.
-    """
-    is_small = math.isfinite(bound) and bound <= max_bound
-    verdict: Verdict = NO_LEAK if is_small else CANNOT_TELL
-    return verdict
-
-
-def _bound_worth_stating(flow: float) -> float:
-    """Compute the largest upper bound of an undetected leak that still allows the verdict `no leak`.
-
-    `flow`: mean flow of the pump while it delivers. The result is a fraction of this flow (`worth.share` in
-    `priors.toml`), or 0 if `flow` is not positive.
-    """
-    return float(DECISION.worth.share) * flow if flow > 0.0 else 0.0
-
-
 def _bound_and_limit(case: Case, bound: float) -> tuple[float, float]:
     """Return the 95 % upper bound of a leak, and the largest bound that still allows the verdict `no leak`.
 
-    If leakage is measured, both results are flows [m^3/s], and the first one is the argument `bound`. Otherwise both
-    are changes of the logarithm of the pressures' ringing (the RMS of their wavelet details). The bound of the ringing
-    is infinite if the ringing was not measured, after an alarm, or at a sampling rate too low to exclude a leak.
+    If leakage is measured, both are flows [m^3/s]: the argument `bound`, and a fraction (`worth.share` in
+    `priors.toml`) of the flow while the pump delivers. Otherwise they are changes of the logarithm of the pressures'
+    ringing (RMS of their wavelet details), infinite if not measured, after an alarm, or at too low a sampling rate.
     """
     if case.leak is not None:
         _, delivered_flow = case.leak.pump_flow  # mean over the time in which the pump delivers
-        return bound, _bound_worth_stating(delivered_flow)
+        return bound, float(DECISION.worth.share) * delivered_flow if delivered_flow > 0.0 else 0.0
     ringing = case.judge.ringing
     if ringing is None or case.alarms or ringing.rate < RMS_PRIORS.rate.ringing:
         return np.inf, 0.0
@@ -233,10 +190,7 @@ def _bound_and_limit(case: Case, bound: float) -> tuple[float, float]:
 
 
 def _findable_step(case: Case) -> float | None:
-    """Compute the mean flow [m^3/s] of the smallest leak that would be detected if it began within the recording.
-
-    Return None if the recording was not tested for such a leak.
-    """
+    """Compute the mean flow [m^3/s] of the smallest step of a leak that would be detected; None if not tested."""
     test = next((test for test in case.tests if test.name == WITHIN), None)
     if test is None or case.leak is None or case.leak.step is None:
         return None
@@ -246,11 +200,9 @@ def _findable_step(case: Case) -> float | None:
 
 
 def _add_tests(case: Case, evidence: Evidence, judging: LeakTest | None) -> Evidence:
-    """Add to the evidence what the judging detector reports, and the results of the tests for a leak.
+    """Add what the judging detector reports, and the results of its tests, in `parts` if there are several.
 
-    - Of the detector: name, fraction and end of the judged samples, and measured ratio of displacement to area.
-    - Of the test `judging`: score, threshold and p-value. If it is None, no results of tests are added.
-    - If there are several tests, the evidence of each test, as `parts`.
+    The test `judging` gives score, threshold and p-value; None adds no results of tests.
     """
     judge = case.judge
     evidence = replace(evidence, detector=judge.provider, share=judge.share, judged_until=judge.judged_until)

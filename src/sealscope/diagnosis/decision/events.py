@@ -14,41 +14,26 @@ from sealscope.diagnosis.inference.observable import Observable
 
 @dataclass(frozen=True)
 class Event:
-    """An event that may happen to a machine or its instruments within a recording, from `events.toml`.
+    """An event that may happen to a machine or its instruments within a recording, from `events.toml`."""
 
-    `name`: such as "piston leak" or "pump wear"; `cause`: heading under which a verdict names the event, None if a
-    verdict never does; `probability`: prior probability that it begins within a recording; `affected`: patterns "data:
-    name" of the observables that it changes; `disturbed`: patterns of those that it may change as a side effect;
-    `description`: what it changes in the words of a reason, such as "the external leakage on side A".
-    """
-
-    name: str
-    cause: str | None
-    probability: float
-    affected: tuple[str, ...]
-    disturbed: tuple[str, ...]
-    description: str
+    name: str  # such as "piston leak" or "pump wear"
+    cause: str | None  # heading under which a verdict names the event, None if a verdict never does
+    probability: float  # prior probability that it begins within a recording
+    affected: tuple[str, ...]  # patterns "data: name" of the observables that it changes
+    disturbed: tuple[str, ...]  # patterns of those that it may change as a side effect
+    description: str  # what it changes in the words of a reason, such as "the external leakage on side A"
 
     @property
     def is_sized(self) -> bool:
-        """True if the event has a prior on the sizes of its changes, by which changes of unusual size count less.
-
-        Events with a cause, which a verdict may name, have such a prior. It is part of `Observable.advantage`.
-        """
+        """True if a verdict may name the event, which then has a prior on its size (part of `Observable.advantage`)."""
         return self.cause is not None
 
     def affects(self, observable: Observable) -> bool:
-        """Return True if the event changes the quantity that an observable (test result) is about.
-
-        The "data: name" of the observable must match one of the patterns `affected`.
-        """
+        """Return True if the event changes the quantity of an observable: one of the patterns `affected` matches."""
         return _matches(f"{observable.data}: {observable.name}", self.affected)
 
     def may_disturb(self, observable: Observable) -> bool:
-        """Return True if the event may change, as a side effect, the quantity that an observable is about.
-
-        The "data: name" of the observable must match one of the patterns `disturbed`.
-        """
+        """Return True if the event may change the quantity of an observable as a side effect (patterns `disturbed`)."""
         return _matches(f"{observable.data}: {observable.name}", self.disturbed)
 
 

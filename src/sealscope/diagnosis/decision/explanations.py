@@ -21,7 +21,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations, product
-from typing import NamedTuple
 
 import numpy as np
 
@@ -43,17 +42,12 @@ LEAK_EVENTS = ("piston leak", "pump leak")
 
 @dataclass(frozen=True)
 class Explanation:
-    """A set of events that explains the changes in a recording.
-
-    - `probability`: posterior probability of the set, given that some event has happened.
-    - `data`: kinds of data (`Observable.data`) in which the set explains a change.
-    - `odds`: posterior probability of the set over the probability that no event has happened.
-    """
+    """A set of events that explains the changes in a recording."""
 
     events: tuple[Event, ...]
-    probability: float
-    data: frozenset[str] = frozenset()
-    odds: float = 0.0
+    probability: float  # posterior probability of the set, given that some event has happened
+    data: frozenset[str] = frozenset()  # kinds of data (`Observable.data`) in which the set explains a change
+    odds: float = 0.0  # posterior probability of the set over the probability that no event has happened
 
     def has(self, *names: str) -> bool:
         """Return True if this set of events contains one with any of the `names`."""
@@ -73,25 +67,12 @@ def explain(
     chance: Callable[[Observable], float] = lambda observable: observable.chance,
     rise: LeakRise | None = None,
 ) -> tuple[Explanation, ...]:
-    """Find the sets of events that may explain the test results of a recording, with their probabilities.
+    """Find the sets of events that may explain the tests (`observables`) of a recording, the most probable first.
 
-    Parameters
-    ----------
-    observables : sequence of Observable
-        Tests of a recording, by all detectors.
-    chance : callable, optional
-        Probability that a healthy recording has at least the score of an observable (`null.HealthyNull.chance`), by
-        default the one that its detector states (`Observable.chance`).
-    rise : LeakRise, optional
-        Leakage above that of healthy recordings. A leak causes it in proportion to its size and to the time since its
-        onset.
-
-    Returns
-    -------
-    tuple of Explanation
-        Sets of events, such as a piston leak or a sensor drift (`events.toml`), the most probable first: each single
-        event, and combinations of up to `MAX_EVENTS` events that the observables support. The probabilities are
-        conditional on some event having happened.
+    `chance` gives the p-value of an observable (`null.HealthyNull.chance`), by default the one that its detector
+    states, and `rise` is the leakage above that of healthy recordings. Returns the single events of `events.toml`, such
+    as a sensor drift, and combinations of up to `MAX_EVENTS` that the observables support. Their probabilities are
+    given that some event has happened.
     """
     events = load_events()
     log_factors = [(observable, _log_factor(observable, chance(observable), rise)) for observable in observables]
@@ -103,29 +84,26 @@ def explain(
     groups: list[tuple[Event, ...]] = [(event,) for event in events]
     groups += [group for size in range(2, MAX_EVENTS + 1) for group in combinations(supported, size)]
     posteriors = [_explain_by_group(group, gains_of) for group in groups]
-    logarithms = np.array([posterior.logarithm for posterior in posteriors])
+    logarithms = np.array([logarithm for logarithm, _ in posteriors])
     weights = np.exp(logarithms - logarithms.max())
     weights /= weights.sum()
     order = np.argsort(-weights, kind="stable")
     # odds against the empty set of events, whose logarithm is 0: its prior is 1, and it explains no change
     odds = np.exp(np.minimum(logarithms, MAX_LOG_ODDS))
-    return tuple(Explanation(groups[k], float(weights[k]), posteriors[k].data, float(odds[k])) for k in order)
+    return tuple(Explanation(groups[k], float(weights[k]), posteriors[k][1], float(odds[k])) for k in order)
 
 
 def _compare_by_likelihood(log_factors: Sequence[tuple[Observable, float]]) -> list[tuple[Observable, float]]:
     """Reduce the log Bayes factors of terms of the volume balance that describe a change worse than the best term.
 
-    The terms are alternative descriptions of the same residual. A term's log likelihood l is taken as the log Bayes
-    factor of the p-value that its detector states, i.e. without calibration by healthy recordings. L is the log
-    likelihood of the best term, and B its calibrated log Bayes factor. Each term gets
+    The terms are alternative descriptions of the same residual. With a term's log likelihood l, which is the log Bayes
+    factor of its uncalibrated p-value, that of the best term L, the calibrated log Bayes factor B of the best term, and
+    the relative misfit m of models (`explanation.misfit` in `priors.toml`), each term gets
 
-        log factor = max(B - (L - l) / (1 + 2 m L), 0),
+        log factor = max(B - (L - l) / (1 + 2 m L), 0).
 
-    where m is the relative misfit of models (`explanation.misfit` in `priors.toml`). Healthy recordings show how rare
-    the best description is, but are too few to show which term is the best; for that only the judged recording counts.
-
-    `log_factors`: observables with their calibrated log Bayes factors, corrected for the misfit
-    (`_correct_for_misfit`). Log factors of data other than the volume balance are returned unchanged.
+    Healthy recordings show how rare the best description is, but are too few to show which term is the best; for that
+    only the judged recording counts. Calibrated factors of other data are returned unchanged.
     """
     likelihoods = [log_bayes_factor(observable.chance) for observable, _ in log_factors]
     volumes = [k for k, (observable, _) in enumerate(log_factors) if observable.data == VOLUMES]
@@ -143,10 +121,9 @@ def _compare_by_likelihood(log_factors: Sequence[tuple[Observable, float]]) -> l
 
 
 def _correct_for_misfit(log_factors: Sequence[tuple[Observable, float]]) -> list[tuple[Observable, float]]:
-    """Reduce the log Bayes factors of observables, since a model describes its data only approximately.
+    """Divide log Bayes factors by 1 + 2 m B, since a model describes its data only approximately.
 
-    Each factor is divided by 1 + 2 m B, where B is the largest log factor of the same kind of data and m the relative
-    misfit of models (`explanation.misfit` in `priors.toml`).
+    B is the largest log factor of the same kind of data, and m the misfit (`explanation.misfit` in `priors.toml`).
     """
     max_factor: dict[str, float] = {}
     for observable, factor in log_factors:
@@ -155,22 +132,14 @@ def _correct_for_misfit(log_factors: Sequence[tuple[Observable, float]]) -> list
     return [(observable, factor / (1.0 + slope * max_factor[observable.data])) for observable, factor in log_factors]
 
 
-class _Posterior(NamedTuple):
-    """Logarithm of the posterior of a set of events, up to a constant, and the kinds of `data` that it explains."""
-
-    logarithm: float
-    data: frozenset[str]
-
-
-def _explain_by_group(group: Sequence[Event], gains_of: Mapping[str, Sequence[_Gains]]) -> _Posterior:
+def _explain_by_group(group: Sequence[Event], gains_of: Mapping[str, Sequence[_Gains]]) -> tuple[float, frozenset[str]]:
     """Compute the log posterior of a set of events, up to a constant, and the kinds of data that the set explains.
 
-        log posterior = sum of log priors of the events + sum over kinds of data of the largest log Bayes factor,
+        log posterior = sum of log priors of the events + sum over kinds of data of the largest log Bayes factor.
 
-    where the largest factor is chosen among the events of the set (`group`). For the leakage's rise over healthy
-    recordings, the negative factors of events that contradict the rise are added. `gains_of`: log Bayes factors by kind
-    of data, in one mapping for each possible onset of an event, by the name of the event (`_possible_gains`). The
-    combination of onsets with the largest sum counts.
+    For the leakage's rise over healthy recordings, the negative factors of events that contradict it are added.
+    `gains_of` has the log Bayes factors of each event by kind of data, in one mapping for each possible onset
+    (`_possible_gains`). The combination of onsets with the largest sum counts.
     """
     log_prior = float(sum(np.log(event.probability) for event in group))
     best, explained = -np.inf, frozenset[str]()
@@ -183,7 +152,7 @@ def _explain_by_group(group: Sequence[Event], gains_of: Mapping[str, Sequence[_G
             gains[RISE] = max(*rises, 0.0) + sum(min(rise, 0.0) for rise in rises)
         if (total := sum(gains.values())) > best:
             best, explained = total, frozenset(data for data, gain in gains.items() if gain > 0.0)
-    return _Posterior(log_prior + best, explained)
+    return log_prior + best, explained
 
 
 def _possible_gains(
@@ -191,9 +160,9 @@ def _possible_gains(
 ) -> Sequence[_Gains]:
     """Compute an event's log Bayes factors by kind of data, in one mapping for each possible time of its onset.
 
-    `factors`: observables with the log Bayes factors of a change of them, against no change. The first mapping is for
-    an onset within the recording. For a leak, if `rise` is given, a second one is for an onset before the recording:
-    such a leak explains only the leakage above that of healthy recordings (the rise) and no other data.
+    `factors` are observables with the log Bayes factors of a change. The first mapping is for an onset within the
+    recording. A leak gets a second one if `rise` is given, for an onset before the recording: such a leak explains only
+    the leakage above that of healthy recordings (the rise).
     """
     gains = _gains_at_onset(event, factors)
     if rise is None or event.name not in LEAK_EVENTS:
@@ -204,23 +173,17 @@ def _possible_gains(
 
 
 def _gains_at_onset(event: Event, factors: Sequence[tuple[Observable, float]]) -> dict[str, float]:
-    """Compute the log Bayes factors of an event that begins within the recording, by kind of data.
+    """Compute the log Bayes factors (at least 0) of an event that begins within the recording, by kind of data.
 
-    `factors`: observables with the log Bayes factors of a change of them, against no change.
-
-    - Of the observables that the event affects, the one with the largest factor gives the time of the event. The other
-      ones count if they may have changed at the same time.
-    - Side effects of the event on further data count only if an affected observable supports the event. Their factors
-      are limited to the largest factor of an affected observable: a much clearer side effect has another cause.
-
-    Each factor is increased by the log odds by the prior on the size of the change. For each kind of data the largest
-    sum is returned, at least 0.
+    `factors` are observables with the log Bayes factors of a change, which are increased by the log odds by the prior
+    on its size. Of those that the event affects, the largest gives the time of the event; the others count if they may
+    have changed then. Side effects on further data count only if an affected observable supports the event. Their
+    factors are limited to the largest one: a much clearer side effect has another cause.
     """
     affected = [(observable, gain) for observable, gain in factors if event.affects(observable)]
     if not affected:
         return {}
     best_explained, best_gain = max(affected, key=lambda pair: pair[1])
-    # side effects count only if other data support the event
     supporting_data = {observable.data for observable, gain in affected if gain > MIN_LOG_FACTOR}
     side_effects = [
         (observable, min(gain, best_gain))
@@ -237,14 +200,11 @@ def _gains_at_onset(event: Event, factors: Sequence[tuple[Observable, float]]) -
 
 
 def _log_factor(observable: Observable, chance: float, rise: LeakRise | None) -> float:
-    """Compute the log Bayes factor of the hypothesis that an observable has changed, against no change.
+    """Compute the log Bayes factor of a change of an observable from its p-value `chance`.
 
-    `chance`: probability that a healthy recording has at least the observable's score; `rise`: leakage above that of
-    healthy recordings. If the leakage rises, a quantity that describes the same change, such as an external leakage,
-    seems to rise as well. The observable of such a quantity states the log likelihood ratio of its description of the
-    change to that by a leak (`log_ratio_to_leak`), and its log factor is at most
-
-        log factor of the rise + this log likelihood ratio.
+    If the leakage rises above that of healthy recordings (`rise`), a quantity that describes the same change, such as
+    an external leakage, seems to rise as well. Its observable states the log likelihood ratio of its description to
+    that by a leak, and its log factor is at most that of the rise plus this ratio.
     """
     factor = log_bayes_factor(chance)
     if observable.log_ratio_to_leak is None or rise is None:
@@ -254,11 +214,7 @@ def _log_factor(observable: Observable, chance: float, rise: LeakRise | None) ->
 
 
 def log_bayes_factor(chance: float) -> float:
-    """Compute the largest log Bayes factor for a change that a p-value `chance` = c allows.
-
-    c is the probability of at least the observed score without a change. The result is -log(-e c log c) for c < 1/e,
-    else 0 (T. Sellke et al., 2001).
-    """
+    """Compute the largest log Bayes factor that a p-value c allows (Sellke): -log(-e c log c) for c < 1/e, else 0."""
     if chance >= np.exp(-1.0):
         return 0.0
     chance = max(chance, np.finfo(float).tiny)
@@ -266,10 +222,9 @@ def log_bayes_factor(chance: float) -> float:
 
 
 def _coincide(observable: Observable, anchor: Observable) -> bool:
-    """Return True if an observable may have changed at the same time as another, `anchor`.
+    """Return True if two observables may have changed together: an onset is unknown, or the two are near.
 
-    This is so if their onsets differ by at most half the sum of the widths of the onsets' 95 % intervals, or if one of
-    the two has no onset.
+    They are near if they differ by at most half the sum of the widths of their 95 % intervals.
     """
     if observable.onset is None or anchor.onset is None:
         return True
@@ -280,10 +235,9 @@ def _coincide(observable: Observable, anchor: Observable) -> bool:
 def probability_of(
     explanations: Sequence[Explanation], *names: str, causes: Sequence[str] = (), data_kind: str | None = None
 ) -> float:
-    """Compute the probability that an event with one of the `names` or one of the `causes` happened.
+    """Compute the probability of an event with one of the `names` or `causes`; 0 without `explanations`.
 
-    `explanations`: sets of events with their probabilities; `data_kind`: if given, only the sets that explain this kind
-    of data (`Observable.data`) count, and their probabilities are renormalised. The result is 0 if no set remains.
+    With `data_kind`, only those of this kind of data (`Observable.data`) count, renormalised.
     """
     relevant = [explanation for explanation in explanations if data_kind is None or data_kind in explanation.data]
     total = sum(explanation.probability for explanation in relevant)
@@ -296,10 +250,9 @@ def probability_of(
 def probability_against_chance(explanations: Sequence[Explanation], causes: Sequence[str], data_kind: str) -> float:
     """Compute the probability that an event with one of the `causes` changed a kind of data, against all else.
 
-    All else is events with other causes, and chance. Let the odds of a set of events be its probability over that of
-    no event. Over the sets of events (`explanations`) that explain the kind of data `data_kind`, the result is
+    All else is other causes, and chance. Over the `explanations` of this kind of data, with odds against no event,
 
-        sum of the odds of the sets that contain an event with one of the causes / (1 + sum of the odds of all sets).
+        probability = sum of the odds of sets that contain such an event / (1 + sum of all odds).
     """
     relevant = [explanation for explanation in explanations if data_kind in explanation.data]
     matching = sum(explanation.odds for explanation in relevant if explanation.has_cause(*causes))

@@ -34,39 +34,29 @@ NODES = 64
 class HealthyNull:
     """Distribution of p-values in healthy recordings of a machine, by which the p-values of detectors are calibrated.
 
-    `surprisals`: -log(chance) of each observable in each healthy recording, by the key of the observable
-    (`null_key`).
+    `surprisals`: -log(chance) of each observable in each healthy recording, by the observable's key (`null_key`).
     """
 
     surprisals: Mapping[str, Sequence[float]] = field(default_factory=dict)
     _posteriors: dict[str, tuple[Array, Array]] = field(default_factory=dict, init=False)
 
     def chance(self, observable: Observable) -> float:
-        """Compute the probability that a healthy recording has at least the score of an observable.
-
-        It is the p-value that the detector states for the observable, corrected by the p-values that it states for
-        healthy recordings of the machine (`calibrate`). `inflations` are possible mean surprisals of healthy
-        recordings, and `weights` the probabilities of these means.
-        """
+        """Compute the p-value of an observable, corrected by those of healthy recordings as in `calibrate`."""
         weights, inflations = self._inflation(null_key(observable))
         return min(float(weights @ np.exp(-observable.surprisal / inflations)), 1.0)
 
     def calibrate(self, key: str, chance: float) -> float:
         """Correct the p-value `chance` that a detector states for a test, by those it stated for healthy recordings.
 
-        The corrected p-value is the sum over k of w_k chance^(1/lambda_k). lambda_k (`inflations`) are possible mean
-        surprisals of healthy recordings, and w_k their posterior weights, given the `surprisals` by the test's `key`.
+        The result is the sum over k of w_k chance^(1/lambda_k). lambda_k (`inflations`) are possible mean surprisals of
+        healthy recordings, and w_k their posterior weights, given the `surprisals` by the test's `key`.
         """
         weights, inflations = self._inflation(key)
         log_chance = np.log(max(chance, np.finfo(float).tiny))
         return min(float(weights @ np.exp(log_chance / inflations)), 1.0)
 
     def uncalibrated_chance(self, key: str, chance: float) -> float:
-        """Compute the p-value that a detector must state so that the calibrated one is `chance`.
-
-        It is the inverse of `calibrate`, but at least the smallest normal floating-point number. `key`: key of the test
-        in `surprisals`.
-        """
+        """Invert `calibrate`: compute the p-value, above 0, that a detector must state so that it becomes `chance`."""
         max_surprisal = -np.log(np.finfo(float).tiny)
         if self.calibrate(key, np.exp(-max_surprisal)) >= chance:
             return float(np.finfo(float).tiny)
@@ -74,11 +64,7 @@ class HealthyNull:
         return float(np.exp(-surprisal))
 
     def _inflation(self, key: str) -> tuple[Array, Array]:
-        """Return weights and values of lambda, a test's unknown mean surprisal in healthy recordings.
-
-        A surprisal is -log(p-value); its mean is 1 if the p-values are stated correctly. The weights are posterior
-        probabilities; both arrays have the shape (k,). `key`: key of the test in `surprisals`.
-        """
+        """Return weights and values (k,) of lambda (`_inflation_posterior`) for the test with this `key`."""
         if key not in self._posteriors:
             self._posteriors[key] = _inflation_posterior(self.surprisals.get(key, ()))
         return self._posteriors[key]
@@ -87,9 +73,9 @@ class HealthyNull:
 def _inflation_posterior(surprisals: Sequence[float]) -> tuple[Array, Array]:
     """Compute posterior weights and values of lambda, the mean of exponentially distributed surprisals -log(p-value).
 
-    Both arrays have the shape (NODES + 1,); the first value is 1, for a detector that states its p-values correctly.
-    The prior of the other values is exponential in log lambda. The likelihood of n surprisals is
-    lambda^-n exp(-their sum / lambda). Without surprisals both arrays are [1].
+    Both have the shape (NODES + 1,). The first value is 1, for p-values that are stated correctly; the prior of the
+    others is exponential in log lambda. n surprisals have the likelihood lambda^-n exp(-their sum / lambda). Without
+    surprisals both arrays are [1].
     """
     priors = DECISION.null
     if not len(surprisals):
@@ -107,15 +93,11 @@ def _inflation_posterior(surprisals: Sequence[float]) -> tuple[Array, Array]:
 def null_key(observable: Observable) -> str:
     """Return the key under which `HealthyNull` stores an observable, such as "noise: noise of the pressures".
 
-    The key consists of the observable's data and name. An observable without an onset is a comparison with healthy
-    recordings. All comparisons by the same data share one key without a name, such as "details: against".
+    Observables without an onset are comparisons with healthy recordings, and share one key for their kind of data.
     """
     return comparison_key(observable.data) if observable.onset is None else f"{observable.data}: {observable.name}"
 
 
 def comparison_key(data: str) -> str:
-    """Return the key under which `HealthyNull` stores comparisons between recordings, such as "details: against".
-
-    `data`: kind of data, as in `Observable.data`.
-    """
+    """Return the key under which `HealthyNull` stores comparisons of a kind of data, such as "details: against"."""
     return f"{data}: against"

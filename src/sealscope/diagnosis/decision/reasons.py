@@ -26,9 +26,6 @@ from sealscope.diagnosis.verdict.evidence import (
 from sealscope.diagnosis.verdict.states import find_separation
 from sealscope.paragraphs import join_names
 
-#: Minimum sampling rate at which the ringing can be judged [Hz].
-_MIN_RINGING_RATE: float = RMS_PRIORS.rate.ringing
-
 
 @cache
 def _texts() -> Mapping[str, Mapping[str, str]]:
@@ -44,21 +41,22 @@ def text_of(table: str, key: str, **values: Any) -> str:
 def reason_of(case: Case, evidence: Evidence, alarm: LeakTest | None, bound: float, other: OtherEvent | None) -> str:
     """Compose the reason of a verdict in words.
 
-    - Verdict `leak`: a description of the leak, then remarks. `alarm` is the test that detected the leak.
-    - Other verdicts: the bound of an undetected leak, another cause of a change, then remarks. `bound` is the 95 %
-      upper bound of the leak's flow [m^3/s]. The other cause is the event `other`. If `other` is None, but a test
-      raised an `alarm`, it is the most probable explanation other than a leak.
+    For a `leak`, it describes the leak that the test `alarm` detected. Otherwise it states the 95 % upper `bound` of an
+    undetected leak [m^3/s], and the cause of a change: the event `other` or, if there is an alarm, the most probable
+    explanation other than a leak. Remarks follow.
     """
     if evidence.verdict == LEAK:
         return _leak_text(case, evidence, alarm) + _remarks(case)
     text = _bound_text(case, evidence, bound)
     if other is not None:
+        name = other.observable.name
         text += text_of(
             "doubt",
             "event",
             words=other.description,
             onset=_onset_text(other.observable),
-            shown=_observable_text(other),
+            # the description may contain the name of the observable already
+            shown="" if name in other.description else text_of("doubt", "shown", name=name),
             sure=100.0 * other.probability,
             rarity=_rarity_text(other.chance),
         )
@@ -68,11 +66,7 @@ def reason_of(case: Case, evidence: Evidence, alarm: LeakTest | None, bound: flo
 
 
 def _leak_text(case: Case, evidence: Evidence, alarm: LeakTest | None) -> str:
-    """Describe a detected leak in words; `alarm`: test that detected it.
-
-    If leakage is measured, the text states the kind of test, with flows for a level above the limit in the rig's file.
-    Otherwise it states the change with the smallest p-value that the detector has found.
-    """
+    """Describe in words a leak that the test `alarm` detected, or the rarest change if leakage is not measured."""
     if case.leak is None:
         rarest = case.rarest_observable
         if rarest.data == "plug-in":
@@ -94,11 +88,9 @@ def _leak_text(case: Case, evidence: Evidence, alarm: LeakTest | None) -> str:
 def _bound_text(case: Case, evidence: Evidence, bound: float) -> str:
     """State in words how large a leak can be that was not detected.
 
-    - If the detector measures leakage, the text states the upper bound of the flow: in L/min, else as a percentage of
-      the pump's flow, else as "any size". With the verdict `cannot tell`, the text adds advice for a better recording.
-    - If it does not, the text describes the pressures' ringing: its change after an alarm, else the limit of its fall.
-
-    `bound`: 95 % upper bound of the leak's mean flow [m^3/s], infinite if unknown.
+    If leakage is measured, the text states its upper `bound` in L/min, else as a percentage of the pump's flow, else as
+    "any size", and after `cannot tell` how to record better. Otherwise it describes the pressures' ringing: its change
+    after an alarm, else the limit of its fall. `bound`: mean flow [m^3/s], infinite if unknown.
     """
     leak, ringing = case.leak, case.judge.ringing
     if leak is None:
@@ -121,36 +113,29 @@ def _bound_text(case: Case, evidence: Evidence, bound: float) -> str:
 
 
 def _ringing_text(evidence: Evidence, ringing: Ringing | None, provider: str) -> str:
-    """State in words the 95 % upper limit [%] of an undetected fall of the pressures' ringing.
+    """State in words the 95 % upper limit [%] of an undetected fall of the ringing (RMS of the pressures' details).
 
-    The ringing is an oscillation of the pressures, measured by the RMS of their wavelet details. The fall is relative
-    to healthy recordings or, without these, to the start of the same recording.
-
-    - Verdict `cannot tell`: the text says that a fall by this limit would not show; otherwise, that no fall is larger.
-    - Too low a sampling rate: the text also says so or, if the recording has unused columns, names these instead.
-    - Ringing not measured (None): the text says that the detector called `provider` sees no change.
+    The fall is relative to healthy recordings or, without these, to the start of the same recording. After `cannot
+    tell`, the text says that such a fall would not show. If the sampling rate is too low, it says so or names unused
+    columns instead. If the ringing was not measured (None), it says that the detector `provider` sees no change.
     """
     if ringing is None:
         return text_of("bound", "unseen", provider=provider)
     percent = -100.0 * np.expm1(-ringing.bound)  # for a fall of the logarithm of the RMS by `bound`
     key = "ringing_hidden" if evidence.verdict == CANNOT_TELL else "ringing"
     text = text_of("bound", key, percent=percent, where=_against_text(ringing))
-    if ringing.rate < _MIN_RINGING_RATE:
+    min_rate = RMS_PRIORS.rate.ringing  # at which the ringing can be judged [Hz]
+    if ringing.rate < min_rate:
         # unused columns are named first: mapping them helps more than a higher rate
         names = {"names": join_names(ringing.unused, most=4)}
-        key, values = ("unused", names) if ringing.unused else ("slow", {"fast": _MIN_RINGING_RATE})
+        key, values = ("unused", names) if ringing.unused else ("slow", {"fast": min_rate})
         text = f"{text_of('bound', key, rate=ringing.rate, **values)}; {text}"
     # without healthy recordings the ringing is compared with that at the start of the recording
     return text if ringing.healthy else text + text_of("bound", "start")
 
 
 def _changed_ringing_text(case: Case, ringing: Ringing) -> str:
-    """Describe in words the rarest change of the pressures' ringing, and the probability that a leak caused it.
-
-    The ringing is an oscillation of the pressures, measured by the RMS of their wavelet details. The text names the
-    wavelet detail, its change [%], and the onset of the change. For a change without an onset, the text states with how
-    many healthy recordings the ringing was compared (`ringing.healthy`).
-    """
+    """Describe the rarest change of the ringing (RMS of the pressures' details), and the probability of a leak."""
     rarest = case.rarest_observable
     percent = 100.0 * abs(np.expm1(rarest.size))  # `size`: change of the logarithm of the RMS
     where = _onset_text(rarest) or _against_text(ringing)
@@ -159,10 +144,7 @@ def _changed_ringing_text(case: Case, ringing: Ringing) -> str:
 
 
 def _against_text(ringing: Ringing | None) -> str:
-    """State in words with how many healthy recordings the pressures' oscillation (ringing) was compared.
-
-    The text also says if their dates are unknown. It is "" without healthy recordings or ringing (None).
-    """
+    """State with how many healthy recordings the ringing was compared, and if these have no dates; "" without any."""
     if ringing is None or not ringing.healthy:
         return ""
     text = text_of("bound", "against", count=ringing.healthy)
@@ -170,12 +152,11 @@ def _against_text(ringing: Ringing | None) -> str:
 
 
 def _rivals_text(case: Case, alarm: LeakTest) -> str:
-    """Describe the most probable explanation other than a leak, and how to tell this explanation from a leak.
+    """Describe the most probable explanation of an `alarm` other than a leak, and how to tell it from a leak.
 
-    `alarm`: test that raised the alarm. If the explanation has several events, the first one is described. If that
-    event is a change of the operating point, the text states only its time: the onset of the step that looks like a
-    leak. The stated probability is that of all explanations without a leak. The text is "" if that time is unknown, or
-    if there is no explanation without a leak.
+    The stated probability is that of all explanations without a leak. Of several events, the first one is described; of
+    a change of the operating point, only its time: the onset of the step that looks like a leak. The text is "" if that
+    time is unknown, or if there is no explanation without a leak.
     """
     leak_probability = case.leak_probability(alarm)
     best = next((explanation for explanation in case.explanations if not explanation.has(*LEAK_EVENTS)), None)
@@ -206,12 +187,6 @@ def _rivals_text(case: Case, alarm: LeakTest) -> str:
 def _onset_text(observable: Observable) -> str:
     """State in words when the change of an observable began; "" for an observable without an onset."""
     return "" if observable.onset is None else text_of("doubt", "onset", seconds=observable.onset.value)
-
-
-def _observable_text(other: OtherEvent) -> str:
-    """Name the observable that shows an event; "" if the event's description contains this name already."""
-    name = other.observable.name
-    return "" if name in other.description else text_of("doubt", "shown", name=name)
 
 
 def _rarity_text(chance: float) -> str:

@@ -25,8 +25,8 @@ PLUG_IN = "plug-in"
 class Detector(Protocol):
     """A detector, which estimates quantities over a recording and tests them for changes, without a verdict.
 
-    The recordings that a detector receives are uniformly sampled. Missing samples of the chamber pressures and the
-    command are interpolated and marked in `Recording.bridged`. Any other channel may be absent or contain NaN.
+    Recordings are uniformly sampled. Missing samples of the chamber pressures and the command are interpolated and
+    marked in `Recording.bridged`. Any other channel may be absent or contain NaN.
 
     A method `learn(recording)` may return the detector's summary of a healthy recording as plain values, or None. A
     detector with this method also receives stored summaries (`healthy.SummarisedRecording`) as baselines, and reads
@@ -42,8 +42,7 @@ class Detector(Protocol):
     def observe(self, recording: Recording, baseline: Sequence[Any] = ()) -> Observed:
         """Estimate the detector's quantities in a `usable` recording, test each for a change, and report both.
 
-        `baseline` holds different leak-free recordings of the same machine, with any load cycle. If it is empty, only
-        changes within the recording are tested.
+        Without a `baseline` of leak-free recordings of the machine, only changes within the recording are tested.
         """
         ...
 
@@ -53,10 +52,7 @@ Factory = Callable[["Rig"], Detector]
 
 
 def unusable_reason(detector: Detector, recording: Recording) -> str | None:
-    """Return a line of text with the reason why a detector cannot use a recording; None if it can use it.
-
-    Raises TypeError if the detector's method `usable` returns anything other than a text or None.
-    """
+    """Return the reason, one line, that a detector cannot use a recording, or None; raise TypeError for others."""
     reason: Any = detector.usable(recording)
     if reason is None:
         return None
@@ -75,8 +71,7 @@ def make_observable(
     name : str
         Name of the change, in plain words.
     chance : float
-        Probability that a healthy recording changes as much. If several changes were tested, the smallest probability
-        times the number of tests.
+        Probability that a healthy recording changes as much; of several changes, the smallest times their number.
     size : float
         The change, in the detector's own unit; negative for a fall.
     onset : tuple of float, optional
@@ -89,11 +84,10 @@ def make_observable(
 
 
 def validate_report(report: Any, name: str) -> Observed:
-    """Return a detector's report, with `name` as its provider; raise an error if the report is not valid.
+    """Return a detector's report, or single observable, with the detector's `name` as provider, if it is valid.
 
-    `name` is the name of the detector. A single observable counts as a report. Raises TypeError for wrong types, and
-    ArithmeticError for a score that is not finite. Raises ValueError for a chance outside 0 to 1, or if
-    `Observed.lack`, the reason why nothing could be observed, has several lines.
+    Raises TypeError for wrong types, ArithmeticError for a score that is not finite, and ValueError for a chance
+    outside 0 to 1, or if `Observed.lack`, the reason why nothing could be observed, has several lines.
     """
     if isinstance(report, Observable):
         report = Observed(name, (report,))
@@ -114,8 +108,8 @@ def validate_report(report: Any, name: str) -> Observed:
 def log_failure(name: str, distribution: str | None, error: Exception) -> str:
     """Describe the error of the detector `name` in one line, and log it with the traceback, once per process.
 
-    `distribution` is the name of the package that brings the detector, None for a built-in detector. An arithmetic
-    error of a built-in detector is due to impossible readings, not to a defect, and is logged at the debug level.
+    `distribution` is the package of a plug-in, None for a built-in detector. An arithmetic error of the latter is due
+    to impossible readings, not to a defect, and is logged at the debug level.
     """
     if distribution is None and isinstance(error, ArithmeticError | np.linalg.LinAlgError):
         _log.debug("%s cannot be computed", name, exc_info=True)

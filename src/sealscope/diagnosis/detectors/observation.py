@@ -46,18 +46,14 @@ _AT_REST = (VOLUME_BALANCE,)
 def limit_threads() -> AbstractContextManager[object]:
     """Limit the loaded linear-algebra libraries to one thread while the returned context is open.
 
-    The matrices are small. Several threads would make the computation three times slower, and its results would not
-    be reproducible to the last bit.
+    With several threads the small matrices would take three times longer, and results differ in the last bit.
     """
     return _thread_pools(len(sys.modules)).limit(limits=1)  # type: ignore[no-any-return]
 
 
 @lru_cache(maxsize=1)
 def _thread_pools(n_modules: int) -> Any:
-    """Find the thread pools of the loaded linear-algebra libraries, as a `threadpoolctl.ThreadpoolController`.
-
-    The search takes milliseconds, and is repeated only when `n_modules`, the number of imported modules, has changed.
-    """
+    """Find the thread pools of the loaded linear-algebra libraries, again if `n_modules`, the imported ones, change."""
     from threadpoolctl import ThreadpoolController
 
     return ThreadpoolController()
@@ -66,9 +62,7 @@ def _thread_pools(n_modules: int) -> Any:
 def observe_rivals(recording: Recording, baseline: Sequence[Healthy], distrust: str | None = None) -> Observed:
     """Test a recording for changes of duty, noise, mains hum and mean pressures, which may be mistaken for a leak.
 
-    The duty is how the machine is moved and loaded. The changes are tested within the recording and against the healthy
-    recordings of `baseline`. If `distrust` states a reason why the pressures cannot be judged, nothing is tested, and
-    the report only states the reason.
+    They are tested within it and against `baseline`. A reason for `distrust` of the pressures is reported instead.
     """
     if distrust:
         return Observed(SIGNALS, lack=distrust)
@@ -82,9 +76,9 @@ def run_detector(
 ) -> Observed:
     """Run the registered detector called `name` on a recording and return the detector's report.
 
-    `baseline` are healthy recordings of the same machine, and `rig` is the machine that the detector assumes.
-    `distrust` is the reason why the pressures cannot be judged, which the report then states; None if they can. Raises
-    KeyError if there is no such detector. An error of the detector is logged and stated in the report.
+    `baseline` are healthy recordings of the machine, `rig` is the assumed machine, and `distrust` the reason, if any,
+    why the pressures cannot be judged. An error of the detector is logged and stated in the report. Raises KeyError if
+    there is no such detector.
     """
     factory = detectors()[name]
     try:
@@ -94,20 +88,16 @@ def run_detector(
                 raise ValueError(f"its name must be that of its entry point, {name!r}, got {detector.name!r}")
             return _observe(detector, recording, baseline, distrust)
     except Exception as error:  # a plug-in may raise anything
-        distribution = getattr(factory, "distribution", None)  # package of a plug-in, None if built in
-        lack = log_failure(name, distribution, error)
+        lack = log_failure(name, getattr(factory, "distribution", None), error)  # None for a built-in detector
         return Observed(name, lack=lack, has_failed=True)
 
 
 def _observe(detector: Detector, recording: Recording, baseline: Sequence[Healthy], distrust: str | None) -> Observed:
     """Run a detector on a recording, compared with the baseline recordings that the detector can use.
 
-    The report is empty and states the reason in these cases:
-
-    - The pressures cannot be judged. The reason is `distrust`, which is None if they can.
-    - The detector cannot use the recording, or it cannot use any of the given baseline recordings.
-    - There is no baseline, and a pressure does not move for some time. The volume balance, which needs no motion, is
-      exempt.
+    The report is empty and states the reason if there is one not to trust the pressures (`distrust`), or if the
+    detector cannot use the recording or any of the given baseline recordings. Without a baseline, the reason may also
+    be a pressure that does not move for some time, except for the volume balance, which needs no motion.
     """
     lack = unusable_reason(detector, recording) or distrust
     if lack is None and not baseline and detector.name not in _AT_REST:
@@ -130,21 +120,20 @@ def _unusable_baseline(detector: Detector, healthy: Healthy) -> str | None:
 
 
 def healthy_surprisals(recording: Recording, rig: Rig) -> Mapping[str, float]:
-    """Compute the surprisal of each change that the detectors test within a healthy recording.
+    """Compute the surprisal, -log(p-value), of each change that the detectors test within a healthy recording.
 
-    A surprisal is -log of the p-value that a detector states, assuming `rig`. Returns surprisals by the key of the
-    change (`null.null_key`). Keys with the prefix `SHUT` are for a volume balance that assumes that valves cut the pump
-    off at rest. The result is stored with the recording, and computed only once.
+    Returns surprisals by the key of the change (`null.null_key`), given the assumed `rig`. Keys with the prefix `SHUT`
+    are for a volume balance that assumes that valves cut the pump off at rest. The result is cached.
     """
     return compute_once(recording, (SURPRISALS, rig), lambda samples: _compute_surprisals(samples, rig))
 
 
 def _compute_surprisals(recording: Recording, rig: Rig) -> Mapping[str, float]:
-    """Compute the surprisals -log(p-value) of changes within a recording, as `healthy_surprisals` returns them.
+    """Compute the surprisals of changes within a recording, as `healthy_surprisals` returns them.
 
-    Changes of the signals (duty, noise, hum, mean pressures) and of the volume balance are tested. Changes of the
-    pressure response are tested, too, if the balance may be of no use: if there is none, or if no flow is recorded,
-    since a control loop may then hold the load by replacing the leakage. `rig` is the assumed machine.
+    These are changes of the signals (duty, noise, hum, mean pressures) and of the volume balance. The pressure response
+    is tested, too, if there is no balance, or if no flow is recorded, since a control loop may then hold the load by
+    replacing the leakage.
     """
     surprisals = _max_surprisals(observe_signals(recording))
     balance = VolumeBalance(rig)
@@ -164,10 +153,9 @@ def _compute_surprisals(recording: Recording, rig: Rig) -> Mapping[str, float]:
 
 
 def _max_surprisals(report: Observed) -> dict[str, float]:
-    """Collect from a report the largest surprisal of each observable that is tested for a change within the recording.
+    """Collect the largest surprisal, -log(p-value), of each test for a change within a recording, by `null_key`.
 
-    A surprisal is -log of the p-value that the detector states. Returns surprisals by key (`null.null_key`). The test
-    for a step of the leak is included, with the key `case.step_key`.
+    The test for a step of the leak is included, with the key `case.step_key`.
     """
     surprisals: dict[str, float] = {}
     for observable in report.observables:
@@ -182,11 +170,10 @@ def _max_surprisals(report: Observed) -> dict[str, float]:
 def healthy_null(baseline: Sequence[Healthy], rig: Rig, *, shut: bool = False) -> HealthyNull:
     """Collect the surprisals -log(chance) of all tests in healthy recordings, as the null distributions of the tests.
 
-    `chance` is the p-value that a detector states for a test result (observable), assuming `rig`. A test for a change
-    within a recording has one value from each healthy recording. The tests that compare recordings share one list of
-    values for each kind of data (`Observable.data`): each healthy recording is compared with all others, and the
-    largest surprisal of the comparison counts. With `shut`, the volume balance assumes that valves cut the pump off at
-    rest.
+    `chance` is the p-value that a detector states, assuming `rig`. A test for a change within a recording has one value
+    from each recording. Comparisons share one list for each kind of data (`Observable.data`): each recording is
+    compared with all others, and the largest surprisal counts. With `shut`, the volume balance assumes that valves cut
+    the pump off at rest.
     """
     surprisals_by_key = defaultdict[str, list[float]](list)
     for healthy in baseline:
@@ -206,11 +193,10 @@ def healthy_null(baseline: Sequence[Healthy], rig: Rig, *, shut: bool = False) -
 
 
 def compare_healthy(baseline: Sequence[Healthy]) -> Iterator[Sequence[Observable]]:
-    """Compare the ringing of each healthy recording with that of all others, and yield the test results (observables).
+    """Compare the ringing of each healthy recording with that of all others, and yield the test results.
 
-    The ringing is an oscillation of the pressures, measured by the RMS of their wavelet details. Only recordings with
-    the same chambers and sampling rate as the first usable recording are compared. If there are fewer than
-    `MIN_COMPARED` such recordings, nothing is yielded.
+    The ringing is measured by the RMS of the pressures' wavelet details. Recordings with other chambers or another
+    sampling rate than the first usable one are left out. If fewer than `MIN_COMPARED` remain, nothing is yielded.
     """
     detector = RmsChange()
     usable_entries = [entry for entry in baseline if _unusable_baseline(detector, entry) is None]

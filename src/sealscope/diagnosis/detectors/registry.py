@@ -34,11 +34,7 @@ _RESERVED = ("diagnose", "always fire", "never fire")
 
 @dataclass(frozen=True)
 class PlugIn:
-    """Factory of a detector from another installed package; calling it with a rig creates the detector.
-
-    `name` is the detector's name, `distribution` the name of the package, and `make` the function or class that the
-    package registers.
-    """
+    """Factory `make` of the detector called `name`, from the package `distribution`; it is called with a rig."""
 
     name: str
     distribution: str
@@ -50,10 +46,7 @@ class PlugIn:
 
     @property
     def fingerprint(self) -> str:
-        """First 16 digits of the SHA-256 of the source file, to tell results of different versions apart.
-
-        The result is "unknown" if the source file cannot be read.
-        """
+        """First 16 digits of the SHA-256 of the source file, to tell versions apart; "unknown" if it cannot be read."""
         source = getattr(sys.modules.get(getattr(self.make, "__module__", "")), "__file__", None)
         try:
             return sha256(Path(source).read_bytes()).hexdigest()[:16] if source else "unknown"
@@ -85,8 +78,7 @@ def detectors() -> Mapping[str, Factory]:
 def plug_ins(built_in_names: frozenset[str]) -> Mapping[str, PlugIn]:
     """Find the detectors of other installed packages, in the order of their names; the result is cached.
 
-    A detector is left out, and the reason is logged, if it cannot be loaded, or if its name is not valid, is reserved,
-    or belongs to a built-in detector or to a detector found before.
+    A detector is left out, with the reason logged, if it cannot be loaded, or if its name is not valid or taken.
     """
     plug_in_of: dict[str, PlugIn] = {}
     for point in sorted(entry_points(group=GROUP), key=lambda point: (point.name, point.value)):

@@ -56,34 +56,18 @@ N_WAKING: int = _PRIORS.wakes
 
 
 class BlockConductance(NamedTuple):
-    """Leakage conductance of the machine in one block, and the pressure and flow at which it was measured.
+    """Leakage conductance of the machine in one block, and the pressure and flow at which it was measured."""
 
-    Attributes
-    ----------
-    begin, end : float
-        Times at which the samples of the block begin and end [s].
-    g, sd : float
-        Conductance of pump and piston together, and its standard error [m^3/(s Pa)]. Values of `g` can be compared
-        between blocks, as they do not shift when later blocks improve the other coefficients of the volume balance.
-    total : float
-        Conductance with the latest estimates of the other coefficients [m^3/(s Pa)].
-    offset : float
-        Standard error of the conductance that is common to all blocks, due to the other coefficients and to the
-        machine's sizes [m^3/(s Pa)].
-    pressure : float
-        Mean of abs(p_A - p_B) [Pa].
-    pump_flow : float
-        Mean absolute flow that moves the piston [m^3/s].
-    """
-
+    # times at which the samples of the block begin and end [s]
     begin: float
     end: float
+    # conductance of pump and piston, comparable between blocks, and its standard error [m^3/(s Pa)]
     g: float
     sd: float
-    total: float
-    offset: float
-    pressure: float
-    pump_flow: float
+    total: float  # conductance with the latest estimates of the other coefficients [m^3/(s Pa)]
+    offset: float  # standard error that is common to all blocks, due to other coefficients and sizes [m^3/(s Pa)]
+    pressure: float  # mean of abs(p_A - p_B) [Pa]
+    pump_flow: float  # mean absolute flow that moves the piston [m^3/s]
 
     @property
     def lpm(self) -> float:
@@ -97,32 +81,16 @@ class BlockConductance(NamedTuple):
 
 
 class NotJudged(NamedTuple):
-    """Reason why a block has no estimate of its leakage.
+    """Reason why a block has no estimate of its leakage."""
 
-    Attributes
-    ----------
-    end : float
-        End of the block [s].
-    status : str
-        The reason in words; "" for samples before the first block.
-    counter : str
-        Name of the counter to increase by one, "" for none.
-    restarts : bool
-        True if later blocks cannot be compared with earlier ones.
-    """
-
-    end: float
-    status: str
-    counter: str = ""
-    restarts: bool = False
+    end: float  # end of the block [s]
+    status: str  # the reason in words; "" for samples before the first block
+    counter: str = ""  # name of the counter to increase by one, "" for none
+    restarts: bool = False  # True if later blocks cannot be compared with earlier ones
 
     @classmethod
     def with_count(cls, end: float, status: str, restarts: bool = False) -> NotJudged:
-        """Build the result of a block without an estimate, which increases the counter "blocks: " + `status`.
-
-        `end`: end of the block [s]; `status`: the reason in words; `restarts`: True if later blocks cannot be compared
-        with earlier ones.
-        """
+        """Build the result of a block without an estimate, which increases the counter "blocks: " + `status`."""
         return cls(end, status, f"blocks: {status}", restarts)
 
 
@@ -134,9 +102,8 @@ BlockResult = Sequence[BlockConductance] | NotJudged
 def _fit_to_blocks(model: Coefficients, grams: Any, column_order: Any, rows: Any) -> None:
     """Fit the coefficients of a volume balance to K blocks together and store them in `model`.
 
-    `grams` (K, m, m) are the products of all m columns of the balance in each block, and `rows` (K,) the number of
-    equations in each block. `column_order` (n + 2,) holds the indices of the columns to use: n nuisances (terms other
-    than the leak), the leak, and the left side, which is the measured volume.
+    `grams` (K, m, m) are the products of all m columns in each block, and `rows` (K,) its numbers of equations.
+    `column_order` (n + 2,): indices of the columns to use, n terms other than the leak, the leak, the left side.
     """
     for k in range(len(grams)):
         load_block(model, grams[k], column_order)
@@ -150,15 +117,11 @@ def _estimate_leak(
 ) -> tuple[float, float, float, float]:
     """Estimate the leak's coefficient in one block of a volume balance.
 
-    `gram` (m, m) are the products of all m columns of the balance, summed over the `n_equations` equations of the
-    block. `column_order` (n + 2,) holds the indices of the columns to use: n nuisances (terms other than the leak), the
-    leak, and the left side. With `updates_model`, the block is also added to the sums in `model`, from which the
-    nuisances' coefficients are computed. Returns (w, w g, w s, w^2 V) with
-
-    - g: the estimate;
-    - w: its precision;
-    - s: the shift that is subtracted from g to keep the series of estimates continuous;
-    - V: the variance of g due to errors of the nuisances' coefficients.
+    `gram` (m, m) are the products of all m columns, summed over the `n_equations` equations of the block, and
+    `column_order` (n + 2,) the indices of the columns to use: n terms other than the leak (nuisances), the leak, the
+    left side. With `updates_model`, the block is added to the sums in `model`, from which the nuisances' coefficients
+    are computed. Returns (w, w g, w s, w^2 V) with the estimate g, its precision w, the shift s that is subtracted from
+    g to keep the series of estimates continuous, and the variance V of g due to errors of the nuisances.
     """
     load_block(model, gram, column_order)
     return estimate_leak(model, n_equations, updates_model)  # type: ignore[no-any-return]
@@ -167,9 +130,9 @@ def _estimate_leak(
 class LiveBalance:
     """Estimate the leakage conductance of a running machine block by block, from the balance of volumes.
 
-    `rig` states displacement and circuit, and `names` are the channels of the samples. Raises InputError if these
-    channels allow no balance. The estimates do not depend on how the samples are divided into calls. The attributes of
-    the class are explained at `pressures.PressureEstimator`, which has the same interface.
+    `names` are the channels of the samples; InputError is raised if they allow no balance. The estimates do not depend
+    on how the samples are divided into calls. `pressures.PressureEstimator`, which has the same interface, explains
+    the attributes of the class.
     """
 
     method = "volumes"
@@ -180,10 +143,7 @@ class LiveBalance:
     has_begun = True
 
     def __init__(self, rig: Rig, names: Sequence[str], litres: bool | None = None) -> None:
-        """Set up the volume balance for a rig and the channels `names`, with no samples yet.
-
-        `litres` tells if the rig states the sizes that are needed for L/min; by default this is found from the rig.
-        """
+        """Set up the balance; `litres` tells if L/min can be stated, by default found from the sizes in the rig."""
         self._balances = live_equations(rig, names, with_tested_terms=True)
         if not self._balances:
             needed = format_ways(rig.circuit.watched_by)
@@ -197,14 +157,11 @@ class LiveBalance:
         self.litres = self.states_flow(rig) if litres is None else litres
         self._roles = tuple(map(ColumnRoles, self._balances))
         self._n_columns = self._roles[0].left + 1  # the left side is the last column
-        nuisances = [[k for k in roles.nuisance if k != roles.leak] for roles in self._roles]  # not the leak
-        self._column_orders = [
-            np.array([*nuisance, roles.leak, roles.left])
-            for nuisance, roles in zip(nuisances, self._roles, strict=True)
-        ]
-        self._models = [
-            Coefficients(*(np.zeros(shape) for shape in coefficient_shapes(len(nuisance)))) for nuisance in nuisances
-        ]
+        self._column_orders, self._models = [], list[Coefficients]()
+        for roles in self._roles:
+            nuisance = [k for k in roles.nuisance if k != roles.leak]
+            self._column_orders.append(np.array([*nuisance, roles.leak, roles.left]))
+            self._models.append(Coefficients(*map(np.zeros, coefficient_shapes(len(nuisance)))))
         self._precision = 0.0  # precision of a usual block's conductance; 0 before the coefficients are learned
         self._moving = 0  # number of successive blocks that move far more than the usual ones
         self._stored: Blocks | None = None  # the last blocks, packed
@@ -222,10 +179,9 @@ class LiveBalance:
     def take(self, run: SampleRun) -> Iterator[BlockResult]:
         """Process the next samples, and yield the result of each block of the volume balance that they complete.
 
-        A result is the conductance of a block, or a `NotJudged` with the reason why there is none. The first `LEARNED`
-        blocks are estimated together: the result of the last one has the conductances of all. The next block is
-        processed only when its result is asked for. After a gap, or a change of the sampling rate, the coefficients of
-        the balance are kept, and earlier samples that do not fill a block are dropped.
+        The next block is processed only when its result is asked for. The first `LEARNED` blocks are estimated
+        together: the result of the last one has the conductances of all. After a gap, or a change of the sampling
+        rate, the coefficients of the balance are kept, and earlier samples that do not fill a block are dropped.
         """
         stream = self._stream
         if stream is None or not run.follows:
@@ -241,22 +197,16 @@ class LiveBalance:
         yield from self._take_blocks(stream.push({name: run.channels[name] for name in self.names}))
 
     def _make_stream(self) -> BlockStream:
-        """Build the object that divides samples at the present sampling rate into blocks.
-
-        This object also stores the samples of each complete block, from which `_take_blocks` computes features.
-        """
-
-        def store_samples(begin: float, samples: Mapping[str, Array]) -> None:
-            self._closed_samples.append((begin, samples, self._rate))
-
-        return BlockStream(self._balances, self._rate, BLOCK_SECONDS, on_samples=store_samples)
+        """Build the object that divides samples at the present rate into blocks, and stores the samples of each."""
+        return BlockStream(
+            self._balances,
+            self._rate,
+            BLOCK_SECONDS,
+            on_samples=lambda begin, samples: self._closed_samples.append((begin, samples, self._rate)),
+        )
 
     def _take_blocks(self, blocks: Blocks | None) -> Iterator[BlockResult]:
-        """Process complete blocks of samples, and yield the result of each: conductances, or a `NotJudged`.
-
-        `blocks` hold the sums of the volume balance, None if no block is complete. The samples of the same blocks have
-        been stored (`_closed_samples`); their features are added to `_signals`.
-        """
+        """Yield the result of each complete block, if any, and store the features of its samples in `_signals`."""
         closed_samples, self._closed_samples = self._closed_samples, []
         for block, samples in zip([] if blocks is None else _split(blocks), closed_samples, strict=True):
             self._signals.take(*samples)
@@ -265,12 +215,9 @@ class LiveBalance:
     def _take_block(self, block: Blocks) -> BlockResult:
         """Estimate the leakage conductance in a block, or store the block until the coefficients can be fitted.
 
-        The first `LEARNED` blocks are stored, and the last of them gives the conductances of all. The result is a
-        `NotJudged`
-
-        - for the stored blocks before the last one,
-        - for a block with missing values or at standstill,
-        - after `N_WAKING` successive blocks that move far more than usual; the coefficients are then learned anew.
+        The first `LEARNED` blocks are stored, and the last of them gives the conductances of all. The others give a
+        `NotJudged`, as do blocks with missing values or at standstill. After `N_WAKING` successive blocks that move far
+        more than usual, the coefficients are learned anew.
         """
         _, end = self._sample_times(block)
         if not block.rows[0]:
@@ -285,8 +232,7 @@ class LiveBalance:
                 return NotJudged(end, "learning", counter="blocks: moves as never before", restarts=True)
             estimate = self._estimate_block(block)
             return estimate if isinstance(estimate, NotJudged) else [estimate]
-        has_moved = _volume_square(block) > 0.0
-        if not has_moved and not self._waiting:
+        if not self._waiting and not _volume_square(block) > 0.0:
             return NotJudged.with_count(end, "at standstill")
         self._waiting += 1
         if self._waiting < LEARNED:
@@ -296,11 +242,7 @@ class LiveBalance:
         return self._estimate_first_blocks(first_blocks) or NotJudged(end, "at standstill")
 
     def _estimate_first_blocks(self, blocks: Blocks) -> list[BlockConductance]:
-        """Fit the coefficients of the volume balance to the first blocks, and return the leakage conductance in each.
-
-        The median precision of the conductances becomes the usual precision. Blocks at standstill are left out of the
-        result.
-        """
+        """Fit coefficients and usual precision to the first blocks; return the conductances of those in motion."""
         for number, (model, column_order) in enumerate(zip(self._models, self._column_orders, strict=True)):
             grams = np.ascontiguousarray(blocks.gram[:, number])  # products of one balance in each block
             _fit_to_blocks(model, grams, column_order, blocks.rows)
@@ -311,10 +253,7 @@ class LiveBalance:
 
     @property
     def _half_stride(self) -> float:
-        """Time [s] by which the samples of a block begin before its first equation, and end after its last one.
-
-        It is half the time between successive equations.
-        """
+        """Half the time between equations [s], by which a block's samples extend beyond the first and the last."""
         return 0.5 * stride_samples(self._rate) / self._rate
 
     def _sample_times(self, block: Blocks) -> tuple[float, float]:
@@ -323,15 +262,12 @@ class LiveBalance:
 
     def _relative_motion(self, block: Blocks) -> float:
         """Compute the mean square of the measured volume in a block, divided by that in earlier blocks."""
-        n_equations = float(block.rows[0])
-        return relative_motion(_volume_square(block), n_equations, self._models[0].numbers)
+        return relative_motion(_volume_square(block), float(block.rows[0]), self._models[0].numbers)
 
     def _solve_block(self, block: Blocks, updates_model: bool = True) -> tuple[float, ...]:
-        """Estimate the leak in a block from all volume balances of the machine together.
+        """Sum the results of the function `_estimate_leak` in a block (w, w g, w s, w^2 V) over all volume balances.
 
-        For each balance, `_estimate_leak` gives the estimate g with its precision w, a shift s and a variance V. The
-        result is the sums of w, w g, w s and w^2 V over the balances. With `updates_model`, the block also updates the
-        other coefficients of the balances.
+        With `updates_model`, the block also updates the other coefficients of the balances.
         """
         n_equations = float(block.rows[0])
         results = [
@@ -343,13 +279,9 @@ class LiveBalance:
     def _estimate_block(self, block: Blocks, updates_model: bool = True) -> BlockConductance | NotJudged:
         """Estimate the leakage conductance in a block from the volume balance.
 
-        - `total` is the conductance with the latest estimates of the balance's other coefficients.
-        - `g` is `total` minus a shift, which keeps the series of `g` continuous while these estimates improve.
-        - `sd` is the part of the standard error that is due to this block alone, and `offset` the part that is common
-          to all blocks.
-
-        Returns a `NotJudged` if the machine stands still and the estimate is therefore too uncertain. With
-        `updates_model`, the block also updates the other coefficients.
+        `sd` is the part of the standard error that is due to this block alone. Returns a `NotJudged` if the machine
+        stands still and the estimate is therefore too uncertain. With `updates_model`, the block also updates the other
+        coefficients.
         """
         begin, end = self._sample_times(block)
         at_standstill = self._relative_motion(block) < STANDSTILL
@@ -366,11 +298,7 @@ class LiveBalance:
         return BlockConductance(begin, end, g, sd, total, offset, pressure, pump_flow)
 
     def relearn(self, since: float = math.inf) -> None:
-        """Drop all learned coefficients of the volume balance, for example after a repair.
-
-        They are then learned anew from the blocks, stored or future, that begin at `since` [s] or later. By default
-        these are the future blocks.
-        """
+        """Drop the coefficients, and learn new ones from stored or future blocks that begin at `since` [s] or later."""
         for model in self._models:
             for values in model:
                 values[:] = 0.0
@@ -378,10 +306,9 @@ class LiveBalance:
         self._waiting = 0 if self._stored is None else int(np.count_nonzero(self._stored.start >= since))
 
     def observables(self, since: float, end: float, onset: float) -> tuple[Observable, ...] | None:
-        """Test the terms of the volume balance and the signals of the last blocks for changes.
+        """Test terms of the volume balance and signals of the last blocks, from `since` to `end` [s], for changes.
 
-        The blocks are those from the time `since` to the block that ends at `end` [s]. The result is None if the
-        stored blocks do not reach from `onset` to `end`, and an empty tuple if there are too few blocks.
+        The result is None if the stored blocks do not reach from `onset` to `end`, and empty if there are too few.
         """
         stored = self._stored
         if stored is None:
@@ -407,10 +334,7 @@ class LiveBalance:
         }
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Restore coefficients and blocks saved by `state`, so that later results are identical to the last bit.
-
-        Raises InputError if the state does not fit this rig and these channels.
-        """
+        """Restore, to the last bit, what `state` saved; raise InputError if it does not fit rig and channels."""
         restore_attributes(self, _SAVED, state)
         saved_models = require_part(state, "known", list)
         if len(saved_models) != len(self._models):
@@ -441,19 +365,15 @@ def _volume_square(block: Blocks) -> float:
 
 
 def size_error(rig: Rig) -> float:
-    """Return the relative standard error of all flows, due to the error of the size from which they are computed.
-
-    This size is the pump's displacement or, behind a servo valve, the piston area.
-    """
+    """Return the relative standard error of all flows: that of the pump displacement or, with a valve, of the area."""
     return float(getattr(INFERENCE.size, rig.circuit.flow_size))
 
 
 def live_equations(rig: Rig, names: Sequence[str], with_tested_terms: bool = False) -> list[Equation]:
     """Build the volume balances of a running machine that the channels `names` allow.
 
-    Balances whose flow is computed from the command are left out. The term of the pump's leakage is left out, too, as
-    it cannot be distinguished from the piston's leakage. `with_tested_terms` includes terms that are not fitted, but
-    only tested for a change, such as those that are zero in a healthy machine.
+    Balances whose flow is computed from the command are left out, and the term of the pump's leakage, which cannot be
+    distinguished from the piston's. `with_tested_terms` includes terms that are only tested for a change, not fitted.
     """
     balances = []
     for balance in equations(rig, frozenset(names)):

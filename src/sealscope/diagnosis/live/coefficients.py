@@ -58,10 +58,8 @@ class Coefficients(NamedTuple):
         - `ENERGY`: sum of squares of the leak's column,
         - `SHIFT`: shift that is subtracted from the estimates of the leak, so that their series remains continuous,
         - `MISFIT`: residual variance of the last block over the usual variance.
-    block : ndarray, shape (n + 2, n + 2)
-        Work array: the products of one block.
-    matrix : ndarray, shape (n, n + 3)
-        Work array: the normal equations.
+    block, matrix : ndarray, shape (n + 2, n + 2) and (n, n + 3)
+        Work arrays: the products of one block, and the normal equations.
     """
 
     sums: Any
@@ -81,9 +79,8 @@ def coefficient_shapes(n: int) -> tuple[tuple[int, ...], ...]:
 def load_block(model: Any, gram: Any, column_order: Any) -> None:
     """Copy the products of a volume balance's columns in one block to `model.block` (n + 2, n + 2).
 
-    `model` is a `Coefficients`, and `gram` (m, m) holds the products of all m columns. `column_order` (n + 2,) holds
-    the indices of the columns to copy, in this order: n nuisances (terms other than the leak), the leak, and the left
-    side.
+    `model` is a `Coefficients`, and `gram` (m, m) holds the products of all m columns. `column_order` (n + 2,): indices
+    of the columns to copy, n nuisances (terms other than the leak), the leak, the left side.
     """
     for i in range(len(column_order)):
         for j in range(len(column_order)):
@@ -143,11 +140,10 @@ def _solve(model: Any) -> None:
 
 @large_law
 def _sum_residual_squares(sums: Any, solution: Any) -> float:
-    """Compute a volume balance's residual sum of squares for given coefficients other than the leak's.
+    """Compute a volume balance's residual sum of squares for given nuisances (coefficients other than the leak's).
 
-    The leak's coefficient is the one that minimises this sum. `sums` (n + 2, n + 2) are the products of the columns of
-    n nuisances (coefficients other than the leak's), leak and left side. Column 0 of `solution` (n, k) holds the
-    nuisances.
+    The leak's coefficient is the one that minimises it. `sums` (n + 2, n + 2) are the products of the columns of n
+    nuisances, leak and left side. Column 0 of `solution` (n, k) holds the nuisances.
     """
     n, square, leak_moment = len(solution), 0.0, 0.0
     # with the left side y, the columns X of the nuisances c and the column l of the leak, the sum is
@@ -167,10 +163,9 @@ def _sum_residual_squares(sums: Any, solution: Any) -> float:
 
 @large_law
 def fit_coefficients(model: Any) -> None:
-    """Compute a volume balance's coefficients other than the leak's, and the variance of its equations.
+    """Compute a volume balance's coefficients other than the leak's, and the variance of its equations, into `model`.
 
-    The coefficients are the least-squares estimate from the sums over blocks in `model`, a `Coefficients`. The variance
-    is the residual sum of squares divided by the number of equations. Both are stored in `model`.
+    They are the least-squares estimate from the sums over blocks in `model`, a `Coefficients`, and its mean square.
     """
     n = len(model.matrix)
     solution = model.matrix[:, n:]
@@ -187,12 +182,11 @@ def fit_coefficients(model: Any) -> None:
 def _learn_block(model: Any, rows: float, g: float) -> float:
     """Add the products in `model.block` to the sums over blocks, update the usual noise, and return the block's weight.
 
-    `model` is a `Coefficients`, `rows` the number of equations in the block, and `g` the leak's coefficient in this
-    block. Column n of `model.matrix` holds the n coefficients other than the leak's (`_solve`). The usual noise is the
-    variance of an equation's residual, averaged over earlier blocks with fading memory. `MISFIT` is the residual
-    variance of this block divided by the usual noise. The weight of the block is 1, or `JUMP`^2 / MISFIT if this is
-    less. If g differs from its earlier estimate by more than `JUMP` standard deviations, the leak has stepped, and
-    earlier blocks do not constrain it any more.
+    `model` is a `Coefficients`, `rows` the number of equations in the block, and `g` its leak coefficient. Column n of
+    `model.matrix` holds the n other coefficients (`_solve`). The usual noise is the variance of an equation's residual,
+    with fading memory; `MISFIT` is that of this block over it. The weight is 1, or `JUMP`^2 / MISFIT if this is less.
+    If g differs from its earlier estimate by more than `JUMP` standard deviations, the leak has stepped, and earlier
+    blocks do not constrain it any more.
     """
     sums, numbers, n = model.sums, model.numbers, len(model.matrix)
     variance = max(_sum_residual_squares(model.block, model.matrix[:, n:]), 0.0) / rows
@@ -217,14 +211,10 @@ def _learn_block(model: Any, rows: float, g: float) -> float:
 def estimate_leak(model: Any, rows: float, is_learned: bool) -> tuple[float, float, float, float]:
     """Estimate the leak's coefficient in one block; with `is_learned`, also add the block to the earlier ones.
 
-    `model` is a `Coefficients`, whose `block` holds the products of the block, and `rows` is the block's number of
-    equations. Returns (w, w g, w s, w^2 V) with
-
-    - g: the estimate;
-    - w: its precision;
-    - s: the shift that is subtracted from g to keep the series of estimates continuous while the other coefficients
-      (nuisances) improve;
-    - V: the variance of g due to the errors of the nuisances.
+    `model` is a `Coefficients`, whose `block` holds the products of the block, and `rows` is its number of equations.
+    Returns (w, w g, w s, w^2 V) with the estimate g, its precision w, the shift s that is subtracted from g to keep the
+    series of estimates continuous while the other coefficients (nuisances) improve, and the variance V of g due to
+    their errors.
     """
     block, n, numbers = model.block, len(model.matrix), model.numbers
     # C: normal matrix of the n nuisances c; b: products of the leak's column (index n) with theirs in this block; b_u:
@@ -262,9 +252,8 @@ def estimate_leak(model: Any, rows: float, is_learned: bool) -> tuple[float, flo
 def relative_motion(square: float, rows: float, numbers: Any) -> float:
     """Compute the mean square of the measured volume in a block, divided by that in earlier blocks.
 
-    `square` is the sum of squares over the block's `rows` equations. `numbers` (`Coefficients.numbers`) holds the same
-    sum (`MOTION`) and number of equations (`ROWS`) over earlier blocks. Returns infinity if only this block moved, and
-    1 if neither this nor an earlier block moved.
+    `square` is the sum of squares over the block's `rows` equations, and `numbers` is `Coefficients.numbers`. Returns
+    infinity if only this block moved, and 1 if neither this nor an earlier block moved.
     """
     usual_square = numbers[MOTION] * rows
     return square * numbers[ROWS] / usual_square if usual_square > 0.0 else (math.inf if square > 0.0 else 1.0)

@@ -35,10 +35,8 @@ class BlockEstimate:
 
     Attributes
     ----------
-    number : int
-        Number of blocks so far, including this one.
-    t : float
-        End of the block [s].
+    number, t : int, float
+        Number of blocks so far, including this one, and end of the block [s].
     status : str
         "learning", "watched" or "alarm", or the reason why the block is not judged, such as "at standstill".
     total_lpm, total_interval_lpm : float and pair of floats, or None
@@ -79,14 +77,10 @@ class WatchedLeak:
         Increase of the conductance, and its standard deviation [m^3/(s Pa)].
     pressure : float
         Mean absolute pressure difference p_A - p_B [Pa].
-    test : str
-        Test that detected the leak, "step" or "level".
-    cause : str
-        Path of the leaking oil.
-    reason : str
-        Reason for the alarm, in one line.
-    score, threshold : float
-        Score of the test and its threshold (`rise.LiveRise`).
+    test, score, threshold : str, float, float
+        Test that detected the leak, "step" or "level", its score and threshold (`rise.LiveRise`).
+    cause, reason : str
+        Path of the leaking oil, and reason for the alarm in one line.
     """
 
     raised_s: float
@@ -117,12 +111,8 @@ class WatchedLeak:
 
     @property
     def rarity(self) -> float:
-        """Probability that a healthy machine scores as high in the test, divided by the `allowed` probability.
-
-        The result is at least 1e-9 and at most 1.
-        """
-        log_allowed = LiveRise(self.test, self.threshold).log_chance
-        log_ratio = self.estimate.log_chance - log_allowed
+        """Probability that a healthy machine scores as high, over the `allowed` one, limited to 1e-9 to 1."""
+        log_ratio = self.estimate.log_chance - LiveRise(self.test, self.threshold).log_chance
         return math.exp(min(0.0, max(log_ratio, math.log(1e-9))))
 
 
@@ -154,15 +144,12 @@ class WatchBaseline(HealthyLevel):
 
     Attributes
     ----------
-    version : int
-        1 for the first baseline, increased by one after each repair.
-    hours : float
-        Operating time over which it was learned [h].
+    version, hours : int, float
+        1 for the first baseline, increased by one after each repair; operating time of learning [h].
     lpm : float or None
         The mean conductance `level` as a flow at the mean pressure difference [L/min], None if it cannot be stated.
     duty_low, duty_high : tuple of float
-        Minimum and maximum over the blocks of the logarithms of mean pressure difference [Pa] and mean pump flow
-        [m^3/s].
+        Minimum and maximum of the logarithms of a block's mean pressure difference [Pa] and pump flow [m^3/s].
     """
 
     version: int
@@ -177,14 +164,13 @@ def find_level_rise(
 ) -> LiveRise | None:
     """Test whether a mean conductance exceeds that of the healthy machine, and estimate by how much.
 
-    `g` and `deviation` are the mean conductance and its standard error [m^3/(s Pa)], and `onset` is the onset to state
-    in the result. `healthy` describes the mean conductances of healthy recordings, or of healthy groups of blocks. Two
-    tests must both be significant at the false-alarm `probability`:
+    `g` and `deviation` are the mean conductance and its standard error [m^3/(s Pa)], and `onset` is that to state in
+    the result. Two tests must both be significant at the false-alarm `probability`:
 
     - g against the lowest healthy mean, increased for the warmest oil (normal distribution),
     - g against the average of the healthy means, given their scatter (Student's t with Welch's degrees of freedom).
 
-    The result is None if a test is not significant, or if there are fewer than two healthy means.
+    The result is None if one is not, or if there are fewer than two healthy means.
     """
     from scipy.special import ndtr, ndtri
 
@@ -207,11 +193,10 @@ def find_level_rise(
 
 
 def level_before_leak(leak: WatchedLeak, t: float) -> HealthyLevel:
-    """Return the conductance before a leak began, and its possible range at time `t` [s] if there were no leak.
+    """Return the conductance before a leak began, and its range at time `t` [s] if only the oil's warmth had changed.
 
-    The range, `low` to `high` of the result, allows for colder and warmer oil: from 1/r to r times the conductance
-    before the leak, where r = warmest^(h / shift). h is the time since the onset [h], but at most `shift`. `warmest`
-    and `shift` are in the table `oil` of `priors.toml`.
+    The range, `low` to `high` of the result, is from 1/r to r times the conductance, where r = warmest^(h / shift). h
+    is the time since the onset [h], but at most `shift`; `warmest` and `shift` are in the table `oil` of `priors.toml`.
     """
     oil, before = INFERENCE.oil, leak.conductance_before
     hours = max(0.0, t - leak.onset_s) / 3600.0
@@ -221,10 +206,9 @@ def level_before_leak(leak: WatchedLeak, t: float) -> HealthyLevel:
 
 
 def mean_flow(flows: Array, errors: Array) -> Flow:
-    """Average the flows of n blocks (n,) [L/min]; return the mean and its standard error [L/min].
+    """Average the flows of n blocks (n,) [L/min] with standard `errors` (n,); return the mean and its standard error.
 
-    The squared standard error is sum(errors^2)/n^2 + s^2/n. Here `errors` (n,) are the standard errors of the flows,
-    and s is the standard deviation of the flows between blocks, 0 for a single block.
+    The latter is sqrt(sum(errors^2)/n^2 + s^2/n) with the standard deviation s, 0 for a single block.
     """
     count = len(flows)
     scatter = float(flows.std(ddof=1)) / math.sqrt(count) if count > 1 else 0.0
@@ -234,8 +218,8 @@ def mean_flow(flows: Array, errors: Array) -> Flow:
 def is_known_duty(duty: Duty, low: Duty, high: Duty) -> bool:
     """Test whether the pressure difference and the pump flow of a block are in a known range, extended by a margin.
 
-    A duty is the logarithms of the mean |p_A - p_B| [Pa] and of the mean pump flow [m^3/s]; `low` and `high` limit the
-    range. The margin towards low pressures is larger, because a leak lowers the pressure difference.
+    A duty is the logarithms of the mean |p_A - p_B| [Pa] and of the mean pump flow [m^3/s]. The margin towards low
+    pressures is larger, because a leak lowers the pressure difference.
     """
     margin = LIVE.watch.margin
     min_pressure, min_flow = low
@@ -245,47 +229,25 @@ def is_known_duty(duty: Duty, low: Duty, high: Duty) -> bool:
 
 @dataclass
 class BaselineLearning:
-    """Running sums over blocks, from which the baseline of a watch is computed.
+    """Running sums over blocks, from which the baseline of a watch is computed."""
 
-    Attributes
-    ----------
-    blocks : int
-        Number of blocks.
-    total : float
-        Sum of the blocks' conductances [m^3/(s Pa)].
-    flow : float
-        Sum over the blocks of the factor from a conductance to a flow [L/min per m^3/(s Pa)], at the mean pressure
-        difference of each block.
-    duty_low, duty_high : tuple of float, or None
-        Smallest and largest duty of a block so far: logarithms of mean pressure difference [Pa] and pump flow [m^3/s].
-    group : list of float
-        Conductances of the group of blocks that is not yet complete. A complete group has `GROUP` blocks.
-    count : int
-        Number of complete groups.
-    mean, squares : float
-        Mean of the group means, and sum of the squared deviations of the group means from this mean.
-    low, high : float or None
-        Smallest and largest group mean.
-    """
-
-    blocks: int = 0
-    total: float = 0.0
-    flow: float = 0.0
+    blocks: int = 0  # number of blocks
+    total: float = 0.0  # sum of the blocks' conductances [m^3/(s Pa)]
+    flow: float = 0.0  # sum of the blocks' flows at a conductance of 1 [L/min per m^3/(s Pa)]
+    # smallest and largest duty of a block so far: logarithms of mean pressure difference [Pa] and pump flow [m^3/s]
     duty_low: Duty | None = None
     duty_high: Duty | None = None
-    group: list[float] = field(default_factory=list)
-    count: int = 0
+    group: list[float] = field(default_factory=list)  # conductances of an incomplete group of `GROUP` blocks
+    count: int = 0  # number of complete groups
+    # mean of the group means, and sum of their squared deviations from it
     mean: float = 0.0
     squares: float = 0.0
+    # smallest and largest group mean
     low: float | None = None
     high: float | None = None
 
     def add(self, g: float, flow: float, duty: Duty) -> None:
-        """Add a block to the sums from which the baseline is computed.
-
-        `g` is the block's conductance [m^3/(s Pa)], `flow` the factor from a conductance to a flow at its mean pressure
-        difference [L/min per m^3/(s Pa)], and `duty` the logarithms of mean pressure difference and pump flow.
-        """
+        """Add a block: its conductance `g`, factor to a flow (`BlockConductance.lpm`) and duty."""
         self.blocks += 1
         self.total += g
         self.flow += flow
@@ -307,16 +269,13 @@ class BaselineLearning:
             self.squares += difference * (mean - self.mean)
 
     def freeze(self, version: int, end: float, hours: float, *, states_lpm: bool) -> WatchBaseline:
-        """Compute the baseline from the sums so far; at least `GROUP` blocks must have been added.
+        """Compute the baseline from at least `GROUP` blocks; it states `version`, the last `end` [s] and `hours`.
 
-        `version`: 1 for the first baseline, increased by one after each repair; `end`: end of the last block [s];
-        `hours`: operating time over which the baseline was learned [h]. With `states_lpm`, the baseline also states its
-        level as a flow [L/min].
+        With `states_lpm`, it also states its level as a flow [L/min].
         """
         assert self.duty_low and self.duty_high and self.low is not None and self.high is not None
         level = self.total / self.blocks
-        mean_flow = self.flow / self.blocks  # [L/min] at a level of 1
-        lpm = level * mean_flow if states_lpm else None
+        lpm = level * (self.flow / self.blocks) if states_lpm else None
         # standard deviation between the `count` groups of blocks
         deviation = math.sqrt(self.squares / (self.count - 1)) if self.count > 1 else 0.0
         healthy = HealthyLevel(level, self.low, self.high, deviation, known_s=end, count=self.count)

@@ -29,15 +29,11 @@ ALARMING = (*LEAK_EVENTS, *(event.name for event in load_events() if event.cause
 
 
 class RiseExplanation(NamedTuple):
-    """Explanation of an increase of the leakage.
-
-    `is_leak` is True if a leak explains it, and `is_outside` if oil leaks almost surely to the outside.
-    `other_events` names the events that explain the increase instead of a leak, "" if there are none.
-    """
+    """Explanation of an increase of the leakage."""
 
     is_leak: bool
-    is_outside: bool = False
-    other_events: str = ""
+    is_outside: bool = False  # True if oil leaks almost surely to the outside
+    other_events: str = ""  # names of the events that explain the increase instead of a leak
 
 
 #: The blocks do not explain the rise yet.
@@ -47,11 +43,10 @@ UNKNOWN = RiseExplanation(is_leak=False)
 def explain_rise(observables: Sequence[Observable], data: str, onset: Interval, is_settled: bool) -> RiseExplanation:
     """Find the cause of an increase of the leakage among the changes observed in the blocks around it.
 
-    `observables` are the results of tests for changes, and `onset` is the interval in which the increase began [s].
-    `data` is the kind of data (`Observable.data`) from which the leakage is estimated, "volumes" or "response".
-    Changes of this kind that began outside the interval are ignored. `is_settled` is True if enough blocks have
-    followed to distinguish a leak to the outside from a sensor fault; until then, only a leak past piston or pump
-    counts as a leak.
+    `observables` are results of tests for changes, and `onset` is the interval in which the increase began [s]. Changes
+    of the kind `data` from which the leakage is estimated ("volumes" or "response") count only if they began in it.
+    `is_settled` is True if enough blocks have followed to distinguish a leak to the outside from a sensor fault; until
+    then, only a leak past piston or pump counts as a leak.
 
     The result is a leak if leaks are more probable than all other events together, else the most probable other events.
     It is `UNKNOWN` if no change of the kind `data` is significant (p-value below `_MAX_CHANCE`), or if none of the

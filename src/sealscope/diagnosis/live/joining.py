@@ -24,17 +24,12 @@ if TYPE_CHECKING:
 #: Channels of an actuator to store: those that it may be watched by, and the oil temperature.
 CHANNELS = ("x", "theta", "omega", "p_A", "p_B", "p_1", "p_2", "u", "T_oil")
 _PRIORS = LIVE.samples
-#: Limits of the step between successive samples, in sampling intervals; relative error of a stated sampling rate.
+#: Limits of the step between successive samples, in sampling intervals.
 _MIN_STEP, _MAX_STEP = _PRIORS.follows
-_MAX_RATE_ERROR: float = _PRIORS.rate
 
 
 def ways_to_watch(rig: Rig) -> tuple[tuple[str, ...], ...]:
-    """Return the sets of channels from which an actuator can be watched, the best set first.
-
-    The volume balance reads the position. The pressure response needs no position, but works only for a cylinder with
-    equal areas that is fed directly by the pump.
-    """
+    """Return the sets of channels by which an actuator can be watched, the best first; some need no position x."""
     has_response = rig.circuit.pump_feeds_chambers and not rig.cylinder.single_rod
     return (*rig.circuit.watched_by, ("p_A", "p_B", "u")) if has_response else rig.circuit.watched_by
 
@@ -48,63 +43,37 @@ def are_successive(steps: Any, rate: float) -> Any:
     """Test whether each sample directly follows the sample before it; False for a gap and for a copy.
 
     `steps` are the times between neighbouring samples [s], a number or an array, and `rate` is the sampling rate [Hz].
-    A sample follows directly if this time is 0.5 to 1.5 sampling intervals (`samples.follows` in `priors.toml`).
+    A successive sample is 0.5 to 1.5 sampling intervals later (`samples.follows` in `priors.toml`).
     """
     return (steps * rate > _MIN_STEP) & (steps * rate < _MAX_STEP)
 
 
 def is_same_rate(rate: float, rate_before: float) -> bool:
     """Test whether two sampling rates [Hz] are equal to within 1 %, the usual error of a logger's stated rate."""
-    return abs(rate / rate_before - 1.0) < _MAX_RATE_ERROR
+    return abs(rate / rate_before - 1.0) < _PRIORS.rate
 
 
 class SampleRun(NamedTuple):
-    """Samples without a gap between them.
+    """Samples without a gap between them."""
 
-    `t` (n,) are their times [s], `channels` their values by channel, and `rate` is the sampling rate [Hz]. `follows`
-    is True if there is no gap between these samples and those before them.
-    """
-
-    t: Array
+    t: Array  # (n,): times [s]
     channels: Mapping[str, Array]
-    rate: float
-    follows: bool
+    rate: float  # sampling rate [Hz]
+    follows: bool  # True if there is no gap between these samples and those before them
 
 
 @dataclass
 class SampleJoiner:
-    """Divide the samples of an actuator into runs without a gap.
+    """Divide the samples of an actuator into runs without a gap."""
 
-    Attributes
-    ----------
-    ways : tuple of tuple of str
-        Sets of channels from which the actuator can be watched (`ways_to_watch`).
-    late_s : float
-        Greatest age of a late or repeated sample, relative to the newest sample [s]; such samples are dropped. An older
-        sample shows that the clock was set back.
-    is_final : bool
-        True if the set of channels must not be replaced any more.
-    names : tuple of str
-        Set of channels in use, empty before the first samples. A set with the position replaces it if a position is
-        recorded later.
-    rate : float
-        Sampling rate [Hz].
-    newest : float
-        Time of the newest sample [s].
-    changed : bool
-        True if `rate` differs from the rate of the last run.
-    counters : dict of str to int
-        Numbers of dropped samples and of interruptions, by reason.
-    """
-
-    ways: tuple[tuple[str, ...], ...]
-    late_s: float = 60.0
-    is_final: bool = False
-    names: tuple[str, ...] = ()
-    rate: float = 0.0
-    newest: float = -math.inf
-    changed: bool = False
-    counters: dict[str, int] = field(default_factory=dict)
+    ways: tuple[tuple[str, ...], ...]  # sets of channels from which the actuator can be watched (`ways_to_watch`)
+    late_s: float = 60.0  # greatest age of a dropped late or repeated sample [s]; an older one: the clock was set back
+    is_final: bool = False  # True if the set of channels must not be replaced any more
+    names: tuple[str, ...] = ()  # set of channels in use, empty before the first samples
+    rate: float = 0.0  # sampling rate [Hz]
+    newest: float = -math.inf  # time of the newest sample [s]
+    changed: bool = False  # True if `rate` differs from the rate of the last run
+    counters: dict[str, int] = field(default_factory=dict)  # numbers of dropped samples and of interruptions, by reason
 
     def count(self, reason: str, number: int = 1) -> None:
         """Add `number` to the counter called `reason`."""
@@ -116,11 +85,7 @@ class SampleJoiner:
         self.newest = -math.inf
 
     def runs(self, samples: Recording) -> Iterator[SampleRun]:
-        """Divide samples into runs without a gap.
-
-        Samples that are late or cannot be used are dropped and counted (`count`). Gaps, and changes of the sampling
-        rate or of the set of channels, are counted, too.
-        """
+        """Divide samples into runs without a gap; count what is dropped, gaps, and changes of rate or channels."""
         names = self._choose_names(samples)
         if reason := _find_lack(samples, names):
             self.count(reason if names else f"samples without {format_ways(self.ways)}", len(samples))
@@ -143,11 +108,7 @@ class SampleJoiner:
             self.changed = False
 
     def _choose_names(self, samples: Recording) -> tuple[str, ...]:
-        """Choose the set of channels to use: the first of `ways` whose channels are all in the samples.
-
-        A set in use is replaced only if the samples contain the piston's position x for the first time, and `is_final`
-        is False. The result is empty if no set was in use and the samples contain none of the sets completely.
-        """
+        """Choose the first of `ways` that is recorded, or (); only one with x replaces it, and not if `is_final`."""
         recorded = next((way for way in self.ways if samples.channels.keys() >= {*way}), ())
         has_new_position = "x" in recorded and "x" not in self.names and not self.is_final
         return recorded if not self.names or has_new_position else self.names
@@ -155,9 +116,9 @@ class SampleJoiner:
     def _iter_runs(self, t: Array) -> Iterator[tuple[int, int]]:
         """Yield the index range (first, last + 1) of each run of times `t` (n,) [s] without a gap.
 
-        Only times later than the newest sample are used. Times that are missing, late or repeated are counted. If a
-        time is more than `late_s` before the newest sample, the clock was set back, which is counted, too. The caller
-        must set `newest` to the last time of each run before asking for the next run.
+        Times that are missing, late or repeated are dropped and counted. A time more than `late_s` before the newest
+        sample shows that the clock was set back, which is counted, too. The caller must set `newest` to the last time
+        of each run before asking for the next run.
         """
         with np.errstate(all="ignore"):  # comparisons with NaN are False, which leads to the search below
             is_one_run = t.size > 1 and t[0] > self.newest and bool(are_successive(np.diff(t), self.rate).all())
@@ -195,10 +156,7 @@ _SAVED = ("is_final", "names", "rate", "newest", "changed", "counters")
 
 
 def _find_lack(samples: Recording, names: Sequence[str]) -> str:
-    """Describe why the samples do not suffice to watch an actuator; "" if they suffice.
-
-    `names` are the channels that are needed. If none are stated, the samples do not suffice.
-    """
+    """Describe why samples do not suffice to watch an actuator by the channels `names`, if any; "" if they suffice."""
     for name in names:
         if name not in samples:
             return f"samples without {name}"

@@ -23,7 +23,7 @@ from sealscope.diagnosis.inference.pressures.response import Follower, parameter
 from sealscope.diagnosis.inference.pressures.samples import find_unmet_requirement
 from sealscope.diagnosis.live.balance import BlockConductance, BlockResult, NotJudged
 from sealscope.diagnosis.live.joining import SampleRun
-from sealscope.diagnosis.live.signals import MIN_BLOCKS, SignalWindow
+from sealscope.diagnosis.live.signals import MIN_BLOCKS, SignalWindow, append_row
 from sealscope.diagnosis.priors.live import LIVE
 from sealscope.diagnosis.priors.pressures import PRESSURE
 from sealscope.diagnosis.verdict.evidence import Cause
@@ -44,8 +44,6 @@ _READ = ("p_A", "p_B", "u")
 _MIN_RATE: float = PRESSURE.blocks.slowest
 #: Rows of the stored samples that are pressures; row 0 is the time.
 _PRESSURES = (1, 2)
-#: Number of last blocks in which the cause of a rise is looked for.
-_WINDOW: int = LIVE.explanation.window
 #: Size of a block's Gram matrix: the residual, and its derivative by each parameter.
 _N_SUMS = 1 + len(PARAMETERS)
 #: Columns of a stored block: its end [s] and number of samples, then parameters, Gram matrix and scores of its fit.
@@ -58,41 +56,21 @@ _MAX_SD: float = PRESSURE.response["G"][1]
 
 
 class PressureEstimator:
-    """Estimate the leakage conductance block by block from the response of the pressures to the command.
+    """Estimate changes of the leakage conductance from the response of the pressures to the command, block by block."""
 
-    It replaces `LiveBalance` if no position is recorded, but states only changes of the conductance. `rig` is the
-    assumed machine, and `litres` tells if it states the sizes that are needed for L/min.
-
-    Attributes
-    ----------
-    method, data : str
-        Name of the way of watching, and kind of data (`Observable.data`) from which the conductance is estimated.
-    states_level : bool
-        False, as the level of the conductance is not stated.
-    size_error : float
-        Relative standard error of changes of the conductance.
-    orifice_factor : float
-        Flow of a leak through an orifice over that of a laminar leak with the same estimated conductance. It widens
-        the upper end of an interval.
-    min_internal_fraction : float
-        Smallest fraction of an estimated leak that is inside the actuator.
-    """
-
-    method = "pressures"
-    data = RESPONSE
-    states_level = False
+    method = "pressures"  # name of the way of watching
+    data = RESPONSE  # kind of data (`Observable.data`) from which the conductance is estimated
+    states_level = False  # True if the level of the conductance is stated
     cause: Cause = "internal or external leak"
-    size_error = conductance_scale_error()
+    size_error = conductance_scale_error()  # relative standard error of changes of the conductance
+    # flow of a leak through an orifice over that of a laminar leak with the same estimated conductance
     orifice_factor: float = PRESSURE.conductance.orifice
-    min_internal_fraction: float = LIVE.watch.inside
+    min_internal_fraction: float = LIVE.watch.inside  # smallest fraction of an estimated leak inside the actuator
     block_seconds: float = _PRIORS.seconds
     states_flow = staticmethod(states_flow)
 
     def __init__(self, rig: Rig, litres: bool | None = None) -> None:
-        """Set up the estimator for a rig, with no samples yet.
-
-        `litres` tells if the rig states the sizes that are needed for L/min; by default this is found from the rig.
-        """
+        """Set up the estimator; `litres` tells if L/min can be stated, by default found from the sizes in the rig."""
         self._rig = rig
         self.litres = states_flow(rig) if litres is None else litres
         self._samples = np.empty((1 + len(_READ), 0))  # times and channels since the last whole block
@@ -110,12 +88,11 @@ class PressureEstimator:
         return self._follower is not None
 
     def take(self, run: SampleRun) -> Iterator[BlockResult]:
-        """Process the next samples, and yield the result of each block that they complete.
+        """Process the next samples, and yield the result of each block that they complete, when it is asked for.
 
-        A result is the conductance of a block, or a `NotJudged` with the reason why there is none. The next block is
-        processed only when its result is asked for. Before the first block, the model is fitted to `response.begins`
-        (`priors.toml`) seconds of samples. If these cannot be used, the reason is yielded, and the fit is tried again
-        with their second half and as many new samples. Samples before a gap that do not fill a block are dropped.
+        Before the first block, the model is fitted to `response.begins` (`priors.toml`) seconds of samples. If these
+        cannot be used, the reason is yielded, and the fit is tried again with their second half and as many new
+        samples. Samples before a gap that do not fill a block are dropped.
         """
         if not run.follows:
             self._held[:] = math.nan  # no reading is stuck so far
@@ -141,12 +118,10 @@ class PressureEstimator:
         self._samples = samples.copy()
 
     def _remove_holds(self, samples: Array, n_block: int, rate: float) -> bool:
-        """Set stuck pressure readings in the first `n_block` columns of `samples` to nan.
+        """Set stuck pressure readings in the first `n_block` columns of `samples` (time, p_A, p_B, command) to nan.
 
-        `samples` (4, n) holds time, p_A, p_B and command, and `rate` is the sampling rate [Hz]. Returns False, and
-        changes nothing, if only later samples can show whether a reading is stuck; otherwise True.
+        Returns False, and changes nothing, if only later samples can show whether a reading is stuck; otherwise True.
         """
-        # `_held`: value that a pressure has repeated up to the last block, nan if the pressure was not stuck
         holds = [find_holds(samples[row], rate, held) for row, held in zip(_PRESSURES, self._held, strict=True)]
         # `pending`: index of the first sample whose flag later samples may change
         if min(hold.pending for hold in holds) < n_block:
@@ -157,15 +132,7 @@ class PressureEstimator:
         return True
 
     def _estimate_block(self, block: Recording) -> BlockResult:
-        """Estimate the leakage conductance in a block of samples, or return the reason why there is none.
-
-        Reasons are:
-
-        - the sampling rate is too low, or values are missing,
-        - the fit has not settled after its start or a gap,
-        - the model does not describe the block,
-        - the standard error of the conductance is above the standard deviation of its prior.
-        """
+        """Estimate the leakage conductance in a block of samples, or return the reason why there is none."""
         begin, end = float(block.t[0]), float(block.t[-1]) + 1.0 / block.rate
         if self._follower is None or block.rate < _MIN_RATE:
             return NotJudged.with_count(end, f"sampled at less than {_MIN_RATE:g} Hz")
@@ -194,16 +161,9 @@ class PressureEstimator:
     def _reject(self, follower: Follower, end: float, is_settling: bool, restarts: bool) -> NotJudged:
         """Report a block that the model of the pressures does not describe, and restart the fit if it is lost.
 
-        The fit (`follower`) is lost after `response.lost` (`priors.toml`) such blocks in succession, or at once if a
-        parameter is not finite. Then the uncertainty of the fit's parameters is widened, the fit must settle anew, and
-        the report states that later blocks cannot be compared with earlier ones. Otherwise there are two cases:
-
-        - If the fit had not settled before this block (`is_settling`), the report is "settling".
-        - If the fit had settled, the report is "not described by the model", and the fit must settle for the next
-          `_RESUMING` blocks.
-
-        `end`: end of the block [s]; `restarts`: True if this block cannot be compared with earlier ones (`_resume`),
-        which the report then states.
+        It is lost after `response.lost` (`priors.toml`) such blocks in succession, or if a parameter is not finite.
+        `end`: end of the block [s]; `is_settling`: True if the fit had not settled before this block; `restarts`: True
+        if this block cannot be compared with earlier ones.
         """
         self._misfits += 1
         if self._misfits >= _PRIORS.lost or not np.isfinite(follower.theta).all():
@@ -215,11 +175,9 @@ class PressureEstimator:
         return NotJudged.with_count(end, status, restarts=restarts)
 
     def _resume(self, follower: Follower, gap: float, rate: float) -> tuple[Follower, bool]:
-        """Prepare the fit of the pressures for a block that follows the last one after a `gap` [s].
+        """Prepare the fit for a block that follows after a `gap` [s], or with another sampling `rate` [Hz].
 
-        After a gap the uncertainty of the parameters is widened, and the fit must settle anew. After a change of the
-        sampling rate a new fit starts from the present parameters. Returns the fit to use, and True if this and later
-        blocks cannot be compared with earlier ones.
+        Returns the fit to use, and True if this and later blocks cannot be compared with earlier ones.
         """
         has_other_rate = follower.machine.rate != rate
         if has_other_rate:
@@ -235,32 +193,27 @@ class PressureEstimator:
     def _follow(self, follower: Follower, block: Recording, is_settling: bool) -> bool:
         """Fit the model of the pressures to a block; return True if the model describes the block.
 
-        `follower` is the fit so far. The fit's sums over the block, and features of the signals in the block, are
-        stored. The block also updates the usual variance of the residuals, faster if the fit is settling
-        (`is_settling`) or the model does not describe the block.
+        The fit's sums over the block, and features of its signals, are stored. The usual variance of the residuals is
+        updated, faster if the fit is settling (`is_settling`) or the model does not describe the block.
         """
         sums = follower.update(block)
         self._signals.take(float(block.t[0]), {name: block[name] for name in _READ}, block.rate)
         row = np.concatenate([[self._end, sums.samples], sums.theta, sums.gram.ravel(), sums.scores.ravel()])
-        # keep the last `_WINDOW` blocks, but none with sums of another size
-        stored = self._rows[1 - _WINDOW :] if self._rows.shape[1:] == row.shape else np.empty((0, len(row)))
-        self._rows = np.vstack([stored, row])
+        self._rows = append_row(self._rows, row)
         # `excess`: chi square of the block above its mean, in standard deviations
         is_described = bool(np.isfinite(follower.theta).all()) and follower.excess < _PRIORS.described
         variance = float(sums.gram[0, 0]) / max(sums.samples, 1.0)  # row 0 of the Gram matrix: residuals
         if math.isfinite(variance):
-            # a geometric mean with fading memory; a block counts with at least 1 Pa^2, and with 0.1 to 10 times the
-            # earlier mean
+            # a geometric mean with fading memory; a block counts as at least 1 Pa^2, and as 0.1 to 10 times the mean
             ratio = float(np.clip(max(variance, 1.0) / follower.variance, 0.1, 10.0))
             n_blocks = _PRIORS.usual if is_described and not is_settling else _RESUMING
             follower.variance *= ratio ** (1.0 / n_blocks)
         return is_described
 
     def observables(self, since: float, end: float, onset: float) -> tuple[Observable, ...] | None:
-        """Test the parameters of the model and the signals of the last blocks for changes.
+        """Test the model's parameters and the signals of the last blocks, from `since` to `end` [s], for changes.
 
-        The blocks are those from the time `since` to the block that ends at `end` [s]. The result is None if the
-        stored blocks do not reach from `onset` to `end`, and an empty tuple if there are too few blocks.
+        The result is None if the stored blocks do not reach from `onset` to `end`, and empty if there are too few.
         """
         rows, seconds = self._rows, self.block_seconds
         # no blocks, a last block that is not the one at `end`, or a first block that begins after the onset
@@ -295,10 +248,7 @@ class PressureEstimator:
         return state | {"follower": save_attributes(follower, _FOLLOWER_ATTRIBUTES) | machine}
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Restore the parameters and blocks saved by `state`, so that later results are identical to the last bit.
-
-        Raises InputError if a part of the saved state is missing or has an invalid value.
-        """
+        """Restore, to the last bit, what `state` saved; raise InputError if a part is missing or not valid."""
         restore_attributes(self, _SAVED, state)
         if (saved := require_part(state, "follower", (Mapping, type(None)))) is None:
             return

@@ -20,25 +20,12 @@ _UNDATED = Interval(math.nan, math.nan, math.nan)
 
 
 class LiveRise(NamedTuple):
-    """An increase of the leakage conductance of a running machine, with the test that detected it.
+    """An increase of a running machine's leakage conductance, with its test; a `observable.DatedTest`."""
 
-    It satisfies the protocol `observable.DatedTest`.
-
-    Attributes
-    ----------
-    test : str
-        "step" for a step within the stream, "level" for a conductance above that of the healthy machine.
-    score : float
-        Score of the test: twice the logarithm of an e-value for a step, a normal quantile for a level.
-    interval : Interval
-        Onset with its 95 % interval [s].
-    size, deviation : float
-        The increase and its standard deviation [m^3/(s Pa)].
-    """
-
-    test: str
-    score: float
-    interval: Interval = _UNDATED
+    test: str  # "step" for a step within the stream, "level" for a conductance above that of the healthy machine
+    score: float  # score of the test: twice the logarithm of an e-value for a step, a normal quantile for a level
+    interval: Interval = _UNDATED  # onset with its 95 % interval [s]
+    # the increase and its standard deviation [m^3/(s Pa)]
     size: float = 0.0
     deviation: float = math.inf
 
@@ -46,8 +33,7 @@ class LiveRise(NamedTuple):
     def log_chance(self) -> float:
         """Logarithm of the probability that a healthy machine has at least this score in the test.
 
-        For a step this is an upper bound by Ville's inequality, -score/2. For a level, whose score is a normal
-        quantile, it is log Phi(-score) with the normal distribution function Phi.
+        By Ville's inequality it is at most -score/2 for a step. For a level it is that of a normal distribution.
         """
         from scipy.special import log_ndtr
 
@@ -59,10 +45,7 @@ class LiveRise(NamedTuple):
         return math.exp(self.log_chance)
 
     def threshold(self, chance: float) -> float:
-        """Return the score of the test that a healthy machine exceeds with a probability of at most `chance`.
-
-        It is -2 log(chance) for a step, and the normal quantile of 1 - chance for a level.
-        """
+        """Return the score that a healthy machine exceeds with the probability `chance`, the inverse of `chance`."""
         from scipy.special import ndtri
 
         return -2.0 * math.log(chance) if self.test == STEP else -float(ndtri(chance))
@@ -72,10 +55,7 @@ class LiveRise(NamedTuple):
         return self.interval
 
     def detectable_step(self, chance: float) -> float:
-        """Return infinity, for any false-alarm probability `chance`: the smallest detectable step is not known.
-
-        It depends on the random walk of the healthy machine's conductance.
-        """
+        """Return infinity: the smallest step that is detectable depends on the conductance's unknown random walk."""
         return math.inf
 
 
@@ -135,11 +115,9 @@ class LiveLeak:
 
 
 def decide_on_stream(leak: LiveLeak | None, false_alarm_probability: float, lack: str = "") -> Evidence:
-    """Decide from the estimated leakage of a watched machine if it leaks.
+    """Decide if a watched machine leaks, from the estimated `leak` or the reason (`lack`) why there is no estimate.
 
-    `leak` is the estimate; if it is None, `lack` is the reason why there is no estimate yet, in one line.
-    `false_alarm_probability` is that of one test. Other explanations of an increase are not considered here, as they
-    are weighed before a test raises the alarm (module `explanation`).
+    Other explanations of a rise are weighed before a test raises the alarm (module `explanation`).
     """
     report = Observed(WATCH, lack=lack, leak=leak)
     # neither reports of other detectors, nor healthy recordings

@@ -45,8 +45,6 @@ WALKS = np.array(_PRIORS.walks)[:, None]
 SIZES = np.array(_PRIORS.sizes)
 #: Fractions of the step's first block in which the leak is open.
 PARTS = np.array(_PRIORS.parts)
-#: Standard deviations beyond which an innovation is a step, not the walk.
-JUMP: float = LIVE.coefficients.jump
 #: Factor per block by which the weight of earlier innovations decays.
 MEMORY: float = _PRIORS.memory
 #: All onsets of the last `RECENT` blocks are stored, then `RECENT / 4` of each doubling of age, up to `HORIZON` blocks.
@@ -72,13 +70,10 @@ _SAVED = tuple(f"_{name}" for name in ("level", "level_variance", "squares", "lo
 class StepDetector:
     """Detect an increase of one coefficient from its estimates block by block, in bounded memory.
 
-    In a healthy machine the coefficient follows a random walk, whose variance q in a block is unknown. For each of
-    several q a Kalman filter predicts the next estimate. The detector sums the evidence of a step for each q and each
-    possible onset j. The module's docstring gives the formulas, whose symbols are used here.
+    The module's docstring gives the formulas, whose symbols are used here. Attributes, of which arrays have a row for
+    each variance q of the coefficient's random walk in a block:
 
-    Attributes, of which arrays have a row for each q:
-
-    - `_level`, `_level_variance`: state of each filter,
+    - `_level`, `_level_variance`: state of each Kalman filter,
     - `_squares`, `_count`: T and n of all innovations, with fading memory,
     - `_log_weights`: log probability of each q,
     - `_log_variances`: sum of log S over all innovations,
@@ -96,10 +91,7 @@ class StepDetector:
         self.forget()
 
     def forget(self) -> None:
-        """Drop the evidence of all blocks so far, and keep the learned noise and random walk.
-
-        Rises that may have begun in these blocks are not detected any more.
-        """
+        """Drop the evidence of all blocks so far, and keep the learned noise and random walk."""
         self._end = -np.inf
         self._sums, self._onsets = np.zeros((_N_ROWS, len(WALKS), 0)), np.zeros((0, 4))
 
@@ -109,11 +101,11 @@ class StepDetector:
         return unit > 0.0 and abs(g) < _MAX_NUMBER * unit and unit / _MAX_NUMBER < deviation < _MAX_NUMBER * unit
 
     def take(self, begin: float, end: float, g: float, deviation: float) -> None:
-        """Update the evidence of a step by the estimate `g` of the coefficient in the next block.
+        """Update the evidence of a step by the estimate `g` of the coefficient in the block from `begin` to `end` [s].
 
-        `begin` and `end` [s] are the limits of the block, and `deviation` is the standard error of `g`. Let e be the
-        innovation, i.e. g minus its prediction by the Kalman filter for a random walk. Let S be the variance of e, and
-        f the effect of a unit step on e. The sums a, b and T for each walk and each possible onset are updated by
+        `deviation` is the standard error of `g`. With the innovation e, i.e. g minus its prediction by the Kalman
+        filter for a random walk, its variance S, and the effect f of a unit step on e, the sums for each walk and each
+        possible onset are updated by
 
             a += f e / S,    b += f^2 / S,    T += e^2 / S.
 
@@ -147,16 +139,15 @@ class StepDetector:
         self._level_variance = gain * variance
 
     def _update_walks(self, variance: Array, square: Array) -> None:
-        """Update the scale of the noise and the probability of each random walk after a block.
+        """Update the scale of the noise, `_squares` / `_count`, and the probability of each random walk after a block.
 
-        The scale of the noise is `_squares` / `_count`. For each walk in `WALKS` a Kalman filter has given the
-        innovation e of the block (measured minus predicted estimate) and the variance S of e. `variance` (q, 1) is S,
-        and `square` (q, 1) is e^2 / S.
+        `variance` (q, 1) is S, the variance of the innovation e (measured minus predicted estimate) for each of
+        `WALKS`, and `square` (q, 1) is e^2 / S.
         """
         square = np.maximum(square, _MIN_SQUARE)
         if self._count >= _N_WARM:
             # clipped, as a large innovation is a step, which must not count as noise or walk
-            square = np.minimum(square, JUMP**2 * self._squares / self._count)
+            square = np.minimum(square, LIVE.coefficients.jump**2 * self._squares / self._count)
             # Bayes' rule with the log density of Student's t; the earlier probabilities fade
             log_weights = MEMORY * self._log_weights - 0.5 * np.log(variance * self._squares)
             log_weights -= 0.5 * (self._count + 1.0) * np.log1p(square / self._squares)
@@ -166,17 +157,15 @@ class StepDetector:
         self._log_variances = self._log_variances + np.log(variance)
 
     def _add_onsets(self, begin: float, end: float) -> None:
-        """Add possible onsets of a step in the block from `begin` to `end` [s].
+        """Add possible onsets of a step in the block from `begin` to `end` [s], one for each of `PARTS`.
 
-        There is one onset for each of `PARTS`, the fractions of the block in which the leak is open. Every
-        `_SELECT_EVERY` blocks, old onsets are thinned out.
+        Every `_SELECT_EVERY` blocks, old onsets are thinned out.
         """
         # at each block the variance of the coefficient's random walk changes with a small probability; after a change
         # all `WALKS` are equally likely
         log_prior = np.logaddexp(np.log1p(-_PRIORS.changes) + self._log_weights, np.log(_PRIORS.changes / len(WALKS)))
-        # the likelihood of n innovations e with variances S and the sum T of e^2 / S is T^(-n/2) times the product of
-        # S^(-1/2). T begins with its value before the onset; the log likelihood before the onset is subtracted from the
-        # log prior, so that only the innovations after the onset count in `_log_likelihoods`
+        # T begins with its value before the onset; the log likelihood until then is subtracted from the log prior, so
+        # that only later innovations count in `_log_likelihoods`
         sums = np.zeros((_N_ROWS, len(WALKS), len(PARTS)))
         sums[_T] = self._squares
         sums[_LOG_PRIOR] = log_prior + 0.5 * (self._count * np.log(self._squares) + self._log_variances)
@@ -189,19 +178,16 @@ class StepDetector:
             self._sums, self._onsets = self._sums[:, :, is_selected], self._onsets[is_selected]
 
     def log_e(self, min_log_e: float = -np.inf) -> float:
-        """Compute the logarithm of the evidence M that the coefficient has risen.
+        """Compute log M, the evidence that the coefficient has risen.
 
-        M is the sum of the likelihood ratios of a step to no step, one for each block in which the rise may begin. A
-        ratio is averaged over the possible random walks of the healthy coefficient (`WALKS`), the prior variances of
-        the step (`SIZES`), and the onsets within a block (`PARTS`). In a healthy machine the mean number of blocks
-        until M exceeds a number A is at least A. The result is minus infinity if no rise can have begun yet, or if a
-        quick upper bound of log M is at most `min_log_e`.
+        M is the sum, over the blocks in which the rise may begin, of the likelihood ratio of a step to no step,
+        averaged over `WALKS`, `SIZES` and `PARTS`. In a healthy machine the mean number of blocks until M exceeds a
+        number A is at least A. The result is minus infinity if no rise can have begun yet, or if a quick upper bound of
+        log M is at most `min_log_e`.
         """
         if not len(self._onsets):
             return -np.inf
-        # for each walk and onset the sums of f e / S, f^2 / S and e^2 / S: e is the error of a prediction, S its
-        # variance, and f the response of e to a unit step (`take`)
-        a, b, T = self._sums[[_A, _B, _T]]
+        a, b, T = self._sums[[_A, _B, _T]]  # sums of f e / S, f^2 / S and e^2 / S (`take`)
         # fraction of T that a step of the best size explains, less than 1 so that its logarithm is finite
         explained = np.minimum(np.maximum(a, 0.0) ** 2 / (b * T), 1.0 - 1e-15)
         max_log_ratio = -0.5 * float(np.min(self._onsets[:, _N] * np.log1p(-explained)))
@@ -221,11 +207,10 @@ class StepDetector:
         return np.asarray(self._sums[_LOG_PRIOR] - 0.5 * (n * log_T + self._log_variances))
 
     def _step_log_ratios(self) -> Array:
-        """Compute the log likelihood ratios (v, q, j) of a rise of the coefficient to no step.
+        """Compute the log likelihood ratios (v, q, j) of a rise to no step.
 
-        v is the prior variance of the step's size (`SIZES`), q the variance of the random walk in a block (`WALKS`),
-        and j the onset. Of n innovations e, errors of predictions with the variance S that answer a unit step by f, the
-        sums are a = sum f e / S, b = sum f^2 / S and T = sum e^2 / S (`take`):
+        v is the prior variance of the step's size (`SIZES`), q the random walk's variance in a block (`WALKS`), and j
+        the onset. With the sums a, b and T over n innovations (`take`):
 
             R = (1 + v b)^(-1/2) (1 - max(a, 0)^2 / ((b + 1/v) T))^(-n/2).
         """
@@ -237,10 +222,8 @@ class StepDetector:
     def _log_terms(self) -> Array:
         """Compute the logarithms (v, q, j) of the terms whose sum is the evidence that the coefficient has risen.
 
-        A term is the likelihood ratio of a step to no step, for a prior variance v of the step (`SIZES`), a variance q
-        of the random walk (`WALKS`) and an onset j. It is multiplied by the posterior probability of q without a step,
-        and divided by the numbers of `SIZES` and `PARTS`, which are equally likely. For a step down the term is 0, and
-        its logarithm -inf.
+        A term is a likelihood ratio (`_step_log_ratios`) times the posterior probability of the walk q without a step,
+        over the numbers of `SIZES` and `PARTS`, which are equally likely. For a step down it is 0, its logarithm -inf.
         """
         likelihoods = self._log_likelihoods()
         total = np.logaddexp.reduce(likelihoods, axis=0) + np.log(len(SIZES) * len(PARTS))
@@ -249,16 +232,13 @@ class StepDetector:
     def rise(self) -> LiveRise:
         """Estimate the onset [s] and the size of a rise of the coefficient, in the coefficient's unit.
 
-        Both are averages over the possible prior variances v of the step's size (`SIZES`), variances q by which the
-        coefficient's random walk grows in a block (`WALKS`), and onsets j, weighted by their posterior probabilities.
-        The onset has a 95 % interval, and the size a standard deviation.
+        Both are averages over the sizes v (`SIZES`), walks q (`WALKS`) and onsets j, weighted by their posterior
+        probabilities. The onset has a 95 % interval, and the size a standard deviation.
         """
         terms = self._log_terms()
         log_evidence = float(np.logaddexp.reduce(terms.ravel()))
         weights = np.exp(terms - log_evidence)  # posterior probabilities (v, q, j)
-        # for each walk and onset the sums of f e / S, f^2 / S and e^2 / S: e is the error of a prediction, S its
-        # variance, and f the response of e to a unit step (`take`)
-        a, b, T = self._sums[_A : _T + 1]
+        a, b, T = self._sums[_A : _T + 1]  # sums of f e / S, f^2 / S and e^2 / S (`take`)
         # mean and variance of the size's posterior, Student's t, for each v, q and j
         precision = b + 1.0 / SIZES[:, None, None]
         sizes = a / precision
@@ -280,34 +260,30 @@ class StepDetector:
         return LiveRise(STEP, 2.0 * log_evidence, interval, self._unit * size, self._unit * deviation)
 
     def bound(self, probability: float = BOUND_PROBABILITY) -> float:
-        """Compute an upper bound of an undetected rise of the coefficient, in the coefficient's unit.
+        """Compute the quantile, at `probability`, of an undetected rise > 0 of the coefficient, in its unit.
 
-        The bound is the quantile, at `probability`, of the rise under the condition that it is positive. It is
-        infinite until there have been enough blocks in which a rise may begin.
+        It is infinite until there have been enough blocks in which a rise may begin.
         """
         if not len(self._onsets):
             return np.inf
-        # for each walk and onset the sums of f e / S, f^2 / S and e^2 / S: e is the error of a prediction, S its
-        # variance, and f the response of e to a unit step (`take`)
-        a, b, T = self._sums[_A : _T + 1]
+        a, b, T = self._sums[_A : _T + 1]  # sums of f e / S, f^2 / S and e^2 / S (`take`)
         # least-squares size of a step at each onset and for each walk, and its standard error; b > 0, as already
         # the first block after the onset responds to a step
         sizes = a / b
         residual_squares = np.maximum(T - a * sizes, np.finfo(float).tiny)
         deviations = np.sqrt(residual_squares / self._onsets[:, _N] / b)
-        log_likelihoods = self._log_likelihoods()
-        log_walk_probabilities = log_likelihoods - np.logaddexp.reduce(log_likelihoods, axis=0)
+        likelihoods = self._log_likelihoods()
+        log_walk_probabilities = likelihoods - np.logaddexp.reduce(likelihoods, axis=0)
         log_weights = log_walk_probabilities + np.logaddexp.reduce(self._step_log_ratios(), axis=0)
         weights = np.exp(log_weights - log_weights.max())
         return self._unit * bound_steps(weights.ravel(), sizes.ravel(), deviations.ravel(), probability)
 
     @property
     def noise(self) -> float:
-        """Ratio of the actual to the predicted variance of the Kalman filter's prediction errors (innovations).
+        """Ratio of the actual to the predicted variance of the innovations (a Kalman filter's prediction errors).
 
-        The ratio is averaged over the blocks, with fading memory, and over `step.stated` (`priors.toml`) additional
-        blocks with the ratio 1. The filter is for a random walk whose variance in a block is a tenth of the first
-        estimate's variance.
+        It is averaged over the blocks with fading memory, and over `step.stated` (`priors.toml`) blocks with the ratio
+        1. The filter is for a random walk whose variance in a block is a tenth of the first estimate's variance.
         """
         walk = 3  # index of this walk, 0.1, in `WALKS`
         return float((self._squares[walk, 0] + _PRIORS.stated) / (self._count + _PRIORS.stated))
@@ -326,9 +302,9 @@ class StepDetector:
 def _select_onsets(block: int, onsets: Array) -> NDArray[np.bool_]:
     """Select the possible onsets of a step to keep: all of the last `RECENT` blocks, and fewer of older blocks.
 
-    Returns flags (j,), True for an onset to keep. Older onsets are kept only at the start of a block, on a grid of
-    blocks that becomes coarser with age, up to the age `HORIZON`. `block` is the number of the present block. `onsets`
-    (j, 4) has the columns `_N` to `_BLOCK_BEGIN`.
+    Returns flags (j,). Older onsets are kept only at the start of a block, on a grid of blocks that becomes coarser
+    with age, up to the age `HORIZON`. `block` is the number of the present block, and `onsets` (j, 4) has the columns
+    `_N` to `_BLOCK_BEGIN`.
     """
     _, onset_block, time, block_begin = onsets.T
     age = block - onset_block

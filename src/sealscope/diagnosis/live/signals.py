@@ -57,10 +57,7 @@ _GROUP_SIZES = (1, 2, 4)
 
 
 class SignalWindow:
-    """Features of the last `WINDOW` blocks of a running machine, and tests for their changes.
-
-    The features are duty (motion and load), noise, mains hum and mean pressures.
-    """
+    """Features (duty, noise, mains hum, mean pressures) of the last blocks of a machine, and tests for changes."""
 
     def __init__(self) -> None:
         self._rows = np.empty((0, 0))  # features of the last blocks, one block in a row
@@ -68,10 +65,7 @@ class SignalWindow:
 
     @np.errstate(all="ignore")
     def take(self, begin: float, channels: Mapping[str, Array], rate: float) -> None:
-        """Compute and store the features of the block that begins at `begin` [s]; skip a block with missing samples.
-
-        `channels` are the samples of the block by channel, and `rate` is the sampling rate [Hz].
-        """
+        """Store the features of the block of `channels` that begins at `begin` [s], unless samples are missing."""
         if not all(np.isfinite(values).all() for values in channels.values()):
             return
         if not self._means.size:
@@ -87,17 +81,11 @@ class SignalWindow:
         features = [float(values[name][0]) if name in values else np.nan for name in FEATURES]
         n_samples, gram = len(channels["p_A"]), design.T @ design
         row = np.array([begin, begin + n_samples / rate, n_samples, speed, fraction_moving, *features, *gram.ravel()])
-        # keep the last `WINDOW` blocks, but none with other channels
-        stored = self._rows[1 - WINDOW :] if self._rows.shape[1:] == row.shape else np.empty((0, len(row)))
-        self._rows = np.vstack([stored, row])
+        self._rows = append_row(self._rows, row)
 
     @np.errstate(all="ignore")
     def observables(self, since: float) -> tuple[Observable, ...]:
-        """Test each feature for a step in the stored blocks that begin at `since` [s] or later.
-
-        The features are duty (motion and load), noise, mains hum and mean pressures. The result is empty if there are
-        fewer than `MIN_BLOCKS` blocks.
-        """
+        """Test each feature for a step in the blocks that begin at `since` [s] or later, if these are `MIN_BLOCKS`."""
         rows = self._rows[self._rows[:, _BEGIN] >= since] if self._rows.size else self._rows
         if len(rows) < MIN_BLOCKS:
             return ()
@@ -117,10 +105,9 @@ class SignalWindow:
     def _test_levels(self, rows: Array, time: Array) -> tuple[LevelChange, ...]:
         """Test the mean pressures in each direction of motion for steps.
 
-        `rows` are the stored features of n blocks, and `time` (n,) the centres of the blocks [s]. The blocks are
-        averaged in groups of equal size, which is the smallest of `_GROUP_SIZES` for which the machine moves in both
-        directions in every group. The result is empty if there is no such size, or if there are fewer than `MIN_BLOCKS`
-        groups.
+        `rows` are the stored features of n blocks, and `time` (n,) their centres [s]. The blocks are averaged in groups
+        of the smallest size in `_GROUP_SIZES` with which the machine moves in both directions in every group. The
+        result is empty if there is none, or fewer than `MIN_BLOCKS` groups.
         """
         n_columns = round((rows.shape[1] - _GRAM.start) ** 0.5)  # a row ends with a flattened square Gram matrix
         for size in _GROUP_SIZES:
@@ -142,3 +129,9 @@ class SignalWindow:
     def load_state(self, state: Any) -> None:
         """Restore the features that `state` returned; raise InputError if they are not valid."""
         restore_attributes(self, ("_rows", "_means"), state)
+
+
+def append_row(rows: Array, row: Array) -> Array:
+    """Append the `row` of a block to the last `WINDOW` - 1 `rows`; drop these if they have another length."""
+    stored = rows[1 - WINDOW :] if rows.shape[1:] == row.shape else np.empty((0, len(row)))
+    return np.vstack([stored, row])

@@ -7,7 +7,7 @@ import math
 import os
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -50,8 +50,6 @@ if TYPE_CHECKING:
 #: Version of the format of the saved state.
 STATE_VERSION = 16
 _PRIORS, _EXPLANATION = LIVE.watch, LIVE.explanation
-#: Number of blocks in the mean that is stated as the leak after an alarm.
-_N_RECENT = _PRIORS.recent
 #: Type of a stored block, with the fields of `BlockConductance`.
 _BLOCK = np.dtype([(name, float) for name in BlockConductance._fields])
 #: Blocks with larger numbers are refused, as their products would overflow.
@@ -72,8 +70,7 @@ class Watch:
     rig, false_alarms_per_1000_h, learn_hours : Rig, float, float
         Arguments of `watch`.
     litres : mapping of str to bool, optional
-        For each way of watching, "volumes" and "pressures", whether the rig states the sizes that are needed for
-        L/min; by default this is found from the rig.
+        Whether L/min can be stated by each way of watching, "volumes" and "pressures"; by default by the rig.
     healthy : HealthyLevel, optional
         Argument of `watch`.
 
@@ -126,10 +123,9 @@ class Watch:
         self._since = math.nan  # begin of the first block since the tests restarted [s]
 
     def _false_alarm_probability(self, test: str, seconds: float) -> float:
-        """Compute the false-alarm probability of a single test that is made once in `seconds`.
+        """Compute the false-alarm probability of a test, `STEP` or `LEVEL`, that is made once in `seconds`.
 
-        Each `test`, `STEP` or `LEVEL`, has a fraction of the stated rate of false alarms (`priors.toml`). The
-        probability is fraction * rate * `seconds`. Raises InputError unless the probability is 1e-12 to 0.05.
+        It is the test's part of the stated rate times `seconds`. Raises InputError unless it is 1e-12 to 0.05.
         """
         rate: float = self.false_alarms_per_1000_h
         fraction_of_alarms = getattr(_PRIORS, test)
@@ -151,10 +147,7 @@ class Watch:
 
     @property
     def method(self) -> str:
-        """Way of watching, "pressures" if the channels in use contain no position and "volumes" otherwise.
-
-        It is "volumes", too, until samples have arrived.
-        """
+        """Way of watching: "pressures" if samples have arrived without a position, otherwise "volumes"."""
         return "volumes" if "x" in self._samples.names or not self._samples.names else "pressures"
 
     @property
@@ -176,10 +169,7 @@ class Watch:
 
     @property
     def evidence(self) -> Evidence:
-        """Present verdict, with the detected leak or with a 95 % upper bound of an undetected leak.
-
-        The verdict is "cannot tell" until there are enough blocks for a bound.
-        """
+        """Present verdict, with the detected leak or a 95 % bound of one; "cannot tell" before enough blocks."""
         leak = self.leak
         if leak is not None:
             estimator = self._estimator or self._make_estimator()
@@ -197,31 +187,25 @@ class Watch:
         Without a leak (None) the result has the present score of the test for a step, limited to below the threshold,
         and the 95 % upper bound of an undetected leak. `estimator` states the uncertainty of flows.
         """
-        make_measure = partial(
-            LiveLeak,
-            flow_factors=(estimator.min_internal_fraction, estimator.orifice_factor),
-            lpm_per_flow=1.0 / LITRE_PER_MINUTE if estimator.litres else None,
-            size_deviation=estimator.size_error,
-        )
-        if leak is not None:
-            return make_measure(
-                test=leak.estimate,
-                cause=leak.cause,
-                flow_per_conductance=leak.pressure,
-                bound_flow=math.inf,  # a detected leak needs neither a bound nor the pump's flow
-                pump_flow=(0.0, 0.0),
-            )
-        # a step may exceed the threshold before it is explained: it must not be reported as a leak yet
-        threshold = -2.0 * math.log(self._false_alarm_probability(STEP, self.block_seconds))
-        score = min(max(2.0 * self._detector.log_e(), 0.0), threshold * (1.0 - 1e-6))  # twice the log e-value
-        pressure, pump_flow = (float(self._compared[name].mean()) for name in ("pressure", "pump_flow"))
-        bound = estimator.orifice_factor * self._detector.bound() * pressure * (1.0 + UPPER_95 * estimator.size_error)
-        return make_measure(
-            test=LiveRise(STEP, score),
-            cause=estimator.cause,
+        if leak is not None:  # it needs neither a bound nor the pump's flow
+            test, cause, pressure, bound, pump_flow = leak.estimate, leak.cause, leak.pressure, math.inf, 0.0
+        else:
+            # a step may exceed the threshold before it is explained: it must not be reported as a leak yet
+            threshold = -2.0 * math.log(self._false_alarm_probability(STEP, self.block_seconds))
+            score = min(max(2.0 * self._detector.log_e(), 0.0), threshold * (1.0 - 1e-6))  # twice the log e-value
+            test, cause = LiveRise(STEP, score), estimator.cause
+            pressure, pump_flow = (float(self._compared[name].mean()) for name in ("pressure", "pump_flow"))
+            max_flow = estimator.orifice_factor * self._detector.bound() * pressure
+            bound = max_flow * (1.0 + UPPER_95 * estimator.size_error)
+        return LiveLeak(
+            test,
+            cause,
             flow_per_conductance=pressure,
+            flow_factors=(estimator.min_internal_fraction, estimator.orifice_factor),
             bound_flow=bound,
             pump_flow=(pump_flow, pump_flow),  # mean over all samples, and while the pump delivers
+            lpm_per_flow=1.0 / LITRE_PER_MINUTE if estimator.litres else None,
+            size_deviation=estimator.size_error,
         )
 
     def update(self, samples: Recording, *, follows: bool = True) -> list[BlockEstimate]:
@@ -244,11 +228,7 @@ class Watch:
         return [estimate for estimate, _ in self.each(samples, follows=follows)]
 
     def each(self, samples: Recording, *, follows: bool = True) -> Iterator[tuple[BlockEstimate, WatchedLeak | None]]:
-        """Process the next samples; yield the estimate of each block, and the leak detected by then or None.
-
-        `follows` is False if the clock starts anew, as at the beginning of a separate file. Samples are processed only
-        as the iterator advances; to process all of them, iterate to the end.
-        """
+        """Process samples as `update` does, yielding each block's estimate, and the leak found by then, if any."""
         if not follows:
             self._samples.restart("pauses between samples")
         for run in self._samples.runs(remove_dropouts(samples)):
@@ -274,11 +254,7 @@ class Watch:
         return LiveBalance(self._rig, self._samples.names, litres)
 
     def continue_from(self, blocks: int, baseline_version: int) -> None:
-        """Continue the numbering of an earlier watch of the same machine, which had other settings.
-
-        `blocks` is the number of blocks of that watch, and `baseline_version` the version of its baseline. The next
-        baseline has the version that follows.
-        """
+        """Continue the numbers of blocks and baselines of an earlier watch of the machine, which had other settings."""
         self.blocks, self.baseline_version = blocks, baseline_version + 1
 
     def relearn(self) -> None:
@@ -290,10 +266,7 @@ class Watch:
         self.dismiss()
 
     def dismiss(self) -> None:
-        """Withdraw the leak alarm and restart the tests with the next block; keep the learned baseline.
-
-        The level from healthy recordings (`healthy`), which may have caused the alarm, is dropped.
-        """
+        """Withdraw the alarm and the level of healthy recordings; restart the tests, but keep the learned baseline."""
         self.leak = self.healthy = None
         self._forget()
 
@@ -305,9 +278,7 @@ class Watch:
     def judge(self, result: BlockResult) -> BlockEstimate:
         """Test the conductances of a block for a leak, and return the estimate of the block.
 
-        `result`: the conductances, or a `NotJudged` with the reason why there are none, which the returned estimate
-        then states. The first blocks, to which the volume balance is fitted, have their conductances in one result.
-        They are all tested; the returned estimate is that of the last one.
+        Of the blocks to which the volume balance is first fitted, which are one result, it is that of the last one.
         """
         self.blocks += 1
         if isinstance(result, NotJudged):
@@ -324,16 +295,16 @@ class Watch:
     def _judge_block(self, estimator: Estimator, block: BlockConductance) -> BlockEstimate:
         """Test the conductance of a block against those of earlier blocks, and estimate the leak in this block.
 
-        The block is added to the baseline, the healthy state, while the baseline is being learned and no leak has been
-        detected. If the block has another duty (pressure difference and pump flow) than the baseline, no flows are
-        stated. `estimator` is the source of the conductances.
+        The block is added to the baseline, the healthy state, while that is being learned and no leak has been
+        detected. No flows are stated for another duty (pressure difference and pump flow) than the baseline's.
         """
         row = np.array([block], _BLOCK)
         is_small = all(abs(number) < _MAX_NUMBER for number in block)  # False for NaN, too
         if not (is_small and self._detector.is_representable(block.g, block.sd)):
             self._samples.count("blocks: beyond floating point")
             return BlockEstimate(self.blocks, block.end, "beyond floating point")
-        has_known_duty = self._has_known_duty(block)
+        baseline = self.baseline
+        has_known_duty = baseline is None or is_known_duty(block.duty, baseline.duty_low, baseline.duty_high)
         self._add_to_tests(block, row, has_known_duty=has_known_duty)
         awaits_explanation = self._test_step(estimator, block)
         if not has_known_duty:
@@ -348,20 +319,14 @@ class Watch:
             self._learn(estimator, block)
         status = "alarm" if self.leak is not None else "learning" if self.baseline is None else "watched"
         estimate = BlockEstimate(self.blocks, block.end, status)
-        blocks = row if self.leak is None else self._blocks_of_leak(self.leak)[-_N_RECENT:]
+        blocks = row if self.leak is None else self._blocks_of_leak(self.leak)[-_PRIORS.recent :]
         return self._add_flows(estimate, estimator, blocks)
-
-    def _has_known_duty(self, block: BlockConductance) -> bool:
-        """Test whether mean |p_A - p_B| and pump flow are in the range of the baseline; True without a baseline."""
-        baseline = self.baseline
-        return baseline is None or is_known_duty(block.duty, baseline.duty_low, baseline.duty_high)
 
     def _add_to_tests(self, block: BlockConductance, row: NDArray[Any], *, has_known_duty: bool) -> None:
         """Add a block to the tests for a leak, which restart after a pause or a change of duty.
 
-        The duty is the mean pressure difference and pump flow. `has_known_duty` tells if the duty is in the range of
-        the baseline. A duty that leaves this range or returns to it counts as changed. `row` is the block as an array
-        (1,) of the type `_BLOCK`.
+        `has_known_duty` tells if the duty (mean pressure difference and pump flow) is in the baseline's range. Leaving
+        this range or returning to it is a change. `row` (1,) is the block as an array of the type `_BLOCK`.
         """
         if not has_known_duty:
             self._samples.count("blocks: another duty")
@@ -376,10 +341,7 @@ class Watch:
         self._compared = np.append(self._compared[1 - RECENT :], row)  # the last `RECENT` blocks
 
     def _learn(self, estimator: Estimator, block: BlockConductance) -> None:
-        """Add a block to the baseline, the healthy state; freeze the baseline after `learn_hours` of operation.
-
-        `estimator`, the source of the conductances, tells if the baseline can be stated in L/min.
-        """
+        """Add a block to the baseline, the healthy state; freeze the baseline after `learn_hours` of operation."""
         self._learning.add(block.g, block.lpm, block.duty)
         hours = self._learning.blocks * self.block_seconds / 3600.0
         if self._learning.blocks >= LEARNED and hours >= self.learn_hours * (1.0 - 1e-12):  # rounding of `hours`
@@ -391,40 +353,32 @@ class Watch:
         """Test for a step of the conductance up to `block`, and raise the alarm if a leak explains the step.
 
         For `RECENT` blocks after the alarm, a step with a higher score replaces onset and size of the leak. Returns
-        True if a step was found and a leak does not explain it, or not yet. `estimator` is the source of the
-        conductances.
+        True if a step was found and a leak does not explain it, or not yet.
         """
         leak = self.leak
         if leak is not None and (leak.test != STEP or block.end - leak.raised_s > RECENT * self.block_seconds):
             return False
         log_threshold = -math.log(self._false_alarm_probability(STEP, block.end - block.begin))
-        # a score is twice the log e-value
-        min_log_e = log_threshold if leak is None else 0.5 * leak.score
+        min_log_e = log_threshold if leak is None else 0.5 * leak.score  # a score is twice the log e-value
         if not self._detector.log_e(min_log_e) > min_log_e:
             return False
         rise = self._detector.rise()
+        cause = None if leak is None else leak.cause
         if leak is None:
             explanation = self._explain(estimator, rise, block)
             if not explanation.is_leak:
                 return True
             cause = OUTSIDE if explanation.is_outside else None
-        else:
-            cause = leak.cause
         reason = f"the leakage conductance rises at {clock_text(rise.interval.value)} beyond its random walk"
         self._raise_leak(estimator, rise, block, threshold=2.0 * log_threshold, reason=reason, cause=cause)
         return False
 
     def _explain(self, estimator: Estimator, rise: LiveRise, block: BlockConductance) -> RiseExplanation:
-        """Find the cause of the increase `rise` of the conductance, from changes of other quantities at its onset.
+        """Find the cause of the increase `rise` of the conductance, from changes of other quantities up to `block`.
 
-        The other quantities are tested in the stored blocks up to `block`, the present block. The cause is
-
-        - unknown if too few blocks have followed the onset,
-        - the start of the machine, if the onset is shortly after it: the tests restart, the start is counted, and the
-          result is `UNKNOWN`,
-        - a leak if the blocks around the onset are no longer stored,
-        - else the cause that `explain_rise` finds. If this is another event than a leak, and enough blocks have
-          followed, the event is counted, and tests and `estimator` restart.
+        The cause is unknown if too few blocks have followed the onset, or if the machine started shortly before it;
+        then the tests restart. It is a leak if the blocks around the onset are no longer stored, else that of
+        `explain_rise`. Once enough blocks have followed, tests and `estimator` restart for another event than a leak.
         """
         n_since = int(np.count_nonzero(self._compared["end"] > rise.interval.high))  # blocks since the onset
         if n_since < _EXPLANATION.shows:
@@ -448,8 +402,7 @@ class Watch:
     def _test_level(self, estimator: Estimator, block: BlockConductance) -> None:
         """Test the mean conductance of the last `GROUP` blocks, up to `block`, and raise the alarm if it is too high.
 
-        The mean is compared with the baseline (`find_level_rise`). Until there is a baseline, it is compared with the
-        healthy recordings, if there are any and the `estimator` states levels; otherwise nothing is tested.
+        It is compared with the baseline or, before there is one, with healthy recordings if `estimator` states levels.
         """
         has_baseline = self.baseline is not None
         healthy: HealthyLevel | None = self.baseline if has_baseline or not estimator.states_level else self.healthy
@@ -491,12 +444,11 @@ class Watch:
         before: float | None = None,
         cause: Cause | None = None,
     ) -> None:
-        """Set the leak alarm, `self.leak`, from a significant increase `rise` of the conductance.
+        """Set the leak alarm, `self.leak`, from a significant increase `rise` of the conductance up to `block`.
 
-        The increase was found at the end of `block`. `threshold` is the test's threshold, and `reason` the text of the
-        alarm. `before` is the conductance before the onset, by default the mean of up to `GROUP` blocks before the
-        onset. `cause` is by default the cause that the estimator states. If there is an alarm already, its time and its
-        conductance before the onset are kept.
+        `reason` is the text of the alarm. `before` is the conductance before the onset, by default the mean of up to
+        `GROUP` blocks; `cause` is by default the estimator's. An earlier alarm keeps its time and its conductance
+        before the onset.
         """
         raised_s = block.end
         if self.leak is not None:
@@ -532,9 +484,8 @@ class Watch:
     def with_cycle_means(self, estimate: BlockEstimate) -> BlockEstimate:
         """Replace the flows in the last block's estimate by means over more blocks, which cover cycles of the machine.
 
-        The means are over the blocks since the tests last restarted, after a pause or a change of duty. After an alarm,
-        they are over the blocks since the onset of the leak. At most the last `RECENT` blocks are used. An estimate of
-        a block that was not judged is returned unchanged.
+        These are the blocks, at most `RECENT`, since the tests last restarted or, after an alarm, since the onset of
+        the leak. An estimate of a block that was not judged is returned unchanged.
         """
         estimator = self._estimator
         if estimator is None or not (estimate.judged and len(self._compared)):
@@ -545,9 +496,8 @@ class Watch:
     def _add_flows(self, estimate: BlockEstimate, estimator: Estimator, blocks: NDArray[Any]) -> BlockEstimate:
         """Add the mean total flow and leak of `blocks` [L/min], with 95 % intervals, to an estimate.
 
-        The leak is the flow above the flow of the baseline or, after an alarm, above the flow before the onset. Without
-        baseline and alarm, no leak is added. If the `estimator` states only changes, no total flow is added. The
-        estimate is returned unchanged if no L/min are stated.
+        The leak is the flow above that of the baseline or, after an alarm, above that before the onset; it is left out
+        without either. The total is left out if the `estimator` states only changes, and both if it states no L/min.
         """
         if not estimator.litres:
             return estimate
@@ -574,10 +524,7 @@ class Watch:
         return replace(estimate, leak_lpm=leak.value, leak_interval_lpm=(max(0.0, low), max(0.0, high)))
 
     def state(self) -> dict[str, Any]:
-        """Return the state of the watch as plain values for JSON, which `from_state` restores.
-
-        ``"version"`` is the version of the format.
-        """
+        """Return the state of the watch as plain values for JSON, which `from_state` restores."""
         # an estimator for other channels than those in use is not saved, as the next samples would replace it
         estimator = self._estimator if self._estimator is not None and self._estimator.method == self.method else None
         return {
@@ -589,10 +536,7 @@ class Watch:
 
     @classmethod
     def from_state(cls, state: Mapping[str, Any]) -> Watch:
-        """Restore a watch from its `state`, which may have passed through JSON.
-
-        Later results are identical to the last bit. Raises InputError if the state is of another version or damaged.
-        """
+        """Restore a watch to the last bit from its `state`; raise InputError if it is of another version or damaged."""
         version = require_part(state, "version", int)
         if version != STATE_VERSION:
             raise InputError(f"saved state must have version {STATE_VERSION}, got {version}")

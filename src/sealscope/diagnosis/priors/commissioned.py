@@ -4,14 +4,10 @@ from sealscope.storage.toml_file import PriorTable, read_priors
 
 
 class SmallestLeakPriors(PriorTable):
-    """Definition of the smallest detectable leak of a machine.
+    """Definition of the smallest detectable leak of a machine."""
 
-    - `power`: probability with which the next recording shows this leak.
-    - `repeats`: factors by which more healthy recordings are assumed, to find how many would halve this leak.
-    """
-
-    power: float
-    repeats: tuple[int, ...]
+    power: float  # probability with which the next recording shows this leak
+    repeats: tuple[int, ...]  # tried factors of more healthy recordings, to find how many would halve this leak
 
 
 class CommissionedPriors(PriorTable):

@@ -4,34 +4,22 @@ from sealscope.storage.toml_file import PriorTable, read_priors
 
 
 class DriftPriors(PriorTable):
-    """Drift of each kind of coefficient in a volume balance.
+    """Drift of each kind of coefficient, as the standard deviation of its relative change in a minute [1/min]."""
 
-    Each field is the standard deviation of the relative change in a minute [1/min].
-
-    - `motion`: coefficients of the motion, such as displacement over area.
-    - `compliance`: compressed oil.
-    - `air`: free air in the oil.
-    - `bias`: constant flow, such as a tachometer shows at standstill because of its offset.
-    - `leak`: leakage past the piston.
-    - `pump`: leakage of the pump.
-    - `outside`: leakage to the outside.
-    - `edge`: gain of a servo valve's control edge.
-    """
-
-    motion: float
-    compliance: float
-    air: float
-    bias: float
-    leak: float
-    pump: float
-    outside: float
-    edge: float
+    motion: float  # coefficients of the motion, such as displacement over area
+    compliance: float  # compressed oil
+    air: float  # free air in the oil
+    bias: float  # constant flow, such as a tachometer shows at standstill because of its offset
+    leak: float  # leakage past the piston
+    pump: float  # leakage of the pump
+    outside: float  # leakage to the outside
+    edge: float  # gain of a servo valve's control edge
 
 
 class DifferencePriors(DriftPriors):
     """Standard deviation of the relative difference between recordings of one machine, for each kind of coefficient.
 
-    The fields have no unit. They are those of `DriftPriors` and, in addition:
+    The fields have no unit. They are those of `DriftPriors` and another one.
 
     - `speed`: flow that the pump loses in proportion to its speed.
     """
@@ -40,142 +28,88 @@ class DifferencePriors(DriftPriors):
 
 
 class LevelPriors(PriorTable):
-    """Standard deviations of constant flows in a volume balance; the prior mean of each flow is zero.
+    """Standard deviations [m^3/s] of constant flows in a volume balance; the prior mean of each flow is zero."""
 
-    - `outside` [m^3/s]: constant leakage to the outside.
-    - `gas` [m^3/s]: flow from an accumulator whose gas changes its temperature.
-    """
-
-    outside: float
-    gas: float
+    outside: float  # constant leakage to the outside
+    gas: float  # flow from an accumulator whose gas changes its temperature
 
 
 class BlockPriors(PriorTable):
-    """Division of a recording into blocks.
+    """Division of a recording into blocks."""
 
-    - `longest`, `shortest` [s]: limits of a block's length.
-    - `blocks`: number of blocks of a recording, unless their length would be outside these limits.
-    - `coarse`: largest number of blocks in tests for changes other than leaks.
-    """
-
+    # [s] limits of a block's length
     longest: float
     shortest: float
-    blocks: int
-    coarse: int
+    blocks: int  # number of blocks of a recording, unless their length would be outside these limits
+    coarse: int  # largest number of blocks in tests for changes other than leaks
 
 
 class ScatterPriors(PriorTable):
-    """Scatter of the leakage between recordings of one machine.
+    """Scatter of the leakage between recordings of one machine, divided by the pump's mean flow."""
 
-    Leakages are divided by the pump's mean flow.
-
-    - `between`: factor by which all standard deviations of `DifferencePriors` together may be wrong.
-    - `freedom`: degrees of freedom of the prior on the scatter of the motion's coefficients.
-    - `estimate`: smallest scatter, over the standard error that a recording states for its leakage.
-    - `finest`: smallest scatter of the leakage.
-    - `leak`: standard deviation of the leakage between recordings.
-    - `largest`: largest scatter of the leakage.
-    - `relative`: largest scatter of the leakage's logarithm.
-    - `unlike`: fraction of days whose unrecorded oil temperature is unlike that of all others.
-    - `session`: standard deviation of the leakage between sessions with oil of one viscosity.
-    - `tail`: probability that a healthy recording lies farther above the others than these predict, and the same below.
-    """
-
-    between: float
-    freedom: float
-    estimate: float
-    finest: float
-    leak: float
-    largest: float
-    relative: float
-    unlike: float
-    session: float
-    tail: float
+    between: float  # factor by which all standard deviations of `DifferencePriors` together may be wrong
+    freedom: float  # degrees of freedom of the prior on the scatter of the motion's coefficients
+    estimate: float  # smallest scatter, over the standard error that a recording states for its leakage
+    finest: float  # smallest scatter of the leakage
+    leak: float  # standard deviation of the leakage between recordings
+    largest: float  # largest scatter of the leakage
+    relative: float  # largest scatter of the leakage's logarithm
+    unlike: float  # fraction of days whose unrecorded oil temperature is unlike that of all others
+    session: float  # standard deviation of the leakage between sessions with oil of one viscosity
+    tail: float  # probability that a healthy recording lies farther above than predicted, and the same below
 
 
 class ConditionPriors(PriorTable):
-    """Effect of operating conditions that differ from those of the healthy recordings.
+    """Effect of operating conditions (load, speed, oil in K) that differ from those of the healthy recordings."""
 
-    - `ratio`: logarithm of load or speed over those of the healthy days, a standard deviation.
-    - `oil` [K]: change of the oil temperature within a day.
-    - `motion`: exponent of load and speed in the ratio of displaced to pumped volume, a standard deviation.
-    - `leak`: exponent of load and speed in a leak's conductance, a standard deviation.
-    """
-
-    ratio: float
-    oil: float
-    motion: float
-    leak: float
+    ratio: float  # logarithm of load or speed over those of the healthy days, a standard deviation
+    oil: float  # change of the oil temperature within a day
+    motion: float  # exponent of load and speed in the ratio of displaced to pumped volume, a standard deviation
+    leak: float  # exponent of load and speed in a leak's conductance, a standard deviation
 
 
 class OilPriors(PriorTable):
-    """Effect of the oil's temperature and viscosity on the leakage of a healthy machine.
+    """Effect of the oil's temperature (per kelvin in 1/K) and viscosity on the leakage of a healthy machine."""
 
-    - `warmest`: largest conductance, with the warmest oil, over the smallest.
-    - `per_kelvin`, `per_kelvin_deviation` [1/K]: relative increase of a leak per kelvin, and its standard deviation.
-    - `shift` [h]: time in which the oil warms by the largest difference.
-    - `per_drop`, `per_drop_deviation`: the leak is inversely proportional to this power of the viscous pressure drop
-      of the motion; the exponent and its standard deviation.
-    - `friction_session`, `friction_changes`: standard deviations of the logarithm of the friction between days, of the
-      same seals, and of seals that wear.
-    - `drop_tells`: probability that a change of this pressure drop is due to the oil and not to the load and speed of
-      the machine.
-    """
-
-    warmest: float
+    warmest: float  # largest conductance, with the warmest oil, over the smallest
+    # relative increase of a leak per kelvin, and its standard deviation
     per_kelvin: float
     per_kelvin_deviation: float
-    shift: float
+    shift: float  # [h] time in which the oil warms by the largest difference
+    # a leak is inversely proportional to this power of the viscous pressure drop; its standard deviation
     per_drop: float
     per_drop_deviation: float
+    # standard deviations of the logarithm of the friction between days, of the same seals, and of seals that wear
     friction_session: float
     friction_changes: float
-    drop_tells: float
+    drop_tells: float  # probability that a change of this drop is due to the oil, not to load and speed
 
 
 class SizePriors(PriorTable):
-    """Uncertainty of the sizes that convert a leak to L/min, as relative standard deviations, and the leak's law.
+    """Uncertainty of the sizes that convert a leak to L/min, as relative standard deviations, and the leak's law."""
 
-    - `displacement`: displacement of the pump.
-    - `law`: mean flow of a leak if its law is unknown: laminar, an orifice, or between the two.
-    - `laminar`: prior probability of a laminar leak.
-    - `readings`: number of independent values by which a recording tells the leak's law.
-    - `meter`: scale of a flow meter.
-    - `area`: piston area.
-    - `creep`: flow of a leak by which a held load creeps.
-    """
-
-    displacement: float
-    law: float
-    laminar: float
-    readings: int
-    meter: float
-    area: float
-    creep: float
+    displacement: float  # displacement of the pump
+    law: float  # mean flow of a leak if its law is unknown: laminar, an orifice, or between the two
+    laminar: float  # prior probability of a laminar leak
+    readings: int  # number of independent values by which a recording tells the leak's law
+    meter: float  # scale of a flow meter
+    area: float  # piston area
+    creep: float  # flow of a leak by which a held load creeps
 
 
 class RepeatPriors(PriorTable):
-    """Differences of the flow that the same motion needs on another day, as relative standard deviations.
+    """Differences of the flow that the same motion needs on another day, as relative standard deviations."""
 
-    - `scatter`: scatter between days.
-    - `recordings`: the prior on the scatter weighs as much as this number of recordings.
-    - `inflation`: largest factor by which the standard errors of the recordings may be too small.
-    """
-
-    scatter: float
-    recordings: float
-    inflation: float
+    scatter: float  # scatter between days
+    recordings: float  # the prior on the scatter weighs as much as this number of recordings
+    inflation: float  # largest factor by which the standard errors of the recordings may be too small
 
 
 class GrowthPriors(PriorTable):
-    """Growth of a leak after its onset within a recording.
+    """Growth of a leak after its onset within a recording."""
 
-    - `steady`: probability that it does not grow.
-    - `most`: largest increase of the leak's flow until the end of the recording, over the flow at the onset.
-    """
-
-    steady: float
-    most: float
+    steady: float  # probability that it does not grow
+    most: float  # largest increase of the leak's flow until the end of the recording, over the flow at the onset
 
 
 class StepSize(PriorTable):
@@ -192,170 +126,98 @@ class StepSize(PriorTable):
 
 
 class SensePriors(PriorTable):
-    """Probabilities that a sign of the recorded flow looks wrong for another reason than wrong wiring.
+    """Probabilities that a sign of the recorded flow looks wrong for another reason than wrong wiring."""
 
-    - `work`: the load gives back more work than it takes.
-    - `leak`: offsets of sensors, compressed oil and losses of the pump look like a negative leak.
-    - `sides`: the sides A and B are exchanged in the log.
-    - `rewired`: a recording has another sign than the healthy recordings before it.
-    """
-
-    work: float
-    leak: float
-    sides: float
-    rewired: float
+    work: float  # the load gives back more work than it takes
+    leak: float  # offsets of sensors, compressed oil and losses of the pump look like a negative leak
+    sides: float  # the sides A and B are exchanged in the log
+    rewired: float  # a recording has another sign than the healthy recordings before it
 
 
 class HeldOilPriors(PriorTable):
-    """Oil that is enclosed in the sides of a cylinder while shut valves hold it; such a time is a hold.
+    """Oil [Pa, 1/Pa] that is enclosed in the sides of a cylinder while shut valves hold it; such a time is a hold."""
 
-    - `compressibility` [1/Pa], `deviation`: relative compression per pressure, and the standard deviation of its
-      logarithm.
-    - `dead`, `dead_deviation`, `least_dead`: dead volume over the recorded stroke's volume, its relative standard
-      deviation, and the smallest one.
-    - `sides`, `sides_deviation`: logarithm of the ratio of the piston areas, of the side with the highest pressure over
-      the other, and its standard deviation.
-    - `sides_told`: probability that the pressures tell which side carries, whatever the offsets of the sensors.
-    - `unlike`: largest ratio of the two piston areas.
-    - `right`: probability that the holds are right about a leak's flow if they disagree with the whole recording.
-    - `agrees`: standard deviation of the logarithm of the ratio of the conductances from holds and whole recording.
-    - `rare`: p-value (probability in a healthy machine) of a rise of the leakage in the holds, below which the rise
-      is used to estimate the flow of the leak.
-    - `settles` [s]: time in which valves shut.
-    - `before` [s]: time before a hold in which the flow shows the leakage of the pump.
-    - `pump_session`: relative standard deviation of this leakage between sessions with the same oil.
-    - `shortest` [s]: shortest hold.
-    - `equalises` [s]: time in which a leak equalises the pressures of a hold.
-    - `loaded`: log odds from which a pressure difference is surely due to a load, and not to an offset of the
-      sensors.
-    - `independent`: number of independent readings of one side in a hold.
-    - `misfit`: fraction of the compressed volume that this model of the oil does not describe.
-    - `from_start`: fraction of the leaks that exist from the start of a recording.
-    - `gain`: relative difference between the gains of two pressure sensors.
-    - `charge`: relative margin above the charge pressure from which no check valve feeds a side.
-    - `resolved` [Pa]: margin in addition, below which a sensor does not tell a pressure from the charge pressure.
-    - `steady` [s]: time over which a pressure is averaged before it is compared with the charge pressure.
-    - `air`, `air_deviation`: volume fraction of free air in the oil, and the standard deviation of its
-      logarithm.
-    """
-
+    # relative compression per pressure, and the standard deviation of its logarithm
     compressibility: float
     deviation: float
+    # dead volume over the recorded stroke's volume, the smallest one, and its relative standard deviation
     dead: float
     least_dead: float
     dead_deviation: float
+    # logarithm of the piston areas' ratio, high pressure side over the other; its standard deviation
     sides: float
     sides_deviation: float
-    sides_told: float
-    unlike: float
-    right: float
-    agrees: float
-    rare: float
-    settles: float
-    before: float
-    pump_session: float
-    shortest: float
-    equalises: float
-    loaded: float
-    independent: float
-    misfit: float
-    from_start: float
-    gain: float
-    charge: float
-    resolved: float
-    steady: float
+    sides_told: float  # probability that the pressures tell which side carries, whatever the offsets of the sensors
+    unlike: float  # largest ratio of the two piston areas
+    right: float  # probability that the holds are right about a leak's flow if they disagree with the whole recording
+    agrees: float  # standard deviation of the logarithm of the ratio of the conductances from holds and whole recording
+    rare: float  # p-value of a rise of the leakage in the holds, below which it gives the flow of the leak
+    settles: float  # [s] time in which valves shut
+    before: float  # [s] time before a hold in which the flow shows the leakage of the pump
+    pump_session: float  # relative standard deviation of this leakage between sessions with the same oil
+    shortest: float  # [s] shortest hold
+    equalises: float  # [s] time in which a leak equalises the pressures of a hold
+    loaded: float  # log odds from which a pressure difference is surely a load, not an offset of the sensors
+    independent: float  # number of independent readings of one side in a hold
+    misfit: float  # fraction of the compressed volume that this model of the oil does not describe
+    from_start: float  # fraction of the leaks that exist from the start of a recording
+    gain: float  # relative difference between the gains of two pressure sensors
+    charge: float  # relative margin above the charge pressure from which no check valve feeds a side
+    resolved: float  # margin in addition, below which a sensor does not tell a pressure from the charge pressure
+    steady: float  # [s] time over which a pressure is averaged before it is compared with the charge pressure
+    # volume fraction of free air in the oil, and the standard deviation of its logarithm
     air: float
     air_deviation: float
 
 
 class PressurePriors(PriorTable):
-    """Smallest pressure at which free air is modelled.
-
-    - `least` [Pa]: this absolute pressure, below which oil boils.
-    """
+    """Smallest absolute pressure [Pa] at which free air is modelled; below it oil boils."""
 
     least: float
 
 
 class ZeroPriors(PriorTable):
-    """Error of p_A - p_B at equal pressures, which the zeros of both pressure sensors cause together.
+    """Error of p_A - p_B [Pa] at equal pressures, which the zeros of both pressure sensors cause together."""
 
-    - `pressure` [Pa]: standard deviation of the error of two usual sensors.
-    - `far` [Pa]: standard deviation of the error if the sensors are far off.
-    - `odds`: probability that they are far off.
-    """
-
-    pressure: float
-    far: float
-    odds: float
+    pressure: float  # standard deviation of the error of two usual sensors
+    far: float  # standard deviation of the error if the sensors are far off
+    odds: float  # probability that they are far off
 
 
 class HealthyPriors(PriorTable):
-    """Leakage conductance of a healthy machine.
+    """Standard deviations [m^3/(s Pa)] of the leakage conductances of a healthy machine."""
 
-    Each field is a standard deviation.
-
-    - `outside` [m^3/(s Pa)]: leakage to the outside.
-    - `piston` [m^3/(s Pa)]: leakage past the piston.
-    """
-
-    outside: float
-    piston: float
+    outside: float  # leakage to the outside
+    piston: float  # leakage past the piston
 
 
 class HeldPriors(PriorTable):
-    """A piston without a recorded position, which a control loop holds or returns.
+    """A piston without a recorded position, which a control loop holds or returns: times in s, speeds in m/s."""
 
-    - `half` [s]: half the width of a test function, the smooth weight of samples in one equation, while the piston is
-      held.
-    - `settles` [s]: time in which pressures settle after a motion.
-    - `slow`: largest speed of a held piston over its highest speed.
-    - `averaged` [s]: time over which the speed is averaged.
-    - `share`: smallest leakage of a pump over its mean flow.
-    - `elsewhere`: fraction of a test function's weight in which noise may change the sign of p_A - p_B.
-    - `creep` [m/s]: largest speed of a load that shut valves hold.
-    """
-
-    half: float
-    settles: float
-    slow: float
-    averaged: float
-    share: float
-    elsewhere: float
-    creep: float
+    half: float  # half the width of a test function (weight of samples in one equation) of a held piston
+    settles: float  # time in which pressures settle after a motion
+    slow: float  # largest speed of a held piston over its highest speed
+    averaged: float  # time over which the speed is averaged
+    share: float  # smallest leakage of a pump over its mean flow
+    elsewhere: float  # fraction of a test function's weight in which noise may change the sign of p_A - p_B
+    creep: float  # largest speed of a load that shut valves hold
 
 
 class RestPriors(PriorTable):
-    """A pump at rest, from which valves may cut off the cylinder.
+    """A pump at rest, from which valves may cut off the cylinder; flows are divided by the mean flow in motion."""
 
-    Flows are divided by the mean flow in motion.
-
-    - `averaged` [s]: time over which the flow is averaged.
-    - `least` [s]: shortest rest.
-    - `share`: largest averaged flow at rest.
-    - `holding`: mean flow of a pump that holds a load.
-    - `moves`: smallest mean flow of the pump in a block that counts as motion, and smallest flow by a flow meter.
-    - `shut`: leakage at rest over that in motion if valves cut the pump off, a standard deviation.
-    - `open`: relative difference of the leakage at rest and in motion if no valve shuts, a standard deviation.
-    - `compliance`: relative error of a compliance at rest that is fitted in motion, a standard deviation.
-    - `valves`: log odds, before any recording, that valves cut the pump off.
-    - `most`: limit of the log odds, from a healthy recording, that valves cut the pump off.
-    - `alone`: the same limit for a judged recording.
-    - `locked`: mean log odds of healthy recordings from which valves surely hold the pressures.
-    """
-
-    averaged: float
-    least: float
-    share: float
-    holding: float
-    moves: float
-    shut: float
-    open: float
-    compliance: float
-    valves: float
-    most: float
-    alone: float
-    locked: float
+    averaged: float  # [s] time over which the flow is averaged
+    least: float  # [s] shortest rest
+    share: float  # largest averaged flow at rest
+    holding: float  # mean flow of a pump that holds a load
+    moves: float  # smallest mean flow of the pump in a block that counts as motion, and smallest flow by a flow meter
+    shut: float  # leakage at rest over that in motion if valves cut the pump off, a standard deviation
+    open: float  # relative difference of the leakage at rest and in motion if no valve shuts, a standard deviation
+    compliance: float  # relative error of a compliance at rest that is fitted in motion, a standard deviation
+    valves: float  # log odds, before any recording, that valves cut the pump off
+    most: float  # limit of the log odds, from a healthy recording, that valves cut the pump off
+    alone: float  # the same limit for a judged recording
+    locked: float  # mean log odds of healthy recordings from which valves surely hold the pressures
 
 
 class InferencePriors(PriorTable):

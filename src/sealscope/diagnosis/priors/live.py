@@ -4,132 +4,81 @@ from sealscope.storage.toml_file import PriorTable, read_priors
 
 
 class SampleClock(PriorTable):
-    """Clock of the samples of a running machine.
+    """Clock of the samples of a running machine."""
 
-    - `follows`: smallest and largest time between successive samples, over the sampling interval. Nearer samples are
-      copies, farther ones have a gap between them.
-    - `rate`: relative error of a stated sampling rate.
-    """
-
+    # limits of the time between successive samples over the interval; nearer: a copy, farther: a gap
     follows: tuple[float, ...]
-    rate: float
+    rate: float  # relative error of a stated sampling rate
 
 
 class LiveBlocks(PriorTable):
-    """Blocks that the samples of a running machine are divided into.
+    """Division of the samples of a running machine into blocks."""
 
-    - `seconds` [s]: length of a block.
-    - `learned` [blocks]: number of blocks before the first estimate.
-    - `tells`: a block at standstill is used if the precision of its estimate of the leak is at least this fraction of a
-      usual block's precision.
-    - `standstill`: a machine stands still if the mean square of its motion is below this fraction of the usual one.
-    - `wakes` [blocks]: the machine is learned anew after this number of blocks with far more motion than ever before.
-    """
-
-    seconds: float
-    learned: int
-    tells: float
-    standstill: float
-    wakes: int
+    seconds: float  # [s] length of a block
+    learned: int  # number of blocks before the first estimate
+    tells: float  # smallest precision, over a usual block's, with which a block at standstill is used
+    standstill: float  # a machine stands still if the mean square of its motion is below this fraction of the usual one
+    wakes: int  # the machine is learned anew after this number of blocks with far more motion than ever before
 
 
 class CoefficientMemory(PriorTable):
-    """Memory of the estimated coefficients of a volume balance.
+    """Memory of the estimated coefficients of a volume balance, in blocks."""
 
-    - `memory` [blocks]: age at which a block has the weight 1/e.
-    - `returns` [blocks]: time constant with which the series of leakage estimates returns to the level given by the
-      present coefficients.
-    - `jump`: standard deviations beyond which a residual is a glitch or a step.
-    """
-
-    memory: float
-    returns: float
-    jump: float
+    memory: float  # age at which a block has the weight 1/e
+    returns: float  # time constant of the return of the leakage estimates to the present coefficients
+    jump: float  # standard deviations beyond which a residual is a glitch or a step
 
 
 class StepPriors(PriorTable):
     """A step of the leak within the stream of blocks, and the random walk of a healthy machine's leakage.
 
     Variances are divided by the variance of a block's estimate.
-
-    - `walks`: variances of the random walk in one block, each equally likely.
-    - `sizes`: variances of the step, each equally likely.
-    - `parts`: fractions of the first block in which the leak is open, each equally likely.
-    - `changes`: probability per block that the random walk changes its size.
-    - `memory`: factor per block by which earlier blocks lose weight in the estimates of noise and random walk.
-    - `recent` [blocks]: age up to which all possible onsets are kept; of older ones only some are.
-    - `horizon` [blocks]: largest age of an onset.
-    - `stated` [blocks]: the variance that an estimate states weighs as much as that observed in so many blocks.
     """
 
-    walks: tuple[float, ...]
-    sizes: tuple[float, ...]
-    parts: tuple[float, ...]
-    changes: float
-    memory: float
-    recent: int
-    horizon: int
-    stated: float
+    walks: tuple[float, ...]  # variances of the random walk in one block, each equally likely
+    sizes: tuple[float, ...]  # variances of the step, each equally likely
+    parts: tuple[float, ...]  # fractions of the first block in which the leak is open, each equally likely
+    changes: float  # probability per block that the random walk changes its size
+    memory: float  # factor per block by which earlier blocks lose weight in the estimates of noise and random walk
+    recent: int  # [blocks] age up to which all possible onsets are kept; of older ones only some are
+    horizon: int  # [blocks] largest age of an onset
+    stated: float  # [blocks] the variance that an estimate states weighs as much as that observed in so many blocks
 
 
 class WatchPriors(PriorTable):
-    """Comparison of a running machine with its baseline.
+    """Comparison of the blocks of a running machine with its baseline."""
 
-    - `pause` [s]: longest pause across which blocks are compared.
-    - `margin`: logarithm by which pressure and flow may lie outside the range of the baseline.
-    - `damped`: logarithm by which a leak may lower the pressure difference.
-    - `inside`: smallest fraction of a leak, as estimated from the pressures, that flows past the piston.
-    - `group` [blocks]: number of blocks whose mean is compared with the baseline.
-    - `recent` [blocks]: number of blocks whose mean is stated as the present leak.
-    - `step`: fraction of the false alarms for the test for a step.
-    - `level`: fraction of the false alarms for the test against the baseline.
-    """
-
-    pause: float
-    margin: float
-    damped: float
-    inside: float
-    group: int
-    recent: int
-    step: float
-    level: float
+    pause: float  # [s] longest pause across which blocks are compared
+    margin: float  # logarithm by which pressure and flow may lie outside the range of the baseline
+    damped: float  # logarithm by which a leak may lower the pressure difference
+    inside: float  # smallest fraction of a leak, as estimated from the pressures, that flows past the piston
+    group: int  # number of blocks whose mean is compared with the baseline
+    recent: int  # number of blocks whose mean is stated as the present leak
+    step: float  # fraction of the false alarms for the test for a step
+    level: float  # fraction of the false alarms for the test against the baseline
 
 
 class RiseExplanationPriors(PriorTable):
-    """Search for the cause of an increase of the leakage in the blocks around it.
+    """Search for the cause of an increase of the leakage in the blocks around it."""
 
-    - `window` [blocks]: number of blocks that are stored.
-    - `shows` [blocks]: number of blocks since the onset before a cause is looked for.
-    - `rare`: largest p-value (probability in a healthy machine) of a change that shows in the blocks.
-    - `start` [blocks]: time after a pause within which an increase is due to the start of the machine.
-    - `settles` [blocks]: number of blocks since the onset after which the explanation is final.
-    """
-
-    window: int
-    shows: int
-    rare: float
-    start: int
-    settles: int
+    window: int  # number of blocks that are stored
+    shows: int  # number of blocks since the onset before a cause is looked for
+    rare: float  # largest p-value (probability in a healthy machine) of a change that shows in the blocks
+    start: int  # [blocks] time after a pause within which an increase is due to the start of the machine
+    settles: int  # number of blocks since the onset after which the explanation is final
 
 
 class LiveResponse(PriorTable):
-    """Fit of a model of the pressure response to a running machine.
+    """Fit of a model of the pressure response to the blocks of a running machine; times are in blocks or s."""
 
-    - `seconds` [s]: length of a block.
-    - `begins` [s]: length of the first fit.
-    - `settling`, `resuming` [blocks]: time until the simulated states have settled, after the start and after a gap.
-    - `described`: the model describes a block if its chi square exceeds its mean by fewer standard deviations.
-    - `lost` [blocks]: the fit starts anew after this number of successive blocks that the model does not describe.
-    - `usual` [blocks]: time over which the usual variance of the residuals is averaged.
-    """
-
-    seconds: float
-    begins: float
+    seconds: float  # [s] length of a block
+    begins: float  # [s] length of the first fit
+    # blocks until the simulated states have settled, after the start and after a gap
     settling: int
     resuming: int
-    described: float
-    lost: int
-    usual: int
+    described: float  # the model describes a block if its chi square exceeds its mean by fewer standard deviations
+    lost: int  # the fit starts anew after this number of successive blocks that the model does not describe
+    usual: int  # blocks over which the usual variance of the residuals is averaged
 
 
 class LivePriors(PriorTable):

@@ -12,90 +12,56 @@ Parameter = Literal[
 
 
 class ResponseBlocks(PriorTable):
-    """Division of a recording into blocks.
+    """Division of a recording into blocks: times in s, rate in Hz."""
 
-    - `most`: largest number of blocks.
-    - `shortest` [s]: shortest block.
-    - `wander` [s]: time for which other priors state the change of a parameter.
-    - `slowest` [Hz]: lowest sampling rate.
-    """
-
-    most: int
-    shortest: float
-    wander: float
-    slowest: float
+    most: int  # largest number of blocks
+    shortest: float  # shortest block
+    wander: float  # time for which other priors state the change of a parameter
+    slowest: float  # lowest sampling rate
 
 
 class MachineScale(PriorTable):
-    """Uncertainty of the rig's mass and area, as relative standard deviations.
+    """Uncertainty of the rig's mass and area, as relative standard deviations."""
 
-    - `mass`: moving mass.
-    - `area`: piston area.
-    """
-
-    mass: float
-    area: float
+    mass: float  # moving mass
+    area: float  # piston area
 
 
 class MainsPriors(PriorTable):
-    """Hum of the electric mains in the pressures.
+    """Hum of the electric mains [Hz] in the pressures."""
 
-    - `lines` [Hz]: frequencies of the grids.
-    - `within`: relative error of these frequencies.
-    - `harmonics`: highest harmonic.
-    """
-
-    lines: tuple[float, ...]
-    within: float
-    harmonics: int
+    lines: tuple[float, ...]  # frequencies of the grids
+    within: float  # relative error of these frequencies
+    harmonics: int  # highest harmonic
 
 
 class ConductancePriors(PriorTable):
-    """Leakage conductance past the piston.
+    """Leakage conductance past the piston [m^3/(s Pa)]."""
 
-    - `wander` [m^3/(s Pa)]: its change in 90 s, a standard deviation.
-    - `level` [m^3/(s Pa)]: its standard deviation between recordings of one machine.
-    - `orifice`: mean flow through an orifice, over that of the laminar leak with the same effect on the pressures.
-    """
-
-    wander: float
-    level: float
-    orifice: float
+    wander: float  # its change in 90 s, a standard deviation
+    level: float  # its standard deviation between recordings of one machine
+    orifice: float  # mean flow through an orifice, over that of the laminar leak with the same effect on the pressures
 
 
 class FrictionLaw(PriorTable):
-    """Parameters of a law of friction for the contact of piston and seal.
+    """Parameters of a law of friction for the contact of piston and seal [m/N, m/s]."""
 
-    - `give` [m/N]: displacement per force before the contact slides. The three numbers are centre, standard deviation
-      and change in 90 s.
-    - `creep` [m/s]: largest speed of creep; None to use the value of the rig.
-    """
-
+    # displacement per force before sliding: centre, standard deviation, change in 90 s
     give: tuple[float, float, float]
-    creep: float | None = None
+    creep: float | None = None  # largest speed of creep; None to use the value of the rig
 
 
 class FollowPriors(PriorTable):
-    """Fits of the pressure response along a recording.
+    """Fits of the pressure response along a recording: times in s or in periods of the ringing."""
 
-    - `window` [s]: length of the first fit.
-    - `beginning` [s]: length of the beginning, which is fitted once before the actual fit to find its initial values.
-    - `block` [s]: length of a block of the beginning.
-    - `settling` [s]: time in which the drive starts.
-    - `centring` [s]: time constant of the mean position, from which the load's spring force is counted.
-    - `slow` [periods]: width of the Gaussian filter that removes the ringing.
-    - `unexplained`: jumps of parameters are tried if a block's chi square exceeds this number of standard deviations.
-    - `explained`: largest fraction of the variance of p_A - p_B that a valid fit leaves unexplained.
-    """
-
-    window: float
-    beginning: float
-    block: float
-    settling: float
-    centring: float
-    slow: float
-    unexplained: float
-    explained: float
+    window: float  # [s] length of the first fit
+    beginning: float  # [s] length of the beginning, fitted first to find initial values
+    block: float  # [s] length of a block of the beginning
+    settling: float  # [s] time in which the drive starts
+    centring: float  # [s] time constant of the mean position, from which the load's spring force is counted
+    slow: float  # [periods] width of the Gaussian filter that removes the ringing
+    unexplained: float  # jumps are tried above this chi square of a block, in standard deviations
+    explained: float  # largest fraction of the variance of p_A - p_B that a valid fit leaves unexplained
 
 
 class PressureResponsePriors(PriorTable):

@@ -4,14 +4,10 @@ from sealscope.storage.toml_file import PriorTable, read_priors
 
 
 class RepairPriors(PriorTable):
-    """Default repair limit.
+    """Default repair limit [mm/min]."""
 
-    - `creep` [mm/min]: creep speed of the piston with its lines shut.
-    - `watch`: fraction of the limit under which a leak only has the level "monitor".
-    """
-
-    creep: float
-    watch: float
+    creep: float  # creep speed of the piston with its lines shut
+    watch: float  # fraction of the limit under which a leak only has the level "monitor"
 
 
 class VerdictPriors(PriorTable):

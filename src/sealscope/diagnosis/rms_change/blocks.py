@@ -34,39 +34,18 @@ DUTY = tuple(vars(RMS_PRIORS.duty))
 class RmsBlocks:
     """Logarithm of the RMS of every wavelet quantity (`QUANTITIES`) in n blocks of a recording.
 
-    A cycle of the command has several blocks, its phases. From `log_rms` and `duty` the mean differences between the
-    phases are removed.
-
-    Attributes
-    ----------
-    edges : array, (n + 1,)
-        Start of each block and end of the last one [s].
-    log_rms : array, (n, 5 per chamber)
-        Logarithm of the RMS of each quantity.
-    duty : array, (n, 4)
-        Logarithm of the RMS of the command, of its rate of change and of the pressure difference dp, and
-        mean(dp)/RMS(dp).
-    chambers : tuple of str
-        Names of the chamber pressures.
-    phases : int
-        Number of blocks per cycle of the command.
-    cycle : float or None
-        Period of the command [s], None if nothing repeats.
-    frozen : str or None
-        Description of the first block in which a pressure reading is stuck; its log RMS is then meaningless. None if no
-        reading is stuck.
-    n_left_out : int
-        Number of blocks that were left out because samples are missing.
+    The mean differences between the phases, the blocks of a cycle, are removed from `log_rms` and `duty`.
     """
 
-    edges: Array
-    log_rms: Array
+    edges: Array  # (n + 1,): start of each block and end of the last one [s]
+    log_rms: Array  # (n, 5 per chamber): logarithm of the RMS of each quantity
+    # (n, 4): log RMS of the command, of its rate of change and of the pressure difference dp, and mean(dp)/RMS(dp)
     duty: Array
-    chambers: tuple[str, ...]
-    phases: int
-    cycle: float | None
-    frozen: str | None = None
-    n_left_out: int = 0
+    chambers: tuple[str, ...]  # names of the chamber pressures
+    phases: int  # number of blocks per cycle of the command
+    cycle: float | None  # period of the command [s], None if nothing repeats
+    frozen: str | None = None  # description of the first block with a stuck pressure reading, if any
+    n_left_out: int = 0  # number of blocks that were left out because samples are missing
 
     @property
     def share(self) -> float:
@@ -84,9 +63,9 @@ class RmsBlocks:
         return float(np.diff(self.edges).min()) if len(self.log_rms) else 0.0
 
     def without_start(self) -> RmsBlocks:
-        """Return the blocks after the machine's start, in which pressures and speed settle.
+        """Return the blocks after the start, in which pressures and speed settle.
 
-        The start is assumed to last 10 s or three cycles, whichever is longer, but at most an eighth of the blocks.
+        It lasts 10 s or three cycles, whichever is longer, but at most an eighth of the blocks.
         """
         n_blocks, prior = len(self.log_rms), RMS_PRIORS.blocks
         start_s = max(prior.settling, prior.settling_cycles * (self.cycle or 0.0))
@@ -108,12 +87,10 @@ def judged_chambers(recording: Recording) -> tuple[str, ...]:
 def measure_levels(recording: Recording) -> tuple[Array, Array]:
     """Compute the log RMS of wavelet details (5 per judged chamber,) and features of the duty (4,) of a recording.
 
-    Both are described for `RmsBlocks`. Samples at the ends, where the wavelet transform depends on padding, are left
-    out.
+    Both are described for `RmsBlocks`. Ends, where the wavelet transform depends on padding, are left out.
     """
     transformed = [details(recording[chamber]) for chamber in judged_chambers(recording)]
     inside = transformed[0].inside()
-    # the recording is a single block
     log_rms, duty = _measure_blocks(recording, transformed, bounds=np.array([inside.start, inside.stop]))
     return log_rms[0], duty[0]
 
@@ -122,8 +99,7 @@ def _measure_blocks(recording: Recording, transformed: list[Details], bounds: In
     """Compute the log RMS of wavelet details (n, 5 per chamber) and features of the duty (n, 4) of n blocks.
 
     Both are described for `RmsBlocks`. `transformed` holds the wavelet details of each chamber, and `bounds` (n + 1,)
-    the sample indices at which blocks begin and end. If only one chamber is recorded, the pressure difference is
-    replaced by the pressure of this chamber minus its mean over the recording.
+    the sample indices of the blocks' ends. The pressure of a single chamber, minus its mean, replaces the difference.
     """
     chambers = chambers_of(recording)
     if len(chambers) == len(CHAMBERS):
@@ -145,10 +121,9 @@ def _measure_blocks(recording: Recording, transformed: list[Details], bounds: In
 def cut_blocks(recording: Recording) -> RmsBlocks:
     """Cut a recording into blocks, and compute for each the log RMS of wavelet details and features of the duty.
 
-    The duty is how the machine is moved and loaded. The recording must be uniformly sampled and its gaps filled in.
-    Blocks in which too many samples were missing are left out, and so are samples at the ends, where the wavelet
-    transform depends on padding. If the duty repeats, its cycle has several blocks, the phases; the mean differences
-    between the phases are removed, unless a reading is stuck.
+    The recording must be uniformly sampled and its gaps filled in. Blocks in which too many samples were missing are
+    left out, and so are the ends, where the wavelet transform depends on padding. If the duty repeats, the mean
+    differences between the phases of its cycle are removed, unless a reading is stuck.
     """
     chambers = judged_chambers(recording)
     transformed = [details(recording[chamber]) for chamber in chambers]
@@ -179,13 +154,9 @@ def _block_bounds(inside: slice, rate: float, cycle: float | None) -> tuple[IntA
     """Choose the sample indices at which blocks begin and end (n + 1,), and the number of blocks per duty cycle.
 
     `inside` are the samples at which the wavelet details do not depend on padding, `rate` is the sampling rate [Hz],
-    and `cycle` the period of the command [s], or None. The length of a block is
-
-    - the fraction 1, 1/2, 1/3, ... of the cycle that is closest to the shortest allowed length,
-    - several cycles if a cycle is shorter than the shortest allowed length,
-    - the shortest allowed length if there is no cycle.
-
-    If there would be too many blocks, they become longer and span whole cycles.
+    and `cycle` the period of the command [s], or None. A block is the fraction 1, 1/2, 1/3, ... of the cycle that is
+    closest to the shortest allowed length, several cycles if they are shorter than this, and of this length without a
+    cycle. If there would be too many blocks, they become longer and span whole cycles.
     """
     prior, n_samples = RMS_PRIORS.blocks, inside.stop - inside.start
     block_s = min_block_s = max(prior.seconds, prior.samples / rate)
@@ -206,9 +177,8 @@ def _find_frozen(
 ) -> str | None:
     """Describe the first block in which a pressure reading is stuck; None if no reading is stuck.
 
-    A reading is stuck if one of its wavelet details d1 to d4 is only rounding error or not finite. `chambers`: names of
-    the pressures; `log_rms` (n, 5 per chamber): log RMS of their details in n blocks; `is_complete` (n,): flags of the
-    blocks without missing samples; `times` (n + 1,): bounds of the blocks [s].
+    A reading is stuck if one of its details d1 to d4 is only rounding error or not finite. `log_rms` (n, 5 per chamber)
+    is that of n blocks, of which `is_complete` (n,) have no missing samples, and `times` (n + 1,) are their bounds [s].
     """
     floor = np.log([ROUNDING * np.abs(recording[name]).max() for name in chambers])[:, None]
     levels = log_rms.reshape(len(log_rms), len(chambers), -1)[:, :, :-1]  # without d3d4

@@ -58,14 +58,7 @@ class RmsChange:
     def learn(self, recording: Recording) -> Summary:
         """Summarise a healthy recording by the log RMS of its wavelet details, for comparison with later recordings.
 
-        The entries of the summary are:
-
-        - `chambers`: names of the chamber pressures that are used, i.e. not mostly clipped (`judged_chambers`),
-        - `recorded`: names of all recorded chamber pressures,
-        - `rate`: sampling rate [Hz],
-        - `start_s`: time of the first sample [s since 1970], None if unknown,
-        - `levels` (5 per chamber,): log RMS of the wavelet quantities,
-        - `duty` (4,): features of how the machine is moved and loaded (`RmsBlocks.duty`).
+        `levels` (5 per chamber,) and `duty` (4,) are as in `RmsBlocks`; `chambers` are those not mostly clipped.
         """
         levels, duty = measure_levels(recording)
         return {
@@ -78,11 +71,9 @@ class RmsChange:
         }
 
     def observe(self, recording: Recording, baseline: Sequence[Healthy] = ()) -> Observed:
-        """Test the RMS of the pressures' wavelet details for changes.
+        """Test the RMS of the wavelet details against `baseline` or, without one, for a change within the recording.
 
-        The recording is compared with the recordings of `baseline` or, without a baseline, tested for a change within
-        it. If the sampling rate is too low, a reading is stuck, or the recording is too short, the report is empty and
-        states the reason.
+        If the sampling rate is too low, a reading is stuck, or the recording is too short, the report only says so.
         """
         min_rate: float = RMS_PRIORS.rate.slowest
         if recording.rate < min_rate:
@@ -102,10 +93,9 @@ class RmsChange:
 def observe_within(blocks: RmsBlocks, rate: float, unused: tuple[str, ...] = ()) -> Observed:
     """Test the wavelet details of every chamber pressure for a step of their RMS within one recording.
 
-    Each detail is tested for a step up and a step down; the more significant step is reported. All details are assumed
-    to change at the same onset. It is estimated from the sum of the log likelihoods of the judged details (d2 to d4),
-    without details whose step has a p-value of 0.5 or more. `rate` is the sampling rate [Hz], and `unused` are recorded
-    columns that belong to no channel. If a detail has too little information, the report states only this reason.
+    The more significant of a step up and a step down is reported for each detail. Their common onset is estimated from
+    the sum of the log likelihoods of the judged details (d2 to d4) whose step has a p-value below 0.5. `rate` is the
+    sampling rate [Hz], and `unused` are columns of no channel. Without enough information, it reports only that.
     """
     changes = dict[str, tuple[StepTest, float]]()  # by detail: the more significant test, and the change of the log RMS
     judged_steps, bounds = list[StepTest](), list[float]()
@@ -141,8 +131,7 @@ def observe_within(blocks: RmsBlocks, rate: float, unused: tuple[str, ...] = ())
 def observe_against(recording: Recording, baseline: Sequence[Healthy]) -> Observed:
     """Test the RMS of a recording's wavelet details for changes against leak-free recordings.
 
-    `baseline` are the leak-free recordings, of which only those with the same chamber pressures and sampling rate are
-    used. If there are none, the report is empty and states the reason.
+    Only those of `baseline` with the same chamber pressures and sampling rate are used. Without any, it says so.
     """
     chambers, recorded = judged_chambers(recording), list(chambers_of(recording))
     # the duty is computed from all recorded chambers, which must therefore be the same
@@ -168,10 +157,9 @@ def compare_summaries(
 ) -> tuple[tuple[Observable, ...], float]:
     """Test the RMS of every chamber pressure's wavelet details for a rise or fall against leak-free recordings.
 
-    `judged` is the summary of the judged recording and `summaries` are the summaries of the leak-free recordings, by
-    `RmsChange.learn`; `chambers` are the pressures to compare. Returns the tests, one observable for each detail and
-    chamber, and the 95 % upper bound of an undetected change of the log RMS. The bound is the smallest of the bounds of
-    the judged details d2 to d4.
+    `judged` and `summaries` are summaries (`RmsChange.learn`) of the judged and the leak-free recordings, and
+    `chambers` the pressures to compare. Returns an observable for each detail and chamber, and the 95 % upper bound of
+    an undetected change of the log RMS, the smallest of the judged details d2 to d4.
     """
     starts = [*(summary.get("start_s") for summary in summaries), judged.get("start_s")]
     times = None if None in starts else np.array(starts, dtype=float)
@@ -200,9 +188,8 @@ def _make_observable(
 ) -> Observable:
     """Make the observable for the change of one wavelet detail, named by its `column`, such as "d3 of p_A".
 
-    `size` is the change of the log RMS, `score` twice the log likelihood ratio of the change, and `chance` the p-value
-    of a single test. The p-value is multiplied by the number of tests: a rise and a fall of each judged detail in each
-    of the `chambers`. `onset`: time of the change [s], None for a comparison with healthy recordings.
+    `size` is the change of the log RMS, `score` twice its log likelihood ratio, and `onset` its time [s], None for a
+    comparison. The p-value `chance` is multiplied by the number of tests: of each judged detail, for rise and fall.
     """
     return Observable(
         name=f"{'rise' if size > 0.0 else 'fall'} of {column}",
@@ -215,9 +202,6 @@ def _make_observable(
 
 
 def _summary_levels(summary: Summary, chambers: Sequence[str]) -> Array:
-    """Select the logarithms of the RMS of the given chambers' wavelet details from a recording's summary.
-
-    The result has five values for each chamber, one chamber after the other.
-    """
+    """Select the log RMS of the chambers' wavelet details, five for one after the other, from a recording's summary."""
     levels = np.asarray(summary["levels"], dtype=float).reshape(len(summary["chambers"]), -1)
     return np.concatenate([levels[summary["chambers"].index(chamber)] for chamber in chambers])

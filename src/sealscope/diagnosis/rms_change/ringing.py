@@ -28,15 +28,13 @@ from sealscope.signals.details import QUANTITIES
 def subtract_noise(log_rms: Array, healthy: Array) -> tuple[Array, Array]:
     """Compute the change of the log RMS of wavelet details without noise, and the fraction of energy that is not noise.
 
-    `log_rms` (n, 5 per chamber): values of n blocks or recordings; `healthy` (k, 5 per chamber): values from which the
-    machine's mean energy S_j in each detail d_j is estimated, as the energy of d_j minus the energy of d1. The noise
-    E_1 is the energy of d1 in the same row of `log_rms`. The changes y and the fractions w are
+    `log_rms` (n, 5 per chamber) are values of n blocks or recordings, and `healthy` (k, 5 per chamber) those from which
+    the machine's mean energy S_j in each detail d_j is estimated, as the energy of d_j minus that of d1. The noise E_1
+    is the energy of d1 in the same row of `log_rms`. The changes y and the fractions w (n, 5 per chamber) are
 
         d2, d3, d4:   y = log RMS - log sqrt(S_j + E_1),    w = S_j / (S_j + E_1)
         d1:           y = log RMS,    w = 1
         d3d4:         y = log RMS minus the terms log sqrt(S_j + E_1) of both d3 and d4,    w = 1.
-
-    Both results have the shape of `log_rms`.
     """
     y, weight = np.array(log_rms), np.ones_like(log_rms)
     min_signal_fraction = RMS_PRIORS.walk.least  # S_j is a difference of two estimates, which might be negative
@@ -56,10 +54,9 @@ def subtract_noise(log_rms: Array, healthy: Array) -> tuple[Array, Array]:
 def change_information(blocks: RmsBlocks) -> tuple[list[Information], Array]:
     """Compute the likelihood of the relative change g of the ringing in each block of a recording.
 
-    The ringing is the oscillation of the pressures, measured by the RMS of their wavelet details; g = log(RMS / mean
-    RMS) after the noise was subtracted (`subtract_noise`). The effect of the duty (how the machine is moved and loaded)
-    is eliminated. Returns one `Information` (a normal likelihood over the blocks) for each column of `blocks.log_rms`,
-    and the mean of each column's fraction of energy that is not noise.
+    g = log(RMS / mean RMS) of the pressures' wavelet details, after noise (`subtract_noise`) and the effect of the duty
+    were subtracted. Returns one `Information` (a normal likelihood over the blocks) for each column of
+    `blocks.log_rms`, and the mean of each column's fraction of energy that is not noise.
     """
     changes, weight = subtract_noise(blocks.log_rms, blocks.log_rms)
     variances = np.mean(np.diff(changes, axis=0) ** 2, axis=0) / 2.0  # a difference has twice the variance
@@ -88,14 +85,14 @@ def estimate_rises(
 ) -> tuple[list[Rise], Array]:
     """Estimate the change g of the log RMS of wavelet details (ringing) relative to n leak-free recordings.
 
-    `log_rms` (5 per chamber,) and `duty` (4,), the features `DUTY`, are values of the judged recording. `healthy` (n, 5
-    per chamber) and `healthy_duty` (n, 4) are values of the leak-free recordings. `times` (n + 1,) are the start times
-    of the leak-free recordings and, last, of the judged recording [s], None if unknown. Returns the changes, one for
-    each wavelet quantity, and the fractions of their energy that are not noise, (5 per chamber,).
+    `log_rms` (5 per chamber,) and `duty` (4,), the features `DUTY`, are those of the judged recording, `healthy` (n, 5
+    per chamber) and `healthy_duty` (n, 4) those of the leak-free ones. `times` (n + 1,) are the start times, the judged
+    recording's last [s], None if unknown. Returns the change of each wavelet quantity, and the fractions of energy that
+    are not noise, (5 per chamber,).
 
-    The model of the values is the sum of a common mean, an effect of the duty (how the machine is moved and loaded),
-    independent scatter, and an Ornstein-Uhlenbeck process over time. The process is independent between sessions, which
-    are separated by pauses. Its variance is stated in `priors.toml` (`recordings.session`), and its rate is unknown.
+    The model is the sum of a common mean, an effect of the duty, independent scatter, and an Ornstein-Uhlenbeck process
+    over time, independent between sessions, which are separated by pauses. Its variance is stated in `priors.toml`
+    (`recordings.session`), and its rate is unknown.
     """
     prior, walk, n = RMS_PRIORS.recordings, RMS_PRIORS.walk, len(healthy)
     exponent_sd = np.array([getattr(RMS_PRIORS.duty, name) for name in DUTY])

@@ -51,18 +51,13 @@ class LeakReading:
 
     Attributes
     ----------
-    file : str
-        Name of the recording.
-    start : float or None
-        Time of its first sample [s since 1970], None if unknown.
-    duration : float
-        Duration [s].
+    file, start, duration : str, float or None, float
+        Name of the recording, time of its first sample [s since 1970], if known, and duration [s].
     basis : Basis or None
         Method by which the level was estimated. None if no level can be stated; `problem` then tells why.
     level, error : float
-        Leakage conductance of pump and piston together and its standard error [m^3/(s Pa)]. For the basis "ringing"
-        it is minus the mean log RMS of the pressures' wavelet details. Unless `states_flow`, it is relative to the
-        assumed machine. nan without a basis.
+        Leakage conductance of pump and piston together and its standard error [m^3/(s Pa)], or minus the mean log RMS
+        of the pressures' wavelet details ("ringing"); relative to the assumed machine unless `states_flow`.
     states_flow : bool
         True if the level can be stated in L/min.
     area : float or None
@@ -83,13 +78,10 @@ class LeakReading:
         Mean flow of the pump [m^3/s]; by the volume balance only while the machine moves. nan for the basis "ringing".
     size_error : float
         Relative standard error of flows due to the machine's sizes (displacement, piston area).
-    sums : RecordingSums or None
-        Sums of the volume balance, for comparison with other recordings; None without a balance.
-    terms : tuple of ColumnRoles
-        Terms of the volume balance that `sums` belongs to.
+    sums, terms : RecordingSums or None, tuple of ColumnRoles
+        Sums of the volume balance, None without a balance, and its terms.
     ringing : Summary or None
-        Summary of the pressures' ringing (RMS of their wavelet details), for comparison with other recordings; None if
-        the channels do not allow it.
+        Summary of the pressures' ringing (RMS of their wavelet details); None if the channels do not allow it.
     """
 
     file: str
@@ -118,11 +110,9 @@ def estimate_reading(
 ) -> LeakReading:
     """Estimate the leakage of a recording.
 
-    `rig` states the sizes of the machine: a Rig, the name of a packaged rig, or the path of its file. If `rig` is None,
-    the thesis's rig is assumed. The leakage can then be stated in L/min only if the recording was simulated with a rig
-    of the same sizes, or if a flow meter was recorded (`LeakReading.states_flow`). `file` is the name of the recording,
-    by default the name of the file from which it was read. If no estimate is possible, `problem` of the result states
-    the reason.
+    `rig` states the sizes of the machine, as for `diagnose`. If it is None, the thesis's rig is assumed, and L/min can
+    be stated only for a simulation with these sizes, or with a flow meter (`LeakReading.states_flow`). `file` is the
+    recording's name, by default its file's. If no estimate is possible, `problem` of the result states the reason.
     """
     used_rig, machine = assumed_rig(rig, recording)
     inspection = inspect_recording(recording)
@@ -145,11 +135,10 @@ def estimate_reading(
 
 
 def _estimate_level(part: Recording, rig: Rig, machine: AssumedMachine) -> dict[str, Any]:
-    """Estimate the leakage by the best method that the channels of a recording allow.
+    """Estimate the leakage by the best method that the channels of a recording without defects allow.
 
-    The methods are the volume balance, the pressure response and the damping of the pressures' ringing, in this order.
-    `part`: the recording, without defects; `rig`, `machine`: assumed sizes. Returns the fields of `LeakReading` that
-    depend on the method, by name; only the field `problem` if no method is possible.
+    These are the volume balance, the pressure response and the damping of the pressures' ringing, with the assumed
+    sizes. Returns the fields of `LeakReading` that depend on the method; only `problem` if no method is possible.
     """
     balance, response, details = VolumeBalance(rig), PressureResponse(rig), RmsChange()
     balance_lack, response_lack = unusable_reason(balance, part), unusable_reason(response, part)
@@ -175,17 +164,14 @@ def _estimate_level(part: Recording, rig: Rig, machine: AssumedMachine) -> dict[
     damping = float(-np.mean(log_rms_by_chamber[:, judged_columns]))
     if np.isfinite(damping):
         return fields | {"basis": "ringing", "level": damping, "error": TREND.reading.ringing}
-    # each reason once
-    reasons = list(dict.fromkeys(lack for lack in (balance_lack, response_lack) if lack is not None))
-    reasons = reasons or ["the pressures do not ring"]
-    return {"problem": "no detector states a level: " + "; ".join(reasons)}
+    reasons = dict.fromkeys(lack for lack in (balance_lack, response_lack) if lack is not None)  # each once
+    return {"problem": "no detector states a level: " + "; ".join(reasons or ["the pressures do not ring"])}
 
 
 def _balance_fields(solution: RecordedBalance, machine: AssumedMachine) -> dict[str, Any]:
     """Collect the fields of `LeakReading` that follow from a solved volume balance, by name.
 
-    The balance (`solution`) uses assumed sizes; the true flows and conductances are `size.scale` (`recorded.Size`)
-    times those of the balance. `machine`: assumed machine, of which only the piston area is used.
+    True flows and conductances are `size.scale` (`recorded.Size`) times those of the balance with assumed sizes.
     """
     size = solution.size
     total = solution.conductance  # value and 95 % interval
@@ -206,11 +192,9 @@ def _balance_fields(solution: RecordedBalance, machine: AssumedMachine) -> dict[
 
 
 def scatter_prior(basis: Basis, usual: float) -> ScatterPrior:
-    """Make the prior on the standard deviation of the leakage level (`LeakReading.level`) between recordings.
+    """Make the prior on the standard deviation of `LeakReading.level` between recordings, estimated by `basis`.
 
-    `basis` is the method by which the levels were estimated, and `usual` the typical level, in the unit of the levels.
-    The typical standard deviation is proportional to `usual` for the volume balance, and a constant for other methods
-    (`priors.toml`).
+    It is proportional to the typical level `usual` for the volume balance, and constant for other methods.
     """
     between = TREND.between
     if basis == "pressure response":
@@ -227,10 +211,8 @@ class TrendPoint(LeakReading):
 
     Attributes
     ----------
-    start : float
-        Time of the recording's first sample [s since 1970].
-    day : float
-        Time since the first recording [days].
+    start, day : float
+        Time of the first sample [s since 1970], and since the first recording [days].
     group : int
         Number of the group of recordings that can be compared with each other; -1 if the recording is left out.
     note : str
@@ -257,12 +239,11 @@ def build_timeline(
 ) -> tuple[list[TrendPoint], tuple[str, ...]]:
     """Sort leakage readings by time and group those that can be compared with each other.
 
-    Only readings of the most frequent method are used. The readings of a group have nearly the same measured ratio of
-    pump displacement to piston area. This ratio changes if a sensor of position or angle was replaced by one of another
-    scale, or if the recording is of another machine. `every` is the time between readings [s], by which the readings
-    are dated in the order of their file names; None if their times are known. Returns the readings with their groups,
-    and for each group a text on its difference from the first group, "" for the first. Raises InputError if the time of
-    a reading is unknown.
+    Only readings of the most frequent method are used. Those of a group have nearly the same measured ratio of pump
+    displacement to piston area, which changes with a sensor of another scale, and from machine to machine. `every` is
+    the time between readings [s], by which they are dated in the order of their file names; None if their times are
+    known. Returns the readings with their groups, and for each group a text on its difference from the first, "" for
+    the first. Raises InputError if the time of a reading is unknown.
     """
     ordered = _sort_by_time(readings, every)
     notes = _note_problems(ordered)
@@ -286,11 +267,7 @@ def build_timeline(
 
 
 def _sort_by_time(readings: Sequence[LeakReading], every: float | None) -> list[LeakReading]:
-    """Sort estimates of the leakage in single recordings by time.
-
-    `every`: time between recordings [s], by which they are dated in the order of their file names; None if their times
-    are known. Raises InputError if the time of a recording is unknown.
-    """
+    """Sort readings by time, dated by `every` [s] as in `build_timeline`; raise InputError if a time is unknown."""
     ordered = sorted(readings, key=lambda reading: numeric_sort_key(reading.file))
     if every is not None:
         ordered = [replace(reading, start=k * every) for k, reading in enumerate(ordered)]
@@ -304,11 +281,7 @@ def _sort_by_time(readings: Sequence[LeakReading], every: float | None) -> list[
 
 
 def _note_problems(readings: Sequence[LeakReading]) -> list[str]:
-    """List the reason why each reading is left out of a trend, "" for those that are used.
-
-    A reading is left out if it has no leakage level, is a copy of another one, or was estimated by another method
-    than most readings.
-    """
+    """List why each reading is left out: no level, a copy, or another method than most readings; "" if it is used."""
     file_of_digest: dict[str, str] = {}
     notes = []
     for reading in readings:
@@ -328,8 +301,8 @@ def _note_problems(readings: Sequence[LeakReading]) -> list[str]:
 def list_findings(points: Sequence[TrendPoint], differences: Sequence[str]) -> list[Finding]:
     """List the findings on a trend: wrong times, recordings left out, and groups that cannot be compared.
 
-    `points` are the recordings in the order of time, and `differences` a text for each group on its difference from
-    the first. Recordings left out for reasons that differ only in numbers share one finding.
+    `points` are in the order of time; `differences` has a text for each group on its difference from the first.
+    Recordings left out for reasons that differ only in numbers share one finding.
     """
     findings, count = _find_clock_errors(points), len(points)
     points_by_reason: dict[str, list[TrendPoint]] = {}
@@ -348,7 +321,7 @@ def list_findings(points: Sequence[TrendPoint], differences: Sequence[str]) -> l
 
 
 def _join_files(readings: Iterable[LeakReading]) -> str:
-    """Join the file names of recordings to a text for messages, which contains at most three names."""
+    """Join up to three file names of recordings to a text for messages."""
     return join_names((reading.file for reading in readings), 3)
 
 
@@ -360,9 +333,8 @@ def _relative_change(scale: float | None, other: float | None) -> float:
 def _find_clock_errors(ordered: Sequence[TrendPoint]) -> list[Finding]:
     """Find signs that a logger's clock was set back; return one finding, or an empty list.
 
-    `ordered`: recordings in the order of time. The signs are recordings that overlap and, if no recordings overlap,
-    times that fall while the numbers in the file names rise. Recordings dated without a time of day have the same start
-    and do not count as overlapping.
+    These are recordings (`ordered` by time) that overlap or, if none do, times that fall while the numbers in the file
+    names rise. Recordings dated without a time of day have the same start and do not count as overlapping.
     """
     overlaps = [
         f"{early.file} was still recording when {late.file} began: a clock was set back, or they are of two machines"

@@ -6,7 +6,7 @@ import math
 import os
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -52,19 +52,15 @@ class Trend:
         Verdict, reason, leak, bound and onset, as in a diagnosis. The verdict is `leak` if the level rose more than a
         healthy machine's may, a leak explains the rise, and no repair followed.
     basis : str or None
-        Method by which the levels were estimated: volume balance, pressure response, or the damping of the pressures'
-        ringing.
-    unit : str
-        Unit of the levels: ``L/min``, or ``%`` of the first recordings if the machine's sizes are not known.
-    pressure : float or None
-        Pressure difference at which L/min are stated [Pa].
+        Method by which the levels were estimated: "volume balance", "pressure response" or "ringing".
+    unit, pressure : str, float or None
+        ``L/min`` at this pressure difference [Pa], or ``%`` of the first recordings if the sizes are not known.
     points : tuple of TrendPoint
         The recordings in the order of their times.
     groups : tuple of str
         A text for each group of comparable recordings on its difference from the first group.
     episodes : tuple of Episode
-        The periods between repairs; the last one is the present one. Days in their `wear` count from the first
-        recording.
+        The periods between repairs, the present one last; days in their `wear` count from the first recording.
     rows : tuple of int
         Indices of the points that are compared; the rows of an `Episode` are indices into `rows`.
     repair : RepairLimit
@@ -73,10 +69,8 @@ class Trend:
         What was assumed of the machine, and who stated it.
     findings : tuple of Finding
         Recordings that are left out or not comparable, and other findings on the data.
-    years : float
-        Mean time to a false alarm [machine-years].
-    healthy : int
-        Number of first recordings that were known to be healthy.
+    years, healthy : float, int
+        Mean time to a false alarm [machine-years], and number of first recordings that were known to be healthy.
     dated : bool
         True if the recordings have dates, False if equal intervals are assumed.
 
@@ -135,10 +129,7 @@ class Trend:
 
     @property
     def leak(self) -> Interval | None:
-        """Increase of the flow past pump and piston since the machine was healthy, in the trend's unit.
-
-        The increase has a 95 % interval. The result is None if neither the verdict nor the test states an increase.
-        """
+        """Increase of the flow past pump and piston over the healthy machine, with interval; None if not stated."""
         value, interval = self.decision.leak_lpm, self.decision.leak_interval_lpm
         if value is not None and interval is not None:
             return Interval(value, *interval)
@@ -169,11 +160,7 @@ class Trend:
 
     @property
     def state(self) -> MachineState:
-        """State of the machine by NAMUR NE 107, such as "good".
-
-        The state is a failure if the verdict is `leak` and the 95 % interval of the present leakage lies above the
-        repair limit.
-        """
+        """State of the machine by NAMUR NE 107, such as "good"; a failure if a leak is surely over the repair limit."""
         condition: str = self.verdict
         if self.verdict == LEAK and self.wear is not None and self.limit is not None:
             condition = "leak over the limit" if self.wear.total.low > self.limit else LEAK
@@ -190,17 +177,10 @@ class Trend:
             last_compared = self.points[self.rows[-1]].day
             limit_day = Interval(*(last_compared + days_to_limit for days_to_limit in wear.reach))
         points = [
-            {
-                "file": point.file,
-                "time": self._format_day(point.day),
-                "day": point.day,
-                "value": point.value,
-                "low": point.low,
-                "high": point.high,
-                "group": None if point.group < 0 else point.group,
-                "temperature_C": point.temperature,
-                "note": point.note,
-            }
+            {"file": point.file, "time": self._format_day(point.day)}
+            | {name: getattr(point, name) for name in ("day", "value", "low", "high")}
+            | {"group": None if point.group < 0 else point.group, "temperature_C": point.temperature}
+            | {"note": point.note}
             for point in self.points
         ]
         return to_plain(  # type: ignore[no-any-return]
@@ -209,9 +189,7 @@ class Trend:
                 "reason": self.reason,
                 "cause": self.decision.cause,
                 "chance": self.decision.stated_chance,
-                "leak_lpm": self.decision.leak_lpm,
-                "leak_interval_lpm": self.decision.leak_interval_lpm,
-                "bound_lpm": self.decision.bound_lpm,
+                **{name: getattr(self.decision, name) for name in ("leak_lpm", "leak_interval_lpm", "bound_lpm")},
                 "total_leakage": total and {"lpm": total.lpm, "interval_lpm": total.interval_lpm},
                 "basis": self.basis,
                 "unit": self.unit,
@@ -248,10 +226,7 @@ class Trend:
         )
 
     def _format_day(self, day: float) -> str | float | None:
-        """Format a time, in days since the first recording, as a date and time in ISO format.
-
-        If no dates are known, or if `day` is not finite, `day` is returned as it is.
-        """
+        """Format days since the first recording as an ISO date and time; return `day` if undated or not finite."""
         if not math.isfinite(day) or not self.dated:
             return day
         time_ms = np.datetime64(round(self.points[0].seconds_since_1970(day) * 1e3), "ms")
@@ -317,10 +292,7 @@ def trend(
         raise InputError(f"machine-years to a false alarm must be 0.1 to 1000, got {years!r}")
     if every is not None and not (math.isfinite(every) and every > 0.0):
         raise InputError(f"every must be > 0 s, got {every!r}")
-    readings = [
-        recording if isinstance(recording, LeakReading) else estimate_reading(recording, rig)
-        for recording in recordings
-    ]
+    readings = [item if isinstance(item, LeakReading) else estimate_reading(item, rig) for item in recordings]
     points, differences = build_timeline(readings, every)
     rows = tuple(k for k, point in enumerate(points) if point.group >= 0)  # -1: the recording is left out
     compared = [points[k] for k in rows]
@@ -349,10 +321,9 @@ def trend(
 
 
 def _add_episodes(trend: Trend) -> Trend:
-    """Complete a trend by the leakage of each recording, the episodes between repairs, and the decision on a leak.
+    """Complete a trend of one or more comparable recordings by leakages, episodes between repairs, and the decision.
 
-    The trend must have at least one recording that can be compared. If there are very many recordings, averages of
-    neighbouring ones are compared; `rows` of the trend are then the recordings nearest in time to the averages.
+    Of very many recordings, averages of neighbours are compared; `rows` are then the recordings nearest to these.
     """
     levels, trend_units_per_level = _convert_levels(trend)
     points, findings = _add_values(trend, levels)
@@ -374,10 +345,7 @@ def _add_episodes(trend: Trend) -> Trend:
 
 
 def _add_values(trend: Trend, levels: Levels) -> tuple[tuple[TrendPoint, ...], tuple[Finding, ...]]:
-    """Add the leakage in the trend's unit to the points of a trend, and a finding if there are outliers.
-
-    `levels` are the converted levels of the compared points. Returns (points, findings).
-    """
+    """Return a trend's points with the converted `levels` of the compared ones, and its findings with any outliers."""
     points, findings = [*trend.points], [*trend.findings]
     _, excess = outlier_excess(levels)  # beyond the limit of outliers, judged in the whole series
     outliers = np.flatnonzero(excess)
@@ -394,32 +362,19 @@ def _add_values(trend: Trend, levels: Levels) -> tuple[tuple[TrendPoint, ...], t
 
 
 def _count_healthy(trend: Trend) -> int:
-    """Count the compared recordings among the first `trend.healthy` recordings, which are known to be healthy.
-
-    Copies count as one recording. The result is at least 1.
-    """
+    """Count the compared recordings among the first `trend.healthy`, at least 1; copies count as one recording."""
     digests = dict.fromkeys(point.digest for point in trend.points)  # in the order of time, copies once
     healthy_digests = list(digests)[: trend.healthy]
     return max(1, sum(trend.points[row].digest in healthy_digests for row in trend.rows))
 
 
-class _ConvertedLevels(NamedTuple):
-    """Leakage of each recording in the trend's unit, L/min or % (`_convert_levels`).
-
-    `trend_units_per_level`: factor from `LeakReading.level` to this unit.
-    """
-
-    levels: Levels
-    trend_units_per_level: float
-
-
-def _convert_levels(trend: Trend) -> _ConvertedLevels:
+def _convert_levels(trend: Trend) -> tuple[Levels, float]:
     """Convert the leakage levels of the compared recordings to the trend's unit and to one oil temperature.
 
-    Levels that are conductances [m^3/(s Pa)] are converted to L/min at the trend's pressure, or to % of the mean level
-    of the healthy recordings. If the oil temperature of every recording is known, conductances are also converted to
-    the temperature of the first recording. A level of the ringing is the negative logarithm of an RMS, and is converted
-    to 100 times its difference from the healthy mean, i.e. to %.
+    Conductances [m^3/(s Pa)] become L/min at the trend's pressure, or % of the healthy recordings' mean. If the oil
+    temperature of every recording is known, they are converted to that of the first. A level of the ringing, a
+    negative log RMS, becomes 100 times its difference from the healthy mean, i.e. %. Returns the converted levels, and
+    the factor from `LeakReading.level` to the trend's unit.
     """
     compared = [trend.points[k] for k in trend.rows]
     t, group, value, error = (
@@ -444,15 +399,14 @@ def _convert_levels(trend: Trend) -> _ConvertedLevels:
     levels = Levels(
         t, value * factor, error * factor, group, covariate=warming, prior=prior, slope_sd=slope_sd * factor
     )
-    return _ConvertedLevels(levels, trend_units_per_level=factor)
+    return levels, factor
 
 
 def _allowed_rise(trend: Trend, trend_units_per_level: float) -> float | None:
-    """Convert the repair limit to the increase of the leakage at which a repair is due, in the trend's unit.
+    """Convert the repair limit to the trend's unit; None if it cannot be converted.
 
-    `trend_units_per_level` is the factor from the leakage level of a recording, a conductance [m^3/(s Pa)], to the
-    trend's unit. A limit stated as a creep speed corresponds to the conductance (speed times piston area) / (median
-    pressure difference). The result is None if the limit cannot be converted.
+    `trend_units_per_level` is the factor from a recording's level, a conductance [m^3/(s Pa)], to the trend's unit. A
+    creep speed corresponds to the conductance (speed times piston area) / (median pressure difference).
     """
     compared = [trend.points[k] for k in trend.rows]
     if trend.repair.kind == "flow" and trend.pressure is not None:

@@ -37,8 +37,7 @@ MIN_RECORDINGS = 3
 class TrendLeak:
     """Increase of the leakage from recording to recording, in the form that `decision.decide` judges.
 
-    The protocol `observable.LeakMeasure` explains the fields; `present_leakage` is the result of `total`. Flows are in
-    the unit of the trend.
+    The protocol `observable.LeakMeasure` explains the fields; flows are in the unit of the trend.
     """
 
     provider: str
@@ -72,10 +71,7 @@ class TrendLeak:
         """Return None for any flow of a leak, as a trend states no leak relative to the pump's flow."""
 
     def total(self, detectable_flow: float | None) -> TotalLeakage | None:
-        """Return the present flow past pump and piston [L/min] with its interval; None if no L/min are stated.
-
-        The detectable flow is not used.
-        """
+        """Return the present flow past pump and piston; None if no L/min are stated. The argument is not used."""
         return self.present_leakage
 
     def history(self, onset_s: float | None) -> None:
@@ -91,32 +87,15 @@ def decide_trend(
     interval: float,
     years: float,
 ) -> Evidence:
-    """Decide from the recordings since the last repair whether the leakage of a machine has increased.
+    """Decide from the comparable recordings since the last repair whether the leakage of a machine has increased.
 
-    Parameters
-    ----------
-    points : sequence of TrendPoint
-        Comparable recordings in the order of time.
-    episode : Episode
-        The period since the last repair, with its test.
-    trend_units_per_level : float
-        Factor from the leakage level of a recording (`LeakReading.level`) to the unit of the trend, L/min or %.
-    pressure : float or None
-        Pressure difference at which L/min are stated [Pa], None if the unit is %.
-    interval : float
-        Median time between two recordings [days].
-    years : float
-        Mean time between false alarms [machine-years]. The allowed probability of a false alarm is `interval` over
-        this time.
-
-    Returns
-    -------
-    Evidence
-        The verdict; "cannot tell" for fewer than three recordings.
+    `points` are in the order of time, and `episode` is the period with its test. `trend_units_per_level` is the factor
+    from `LeakReading.level` to the unit of the trend, `pressure` the pressure difference at which L/min are stated
+    [Pa], None for the unit %, and `interval` the median time between two recordings [days]. Over the mean time `years`
+    between false alarms, it is the allowed probability of a false alarm. Fewer than three recordings cannot tell.
     """
     wear = episode.wear
-    # `interval` over the mean time until a healthy machine reaches this score of the test, exp(log_days); above 0 also
-    # where the exponential underflows
+    # `interval` over the mean time until a healthy machine scores as high, exp(log_days); > 0 even if that underflows
     chance = float(np.clip(np.exp(np.log(interval) - episode.log_days), np.finfo(float).tiny, 1.0))
     if points[0].basis == "ringing":
         report = _report_ringing(points, wear, chance)
@@ -133,19 +112,17 @@ def decide_trend(
 def _measure_leak(
     points: Sequence[TrendPoint], wear: Wear, chance: float, trend_units_per_level: float, pressure: float | None
 ) -> TrendLeak:
-    """Describe the increase of the leakage since the last repair as a TrendLeak.
+    """Describe the increase of the leakage since the last repair, from the recordings (`points`) since then.
 
-    `points` are the recordings since the repair, `wear` is the estimated state of the machine, and `chance` the
-    probability of such an increase in a healthy machine. `trend_units_per_level`: factor from a level (leakage over
-    pressure of a recording) to the unit of the trend; `pressure`: pressure difference at which flows are stated [Pa],
-    None if the unit of the trend is %. The flow of the leak is proportional to p^k, with k from `EXPONENTS` for a
-    laminar leak, an orifice and laws between; the stated flow is the mean over these laws.
+    `chance` is the probability of such an increase in a healthy machine, `trend_units_per_level` the factor from a
+    level (leakage over pressure of a recording) to the unit of the trend, and `pressure` the pressure difference at
+    which flows are stated [Pa], None if that unit is %. The flow of the leak is proportional to p^k, with k from
+    `EXPONENTS` for a laminar leak, an orifice and laws between; the stated flow is the mean over these laws.
     """
     onset_day = -np.inf if wear.onset is None else wear.onset.value
     pressures_since = [point.pressure for point in points if point.day >= onset_day]
     pressure_ratio = float(np.median(pressures_since)) / pressure if pressure and pressures_since else 1.0
-    # A level is the flow over the pressure of the recording. The flow at `pressure` is the level times `pressure` only
-    # for a laminar leak, k = 1; for other laws there is a further factor.
+    # the flow at `pressure` is the level times `pressure` for a laminar leak, k = 1; other laws have a further factor
     flow_factors = pressure_ratio ** (1.0 - np.array(EXPONENTS))
     leak_sd = (wear.leak.high - wear.leak.low) / (2.0 * WITHIN_95)
     # converted as a leak: a flow over the pressure is a level
@@ -169,9 +146,7 @@ def _measure_leak(
 def _normal_rise(wear: Wear, chance: float) -> Rise | None:
     """Describe the increase of the leakage by a normal distribution that is negative with the probability `chance`.
 
-    The mean is the estimated increase or, if this is 0, its upper bound. The standard deviation is the mean divided by
-    the normal quantile of 1 - `chance`. The result is None if the chance is 0.5 or more, or if the upper bound is not
-    positive.
+    Its mean is the estimated increase or, if that is 0, its upper bound. None for a chance >= 0.5 or a bound <= 0.
     """
     from scipy.special import ndtri
 
@@ -183,10 +158,9 @@ def _normal_rise(wear: Wear, chance: float) -> Rise | None:
 
 
 def _total_leakage(total: Interval, size_deviation: float, pressure: float) -> TotalLeakage:
-    """Compute the present leakage [L/min], with an interval that includes the error of area and displacement.
+    """Compute the present leakage at `pressure` [Pa], with an interval that includes the error of the machine's sizes.
 
-    `total`: leakage with the 95 % interval of its estimate [L/min]; `size_deviation`: relative standard error of all
-    flows due to area and displacement; `pressure`: pressure difference at which the flow is stated [Pa].
+    `total` has the interval of its estimate [L/min]; `size_deviation` is the sizes' relative standard error.
     """
     half_width = WITHIN_95 * total.value * size_deviation  # part of the error that is due to the sizes
     below, above = (float(np.hypot(end - total.value, half_width)) for end in (total.low, total.high))
@@ -194,10 +168,9 @@ def _total_leakage(total: Interval, size_deviation: float, pressure: float) -> T
 
 
 def _report_ringing(points: Sequence[TrendPoint], wear: Wear, chance: float) -> Observed:
-    """Report the decrease of the pressures' ringing since the last repair, in the form of a detector's observations.
+    """Report the decrease of the pressures' ringing (RMS of their wavelet details) since the last repair.
 
-    The ringing is an oscillation, measured by the RMS of the pressures' wavelet details. `chance` is the probability of
-    such a decrease in a healthy machine. The ringing gives no upper bound of a leak.
+    `chance` is the probability of such a decrease in a healthy machine. No upper bound of a leak is stated.
     """
     size = -wear.leak.value / 100.0  # change of the log RMS; the leak is in %
     # a score is twice the logarithm of a likelihood ratio, here of 1 / chance
@@ -210,10 +183,9 @@ def _report_ringing(points: Sequence[TrendPoint], wear: Wear, chance: float) -> 
 
 
 def _split_at_onset(points: Sequence[TrendPoint], wear: Wear) -> tuple[list[TrendPoint], list[TrendPoint]]:
-    """Split recordings into those before the onset of the leak and those since; return both lists.
+    """Split the recordings that can be compared with the last one into those before the onset of the leak and the rest.
 
-    `points` are the recordings in the order of time; only those that can be compared with the last one are included.
-    `wear` states the onset. Without an onset, the second list is the last recording only.
+    `points` are in the order of time. Without an onset, the rest is the last recording only.
     """
     onset = points[-1].day if wear.onset is None else wear.onset.value
     comparable = [point for point in points if point.group == points[-1].group]
@@ -222,11 +194,10 @@ def _split_at_onset(points: Sequence[TrendPoint], wear: Wear) -> tuple[list[Tren
 
 
 def _rival_changes(points: Sequence[TrendPoint], wear: Wear) -> tuple[Observable, ...]:
-    """Test the terms of the volume balance other than the leak for a change at the onset of the leak.
+    """Test the other terms of the volume balance for a change at the onset of the leak, which may explain the increase.
 
-    Such a change could explain the increase instead of a leak. The recordings since the onset are compared with those
-    before. Only recordings whose balance has the same terms as that of the last recording are used. The result is empty
-    if there are no such recordings before the onset, or if the last recording has several balances or no balance.
+    The recordings since the onset are compared with those before, if their balance has the terms of the last one's. The
+    result is empty if there are none before the onset, or if the last recording has no or several balances.
     """
     names = [roles.names for roles in points[-1].terms]  # names of the terms of each balance
     sums_before, sums_since = (
@@ -244,11 +215,10 @@ def _rival_changes(points: Sequence[TrendPoint], wear: Wear) -> tuple[Observable
 
 
 def _report_rms_change(points: Sequence[TrendPoint], wear: Wear) -> Observed:
-    """Test the pressures' ringing of the last recording for a change since the onset of the leak.
+    """Test the ringing (RMS of the pressures' wavelet details) of the last recording for a change since the onset.
 
-    The ringing is an oscillation, measured by the RMS of the pressures' wavelet details. The last recording is compared
-    with the recordings before the onset that have the same channels and sampling rate. The result contains no
-    observables if there are no such recordings, or if the ringing is itself the basis of the trend.
+    It is compared with the recordings before the onset that have the same channels and sampling rate. The result has no
+    observables if there are none, or if the ringing is itself the basis of the trend.
     """
     judged = points[-1].ringing
     if judged is None or points[-1].basis == "ringing":

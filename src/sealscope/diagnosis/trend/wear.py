@@ -55,45 +55,23 @@ _MAX_FREEDOM = 20
 
 
 class ScatterPrior(NamedTuple):
-    """Prior on the standard deviation of a healthy machine's leakage level between recordings (`Levels`).
+    """Prior on the standard deviation of a healthy machine's leakage level between recordings, inverse chi-square."""
 
-    It is a scaled inverse chi-square distribution. `scale` is the typical standard deviation, in the unit of the
-    levels, and `freedom` the degrees of freedom.
-    """
-
-    scale: float
-    freedom: float
+    scale: float  # typical standard deviation, in the unit of the levels
+    freedom: float  # degrees of freedom
 
 
 @dataclass(frozen=True, eq=False)
 class Levels:
-    """Leakage levels of n recordings in the order of time, and the prior on their scatter.
+    """Leakage levels of n recordings in the order of time, and the prior on their scatter."""
 
-    Attributes
-    ----------
-    t : ndarray, shape (n,)
-        Times [days].
-    value : ndarray, shape (n,)
-        Leakage in each recording, in any unit that is common to all.
-    error : ndarray, shape (n,)
-        Standard error that each recording states for its level.
-    group : ndarray, shape (n,)
-        Number of the group of comparable recordings, which have a common mean.
-    covariate : ndarray, shape (n,)
-        An explanatory variable, the warming of the oil [K].
-    prior : ScatterPrior
-        Prior on the standard deviation between recordings.
-    slope_sd : float
-        Prior standard deviation of the covariate's coefficient, 0 if it has no effect.
-    """
-
-    t: Array
-    value: Array
-    error: Array
-    group: IntArray
-    covariate: Array
-    prior: ScatterPrior
-    slope_sd: float = 0.0
+    t: Array  # (n,): times [days]
+    value: Array  # (n,): leakage in each recording, in any unit that is common to all
+    error: Array  # (n,): standard error that each recording states for its level
+    group: IntArray  # (n,): number of the group of comparable recordings, which have a common mean
+    covariate: Array  # (n,): an explanatory variable, the warming of the oil [K]
+    prior: ScatterPrior  # prior on the standard deviation between recordings
+    slope_sd: float = 0.0  # prior standard deviation of the covariate's coefficient, 0 if it has no effect
 
     def __len__(self) -> int:
         return self.t.size
@@ -128,16 +106,13 @@ class Levels:
         return math.sqrt(float(np.average([prior_variance, measured_variance], weights=weights)))
 
     def average_neighbours(self, max_count: int = 240) -> Levels:
-        """Average levels of successive recordings, so that about `max_count` levels remain, to limit computing time.
+        """Average levels of successive recordings of a group, so that about `max_count` levels remain, to save time.
 
-        An average is over up to ceil(n / `max_count`) of the n recordings, all of one group. As no average spans two
-        groups, slightly more than `max_count` may remain. Times and covariates are averaged, too. The standard error of
-        an average is sqrt(sum of error^2) / number. With n <= `max_count` the levels are returned unchanged.
+        The standard error of an average is sqrt(sum of error^2) / number. Few levels are returned unchanged.
         """
         size = math.ceil(len(self) / max_count)
         if size <= 1:
             return self
-        # successive recordings of one group
         runs = np.split(np.arange(len(self)), np.flatnonzero(np.diff(self.group)) + 1)
         parts = [run[k : k + size] for run in runs for k in range(0, run.size, size)]
         error = np.array([math.sqrt(np.sum(self.error[rows] ** 2)) / rows.size for rows in parts])
@@ -156,11 +131,10 @@ def outlier_excess(levels: Levels) -> tuple[Array, Array]:
 
         sign(d) max(abs(d) - L, 0).
 
-    Two successive levels beyond the limit on the same side are a change of the machine. The excess of a level is
-    therefore 0 if the level before it is also beyond the limit. The first level of a group has the excess 0, too.
-    Returns two variants, each (n,). The first treats each level as the latest level. The second is for the whole
-    series: the excess is also 0 if the next level is beyond the limit on the same side, and for the last level of a
-    group.
+    Two successive levels beyond the limit on the same side are a change of the machine: the excess is 0 if the level
+    before is also beyond the limit, and for the first level of a group. Returns two variants, each (n,). The first
+    treats each level as the latest level. The second is for the whole series: the excess is also 0 if the next level is
+    beyond the limit on the same side, and for the last level of a group.
     """
     excess_as_last, excess = np.zeros((2, len(levels)))
     for group in np.unique(levels.group):
@@ -179,39 +153,22 @@ def outlier_excess(levels: Levels) -> tuple[Array, Array]:
 
 
 class _Changes(NamedTuple):
-    """Hypotheses of a change of the leakage level: c changes over n recordings, with m different profiles over time.
+    """Hypotheses of a change of the leakage level: c changes over n recordings, with m different profiles over time."""
 
-    Attributes
-    ----------
-    profiles : ndarray, shape (n, m)
-        Effect of a change of unit size on each recording, g in the module's docstring.
-    profile_index : ndarray, shape (c,)
-        Column of `profiles` that belongs to each change.
-    scale : ndarray, shape (c,)
-        Prior scale of the size of each change, in units of the scatter tau.
-    begin : ndarray, shape (c,)
-        Index of the first recording after each change.
-    grows : ndarray, shape (c,)
-        True for a growth, False for a step.
-    log_weight : ndarray, shape (c,)
-        Logarithm of the weight w_j in the module's docstring. The changes with the same `begin` share this weight.
-    """
-
-    profiles: Array
-    profile_index: IntArray
-    scale: Array
-    begin: IntArray
-    grows: NDArray[np.bool_]
-    log_weight: Array
+    profiles: Array  # (n, m): effect of a change of unit size on each recording, g in the module's docstring
+    profile_index: IntArray  # (c,): column of `profiles` that belongs to each change
+    scale: Array  # (c,): prior scale of the size of each change, in units of the scatter tau
+    begin: IntArray  # (c,): index of the first recording after each change
+    grows: NDArray[np.bool_]  # (c,): True for a growth, False for a step
+    log_weight: Array  # (c,): logarithm of w_j in the module's docstring, shared by changes with the same `begin`
 
     @classmethod
     def enumerate(cls, levels: Levels, n_healthy: int, *, steps_only: bool = False) -> _Changes:
         """Build the hypotheses of all steps and growths that may begin after the first `n_healthy` recordings.
 
-        Each step or growth is combined with several prior scales of its size, each of which is a separate hypothesis.
-        The scales of a step are multiples of the scatter tau (`change.steps` in `priors.toml`). The size of a growth is
-        its rise per month; its scales are tau over several times (`change.intervals`, multiples of the median interval
-        of recordings). With `steps_only` there are no growths.
+        Each step or growth is combined with several prior scales of its size. Those of a step are multiples of the
+        scatter tau (`change.steps` in `priors.toml`). The size of a growth is its rise per month, with the scales tau
+        over several times (`change.intervals`, multiples of the median interval of recordings).
         """
         scales = TREND.change
         begin = np.arange(max(n_healthy, 1), len(levels))  # first recording after each change
@@ -233,11 +190,7 @@ class _Changes(NamedTuple):
 
     @classmethod
     def from_profile(cls, profile: Array, scale: float) -> _Changes:
-        """Build the single hypothesis of a growth that begins with the first recording.
-
-        `profile` (n,) is the effect of a growth of unit size on each recording, and `scale` the prior scale of its
-        size, in units of the scatter tau.
-        """
+        """Build the hypothesis of a growth, with the effect `profile` (n,) per unit size, from the first recording."""
         first = np.zeros(1, dtype=np.int64)
         return cls(
             profile[:, None], first, np.array([scale]), first, grows=np.ones(1, dtype=bool), log_weight=np.zeros(1)
@@ -247,29 +200,18 @@ class _Changes(NamedTuple):
 class _Node(NamedTuple):
     """Likelihoods at one point of the grid of tau and r, for n recordings and m profiles of a change over time.
 
-    tau is the standard deviation between recordings, and r the fraction of its variance that is correlated over time.
-
-    Attributes
-    ----------
-    tau : float
-        Standard deviation between recordings.
-    log_null : ndarray, shape (n,)
-        Logarithm of prior times likelihood without a change, after each recording.
-    a, b : ndarray, shape (n, m)
-        Terms of the likelihood ratio exp(b delta - a delta^2/2) of a change of size delta, after each recording.
-    mean, variance : float
-        Mean level of the last group of comparable recordings without a change, and its variance.
-    mean_slope : ndarray, shape (m,)
-        Decrease of this mean per unit of a change.
+    r is the fraction of tau^2 that is correlated over time.
     """
 
-    tau: float
-    log_null: Array
+    tau: float  # standard deviation between recordings
+    log_null: Array  # (n,): logarithm of prior times likelihood without a change, after each recording
+    # (n, m): terms of the likelihood ratio exp(b delta - a delta^2/2) of a change of size delta
     a: Array
     b: Array
+    # mean level of the last group of comparable recordings without a change, and its variance
     mean: float
     variance: float
-    mean_slope: Array
+    mean_slope: Array  # (m,): decrease of this mean per unit of a change
 
 
 def _evaluate_grid(levels: Levels, profiles: Array, *, may_grow: bool = False) -> list[_Node]:
@@ -281,13 +223,9 @@ def _evaluate_grid(levels: Levels, profiles: Array, *, may_grow: bool = False) -
 
         shared + tau^2 (r C + (1 - r) I) + diag(error^2) = L L'.
 
-    Here `shared` is due to the priors on the level of each group, the growth and the covariate's coefficient. C is the
-    correlation over the time between recordings, and `error` are the standard errors that the recordings state.
-    Multiplied by L^-1,
-
-    - the levels, without their outlying parts (`outlier_excess`), become z;
-    - the profiles become G;
-    - the covariances of the levels with the mean level of the last group become u.
+    Here `shared` is due to the priors on the level of each group, the growth and the covariate's coefficient, and C is
+    the correlation over time. Multiplied by L^-1, the levels without their outlying parts (`outlier_excess`) become z,
+    the profiles G, and the covariances of the levels with the mean level of the last group u.
     """
     from scipy.linalg import solve_triangular
 
@@ -323,7 +261,6 @@ def _evaluate_grid(levels: Levels, profiles: Array, *, may_grow: bool = False) -
             # sum of z^2 up to each recording, with the last term of each sum from `z_as_last`; the same for b
             square = np.cumsum(z**2) - (z**2 - z_as_last**2)[:, 0]
             log_null = log_prior - np.cumsum(np.log(L.diagonal())) - 0.5 * square
-            # a change of size delta has the likelihood ratio exp(b delta - a delta^2/2)
             a, b = np.cumsum(G**2, axis=0), np.cumsum(G * z, axis=0) - G * (z - z_as_last)
             # mean level of the last group and its variance, given all levels, if nothing has changed
             level = float(levels.value[0] + u[:-1, 0] @ z[:-1, 0] + u[-1, 0] * z_as_last[-1, 0])
@@ -335,9 +272,9 @@ def _evaluate_grid(levels: Levels, profiles: Array, *, may_grow: bool = False) -
 def _log_mean_ratio(a: Array, b: Array, scale: Array) -> Array:
     """Compute the log of the mean likelihood ratio of a change whose size delta has a half-normal prior.
 
-    A change of size delta has the likelihood ratio exp(b delta - a delta^2/2) to no change. For a prior with the
-    `scale` k, the mean over delta > 0 is ``2 (1 + a k^2)^(-1/2) exp(b^2 v/2) Phi(b sqrt(v))`` with ``v = 1/(a +
-    1/k^2)`` and the normal distribution function Phi. The arguments are broadcast together.
+    A change has the likelihood ratio exp(b delta - a delta^2/2). For a prior with the `scale` k, the mean over
+    delta > 0 is ``2 (1 + a k^2)^(-1/2) exp(b^2 v/2) Phi(b sqrt(v))`` with ``v = 1/(a + 1/k^2)`` and the normal
+    distribution function Phi. The arguments are broadcast together.
     """
     from scipy.special import log_ndtr
 
@@ -347,14 +284,10 @@ def _log_mean_ratio(a: Array, b: Array, scale: Array) -> Array:
 
 
 class ChangeScores(NamedTuple):
-    """Result of the sequential test for a change of the leakage level, after each of n recordings.
+    """Result of the sequential test for a change of the leakage level, after each of n recordings."""
 
-    `log_R` (n,) is the logarithm of the test statistic R, and `begin` (n,) the index of the first recording after the
-    most probable change.
-    """
-
-    log_R: Array
-    begin: IntArray
+    log_R: Array  # (n,): logarithm of the test statistic R [days]
+    begin: IntArray  # (n,): index of the first recording after the most probable change
 
     def find_alarm(self, days: float) -> int | None:
         """Return the index of the first recording with R > `days`, the mean time to a false alarm [days]; else None."""
@@ -365,23 +298,21 @@ class ChangeScores(NamedTuple):
 def score_changes(levels: Levels, n_healthy: int = 1, *, falls: bool = False, may_grow: bool = False) -> ChangeScores:
     """Compute the statistic R of the sequential test for a rise of the leakage level, either a step or a growth.
 
-    R [days] is a sum over all possible changes. Each term is the likelihood ratio of the change to no change, times the
-    time between the recordings before and after the beginning of the change [days], at most `wait` (`priors.toml`). The
-    first `n_healthy` recordings are assumed unchanged. With `falls` the test is for a downward step instead. With
-    `may_grow`, an even growth since the first recording does not count as a change. Returns log R of the recordings up
-    to each recording, and where the most probable change begins.
+    R [days] is a sum over all possible changes after the first `n_healthy` recordings. Each term is the likelihood
+    ratio of the change to no change, times the time between the recordings before and after its beginning [days], at
+    most `wait` (`priors.toml`). With `falls` the test is for a downward step instead. With `may_grow`, an even growth
+    since the first recording does not count as a change. Returns log R of the recordings up to each recording, and
+    where the most probable change begins.
     """
     if falls:
         levels = replace(levels, value=-levels.value)
     n, changes = len(levels), _Changes.enumerate(levels, n_healthy, steps_only=falls)
-    # sums of prior times likelihood with each change, and without a change, over a grid of the unknown scatter between
-    # recordings and of its correlated part
+    # sums of prior times likelihood with each change, and without a change, over the grid of tau and r
     log_terms, log_null = np.full((n, changes.begin.size), -np.inf), np.full(n, -np.inf)
     if not changes.begin.size:  # no change can begin: R = 0
         return ChangeScores(log_null, np.zeros(n, dtype=np.int64))
     for node in _evaluate_grid(levels, changes.profiles, may_grow=may_grow):
         log_null = np.logaddexp(log_null, node.log_null)
-        # a change of the size d has the likelihood ratio exp(b d - a d^2 / 2)
         a, b = node.a[:, changes.profile_index], node.b[:, changes.profile_index]
         log_terms = np.logaddexp(log_terms, node.log_null[:, None] + _log_mean_ratio(a, b, changes.scale * node.tau))
     # weighted likelihood ratio w_j LR_j(n) of each change; changes that begin after recording n do not count yet
@@ -390,40 +321,22 @@ def score_changes(levels: Levels, n_healthy: int = 1, *, falls: bool = False, ma
     return ChangeScores(np.logaddexp.reduce(log_terms, axis=1), changes.begin[np.argmax(log_terms, axis=1)])
 
 
-def _draw_normal(random: np.random.Generator, mean: Array, sd: Array, *, positive: bool) -> Array:
-    """Draw one number from each of d normal distributions, shape (d,).
-
-    `mean` (d,) and `sd` (d,): means and standard deviations; `positive`: truncate the distributions to numbers above 0;
-    `random`: source of random numbers.
-    """
-    from scipy.special import ndtr, ndtri
-
-    p_negative = ndtr(-mean / sd) if positive else np.zeros(len(mean))
-    # random probabilities, which the inverse distribution function converts to numbers
-    p = p_negative + (1.0 - p_negative) * random.random(len(mean))
-    return np.asarray(mean + sd * ndtri(np.clip(p, 1e-300, 1.0 - 1e-16)))  # clipped, as ndtri is infinite at 0 and 1
-
-
 class _Draws(NamedTuple):
-    """Random draws (d,) from the posterior distribution of a change of the leakage level.
+    """Random draws (d,) from the posterior distribution of a change of the leakage level."""
 
-    `tau` is the standard deviation between recordings, `change` the index of the drawn hypothesis in `_Changes`,
-    `amplitude` the size of the change, i.e. of a step, or of a growth per month, and `mean_before` the mean level
-    before the change.
-    """
-
-    tau: Array
-    change: IntArray
-    amplitude: Array
-    mean_before: Array
+    tau: Array  # standard deviation between recordings
+    change: IntArray  # index of the drawn hypothesis in `_Changes`
+    amplitude: Array  # size of the change: of a step, or of a growth per month
+    mean_before: Array  # mean level before the change
 
     @classmethod
     def sample(cls, levels: Levels, changes: _Changes, *, signed: bool = False) -> _Draws:
-        """Draw scatter, change, its size and the mean level before it from their posterior, given the leakage `levels`.
+        """Draw scatter, change (one of `changes`), its size and the mean before it, given `levels`.
 
-        `changes` are the hypotheses, one of which is chosen in each draw. The size of a change has a half-normal prior
-        or, with `signed`, a normal prior, so that it may be negative. The seed is fixed.
+        The size of a change has a half-normal prior or, with `signed`, a normal prior. The seed is fixed.
         """
+        from scipy.special import ndtr, ndtri
+
         random = np.random.default_rng(20)  # a fixed seed, so that results repeat
         nodes = _evaluate_grid(levels, changes.profiles)
         # [-1]: after the last recording
@@ -438,7 +351,10 @@ class _Draws(NamedTuple):
         flat_index = random.choice(weight.size, _N_DRAWS, p=weight.ravel() / weight.sum())
         node_number, change = np.unravel_index(flat_index, weight.shape)
         mean, sd = (b * v)[node_number, change], np.sqrt(v)[node_number, change]
-        amplitude = _draw_normal(random, mean, sd, positive=not signed)
+        # by the inverse distribution function, of random probabilities; without `signed`, only numbers above 0
+        p_negative = np.zeros(len(mean)) if signed else ndtr(-mean / sd)
+        p = np.clip(p_negative + (1.0 - p_negative) * random.random(len(mean)), 1e-300, 1.0 - 1e-16)  # finite ndtri
+        amplitude = np.asarray(mean + sd * ndtri(p))
         tau, level, variance = np.array([(node.tau, node.mean, node.variance) for node in nodes])[node_number].T
         # a change lowers the mean before it, by `slope` per unit of its size
         slope = np.stack([node.mean_slope[changes.profile_index] for node in nodes])[node_number, change]
@@ -459,20 +375,14 @@ class Wear(NamedTuple):
     ----------
     total : Interval
         Present level, without the scatter of the last recording.
-    leak : Interval
-        Rise of the level since the change; if nothing changed, the rise that the levels allow.
-    bound : float
-        95 % upper bound of this rise.
-    growth : Interval
-        Rise per month.
+    leak, bound, growth : Interval, float, Interval
+        Rise of the level since the change, or that the levels allow; its 95 % upper bound; rise per month.
     step : Interval or None
         Size of the step; None if a growth is more probable or nothing changed.
     onset : Interval or None
         Time of the change [days], None if nothing changed.
-    healthy : Interval
-        Mean level before the change, with the range of 95 % of the recordings then.
-    scatter : float
-        Standard deviation between recordings.
+    healthy, scatter : Interval, float
+        Mean level before the change, with the range of 95 % of the recordings then, and their standard deviation.
     limit : float or None
         Level at which a repair is due, None if there is no limit.
     reach : Interval or None
@@ -502,9 +412,9 @@ def estimate_wear(levels: Levels, allowed_rise: float | None, change_begin: int 
     """Estimate leakage level, growth and time to the repair limit after the last recording.
 
     `allowed_rise` is the rise above the healthy level at which a repair is due, None if there is no limit.
-    `change_begin` is the index of the first recording after the change that the test has found, None if the test has
-    found no change. An even growth or decrease over all recordings is then estimated, with a wide prior. Growth and
-    time to the limit are NaN if the recordings span less than a day.
+    `change_begin` is the index of the first recording after the change that the test has found. If it is None, an even
+    growth or decrease over all recordings is estimated, with a wide prior. Over less than a day, growth and time are
+    NaN.
     """
     is_changed = change_begin is not None
     is_long = levels.t[-1] - levels.t[0] >= 1.0  # [days]
@@ -528,8 +438,11 @@ def estimate_wear(levels: Levels, allowed_rise: float | None, change_begin: int 
     limit = reach = None
     if allowed_rise is not None:
         limit = healthy.value + allowed_rise
-        days = _days_to_limit(current_level, growth, limit)
-        reach = _interval_of_draws(days) if is_long else Interval(math.nan, 0.0, math.inf)
+        reach = Interval(math.nan, 0.0, math.inf)
+        if is_long:
+            with np.errstate(divide="ignore", invalid="ignore"):  # a division by a growth of 0 is not used
+                days = np.where(growth > 0.0, (limit - current_level) / growth, math.inf) * DAYS_PER_MONTH
+            reach = _interval_of_draws(np.where(current_level >= limit, 0.0, days))
     unknown = Interval(math.nan, -math.inf, math.inf)
     # if a growth is more probable than a step, the draws of a step do not count for the growth
     return Wear(
@@ -546,22 +459,10 @@ def estimate_wear(levels: Levels, allowed_rise: float | None, change_begin: int 
     )
 
 
-def _days_to_limit(level: Array, growth: Array, limit: float) -> Array:
-    """Compute the days until each of d leakage levels reaches the limit, shape (d,).
-
-    `level`, `growth` (d,): present level and growth per month, in the unit of the limit. The result is 0 if the level
-    has reached the limit, and infinite if it does not grow.
-    """
-    with np.errstate(divide="ignore", invalid="ignore"):  # a division by a growth of 0 is not used
-        days = np.where(growth > 0.0, (limit - level) / growth, math.inf) * DAYS_PER_MONTH
-    return np.where(level >= limit, 0.0, days)
-
-
 def _estimate_healthy_range(levels: Levels) -> tuple[Interval, float]:
-    """Estimate the mean leakage level and the scatter of recordings without a change.
+    """Estimate the mean leakage level of recordings without a change, and their standard deviation.
 
-    Returns the mean level and the standard deviation between recordings. The interval of the mean level contains 95 %
-    of the levels of single recordings, with their scatter and standard errors.
+    The interval of the mean contains 95 % of the levels of single recordings, with their scatter and standard errors.
     """
     no_change = _Changes.from_profile(np.zeros(len(levels)), scale=1.0)  # without an effect, whatever the scale
     draws = _Draws.sample(levels, no_change)
@@ -572,20 +473,14 @@ def _estimate_healthy_range(levels: Levels) -> tuple[Interval, float]:
 
 
 class Episode(NamedTuple):
-    """A period between two repairs of a machine, and the result of the test for a leak in it.
+    """A period between two repairs of a machine, and the result of the test for a leak in it."""
 
-    The period has the rows `begin` to `end` - 1 of the compared recordings. `alarm` is the row at which the test
-    raised an alarm, or None. `log_days` is the logarithm of the largest mean time to a false alarm [days] for which the
-    test would raise an alarm. `wear` is the state after the last row. `fell` is True if the period began with a repair,
-    i.e. a fall of the level.
-    """
-
-    begin: int
-    end: int
-    alarm: int | None
-    log_days: float
-    wear: Wear
-    fell: bool
+    begin: int  # first of the compared recordings in the period
+    end: int  # index after the last one
+    alarm: int | None  # index at which the test raised an alarm
+    log_days: float  # logarithm of the largest mean time to a false alarm [days] with which the test raises an alarm
+    wear: Wear  # state after the last recording
+    fell: bool  # True if the period began with a repair, i.e. a fall of the level
 
 
 def find_episodes(
@@ -594,9 +489,8 @@ def find_episodes(
     """Divide a series of recordings at repairs, and test and estimate the leakage in each period between them.
 
     `years` is the smallest mean time between false alarms. The first `n_healthy` recordings are known to be healthy.
-    `allowed_rise` is the rise of the level at which a repair is due, None if there is no limit. A repair is a fall of
-    the level, which the test for a rise detects with the sign reversed. After a repair the level is estimated anew,
-    with the scatter before the repair as prior.
+    `allowed_rise` is the rise at which a repair is due, None if there is no limit. After a repair, a fall of the level
+    (`_find_repair`), the level is estimated anew, with the scatter before the repair as prior.
     """
     days = years * DAYS_PER_YEAR
     begin, episodes = 0, list[Episode]()
@@ -621,10 +515,9 @@ def find_episodes(
 def _find_repair(levels: Levels, rise: ChangeScores, n_healthy: int, days: float) -> int:
     """Find the index of the first recording after the first repair; the number of recordings if there is no repair.
 
-    A repair is a fall of the leakage level that the sequential test detects. `rise` is the result of the test for a
-    rise, and `days` the mean time to a false alarm [days]. The first `n_healthy` recordings are known to be healthy. If
-    a rise is detected before a fall, the level of the worn machine since that rise replaces the healthy level: a repair
-    is then a fall below the worn level.
+    A repair is a fall of the leakage level, found by the test for a rise with the sign reversed. `rise` is the result
+    of the test for a rise, `days` the mean time to a false alarm [days], and `n_healthy` the number of first recordings
+    that are known to be healthy. If a rise is detected first, a repair is a fall below the worn level since that rise.
     """
     first = 0  # index of the first recording that is tested for a fall
     fall = score_changes(levels, n_healthy, falls=True)

@@ -43,8 +43,8 @@ _MACHINE_NAMES = ("machine", "actuator", "asset", "serial number", "serial", "ri
 class Diagnosis(Evidence):
     """Verdict on one recording: the combined evidence of all detectors.
 
-    The fields of `Evidence` are those of the combined evidence. Of these, `parts` is the evidence of every detector,
-    with that of the deciding detector first. The other fields are:
+    The fields of `Evidence` are those of the combined evidence, with that of every detector in `parts`, the deciding
+    detector's first. The other fields are:
 
     Parameters
     ----------
@@ -100,8 +100,8 @@ class Diagnosis(Evidence):
     ) -> Diagnosis:
         """Make the diagnosis of a recording from the combined evidence and from statements in the recording's file.
 
-        The size of the leak relative to the `machine` is added if the evidence lacks it. `file` is the name of the
-        recording; None stands for the name of the file it was read from. `fields` are the other fields of `Diagnosis`.
+        The size of the leak relative to the `machine` is added if the evidence lacks it. `file` is the recording's
+        name, by default that of its file; `fields` are the other fields of `Diagnosis`.
         """
         if evidence.relative is None:
             evidence = replace(evidence, relative=relative_leak(evidence, recording, machine))
@@ -124,10 +124,7 @@ class Diagnosis(Evidence):
 
     @property
     def limit_lpm(self) -> float | None:
-        """Repair limit as a flow past the piston [L/min].
-
-        The result is None if the limit is a creep speed of the piston and the piston's area is not stated.
-        """
+        """Repair limit as a flow past the piston [L/min]; None for a creep speed without a stated piston area."""
         area = self.machine.area if self.machine is not None and self.machine.area_stated else None
         return self.limit.flow_lpm(area)
 
@@ -135,9 +132,8 @@ class Diagnosis(Evidence):
     def repair_lpm(self) -> float | None:
         """Repair limit [L/min] to draw in the plot of the leak over time (`course`).
 
-        If the plot shows the total leakage, the leakage of the healthy machine is added to the limit: the median of the
-        plotted flow before the onset of the leak. If the leak was open from the start, its flow is subtracted from the
-        median. The result is None if there is no plot, or if limit or healthy leakage is not known as a flow.
+        If the plot shows the total leakage, the healthy machine's is added: the median of the plotted flow before the
+        onset, minus the leak if this was open from the start. None without a plot, known limit or healthy leakage.
         """
         course, limit = self.course, self.limit_lpm
         if course is None or limit is None:
@@ -155,10 +151,9 @@ class Diagnosis(Evidence):
 
     @property
     def measured_ratio(self) -> tuple[float, tuple[float, float]] | None:
-        """Measured over assumed value of the ratio of pump displacement to piston area, with 95 % interval (low, high).
+        """Measured over assumed ratio of pump displacement to piston area, with 95 % interval (low, high).
 
-        The figures are those of the deciding detector or, if it has not measured the ratio, those of the first other
-        detector that has measured it. The result is None if no detector has measured it.
+        It is that of the first detector that has measured it, beginning with the deciding one; None if none has.
         """
         for decision in (self, *self.parts):
             if decision.ratio is not None and decision.ratio_interval is not None:
@@ -177,11 +172,7 @@ class Diagnosis(Evidence):
 
     @property
     def _condition(self) -> str:
-        """Name of the condition in `states.toml` that corresponds to the verdict, such as "leak" or "no change".
-
-        For the verdict `no leak` it depends on whether the leakage is known to be healthy and, if so, is usual
-        (`is_baseline`), else on the deciding detector.
-        """
+        """Name of the condition in `states.toml` that corresponds to the verdict, such as "leak" or "no change"."""
         if self.verdict != NO_LEAK:
             return self.verdict
         if self.known_healthy:
@@ -190,11 +181,7 @@ class Diagnosis(Evidence):
 
     @property
     def named_cause(self) -> str | None:
-        """Cause that the verdict names, either of the leak or of another event; None if the verdict names no cause.
-
-        Causes in `LEAKS`, such as "piston leak", are named only with the verdict `leak`. Any other cause is named only
-        with another verdict.
-        """
+        """Cause that the verdict names, or None: one of `LEAKS` with `leak`, any other cause with other verdicts."""
         return self.cause if (self.verdict == LEAK) == (self.cause in LEAKS) else None
 
     @property
@@ -205,10 +192,7 @@ class Diagnosis(Evidence):
 
     @property
     def state(self) -> MachineState:
-        """State of the machine by NAMUR NE 107, such as "good".
-
-        It is "failure" if the leak surely exceeds the repair limit.
-        """
+        """State of the machine by NAMUR NE 107, such as "good"; "failure" for a leak surely over the repair limit."""
         is_over_limit = self.severity is not None and self.severity.level == "repair"
         condition = "leak over the limit" if is_over_limit else self._condition
         onset_s = to_plain(self.onset_s)  # None if not finite
@@ -216,10 +200,7 @@ class Diagnosis(Evidence):
 
     @property
     def known_healthy(self) -> bool:
-        """True if there is no leak and the leakage is known to be as low as a healthy machine's.
-
-        This is known from leak-free recordings, or from the healthy leakage that the rig states.
-        """
+        """True if there is no leak, and leak-free recordings or the rig show that the leakage is healthy."""
         is_healthy_by_rig = self.total_leakage is not None and self.total_leakage.healthy
         return self.verdict == NO_LEAK and (self.baselines > 0 or is_healthy_by_rig)
 
@@ -227,9 +208,9 @@ class Diagnosis(Evidence):
     def is_baseline(self) -> bool:
         """True if the recording may serve as a baseline, as no leak was found and its leakage is usual.
 
-        The leakage is usual if at least 1 in 20 healthy recordings scores as high in the comparison with healthy
-        recordings. The result is False without this comparison, or if a cause of a change is stated. It is also False
-        if the total leakage is surely above 0, and an undetected leak could be the whole of it.
+        At least 1 in 20 healthy recordings must score as high in the comparison with healthy recordings. The result is
+        False without this comparison, if a cause of a change is stated, or if the total leakage is surely above 0 and
+        an undetected leak could be the whole of it.
         """
         comparison = self._find_test(AGAINST)
         if self.verdict != NO_LEAK or self.cause is not None or comparison is None or not _is_usual(comparison):
@@ -242,11 +223,7 @@ class Diagnosis(Evidence):
 
     @property
     def rises_within(self) -> bool:
-        """True if the leakage probably rose within the recording, although no onset is stated.
-
-        A rise is probable if fewer than 1 in 20 healthy recordings score as high in the test for a rise within the
-        recording.
-        """
+        """True if fewer than 1 in 20 healthy recordings seem to rise as much within, and no onset is stated."""
         step_test = self._find_test(WITHIN)
         return self.onset_s is None and step_test is not None and not _is_usual(step_test)
 
@@ -256,10 +233,7 @@ class Diagnosis(Evidence):
         return next((test for test in tests if test.detector == name), None)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the diagnosis as plain values for JSON, in the order of the output contract.
-
-        Numbers that are not finite become None.
-        """
+        """Return the diagnosis as plain values for JSON, in the order of the output contract; None if not finite."""
         ratio, ratio_interval = self.measured_ratio or (None, None)
         total = None if self.total_leakage is None else dict(vars(self.total_leakage))
         if total is not None:
@@ -287,23 +261,14 @@ class Diagnosis(Evidence):
                 "rig": self.machine and self.machine.as_dict(),
                 "severity": self.severity and self.severity.as_dict(),
                 "limit": self.limit.as_dict(),
-                "evidence": {
-                    "detector": self.detector or None,
-                    "share": self.share,
-                    "baselines": self.baselines,
-                    "ratio": ratio,
-                    "ratio_interval": ratio_interval,
-                    "refuses": sorted(self.refuses),
-                },
+                "evidence": {"detector": self.detector or None, "share": self.share, "baselines": self.baselines}
+                | {"ratio": ratio, "ratio_interval": ratio_interval, "refuses": sorted(self.refuses)},
                 "state": self.state,
             }
         )
 
     def to_frame(self) -> pandas.DataFrame:
-        """Return the diagnosis as a table with one row; an interval has two columns.
-
-        `pandas.concat` joins the tables of several diagnoses. Raises MissingExtra if pandas is not installed.
-        """
+        """Return a table of one row for `pandas.concat`, two columns for an interval; MissingExtra without pandas."""
         try:
             import pandas
         except ImportError:
@@ -365,7 +330,6 @@ class Diagnosis(Evidence):
         """Return the diagnosis as an HTML table for notebooks."""
 
         def format_figure(value: float | None, interval: tuple[float, float] | None = None) -> str:
-            """Format a number, followed by its interval if there is one; "" for None."""
             ends = "" if interval is None else f" ({interval[0]:.4g} to {interval[1]:.4g})"
             return "" if value is None else f"{value:.4g}{ends}"
 

@@ -48,8 +48,7 @@ class LeakCourse:
     lpm, low, high : ndarray, shape (k,)
         Flow at these times, and its 95 % interval [L/min].
     whole : bool
-        True for the total flow past pump and piston, which is stated if no onset of a leak is known. False for the
-        increase of this flow since the onset.
+        True for the total flow past pump and piston, without a known onset; False for its increase since the onset.
     """
 
     t: Array
@@ -87,10 +86,7 @@ class TotalLeakage:
 
     @property
     def healthy(self) -> bool:
-        """True if the upper end of the flow's 95 % interval is at most the largest flow of a healthy machine.
-
-        The result is False if the interval or the largest healthy flow is not known.
-        """
+        """True if the 95 % interval is known to be at most the largest flow of a healthy machine."""
         is_known = self.healthy_lpm is not None and self.interval_lpm is not None
         return is_known and self.interval_lpm[1] <= self.healthy_lpm  # type: ignore[index,operator]
 
@@ -102,10 +98,10 @@ class RelativeLeak:
     Attributes
     ----------
     pump_share, pump_share_interval : float and pair of floats, or None
-        Leak as a fraction of the pump's mean flow, and its 95 % interval. None if the pump's motion is not recorded.
+        Leak as a fraction of the pump's mean flow, and its 95 % interval; None if the pump's motion is not recorded.
     creep, creep_interval : float and pair of floats, or None
-        Leak divided by the piston's area, and its 95 % interval [m/s]. This is the speed at which the piston would
-        creep with its lines shut. None if the position has no unit.
+        Speed at which the leak would let the piston creep with its lines shut (leak over piston area), and its 95 %
+        interval [m/s]; None if the position has no unit.
     """
 
     pump_share: float | None = None
@@ -125,18 +121,15 @@ class Evidence:
     reason : str
         Reason for the verdict, in one line.
     score, threshold : float, optional
-        A change is detected if the score exceeds the threshold. It is reported as a leak if no other event explains
-        it better.
+        A change is detected if the score exceeds the threshold; it is a leak if no other event explains it better.
     onset_s, onset_interval_s : float and pair of floats, optional
         Time at which the leak began, on the recording's time axis, and its 95 % interval [s].
     leak_lpm, leak_interval_lpm : float and pair of floats, optional
         Mean flow past the piston while the leak is open, and its 95 % interval [L/min].
     parts : tuple of Evidence
-        The detector's single tests, each with a score and a threshold; for a combined verdict, the evidence of every
-        detector.
+        The detector's single tests; for a combined verdict, the evidence of every detector.
     cause : str, optional
-        Cause of the change. For a cause other than a leak past piston or pump, the verdict is `no leak` or
-        `cannot tell`.
+        Cause of the change. Unless it is a leak past piston or pump, the verdict is `no leak` or `cannot tell`.
     course : LeakCourse, optional
         The leak over the time of the recording, if the detector estimates it.
     refuses : frozenset of {"onset_s", "leak_lpm"}
@@ -146,15 +139,13 @@ class Evidence:
     share : float
         Fraction of the recording, 0 to 1, that was used for the verdict.
     judged_until : float
-        Time of the last judged sample, as a fraction of the recording's duration. A leak does not end by itself:
-        therefore only one that begins after this time is overlooked.
+        Time of the last judged sample, as a fraction of the duration; only a leak that begins later is overlooked.
     detector : str
-        Name of the detector or of its test; for a combined verdict, the name of the deciding detector, "" if none did.
+        Name of the detector or of its test; for a combined verdict, of the deciding detector, "" if none did.
     usable : bool
         Whether the recording had the channels and the length that the detector needs.
     chance : float, optional
-        Probability that a leak-free recording scores as high, by the detector's own null distribution. It is at most
-        the false-alarm probability if the score exceeds the threshold.
+        Probability that a leak-free recording scores as high, by the detector's own null distribution.
     relative : RelativeLeak, optional
         The leak relative to other quantities of the recording; stated even if L/min is refused.
     ratio, ratio_interval : float and pair of floats, optional
@@ -208,19 +199,12 @@ class Evidence:
 
     @property
     def stated_chance(self) -> float | None:
-        """The `chance` to display, raised to at least `RAREST`, as smaller probabilities cannot be trusted.
-
-        It is None if the chance is unknown.
-        """
+        """The `chance` to display, at least `RAREST`, as smaller ones cannot be trusted; None if it is unknown."""
         return None if self.chance is None else max(RAREST, self.chance)
 
     @property
     def odds(self) -> str | None:
-        """The stated `chance` in words, such as "1 in 50 healthy recordings looks like this".
-
-        If the verdict is `no leak` without an alarm, the text is "shows as much change" instead of "looks like this".
-        It is None if the chance is unknown.
-        """
+        """The stated `chance` in words, such as "1 in 50 healthy recordings looks like this"; None if it is unknown."""
         if self.stated_chance is None:
             return None
         is_unchanged = self.verdict == NO_LEAK and not self.alarmed

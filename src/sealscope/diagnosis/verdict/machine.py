@@ -30,10 +30,8 @@ class AssumedMachine:
         Name of the rig.
     stated_by : {"call", "recording", "nobody"}
         Source of the rig: the caller (`--rig` or a Rig), the recording's provenance, or a mere assumption.
-    area : float
-        Mean piston area of both sides [m^2].
-    displacement : float
-        Displacement of the pump [m^3/rev].
+    area, displacement : float
+        Mean piston area of both sides [m^2], and displacement of the pump [m^3/rev].
     area_stated, displacement_stated : bool
         Whether the size is known from the rig, or was stated separately.
     flow_meter : bool
@@ -76,12 +74,9 @@ class AssumedMachine:
 def assumed_rig(rig: Rig | str | os.PathLike[str] | None, recording: Recording) -> tuple[Rig, AssumedMachine]:
     """Choose the rig that detectors assume for a recording, and tell who stated its areas and displacement.
 
-    - A given `rig` is used. It counts as stated by the call if it is a whole rig, else by nobody.
-    - If `rig` is None, the thesis's rig is used. It counts as stated by the recording if the recording's provenance
-      names a rig of the same areas and displacement. Otherwise nobody stated it, and all its values are marked as
-      assumptions.
-
-    Raises InputError if `rig` cannot be read.
+    A given `rig` counts as stated by the call if it is a whole rig, else by nobody. Without one, the thesis's rig is
+    used. It counts as stated by the recording if that names a rig of the same areas and displacement; else by nobody,
+    with all its values marked as assumptions. Raises InputError if `rig` cannot be read.
     """
     used_rig = load_rig(_DEFAULT if rig is None else rig)
     stated_by: StatedBy
@@ -112,18 +107,15 @@ def states_rig(rig: Rig) -> bool:
 
 
 def measures_flow(units: Mapping[str, str]) -> bool:
-    """Return True if the pump's flow is measured by a flow meter in m^3/s, the channel `q_pump`.
-
-    The result is False if the flow is computed from the pump's angle or speed. `units`: unit of each channel, by name.
-    """
+    """Return True if a flow meter [m^3/s], the channel `q_pump`, measures the pump's flow, by the channels' `units`."""
     return flow_source(units) == "q_pump" and units["q_pump"] == "m^3/s"
 
 
 def healthy_leakage(rig: Rig) -> float:
     """Return the largest leakage conductance of a healthy pump [m^3/(s Pa)] by the rig (`pump.G_healthy`).
 
-    If the conductance is only assumed in a rig's file, it is used if the same file states the displacement of the pump.
-    Otherwise it may belong to another pump, such as that of the default rig, and the result is 0.
+    An assumed one is used if the same file states the displacement; else it may belong to another pump, such as that of
+    the default rig, and the result is 0.
     """
     is_from_same_file = rig.entry("pump.G_healthy").place == rig.entry("pump.q_b").place
     is_of_this_pump = states_rig(rig) and rig.states("pump.q_b") and is_from_same_file
@@ -136,10 +128,7 @@ def unstated_rig() -> Rig:
 
 
 def _names_rig_of_same_geometry(provenance: Mapping[str, Any], rig: Rig) -> bool:
-    """Return True if a recording's provenance names a packaged rig of the same areas and displacement as `rig`.
-
-    The recording is then a simulated one. The result is False if the simulation overrode areas or displacement.
-    """
+    """Return True if a recording was simulated with a packaged rig of the areas and displacement of `rig`."""
     experiment = provenance.get("experiment")
     if not isinstance(experiment, Mapping):
         return False

@@ -37,8 +37,7 @@ class RepairLimit:
     kind : {"flow", "creep"}
         Whether `value` is a flow or a creep speed.
     stated : bool
-        True if the caller gave the limit, False for the default creep speed of `priors.toml`, which applies to any
-        piston area.
+        True if the caller gave the limit, False for the default creep speed of `priors.toml`.
     """
 
     value: float
@@ -47,10 +46,7 @@ class RepairLimit:
 
     @classmethod
     def parse(cls, text: str | None) -> RepairLimit:
-        """Parse a repair limit such as "5 mL/min" or "8 mm/min"; None gives the default limit.
-
-        Raises InputError unless the text is a positive flow or speed with its unit.
-        """
+        """Parse a repair limit such as "5 mL/min" or "8 mm/min", by default that of `priors.toml`; else InputError."""
         if text is None:
             return cls(VERDICT.repair.creep * MM_PER_MINUTE, "creep", stated=False)
         without_exponent = _EXPONENT.sub("", text) if isinstance(text, str) else ""  # its e is no unit
@@ -109,12 +105,9 @@ class Severity:
 
     @property
     def level(self) -> Level | None:
-        """Urgency of the repair, from the 95 % interval of the leak divided by the repair limit (`of_limit`).
+        """Urgency of the repair, from the 95 % interval of the leak divided by the repair limit; None if not known.
 
-        - "repair": the whole interval is above 1.
-        - "monitor": the whole interval is below `repair.watch` of `priors.toml`.
-        - "plan": any other interval.
-        - None: `of_limit` is not known.
+        "repair": the interval is above 1; "monitor": it is below `repair.watch` of `priors.toml`; else "plan".
         """
         if self.of_limit is None:
             return None
@@ -124,10 +117,7 @@ class Severity:
         return "monitor" if high < VERDICT.repair.watch else "plan"
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the severity as plain values for JSON: `level`, and for each figure its value and 95 % interval.
-
-        An interval is named like `creep_mm_per_min_interval`. Both are None if the figure is not known.
-        """
+        """Return `level`, figures and their intervals (`creep_mm_per_min_interval`) for JSON; None if not known."""
         plain: dict[str, Any] = {"level": self.level}
         for name in ("mL_per_min", "pump_share", "creep_mm_per_min", "of_limit"):
             figure = getattr(self, name)
@@ -137,10 +127,7 @@ class Severity:
 
 
 def severity(evidence: Evidence, limit: RepairLimit) -> Severity | None:
-    """Compute the severity of the leak that `evidence` states, relative to a repair limit.
-
-    The result is None if the verdict is not `leak`, or if the size of the leak is unknown.
-    """
+    """Compute the severity of a leak relative to a repair limit; None without a leak, or if its size is unknown."""
     if evidence.verdict != LEAK or (evidence.leak_lpm is None and evidence.relative is None):
         return None
     relative = evidence.relative or RelativeLeak()
@@ -161,9 +148,8 @@ def severity(evidence: Evidence, limit: RepairLimit) -> Severity | None:
 def relative_leak(evidence: Evidence, recording: Recording, machine: AssumedMachine) -> RelativeLeak | None:
     """Convert a leak in L/min to a fraction of the pump's mean flow and to a creep speed of the piston.
 
-    `evidence` states the leak, and `machine` the displacement and the piston area. The pump's mean speed is computed
-    from the `recording`. The result is None if the evidence states no L/min. The fraction is None if the pump stands
-    still, or if neither its speed nor its angle is recorded.
+    `machine` states displacement and piston area. The result is None if the `evidence` states no L/min. The fraction is
+    None if the pump stands still, or if neither its speed nor its angle is recorded.
     """
     if evidence.leak_lpm is None or evidence.leak_interval_lpm is None:
         return None
@@ -187,10 +173,7 @@ def _mean_speed(recording: Recording) -> float:
 
 
 def _convert_figure(value: float | None, interval: tuple[float, float] | None, factor: float = 1.0) -> _Figure:
-    """Multiply a value and its `interval` (low, high) by a factor.
-
-    Returns (value, low, high), or None if one of these is unknown or not finite.
-    """
+    """Return `factor` times (value, low, high); None if one of these is unknown or not finite."""
     if value is None or interval is None or not all(math.isfinite(number) for number in (value, *interval)):
         return None
     return factor * value, factor * interval[0], factor * interval[1]

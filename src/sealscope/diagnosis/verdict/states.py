@@ -26,10 +26,8 @@ class MachineState:
 
     Attributes
     ----------
-    name : str
-        "good", "check function", "out of specification", "maintenance required" or "failure".
-    symbol : str
-        Letter of the state.
+    name, symbol : str
+        "good", "check function", "out of specification", "maintenance required" or "failure", and its letter.
     health : int
         Number of the state in OPC UA's DeviceHealthEnumeration.
     severity : int
@@ -38,10 +36,8 @@ class MachineState:
         Condition that led to the state, such as "leak" or "no data".
     since_s : float or None
         Time at which the state began, on the clock of the samples [s]; None if unknown.
-    cause : str or None
-        Cause of the change.
-    action : str
-        What is to be done.
+    cause, action : str or None, str
+        Cause of the change, and what is to be done.
     """
 
     name: str
@@ -70,9 +66,8 @@ def state_of(
 ) -> MachineState:
     """Return the state of a machine for a condition of `states.toml`; raise KeyError for an unknown condition.
 
-    `cause` is the cause of the change, None if unknown. A cause that `states.toml` lists determines the action and,
-    unless the condition is a leak past piston or pump (`LEAKING`), also the state. `since_s` is the time at which the
-    state began [s]. `action` replaces the action that `states.toml` states.
+    A `cause` that `states.toml` lists determines the action and, unless the condition is a leak past piston or pump
+    (`LEAKING`), also the state. `since_s` is the time at which it began [s]. `action` replaces that of `states.toml`.
     """
     tables = _tables()
     name = tables["conditions"][condition]["state"]
@@ -99,9 +94,8 @@ def joint_causes() -> Mapping[str, tuple[str, ...]]:
 def action_of(condition: str, cause: str | None = None, parts: Sequence[str] = ()) -> str:
     """Return the action of `states.toml` for the cause of a change; without a listed cause, that for the condition.
 
-    `parts` are components of the machine that may be mistaken for a worn seal, such as an open "bypass". If the
-    condition is a leak past piston or pump, checks of these parts come first. Raises KeyError for an unknown condition
-    or part.
+    `parts` are components that may be mistaken for a worn seal, such as an open "bypass". For a leak past piston or
+    pump, checks of these come first. Raises KeyError for an unknown condition or part.
     """
     tables = _tables()
     row = tables["causes"].get(cause or "", tables["conditions"][condition])
