@@ -3,14 +3,10 @@
 Numba's ``cache=True`` stores the machine code of a function by the source of its own file only. After an edit to
 another file, with a function that it calls, it would silently return the old machine code. Here the name of the cache
 folder is a hash over the sources of all packages with compiled code, the versions of numba and Python, and the
-processor. The folder is in the user's cache folder, as site-packages may be read-only. `SEALSCOPE_CACHE_DIR` moves
-it; an empty value turns caching off.
+processor. It is in the user's cache folder, unless `SEALSCOPE_CACHE_DIR` moves it; an empty value turns caching off.
+Compiled code is unpickled, which can run any command: only folders that no other user can write are used.
 
-Two kinds of functions are compiled: kernels, which Python calls, and laws, small functions such as a formula of
-physics that kernels call.
-
-Compiled code is unpickled, which can run any command: only folders that no other user can write are used. A file of
-the cache that is truncated or cannot be written is a cache miss.
+Kernels are functions that Python calls; laws are functions, such as a formula of physics, that kernels call.
 """
 
 from __future__ import annotations
@@ -54,21 +50,14 @@ _log = logging.getLogger(__name__)
 
 
 def is_known_version(version: str) -> bool:
-    """Return True if a numba version, such as "0.61.2", is within the range `KNOWN_VERSIONS`.
-
-    In these versions numba has the private names that `numba_private` uses.
-    """
+    """Return True if a numba version, such as "0.61.2", has the private names that `numba_private` uses."""
     first, after = KNOWN_VERSIONS
     return first <= tuple(int(digits) for digits in re.findall(r"\d+", version)[:3]) < after
 
 
 @cache
 def _compiler() -> ModuleType:
-    """Import the module that compiles functions with the installed version of numba.
-
-    The module is `numba_private` for a version in `KNOWN_VERSIONS`. For other versions the module is `numba_pipeline`,
-    which compiles slowly and does not cache; a warning is then logged.
-    """
+    """Import `numba_private` for a version of numba in `KNOWN_VERSIONS`, else `numba_pipeline`, after a warning."""
     if is_known_version(numba.__version__):
         return import_module("sealscope.numba_private")
     low, high = (".".join(map(str, version)) for version in KNOWN_VERSIONS)
@@ -78,10 +67,7 @@ def _compiler() -> ModuleType:
 
 
 def source_hash(root: Path) -> str:
-    """Compute a hash over the Python and TOML files of all packages with compiled code, as hexadecimal digits.
-
-    `root`: folder that contains these packages.
-    """
+    """Compute a hash, in hex digits, over the sources of all packages with compiled code in the folder `root`."""
     digest = hashlib.sha256()
     for package in _COMPILED_PACKAGES:
         files = [root / package]
@@ -94,11 +80,7 @@ def source_hash(root: Path) -> str:
 
 
 def _user_cache_folder() -> Path | None:
-    """Choose the folder in which compiled code of this user is cached.
-
-    The folder is `SEALSCOPE_CACHE_DIR` if this environment variable is set, else a folder in the user's cache folder.
-    None if the variable is empty, which turns caching off, or if the user has no home folder.
-    """
+    """Choose the cache folder: `SEALSCOPE_CACHE_DIR`, or the user's; None if that is empty, or without a home."""
     setting = os.environ.get("SEALSCOPE_CACHE_DIR")
     if setting is not None:
         return Path(setting) if setting else None
@@ -107,10 +89,7 @@ def _user_cache_folder() -> Path | None:
 
 
 def _prune(kernels: Path, current: str) -> None:
-    """Remove old subfolders of `kernels`, which has one for each version of the sources.
-
-    The subfolder named `current` is kept, and so are the `_MAX_GENERATIONS` - 1 most recently used others.
-    """
+    """Remove subfolders of `kernels` but `current` and the `_MAX_GENERATIONS` - 1 most recently used others."""
     older = sorted(
         (entry for entry in kernels.iterdir() if entry.is_dir() and entry.name != current),
         key=lambda entry: entry.stat().st_mtime,
@@ -123,8 +102,7 @@ def _prune(kernels: Path, current: str) -> None:
 def _check_owner(folder: Path, forbidden: int) -> None:
     """Raise PermissionError unless `folder` is a directory, not a link, that belongs to this user alone.
 
-    `forbidden`: permission bits that must not be set, such as 0o022, with which others could write. On Windows all
-    existing folders pass.
+    `forbidden`: permission bits that must not be set, such as 0o022, with which others could write; not on Windows.
     """
     status = folder.lstat()
     if not hasattr(os, "getuid"):  # on Windows the folders of a user are private
@@ -134,10 +112,7 @@ def _check_owner(folder: Path, forbidden: int) -> None:
 
 
 def _make_private(folder: Path) -> None:
-    """Create a folder that only this user can read and write (mode 0700), or restrict an existing one to this user.
-
-    Raises OSError if the folder belongs to another user, or if others could write to it until now.
-    """
+    """Create a folder for this user only, or restrict an existing one; raise OSError if others could write to it."""
     folder.mkdir(mode=0o700, exist_ok=True)
     _check_owner(folder, forbidden=0o022)  # others cannot write
     if folder.lstat().st_mode & 0o077:
@@ -149,9 +124,9 @@ def _make_private(folder: Path) -> None:
 def cache_directory() -> Path | None:
     """Create the folder for the compiled code of these sources, and return its path.
 
-    The user's cache folder is preferred; if it is not safe or not writable, a private folder among the temporary
-    files is used. Folders of older sources are removed (`_prune`). Returns None if caching is turned off, and None
-    after a warning if no folder can be used.
+    The user's cache folder is preferred; if it is not safe or not writable, a private folder among the temporary files
+    is used. Folders of older sources are removed (`_prune`). Returns None if caching is turned off, and None after a
+    warning if no folder can be used.
     """
     base = _user_cache_folder()
     if base is None:
@@ -185,17 +160,15 @@ def cache_directory() -> Path | None:
 def kernel(function: _F, fastmath: Any = False) -> _F:
     """Compile a function that Python calls, without Python objects and without the GIL, and cache its code.
 
-    Floating-point arithmetic follows IEEE 754, unless `fastmath` allows deviations: True, or a set of LLVM's
-    fast-math flags, as for `numba.njit`.
+    Arithmetic follows IEEE 754 unless `fastmath` is True or a set of LLVM's fast-math flags, as for `numba.njit`.
     """
     return _compiler().compile_kernel(function, fastmath, cache_directory())  # type: ignore[no-any-return]
 
 
 def _compile_law(function: _F, fastmath: Any, inlined: bool = True) -> _F:
-    """Compile a law, a function that other compiled functions call.
+    """Compile a law, a function for other compiled functions; `inlined`: True to insert its code in their place.
 
-    `fastmath`: allowed deviations from IEEE 754 as LLVM's fast-math flags, False for none; `inlined`: True to insert
-    the law's code in place of each call. The law is returned uncompiled if numba's compilation is disabled.
+    `fastmath`: LLVM's fast-math flags, False for none. Without numba's compilation, the law is returned as it is.
     """
     if numba.config.DISABLE_JIT:
         return function
@@ -203,40 +176,29 @@ def _compile_law(function: _F, fastmath: Any, inlined: bool = True) -> _F:
 
 
 def law(function: _F) -> _F:
-    """Compile a small function, such as a formula of physics, for use in other compiled functions.
-
-    Its code is inserted in place of each call. A call from Python runs the uncompiled function.
-    """
+    """Compile a small function, such as a formula, for use in other compiled functions; Python runs it uncompiled."""
     return _compile_law(function, fastmath=False)
 
 
 def large_law(function: _F) -> _F:
-    """Compile a large function for use in other compiled functions, which call it instead of containing its code.
-
-    A call from Python runs compiled code, too.
-    """
+    """Compile a large function that other compiled functions call, instead of containing its code, and Python, too."""
     return _compile_law(function, fastmath=False, inlined=False)
 
 
 def contracted(function: _F) -> _F:
-    """Compile a small function for use in other compiled functions, with fused multiply-adds allowed.
+    """Compile a small function like `law`, with fused multiply-adds and divisions by reciprocals allowed.
 
-    A division may also become a product with the reciprocal. The last digits of the results then depend on the
-    processor, but not on how the data are split into blocks or lanes (`physics.lanes`).
+    The last digits of the results then depend on the processor, but not on the split into blocks or lanes.
     """
     return _compile_law(function, fastmath={"contract", "arcp"})  # fused multiply-adds, reciprocals
 
 
 class Entry:
-    """A compiled function with the C signature double f(double *memory, double *input), called by its address.
-
-    It is compiled when its `address` is first requested.
-    """
+    """A function double f(double *memory, double *input), compiled when its `address` is first requested."""
 
     _SIGNATURE = numba.float64(types.CPointer(numba.float64), types.CPointer(numba.float64))
 
     def __init__(self, function: Callable[..., Any]) -> None:
-        """Prepare the compilation of `function`, which takes two arrays of doubles and returns a double."""
         self._address = _compiler().compile_at_address(function, self._SIGNATURE, cache_directory())
 
     @cached_property
@@ -245,25 +207,19 @@ class Entry:
         return int(self._address())
 
 
-def entry(function: Callable[..., Any]) -> Entry:
-    """Wrap a function of two arrays of doubles in an `Entry`, for calls by its address from kernels and from C."""
-    return Entry(function)
+#: The decorator of functions that kernels and C call by their address.
+entry = Entry
 
 
 @intrinsic  # type: ignore[misc]
 def call_at(context: Any, address: Any, memory: Any, sample: Any) -> Any:
-    """Call the function double f(double *memory, double *sample) at an address, and return its result.
+    """Call the function double f(double *memory, double *sample) at an address, in compiled code only.
 
-    For use in compiled code only. The function's `address`, `memory` and `sample` are addresses as 64-bit integers.
-    Numba passes `context`, and gets the signature of the call and the generator of its code (`emit_call`).
+    `address`, `memory` and `sample` are addresses as 64-bit integers. Numba passes `context`.
     """
 
     def emit_call(target: Any, builder: Any, signature: Any, values: Any) -> Any:
-        """Emit the LLVM instructions that call the function at the address; return its result, a double.
-
-        Numba passes the arguments. `values` are the addresses of the function, of `memory` and of `sample`: 64-bit
-        integers, which are converted to pointers here.
-        """
+        """Emit the LLVM instructions that call the function at the first of the addresses `values` with the others."""
         double = target.get_value_type(numba.float64)
         pointer = double.as_pointer()
         function = builder.inttoptr(values[0], llvm.FunctionType(double, [pointer, pointer]).as_pointer())
@@ -274,36 +230,23 @@ def call_at(context: Any, address: Any, memory: Any, sample: Any) -> Any:
 
 @intrinsic  # type: ignore[misc]
 def address_of(context: Any, pointer: Any) -> Any:
-    """Convert a pointer to a 64-bit integer, its address; for use in compiled code only.
-
-    Numba passes `context`, and gets the signature of the conversion and the generator of its code (`emit_conversion`).
-    """
-
-    def emit_conversion(target: Any, builder: Any, signature: Any, values: Any) -> Any:
-        """Emit the LLVM instruction that converts the pointer to a 64-bit integer; return its result.
-
-        Numba passes the arguments; the only item of `values` is the pointer.
-        """
-        return builder.ptrtoint(values[0], target.get_value_type(numba.int64))
-
-    return numba.int64(pointer), emit_conversion
+    """Convert a pointer to a 64-bit integer, its address, in compiled code only; numba passes `context`."""
+    return numba.int64(pointer), lambda target, builder, signature, values: builder.ptrtoint(
+        values[0], target.get_value_type(numba.int64)
+    )
 
 
 def record_dtype(*numbers: str, **parts: Any) -> np.dtype[Any]:
-    """Build the NumPy dtype of a record of doubles.
+    """Build the NumPy dtype of a record of doubles: the single doubles `numbers`, then `parts` by name.
 
-    `numbers`: names of the fields that are single doubles; they come first. `parts`: further fields by name, each with
-    the shape of an array of doubles or with the dtype of a nested record.
+    A part is the shape of an array of doubles, or the dtype of a nested record.
     """
     further = [(name, part) if isinstance(part, np.dtype) else (name, "f8", part) for name, part in parts.items()]
     return np.dtype([*((name, "f8") for name in numbers), *further])  # f8: NumPy's name of a double
 
 
 def make_record(layout: np.dtype[Any], source: object = None, **values: Any) -> np.recarray[Any, Any]:
-    """Make a record array (1,) with the dtype `layout`.
-
-    Each field is taken from `values`, else from the attribute of `source` with its name, else zero.
-    """
+    """Make a record array (1,), each field from `values`, else from the attribute of `source`, else 0."""
     record = np.zeros(1, layout).view(np.recarray)
     for name in layout.fields or ():
         record[name] = values.get(name, getattr(source, name, 0.0))
@@ -311,31 +254,19 @@ def make_record(layout: np.dtype[Any], source: object = None, **values: Any) -> 
 
 
 def record_view(layout: Any) -> Callable[[Any], Any]:
-    """Build a compiled function that views the doubles at a pointer as a record, without copying them.
-
-    `layout`: NumPy dtype of the record, with doubles and arrays of doubles as fields.
-    """
+    """Build a compiled function that views the doubles at a pointer as a record of the dtype `layout`."""
     record_pointer = numba.types.CPointer(numba.from_dtype(layout))
 
     @intrinsic  # type: ignore[misc]
     def cast_pointer(context: Any, pointer: Any) -> Any:
-        """Cast a pointer to doubles to a pointer to the record, in compiled code only.
-
-        Numba passes `context`, and gets the signature of the cast and the generator of its code (`emit_cast`).
-        """
-
-        def emit_cast(target: Any, builder: Any, signature: Any, values: Any) -> Any:
-            """Emit the LLVM instruction that casts the pointer, the only item of `values`; return its result.
-
-            Numba passes the arguments.
-            """
-            return builder.bitcast(values[0], target.get_value_type(record_pointer))
-
-        return record_pointer(pointer), emit_cast
+        """Cast a pointer to doubles to a pointer to the record, in compiled code only; numba passes `context`."""
+        return record_pointer(pointer), lambda target, builder, signature, values: builder.bitcast(
+            values[0], target.get_value_type(record_pointer)
+        )
 
     @law
     def record(pointer: Any) -> Any:
-        """View the doubles at a pointer as the record with the dtype `layout`."""
+        """View the doubles at a pointer as the record."""
         return numba.carray(cast_pointer(pointer), 1)[0]
 
     return record  # type: ignore[no-any-return]
@@ -344,8 +275,8 @@ def record_view(layout: Any) -> Callable[[Any], Any]:
 def plain_code(function: Callable[..., Any], *arguments: str) -> tuple[str, str]:
     """Compile a function to LLVM code that needs no Python; return the code and the function's symbol.
 
-    `arguments`: type of each argument, "double*", "double" or "int64". The function must return an integer and
-    allocate nothing. C calls it as ``int symbol(int64_t *result, void **unused, arguments...)``.
+    `arguments`: type of each argument, "double*", "double" or "int64". The function must return an integer and allocate
+    nothing. C calls it as ``int symbol(int64_t *result, void **unused, arguments...)``.
     """
     numba_types = {"double*": numba.types.CPointer(numba.float64), "double": numba.float64, "int64": numba.int64}
     signature = numba.int64(*(numba_types[argument] for argument in arguments))

@@ -8,6 +8,7 @@ results are the same, but each process compiles anew.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -46,28 +47,15 @@ class ConstantLengths(FunctionPass):  # type: ignore[misc]
     _name = "sealscope_settled_laws"
 
     def __init__(self) -> None:
-        """Create the compiler pass, as numba requires."""
         FunctionPass.__init__(self)
 
     def run_pass(self, state: Any) -> bool:
-        """Replace each `len` of an argument of fixed size by a constant.
-
-        `state`: numba's state of the compilation, with the code to change. Returns True if the code was changed.
-        """
+        """Replace each `len` of an argument of fixed size in the compiled code; return True if it was changed."""
         code, changed = state.func_ir, False
-
-        def find_definition(variable: Any) -> Any:
-            """Find the expression that defines a variable in numba's intermediate code.
-
-            Returns None if there is not exactly one.
-            """
-            return guard(get_definition, code, variable)
+        find_definition = partial(guard, get_definition, code)  # the one expression that defines a variable, or None
 
         def type_of(source: Any) -> Any:
-            """Find the numba type of an argument of the compiled function, or of an attribute of an argument.
-
-            `source`: expression in numba's intermediate code. Returns None for other expressions.
-            """
+            """Find the numba type of an argument of the compiled function or of an argument's attribute, else None."""
             if isinstance(source, ir.Arg):
                 return state.args[source.index]
             owner = find_definition(source.value) if getattr(source, "op", None) == "getattr" else None
@@ -79,11 +67,7 @@ class ConstantLengths(FunctionPass):  # type: ignore[misc]
             return None
 
         def find_length(value: Any) -> int | None:
-            """Find the number that a call of `len` returns.
-
-            `value`: expression in numba's intermediate code. Returns None if it is not a call of `len`, or if the
-            length is not known.
-            """
+            """Find the number that an expression in intermediate code returns if it is a call of `len`, else None."""
             if getattr(value, "op", None) != "call" or len(value.args) != 1:
                 return None
             if getattr(find_definition(value.func), "value", None) is not len:
@@ -110,7 +94,7 @@ class _FullCompiler(CompilerBase):  # type: ignore[misc]
     """numba's own compiler, with `ConstantLengths` after its pass that replaces other constants."""
 
     def define_pipelines(self) -> list[Any]:
-        """Build the list of numba's pipelines, which has one entry: the usual passes and `ConstantLengths`."""
+        """Build the list of numba's pipelines: one, with the usual passes and `ConstantLengths`."""
         pipeline = DefaultPassBuilder.define_nopython_pipeline(self.state, "sealscope")
         pipeline.add_pass_after(ConstantLengths, RewriteSemanticConstants)
         pipeline.finalize()
@@ -121,18 +105,15 @@ _OPTIONS = {"nogil": True, "error_model": "numpy", "pipeline_class": _FullCompil
 
 
 def compile_kernel(function: Callable[..., Any], fastmath: Any, folder: Path | None) -> Any:
-    """Prepare a function that Python calls for compilation at its first call.
-
-    `fastmath`: as for `numba.njit`; `folder` is not used, as nothing is cached here.
-    """
+    """Prepare a function for compilation at Python's first call; `fastmath` as for `numba.njit`; `folder`: unused."""
     return numba.njit(fastmath=fastmath, **_OPTIONS)(function)
 
 
 def compile_law(function: Callable[..., Any], fastmath: Any, inlined: bool, folder: Path | None) -> Any:
-    """Compile a function for calls from other compiled functions.
+    """Compile a function for calls from other compiled functions; `folder` is not used.
 
     `fastmath`: as for `numba.njit`; `inlined`: True if numba may insert the function's code in place of a call, and
-    Python is to run the uncompiled function; `folder` is not used, as nothing is cached here.
+    Python is to run the uncompiled function.
     """
     if inlined:
         return register_jitable(fastmath=fastmath, **_OPTIONS)(function)
@@ -140,10 +121,7 @@ def compile_law(function: Callable[..., Any], fastmath: Any, inlined: bool, fold
 
 
 def compile_at_address(function: Callable[..., Any], signature: Any, folder: Path | None) -> Callable[[], int]:
-    """Build a function without arguments that compiles `function` for calls from C and returns its address.
-
-    `signature`: numba's signature of `function`; `folder` is not used, as nothing is cached here.
-    """
+    """Build a function that compiles `function` for C by its `signature` and returns its address; `folder`: unused."""
     callbacks: list[Any] = []  # keeps the compiled code in memory
 
     def compile_address() -> int:

@@ -81,8 +81,8 @@ class TolerantCache(FunctionCache):  # type: ignore[misc]
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Load the compiled code of a function for the argument types `sig`; None if it is missing or damaged.
 
-        Loaded code needs numba's reference counting, which is set up here for `target_context`. The remaining set-up of
-        numba takes longer than loading, and is left to the next compilation. A damaged cache is emptied.
+        Loaded code needs numba's reference counting, which is set up here; the remaining set-up of numba takes longer
+        than loading, and is left to the next compilation. A damaged cache is emptied.
         """
         try:
             rtsys.initialize(target_context)
@@ -95,10 +95,7 @@ class TolerantCache(FunctionCache):  # type: ignore[misc]
         return None
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        """Save the compiled code `data` of a function for the argument types `sig`.
-
-        An error, such as a full disk, is only logged.
-        """
+        """Save the compiled code `data` of a function for the argument types `sig`; an error is only logged."""
         try:
             super().save_overload(sig, data)
         except Exception as error:
@@ -117,7 +114,7 @@ class _ShortCompiler(CompilerBase):  # type: ignore[misc]
     """numba's compiler with only the passes in `_PASSES`."""
 
     def define_pipelines(self) -> list[Any]:
-        """Build the list of numba's pipelines, which has one entry: the passes in `_PASSES`."""
+        """Build the list of numba's pipelines: one, with the passes in `_PASSES`."""
         pipeline = PassManager("nopython")
         for step in _PASSES:
             pipeline.add_pass(step, step.__name__)
@@ -129,10 +126,7 @@ _config_lock = Lock()
 
 
 def _dispatcher(function: Callable[..., Any], options: dict[str, Any], folder: Path | None) -> Any:
-    """Build numba's dispatcher of a function, the object that compiles it when it is called.
-
-    Compiled code is cached in `folder`, unless it is None. `options`: further arguments of `numba.njit`.
-    """
+    """Build numba's dispatcher of a function, which compiles it when it is called; `folder`: cache, None for none."""
     dispatcher = numba.njit(pipeline_class=_ShortCompiler, nogil=True, error_model="numpy", **options)(function)
     if folder is None:
         return dispatcher
@@ -151,18 +145,15 @@ def _dispatcher(function: Callable[..., Any], options: dict[str, Any], folder: P
 
 
 def compile_kernel(function: Callable[..., Any], fastmath: Any, folder: Path | None) -> Any:
-    """Prepare a function that Python calls for compilation at its first call.
-
-    `fastmath`: as for `numba.njit`; `folder`: cache for the compiled code, None without a cache.
-    """
+    """Prepare a function for compilation at Python's first call; `fastmath` as for `numba.njit`; `folder`: cache."""
     return _dispatcher(function, {"no_cfunc_wrapper": True, "fastmath": fastmath}, folder)
 
 
 class _LawLibrary(JITCodeLibrary):  # type: ignore[misc]
     """Compiled code of a function that only other compiled functions call, without machine code of its own.
 
-    The code is linked into these functions as LLVM code, and never called by its address. It is optimised here once,
-    not in each function that calls it, so that all of them compute identical results.
+    The code is linked into these functions as LLVM code. It is optimised here once, not in each function that calls it,
+    so that all of them compute identical results.
     """
 
     def _finalize_final_module(self) -> None:
@@ -171,16 +162,10 @@ class _LawLibrary(JITCodeLibrary):  # type: ignore[misc]
 
 
 class _LawCompiler(_ShortCompiler):
-    """Compiler of functions that only other compiled functions call.
-
-    It generates no machine code, and takes a fifth of the time that compiling for Python takes.
-    """
+    """Compiler of functions for other compiled functions, to LLVM code in a `_LawLibrary`, in a fifth of the time."""
 
     def define_pipelines(self) -> list[Any]:
-        """Build the list of numba's pipelines with one entry, the passes in `_PASSES`, and turn off machine code.
-
-        The compiled function is kept as LLVM code in a `_LawLibrary`.
-        """
+        """Build the list of numba's pipelines: one, with the passes in `_PASSES` but without machine code."""
         self.state.flags.no_compile = True
         self.state.library = _LawLibrary(self.state.targetctx.codegen(), self.state.func_id.func_qualname)
         return super().define_pipelines()
@@ -197,34 +182,26 @@ class _Law(CPUDispatcher):  # type: ignore[misc]
     folder: Path | None = None
 
     def add_overload(self, cres: Any) -> None:
-        """Register compiled code for use in other compiled functions, without an entry point for Python.
-
-        `cres`: numba's result of the compilation.
-        """
+        """Register the compiled code `cres` for other compiled functions, without an entry point for Python."""
         placeholder = object()  # in place of the entry point, under which numba finds the code
         self.targetctx.insert_user_function(placeholder, cres.fndesc, [cres.library])
         self.overloads[tuple(cres.signature.args)] = cres._replace(entry_point=placeholder)
 
     @cached_property
     def _for_python(self) -> Any:
-        """Function that runs if Python calls the law.
-
-        The function is the law's Python source if the law is small (inlined), else a kernel that is compiled from this
-        source.
-        """
+        """The function for Python: the source of a small (inlined) law, or a kernel compiled from a large one's."""
         inlined = self.targetoptions["forceinline"]
         return self.py_func if inlined else compile_kernel(self.py_func, self.targetoptions["fastmath"], self.folder)
 
     def __call__(self, *arguments: Any, **named: Any) -> Any:
-        """Run the law for a call from Python: the source of a small law, or the kernel of a large one."""
         return self._for_python(*arguments, **named)
 
 
 def compile_law(function: Callable[..., Any], fastmath: Any, inlined: bool, folder: Path | None) -> Any:
     """Prepare a law, a function for calls from other compiled functions, for compilation when it is first needed.
 
-    `fastmath`: as for `numba.njit`; `inlined`: True to insert the law's code in place of each call, as for a small law;
-    `folder`: cache for a large law that Python calls (`_Law`), None without a cache.
+    `fastmath`: as for `numba.njit`; `inlined`: True to insert the law's code in place of each call; `folder`: cache for
+    a large law that Python calls (`_Law`), None without a cache.
     """
     options = {"nopython": True, "nogil": True, "error_model": "numpy", "fastmath": fastmath, "forceinline": inlined}
     options |= {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
@@ -235,10 +212,7 @@ def compile_law(function: Callable[..., Any], fastmath: Any, inlined: bool, fold
 
 
 def compile_at_address(function: Callable[..., Any], signature: Any, folder: Path | None) -> Callable[[], int]:
-    """Build a function without arguments that compiles `function` for calls from C and returns its address.
-
-    `signature`: numba's signature of `function`; `folder`: cache for the compiled code, None without a cache.
-    """
+    """Build a function that compiles `function` for C by its `signature` and returns its address; `folder`: cache."""
     dispatcher = _dispatcher(function, {"no_cpython_wrapper": True}, folder)
 
     def compile_address() -> int:

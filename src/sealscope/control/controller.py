@@ -16,9 +16,9 @@ from sealscope.recordings.recording import Array
 class Measured(NamedTuple):
     """The inputs of a controller at one of its samples: time, target and measurements.
 
-    `t` [s]: time; `target` [m]: target of the piston's position; `target_speed` [m/s]: mean speed of the target during
-    the time in which the computed voltage will act; `x` [m]: measured position from mid-stroke; `p_A`, `p_B` [Pa]:
-    measured pressures of the two chambers; `theta` [rad]: measured angle of the motor.
+    `t` [s]: time; `target` [m] of the piston's position; `target_speed` [m/s]: mean speed of the target while the
+    computed voltage will act; `x` [m]: measured position from mid-stroke; `p_A`, `p_B` [Pa]: measured pressures of the
+    two chambers; `theta` [rad]: measured angle of the motor.
     """
 
     t: float
@@ -38,10 +38,9 @@ class CompiledLaw(NamedTuple):
     """A controller's control law as machine code, with its memory at the start of a run.
 
     `address`: address of a function ``double law(double *memory, double *measured)``, from numba.cfunc or a C compiler,
-    that returns the voltage [V] for the numbers of a `Measured`. `memory` (n,): the parameters and the state of the
-    control law, which each call updates; memory[0] is the leakage flow [m^3/s] that the controller compensates, or NaN
-    if it does not report this flow. `kept`: an object that must not be freed while the law is in use, such as the
-    `CompiledLaw` that this law calls, or None.
+    that returns the voltage [V] for the numbers of a `Measured`. `memory` (n,): parameters and state of the control
+    law, which each call updates; memory[0] is the leakage flow [m^3/s] that the controller compensates, or NaN if it
+    reports none. `kept`: an object that the law needs, such as the `CompiledLaw` that it calls, or None.
     """
 
     address: int
@@ -53,17 +52,12 @@ class Started:
     """A compiled control law that Python can call: it computes the voltage [V] for each `Measured`."""
 
     def __init__(self, law: CompiledLaw) -> None:
-        """Prepare calls of `law` by its address, and a place from which it reads the numbers of a `Measured`."""
         self._law, self._measured = law, np.empty(len(Measured._fields))
         self._call = LAW(law.address)
         self._addresses = law.memory.ctypes.data, self._measured.ctypes.data
 
     def __call__(self, measured: Measured) -> float:
-        """Compute the controller's voltage [V] from the measurements of its next sample.
-
-        Each call advances the controller's state: call the law exactly once a sample. An exception that a controller
-        written in Python raises is passed on.
-        """
+        """Compute the voltage [V] of the next sample, once a sample; pass on a Python controller's exception."""
         self._measured[:] = measured
         volts = float(self._call(*self._addresses))
         reraise_python_error(self._law)
@@ -71,10 +65,7 @@ class Started:
 
     @property
     def compensated(self) -> float:
-        """Leakage flow [m^3/s] that the controller compensated at its last sample.
-
-        Raises AttributeError if the controller reports no such flow.
-        """
+        """Leakage flow [m^3/s] compensated at the last sample; AttributeError if the controller reports none."""
         flow = float(self._law.memory[0])
         if math.isnan(flow):
             raise AttributeError("compensated")
@@ -86,10 +77,9 @@ LAW = ctypes.CFUNCTYPE(ctypes.c_double, ctypes.c_void_p, ctypes.c_void_p)
 
 
 class _PythonLaw:
-    """A controller written in Python that compiled code can call by an address."""
+    """A controller written in Python, its function `voltage`, that compiled code can call by the address of `law`."""
 
     def __init__(self, voltage: Callable[[Measured], float]) -> None:
-        """Wrap the controller's Python function `voltage` as a C function, and make the `CompiledLaw` that calls it."""
         self._voltage, self._memory = voltage, np.full(1, math.nan)
         self.raised: BaseException | None = None
         self._function = LAW(self._call_voltage)
@@ -98,12 +88,10 @@ class _PythonLaw:
         self.law = CompiledLaw(address, self._memory, self)
 
     def _call_voltage(self, _memory: int, measured: int) -> float:
-        """Call the Python controller, and return the voltage [V] that it sets.
+        """Compute the controller's voltage [V] from the numbers of a `Measured` at the address `measured`.
 
-        `_memory` is the address of the law's memory, which compiled callers pass; it is that of `self._memory`.
-        `measured` is the address of the measured values, in the order of the fields of `Measured`. The leakage flow
-        that the controller compensates is stored in `self._memory[0]`, NaN if the controller does not report this
-        flow. If the controller raises an exception, this is stored in `self.raised`, and the result is NaN.
+        The leakage flow that it compensates is stored in `self._memory[0]`, NaN if it reports none. If the controller
+        raises an exception, this is stored in `self.raised`, and the result is NaN.
         """
         try:
             numbers = (ctypes.c_double * len(Measured._fields)).from_address(measured)
@@ -117,20 +105,13 @@ class _PythonLaw:
 
 
 def start_law(controller: Controller) -> CompiledLaw:
-    """Start a controller for one run and return its control law.
-
-    The law is machine code if the controller has a method `compiled` that provides it. Otherwise the law calls the
-    Python function that `start` returns.
-    """
+    """Start a controller for one run; return its machine code, or else a law that calls its Python function."""
     law: CompiledLaw | None = controller.compiled() if hasattr(controller, "compiled") else None
     return _PythonLaw(controller.start()).law if law is None else law
 
 
 def reraise_python_error(law: CompiledLaw) -> None:
-    """Raise the exception with which a Python controller failed while `law` was called; without one, do nothing.
-
-    The Python controller is `law` itself, or the inner controller whose law `law` calls.
-    """
+    """Raise the exception, if any, with which a Python controller failed that `law`, or an inner law, calls."""
     innermost: Any = law
     while isinstance(innermost, CompiledLaw):  # `kept` is the inner law, or the Python controller
         innermost = innermost.kept
@@ -180,9 +161,5 @@ class Controller(Protocol):
         ...
 
     def start(self) -> Callable[[Measured], float]:
-        """Start a run of the controller, and return its control law.
-
-        The law is a function that computes the voltage [V] of a sample from its `Measured`: time, target and
-        measurements. The law is called once a sample.
-        """
+        """Start a run of the controller, and return the function that computes the voltage [V] from each `Measured`."""
         ...

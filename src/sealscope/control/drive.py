@@ -19,8 +19,7 @@ if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
 
-#: Smallest pressure drop across a valve that a controller assumes, as a fraction of the supply pressure. It keeps the
-#: voltage finite under loads that the valve cannot move.
+#: Smallest pressure drop across a valve over the supply pressure, to keep the voltage finite under any load.
 _MIN_VALVE_FRACTION = 0.1
 #: Gain by which a small voltage is increased until the overlap of the valve's edges is passed.
 _OVERLAP_GAIN = 4.0
@@ -38,12 +37,12 @@ def drive_voltage(m: Any, flow: float, dp: float) -> float:
     `m`: a record `DRIVE`, the parameters and the filter state of the drive.
 
     A servo valve (Q_N > 0) needs u = u_N flow/(Q_N sqrt((p_s - sign(flow) dp)/(2 dp_N))); the pressure drop p_s -
-    sign(flow) dp is taken as at least 10 % of p_s. To pass the overlap of the edges, 4 u is then added to u, at most
+    sign(flow) dp is taken as at least 10 % of p_s. To pass the edges' overlap, 4 u is then added to u, at most
     +-`dead_volts`.
 
     A pump needs u = (omega + shortfall H(omega + droop dp))/omega_per_volt, with omega = flow/displacement and the
     other parameters of a `Drive`. H is the high-pass filter s/(s + corner), which each call advances by one sample;
-    `m.decay` is exp(-corner/rate) at the sampling rate.
+    `m.decay` is exp(-corner/rate).
     """
     if m.Q_N > 0.0:  # a servo valve
         valve_drop = max(m.p_s - math.copysign(dp, dp * flow), _MIN_VALVE_FRACTION * m.p_s)  # copysign: sign(flow) dp
@@ -69,11 +68,7 @@ def filter_lag(values: np.ndarray, decay: float, state: float, out: np.ndarray) 
 
 
 def check_numbers(what: str, source: object, positive: Sequence[str], not_negative: Sequence[str] = ()) -> None:
-    """Check that attributes of an object are finite numbers in their range; raise InputError otherwise.
-
-    `what`: name of the object in the error message; `source`: the object; `positive`: names of its attributes that
-    must be > 0; `not_negative`: names of its attributes that must be >= 0.
-    """
+    """Raise InputError, with `what` for `source`, unless the named attributes are finite and > 0 or >= 0."""
     for name in (*positive, *not_negative):
         value = getattr(source, name)
         if not (math.isfinite(value) and (value > 0 or (value == 0 and name in not_negative))):
@@ -88,14 +83,11 @@ class _Invertible(ABC):
         """Make the drive's parameters in the form that `drive_voltage` takes, a record (1,) `DRIVE`.
 
         `rate` [Hz]: sampling rate of the controller; `dead_volts` [V]: largest voltage that is added to pass the
-        overlap of a servo valve's edges.
+        overlap of a servo valve's edges. A pump's drive ignores the latter, a valve, which has no filter, the former.
         """
 
     def inverse(self, rate: float) -> Callable[[float, float], float]:
-        """Build a function of flow [m^3/s] and p_A - p_B [Pa] that computes the voltage [V] for the flow.
-
-        For a pump, the function filters its inputs and must be called once a sample, at the sampling rate `rate` [Hz].
-        """
+        """Build a function of flow [m^3/s] and p_A - p_B [Pa] for the voltage [V], to call at `rate` [Hz]."""
         (coefficients,) = self.coefficients(rate)
         return lambda flow, dp: float(drive_voltage(coefficients, flow, dp))
 
@@ -150,9 +142,9 @@ class Drive(_Invertible):
     def flow(self, u: Array, dp: Array, rate: float) -> Array:
         """Compute the pump's flow (n,) [m^3/s] for voltages `u` (n,) [V] against `dp` = p_A - p_B (n,) [Pa].
 
-        `rate` [Hz]: sampling rate of voltages and pressures. The motor's speed is omega = (omega_d + shortfall (y -
-        droop dp))/(1 + shortfall), with the commanded speed omega_d. The signal y is omega_d + droop dp after a
-        first-order lag with the time constant `lag` (`filter_lag`). The run begins at standstill under the first dp.
+        `rate` [Hz]: sampling rate of both. The motor's speed is omega = (omega_d + shortfall (y - droop dp))/(1 +
+        shortfall), with the commanded speed omega_d. The signal y is omega_d + droop dp after a first-order lag with
+        the time constant `lag` (`filter_lag`). The run begins at standstill under the first dp.
         """
         omega_d, droop_speed = self.omega_per_volt * u, self.droop * dp
         lag_input, y = omega_d + droop_speed, np.empty_like(omega_d)
@@ -161,17 +153,11 @@ class Drive(_Invertible):
         return np.asarray(self.displacement * omega)
 
     def coefficients(self, rate: float, dead_volts: float = 0.0) -> Any:
-        """Make the parameters of the pump's drive in the form that `drive_voltage` takes, a record (1,) `DRIVE`.
-
-        `rate` [Hz]: sampling rate of the controller. `dead_volts` is ignored: only a servo valve has an overlap.
-        """
+        """Make the parameters of a pump's drive (`_Invertible.coefficients`)."""
         return make_record(DRIVE, self, decay=math.exp(-self.corner / rate))
 
     def steady_voltage(self, flow: float) -> float:
-        """Compute the voltage [V] at which the pump delivers a constant `flow` [m^3/s].
-
-        The motor is assumed to turn at its commanded speed, under any load.
-        """
+        """Compute the voltage [V] for a constant `flow` [m^3/s] if the motor turns at its commanded speed."""
         return flow / self.displacement / self.omega_per_volt
 
     def unloaded_flow(self, u: float) -> float:
@@ -211,11 +197,7 @@ class ValveDrive(_Invertible):
         return 0.5 * (self.p_s + 2.0 * rig.supply.p_return)  # the supply is at p_s + p_return
 
     def coefficients(self, rate: float, dead_volts: float = 0.0) -> Any:
-        """Make the parameters of the servo valve in the form that `drive_voltage` takes, a record (1,) `DRIVE`.
-
-        `dead_volts` [V]: largest voltage that is added to pass the overlap of the valve's edges. `rate` is ignored:
-        the model of a valve has no filter.
-        """
+        """Make the parameters of a servo valve (`_Invertible.coefficients`)."""
         return make_record(DRIVE, self, dead_volts=dead_volts)
 
     def steady_voltage(self, flow: float) -> float:

@@ -21,8 +21,7 @@ if TYPE_CHECKING:
 
 #: Time constant [s] of the average of the pressures that drive the leak.
 _PRESSURE_LAG = 0.005
-#: Time constant [s] with which a change of the estimate enters the control law. It is long because the inner
-#: controller's integral must follow.
+#: Time constant [s] by which a changed estimate enters the control law, so that the inner integral can follow.
 _BLEND = 0.5
 #: A leak is compensated once its estimate exceeds this many standard errors, until the estimate is below half of them.
 _SIGNIFICANT_SDS = 4.0
@@ -47,7 +46,7 @@ def _tolerant_law(memory: Any, sample: Any) -> Any:
     """Compute the voltage [V] of a sample: the inner controller's, plus the one at which the pump feeds the leak.
 
     The leak's flow is G times the averaged p_A - p_B. G is the conductance that the observer estimates, minus the
-    assumed conductance; it stays 0 until it is significant, and changes slowly. While G is not 0, the sum is limited to
+    assumed one; it stays 0 until it is significant, and changes slowly. While G is not 0, the sum is limited to
     +-u_max. `memory`, `sample`: addresses of a record `_MEMORY`, which is updated, and of the numbers of a `Measured`.
     """
     m, measured = _memory_at(memory), measured_at(sample)
@@ -86,12 +85,12 @@ def _tolerant_law(memory: Any, sample: Any) -> Any:
 class FaultTolerant:
     """A controller that compensates the leakage across the piston, in addition to another controller.
 
-    The voltage is that of the controller `inner`, plus the voltage at which the `drive` delivers the leakage flow G dp.
-    Here dp is p_A - p_B averaged over some milliseconds. A Kalman filter (`update_observer`, with the model `balance`)
-    estimates the conductance between the chambers from the measurements. G [m^3/(s Pa)] is this estimate minus
-    `G_assumed`, the assumed leakage conductance of the pump. G stays 0 until it exceeds 4 standard errors and would
-    move the piston by half an encoder count a second: without a leak the voltages are exactly those of `inner`. The
-    voltage is limited to +-`u_max` [V] while a leak is compensated.
+    The voltage is that of the controller `inner`, plus the one at which the `drive` delivers the leakage flow G dp,
+    with p_A - p_B averaged over some milliseconds as dp. A Kalman filter (`update_observer`, with the model `balance`)
+    estimates the conductance between the chambers. G [m^3/(s Pa)] is this estimate minus `G_assumed`, the assumed
+    leakage conductance of the pump. G stays 0 until it exceeds 4 standard errors and would move the piston by half an
+    encoder count a second: without a leak the voltages are exactly those of `inner`. The voltage is limited to
+    +-`u_max` [V] while a leak is compensated.
 
     `known` >= 0 [m^3/(s Pa)], if not None, replaces the estimated G: the ideal controller, which knows the leak. The
     compensated flow [m^3/s] is reported as `compensated`.
@@ -112,8 +111,7 @@ class FaultTolerant:
     def from_rig(cls, rig: Rig, inner: Controller | None = None, *, known: float | None = None) -> Self:
         """Build the controller from a rig's parameters; raise InputError for a rig whose pump angle is not measured.
 
-        `inner`: controller of the position, by default the rig's `PositionPI`; `known` [m^3/(s Pa)]: conductance of
-        the leak, if it is not to be estimated.
+        `inner`: by default the rig's `PositionPI`; `known` [m^3/(s Pa)]: the leak's conductance, None to estimate it.
         """
         from sealscope.physics.cylinder import mid_stroke_volumes
 
@@ -132,14 +130,8 @@ class FaultTolerant:
             noise=math.hypot(max(sensors.p_A.noise, sensors.p_B.noise), sensors.common_noise),
             shut=SHUT * (makeup.p_crack + makeup.p_open) if makeup.check_valves == "pilot-operated" else 0.0,
         )
-        return cls(
-            inner or PositionPI.from_rig(rig),
-            Drive.from_rig(rig),
-            balance,
-            u_max=rig.daq.u_max,
-            G_assumed=rig.pump.G_pump,
-            known=known,
-        )
+        inner = inner or PositionPI.from_rig(rig)
+        return cls(inner, Drive.from_rig(rig), balance, rig.daq.u_max, G_assumed=rig.pump.G_pump, known=known)
 
     @property
     def rate(self) -> float:
@@ -152,7 +144,7 @@ class FaultTolerant:
         return self.inner.delay
 
     def start(self) -> Callable[[Measured], float]:
-        """Start a run, and return the function that computes the voltage [V] from the `Measured` of each sample."""
+        """Start a run; return the function that computes the voltage [V] from each `Measured`."""
         return Started(self.compiled())
 
     def compiled(self) -> CompiledLaw:

@@ -34,9 +34,9 @@ _memory_at = record_view(_MEMORY)
 def _flatness_law(memory: Any, sample: Any) -> Any:
     """Compute the voltage [V] of a sample: feedback plus feed-forward by the equations of `Flatness`, within +-u_max.
 
-    The feed-forward is the voltage at which the drive delivers the flow G dp + C d(dp)/dt against dp. Here dp is the
-    pressure difference that the load and the target's speed v and acceleration a require. `memory`, `sample`: addresses
-    of a record `_MEMORY`, which is updated, and of the numbers of a `Measured`.
+    The feed-forward is the voltage at which the drive delivers the flow G dp + C d(dp)/dt against the pressure
+    difference dp that the load and the target's speed v and acceleration a require. `memory`, `sample`: addresses of a
+    record `_MEMORY`, which is updated, and of the numbers of a `Measured`.
     """
     m, measured = _memory_at(memory), measured_at(sample)
     feedback, is_first = m.feedback, m.is_first > 0.0
@@ -68,10 +68,9 @@ class Flatness:
     The PI controller `feedback` provides the voltage for A v and for the correction of the error. The feed-forward adds
     the pump's leakage G dp, the compression C d(dp)/dt of the oil, and the speed that the drive loses under dp.
 
-    The friction is F_f(v) = F_C tanh(v/v_th) + F_v v. F_load is the force of the measured pressures minus (M a +
-    F_f), averaged over time. The controller assumes `M` [kg], `F_C` [N], `F_v` [N s/m], `v_th` [m/s], `G` [m^3/(s
-    Pa)] and `C` = V/(2 K) [m^3/Pa]. A speed of the target above `v_max` [m/s] is taken as a jump of the target, and is
-    not fed forward.
+    The friction is F_f(v) = F_C tanh(v/v_th) + F_v v. F_load is the force of the measured pressures minus (M a + F_f),
+    averaged over time. `M` [kg], `F_C` [N], `F_v` [N s/m], `v_th` [m/s], `G` [m^3/(s Pa)] and `C` = V/(2 K) [m^3/Pa]
+    are assumed. A speed of the target above `v_max` [m/s] is taken as a jump of the target, and is not fed forward.
 
     Source: J. Levine, Analysis and Control of Nonlinear Systems: A Flatness-based Approach, Springer 2009, chapter 6.
     """
@@ -118,7 +117,7 @@ class Flatness:
         return self.feedback.delay
 
     def start(self) -> Callable[[Measured], float]:
-        """Start a run, and return the function that computes the voltage [V] from the `Measured` of each sample."""
+        """Start a run; return the function that computes the voltage [V] from each `Measured`."""
         return Started(self.compiled())
 
     def compiled(self) -> CompiledLaw:

@@ -22,8 +22,7 @@ _SD_C, _SD_AREA, _SD_G = 0.3, 0.01, 1e-11
 _COMPRESSION_ERROR, _SWEPT_ERROR = 0.02, 2e-4
 #: Noise variance of an averaged pressure, relative to that of a single sample.
 _MEAN_NOISE = 0.1
-#: Standard deviation of the conductance's random walk in a block: absolute [m^3/(s Pa)], and relative to the
-#: estimate.
+#: Standard deviation of the conductance's random walk in a block: absolute [m^3/(s Pa)], and relative.
 _WALK, _RELATIVE_WALK = 1e-15, 0.03
 #: A block with an innovation above this many standard deviations is left out as an outlier. If the next block is an
 #: outlier with the same sign, a leak has opened suddenly.
@@ -48,15 +47,15 @@ OBSERVER = record_dtype(
 def update_observer(m: Any, theta: float, x: float, p_A: float, p_B: float) -> None:
     """Update the estimate of the leakage between the chambers with one sample of the measurements.
 
-    `m`: record `OBSERVER`, the memory of the estimate; `theta` [rad]: angle of the pump; `x` [m]: position; `p_A`,
-    `p_B` [Pa]: pressures.
+    `m`: record `OBSERVER`, the memory; `theta` [rad]: angle of the pump; `x` [m]: position; `p_A`, `p_B` [Pa]:
+    pressures.
 
-    A Kalman filter estimates the conductance G between the chambers from the volume balance of each block of
-    `BLOCK` seconds. The chamber with the higher pressure is balanced, because a check valve may feed the other chamber.
-    For chamber A, D dtheta - A dx - (V(x)/K) dp_A - (|p_A - p_B|/K) D dtheta_in = G integral of (p_A - p_B) dt; for B
-    the signs are opposite. Here dtheta and dx are the rotation and the travel in the block. dtheta_in is the rotation
-    that pumps oil into the balanced chamber; this oil is compressed from the other chamber's lower pressure. The filter
-    also estimates the relative errors of 1/K and of the area. Friction and load do not enter.
+    A Kalman filter estimates the conductance G between the chambers from the volume balance of each block of `BLOCK`
+    seconds. The chamber with the higher pressure is balanced, because a check valve may feed the other. For chamber A,
+    D dtheta - A dx - (V(x)/K) dp_A - (|p_A - p_B|/K) D dtheta_in = G integral of (p_A - p_B) dt; for B the signs are
+    opposite. dtheta and dx are the rotation and the travel in the block. dtheta_in is the rotation that pumps oil into
+    the balanced chamber; this oil is compressed from the other chamber's lower pressure. The filter also estimates the
+    relative errors of 1/K and of the area. Friction and load do not enter.
     """
     sample, means = (theta, x, p_A, p_B), m.means  # `means`: moving averages of the same four signals
     if m.count == 0.0:
@@ -82,11 +81,8 @@ def update_observer(m: Any, theta: float, x: float, p_A: float, p_B: float) -> N
 def _update_with_block(m: Any, dp_sum: float) -> None:
     """Update the Kalman filter of a leak observer with the volume balance of the block of samples that ends now.
 
-    The filter's state is the leakage conductance and the relative errors of 1/K and of the piston area. `m`: record
-    `OBSERVER`, the memory of the filter; `dp_sum`: sum of p_A - p_B [Pa] over the block's samples, of which the first
-    and the last count half.
-
-    The block is left out if
+    `m`: record `OBSERVER`, the memory of the filter; `dp_sum`: sum of p_A - p_B [Pa] over the block's samples, of which
+    the first and the last count half. The block is left out if
 
     - the mean of p_A - p_B is within +-`MIN_DP`;
     - p_A - p_B changes its sign, or is too small to shut a check valve;
@@ -145,10 +141,7 @@ def _update_with_block(m: Any, dp_sum: float) -> None:
 
 @law
 def conductance(m: Any) -> tuple[float, float, float]:
-    """Return an observer's estimate of the leakage conductance, its standard error, and the number of blocks used.
-
-    Estimate and error are in m^3/(s Pa). `m`: record `OBSERVER`, the memory of the observer.
-    """
+    """Return conductance and standard error [m^3/(s Pa)], and number of blocks used, of a record `OBSERVER`."""
     return m.state[0], math.sqrt(m.P[0, 0]), m.n_blocks
 
 
@@ -156,10 +149,10 @@ def conductance(m: Any) -> tuple[float, float, float]:
 class Balance:
     """The leak observer's model of the machine, from which it computes the volume balance of a chamber.
 
-    `D` [m^3/rad]: displacement of the pump; `area_A`, `area_B` [m^2]: piston areas; `V_A`, `V_B` [m^3]: volumes of
-    the chambers at mid-stroke; `K` [Pa]: bulk modulus of the oil; `x_step` [m]: position change of one encoder count;
-    `noise` [Pa]: standard deviation of a pressure sample; `shut` [Pa]: pressure difference |p_A - p_B| above which
-    the check valve of the chamber with the higher pressure is shut, 0 for a rig without such valves.
+    `D` [m^3/rad]: displacement of the pump; `area_A`, `area_B` [m^2]: piston areas; `V_A`, `V_B` [m^3]: volumes of the
+    chambers at mid-stroke; `K` [Pa]: bulk modulus of the oil; `x_step` [m]: position change of one encoder count;
+    `noise` [Pa]: standard deviation of a pressure sample; `shut` [Pa]: |p_A - p_B| above which the check valve of the
+    chamber with the higher pressure is shut, 0 without such valves.
     """
 
     D: float
@@ -174,10 +167,7 @@ class Balance:
 
 
 def make_observer(balance: Balance, rate: float) -> Any:
-    """Make the memory of a leak observer before its first sample, a record (1,) `OBSERVER`.
-
-    `rate` [Hz]: sampling rate of the controller.
-    """
+    """Make the initial memory of a leak observer, a record (1,) `OBSERVER`; `rate` [Hz] of its samples."""
     return make_record(
         OBSERVER,
         balance,

@@ -38,8 +38,8 @@ class Margins:
     `speed` [m/s]: speed of the piston; `gain`: factor by which the loop's gain may grow, inf if unlimited; `phase`
     [rad]: smallest distance of arg L from -pi where |L| = 1; `crossover` [Hz]: highest frequency at which |L| = 1;
     `delay` [s]: smallest additional delay at which the loop becomes unstable; `peak`: largest sensitivity 1/|1 + L|;
-    `damped`: True if the rig without controller is stable. The rig may be unstable in slow strokes, where friction
-    falls with speed; the margins then do not prove that the loop is stable.
+    `damped`: True if the rig without controller is stable. It may be unstable in slow strokes, where friction falls
+    with speed; the margins then do not prove that the loop is stable.
     """
 
     speed: float
@@ -56,11 +56,6 @@ def margins(rig: Rig, controller: Controller, speed: float = 0.0, load: float = 
 
     The piston moves at `speed` [m/s] (0: standstill) under a force `load` [N] in addition to the rig's own load. Raises
     InputError for a speed that the drive cannot reach.
-
-    The rig is linearised over one sample of the controller, y(k+1) = A y(k) + B u(k), by finite differences of the
-    solver's steps. The controller's transfer functions C_j(z) are computed from its responses to an impulse of each
-    measurement j = x, p_A, p_B, theta. The open loop is L(z) = -z^-delay sum_j C_j(z) c_j (z I - A)^-1 B, where the row
-    c_j picks measurement j from the state.
 
     Examples
     --------
@@ -82,9 +77,11 @@ def open_loop(
     """Compute the open-loop response L (n,) of a rig and its controller at frequencies `f` (n,) [Hz].
 
     L = -z^-delay sum_j C_j(z) P_j(z) with z = exp(2 pi i f/rate). C_j is the controller's transfer function from
-    measurement j (x, p_A, p_B or theta) to the voltage, P_j the rig's transfer function from the voltage to measurement
-    j. The rig is linearised while its piston moves at `speed` [m/s] (0: standstill), under a force `load` [N] in
-    addition to the rig's own. The second result is True if the linearised rig is stable without the controller.
+    measurement j (x, p_A, p_B or theta) to the voltage, from its response to an impulse. P_j is that of the rig from
+    the voltage to measurement j: c_j (z I - A)^-1 B, where y(k+1) = A y(k) + B u(k) is the rig linearised over one
+    sample, and the row c_j picks measurement j from the state. The piston moves at `speed` [m/s] (0: standstill), under
+    a force `load` [N] in addition to the rig's own. The second result is True if the linearised rig is stable without
+    control.
     """
     A, B, state = _linearise(rig, controller.rate, speed, load)
     z = np.exp(2j * math.pi * f / controller.rate)
@@ -103,9 +100,9 @@ def open_loop(
 def _linearise(rig: Rig, rate: float, speed: float, load: float) -> tuple[Array, Array, Array]:
     """Linearise the rig over one sample at the sampling rate `rate` [Hz]: y(k+1) = A y(k) + B u(k).
 
-    Returns A (14, 14), B (14,) [per V] and the state (14,) at which the rig is linearised: at standstill, or with the
-    piston at mid-stroke and moving at `speed` [m/s], under the additional force `load` [N]. Raises InputError for a
-    speed that the drive cannot reach.
+    Returns A (14, 14), B (14,) [per V] and the state (14,) at which the rig is linearised by finite differences of the
+    solver's steps: at standstill, or with the piston at mid-stroke and moving at `speed` [m/s], under the additional
+    force `load` [N]. Raises InputError for a speed that the drive cannot reach.
     """
     from sealscope.physics.rig import pack_numbers, rig_numbers
     from sealscope.physics.solvers.advance import EXPLICIT, IMPLICIT, advance, step_nodes
@@ -136,10 +133,7 @@ def _linearise(rig: Rig, rate: float, speed: float, load: float) -> tuple[Array,
         samples, limit = round(_SETTLING * rate), rig.daq.u_max
 
         def find_moving_state(u: float) -> tuple[Array, float]:
-            """Simulate the rig at a constant voltage u [V] from standstill; return its last state and its mean speed.
-
-            The speed [m/s] is the mean over the second half of the run, after `_SETTLING` seconds.
-            """
+            """Simulate the rig at u [V] from standstill; return its last state and its settled mean speed [m/s]."""
             first_state = advance_state(y, u, samples)
             last_state = advance_state(first_state, u, samples)
             return last_state, float(last_state[POSITION] - first_state[POSITION]) * rate / samples
@@ -170,7 +164,7 @@ def _impulse_responses(controller: Controller, state: Array) -> list[tuple[int, 
 
     An impulse changes one measurement during one sample. At all other samples target, position and angle are 0, and the
     chamber pressures are those in the rig's `state` (14,). Returns pairs of the measurement's index in the state and
-    the response (n,) [V per SI unit of the measurement]. Responses that are zero are left out.
+    the response (n,) [V per SI unit of the measurement], without responses that are zero.
     """
     from sealscope.physics.state import P_A, P_B, POSITION, THETA
 
@@ -179,10 +173,7 @@ def _impulse_responses(controller: Controller, state: Array) -> list[tuple[int, 
     n = round(_RESPONSE_DURATION * controller.rate)
 
     def respond(impulse: Measured) -> Array:
-        """Compute the controller's voltages (n,) [V], the first at a sample with the measurements `impulse`.
-
-        All samples before and after the first have the measurements at standstill.
-        """
+        """Compute the voltages (n,) [V] from the measurements `impulse` on; all others are at standstill."""
         voltage = controller.start()
         for _ in range(round(controller.rate)):  # settle for a second
             voltage(standstill)
@@ -200,10 +191,9 @@ def _impulse_responses(controller: Controller, state: Array) -> list[tuple[int, 
 
 
 def _frequency_response(response: Array, z: NDArray[np.complex128]) -> NDArray[np.complex128]:
-    """Compute the frequency response (m,) of a controller from its impulse response, by the z-transform.
+    """Compute the frequency response (m,) of a controller from its impulse response, by the z-transform sum_k a_k z^-k.
 
-    The z-transform is sum_k a_k z^-k. `response` (n,): the first n values a_k; all later values are taken as equal to
-    the last of these, as for an integrator. `z` (m,): complex numbers at which the transform is computed.
+    `response` (n,): the first n values a_k, of which the last, as of an integrator, persists; `z` (m,).
     """
     last_value = response[-1]
     transient = response - last_value
@@ -221,8 +211,7 @@ def _frequency_response(response: Array, z: NDArray[np.complex128]) -> NDArray[n
 def compute_margins(f: Array, L: NDArray[np.complex128], speed: float = 0.0, damped: bool = True) -> Margins:
     """Compute the stability margins of an open-loop response L (n,) at the frequencies `f` (n,) [Hz].
 
-    Between the frequencies, L is interpolated linearly. `speed` [m/s] of the piston, and `damped`, True if the rig is
-    stable without the controller, are copied to the result.
+    Between them, L is interpolated linearly. `speed` [m/s] and `damped` are copied to the result.
     """
     indices = np.arange(f.size)
     unit_gain = _crossings(np.abs(L) - 1.0)  # fractional indices at which |L| = 1

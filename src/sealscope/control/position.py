@@ -30,9 +30,9 @@ _memory_at = record_view(FOLLOWING)
 def following_voltage(m: Any, measured: Any) -> float:
     """Compute the voltage [V] of a sample by PI control with velocity feed-forward (`PositionPI`), within +-u_max.
 
-    The drive delivers the flow A v_c at this voltage. A is the piston area of the chamber with the higher pressure. The
-    commanded velocity is v_c = v_target + k_v e + k_i integral of e dt, with the error e = target - x. `m`: a record
-    `FOLLOWING`, whose integral and averaged p_A - p_B are updated; `measured`: a `Measured`.
+    It is that at which the drive delivers the flow A v_c. A is the piston area of the chamber with the higher pressure.
+    The commanded velocity is v_c = v_target + k_v e + k_i integral of e dt, with the error e = target - x. `m`: a
+    record `FOLLOWING`, whose integral and averaged p_A - p_B are updated; `measured`: a `Measured`.
     """
     m.dp += m.pressure_gain * (measured.p_A - measured.p_B - m.dp)
     error = measured.target - measured.x
@@ -47,10 +47,7 @@ def following_voltage(m: Any, measured: Any) -> float:
 
 @entry
 def _position_law(memory: Any, measured: Any) -> Any:
-    """Compute the voltage [V] of a sample by `following_voltage`, for compiled code that calls it by its address.
-
-    `memory`, `measured`: addresses of a record `FOLLOWING` and of the numbers of a `Measured`.
-    """
+    """Compute `following_voltage` [V] from the addresses of a record `FOLLOWING` and of the numbers of a `Measured`."""
     return following_voltage(_memory_at(memory), measured_at(measured))
 
 
@@ -58,13 +55,13 @@ def _position_law(memory: Any, measured: Any) -> Any:
 class PositionPI:
     """A PI controller of the piston's position with velocity feed-forward; its fields are assumptions about the rig.
 
-    The commanded velocity is v_c = v_target + k_v e + k_i integral of e dt, with the error e = target - x. The
-    voltage is the one at which the `drive` delivers the flow v_c A; A is the piston area of the chamber with the
-    higher pressure, which carries the load. For a pump the load is neglected: the commanded speed of the motor is
-    omega_d = omega_c + (C_e/k_p) s/(s + K_i/k_p) omega_c, where omega_c is the speed for the flow. This inverts the
-    speed loop omega/omega_d = (k_p s + K_i)/((k_p + C_e) s + K_i), eqs. (4.2)-(4.4) of the thesis. For a servo valve
-    the voltage depends on the measured pressure difference. Small voltages are increased by up to `dead_volts` [V] to
-    pass the overlap of the valve's edges.
+    The commanded velocity is v_c = v_target + k_v e + k_i integral of e dt, with the error e = target - x. The voltage
+    is the one at which the `drive` delivers the flow v_c A; A is the piston area of the chamber with the higher
+    pressure, which carries the load. For a pump the load is neglected: the commanded speed of the motor is omega_d =
+    omega_c + (C_e/k_p) s/(s + K_i/k_p) omega_c, where omega_c is the speed for the flow. This inverts the speed loop
+    omega/omega_d = (k_p s + K_i)/((k_p + C_e) s + K_i), eqs. (4.2)-(4.4) of the thesis. For a servo valve the voltage
+    depends on the measured pressure difference. Small voltages are increased by up to `dead_volts` [V] to pass the
+    overlap of the valve's edges.
 
     The integral is frozen within `dead_band` [m] of the target, where it would oscillate against static friction or
     between two encoder counts, and while the voltage is at its limit `u_max` [V].
@@ -91,10 +88,7 @@ class PositionPI:
 
     @classmethod
     def from_rig(cls, rig: Rig, **gains: float) -> Self:
-        """Build the controller from a rig's parameters, for its pump or servo valve.
-
-        `gains`: values of other fields, such as `k_v`, `k_i` or `rate`, which replace the defaults.
-        """
+        """Build the controller from a rig's pump or servo valve; `gains`: values of other fields, such as `k_v`."""
         valve, drive = rig.valve, drive_of(rig)
         gains.setdefault("dead_band", 1.5 * rig.sensors.x.resolution)  # one and a half encoder counts
         if isinstance(drive, Drive):
@@ -106,22 +100,15 @@ class PositionPI:
         return cls(rig.cylinder.A_A, rig.cylinder.A_B, drive, rig.daq.u_max, **gains)  # type: ignore[arg-type]
 
     def start(self) -> Callable[[Measured], float]:
-        """Start a run, and return the function that computes the voltage [V] from the `Measured` of each sample."""
+        """Start a run; return the function that computes the voltage [V] from each `Measured`."""
         return Started(self.compiled())
 
     def compiled(self) -> CompiledLaw:
-        """Return the control law as machine code, with a new memory for one run.
-
-        The machine code is the same for all runs. The memory holds the controller's parameters and its initial state,
-        so that a run does not continue an earlier one.
-        """
+        """Return the control law as machine code, with a new memory for one run."""
         return CompiledLaw(_position_law.address, self.make_memory().view(np.float64))
 
     def make_memory(self) -> Any:
-        """Make the parameters and initial state of the control law, as a record (1,) `FOLLOWING`.
-
-        This is the form that `following_voltage` takes.
-        """
+        """Make the parameters and initial state for `following_voltage`, a record (1,) `FOLLOWING`."""
         T = 1.0 / self.rate
         return make_record(
             FOLLOWING,

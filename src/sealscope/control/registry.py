@@ -41,7 +41,7 @@ GROUP = "sealscope.controllers"
 
 @cache
 def _installed() -> Mapping[str, EntryPoint]:
-    """Find the controllers that installed distributions provide; return their entry points by name of controller."""
+    """Find the entry points of the controllers that installed distributions provide, by name."""
     return {point.name: point for point in entry_points(group=GROUP)}
 
 
@@ -51,11 +51,7 @@ def is_installed(name: str) -> bool:
 
 
 def check_controller_name(name: str) -> None:
-    """Check that `name` is a built-in or installed controller, or has the form of a user's controller.
-
-    A user's controller is written ``MODULE:NAME`` or ``FILE.py:NAME``. Such a controller is not imported, and need
-    not exist. Raises InputError for any other name.
-    """
+    """Raise InputError unless `name` is a known controller, or has the form ``MODULE:NAME`` or ``FILE.py:NAME``."""
     module_or_file, _, attribute = name.rpartition(":")
     if not is_installed(name) and not (module_or_file and attribute):
         names = (*CONTROLLERS, *_installed())
@@ -68,10 +64,9 @@ def check_controller_name(name: str) -> None:
 def controller_named(name: str, rig: Rig) -> Controller:
     """Make the controller called `name` for a rig.
 
-    `name`: the name of a built-in or installed controller, or ``MODULE:NAME`` or ``FILE.py:NAME`` of a class or
-    function. A class with a method `from_rig` makes the controller by this method; any other class or function is
-    called with the rig. Raises InputError for an unknown name, for code that fails, and for a controller without
-    `rate`, `delay` or `start`.
+    `name`: a built-in or installed controller, or ``MODULE:NAME`` or ``FILE.py:NAME`` of a class or function. A class
+    with a method `from_rig` makes the controller by this method; any other class or function is called with the rig.
+    Raises InputError for an unknown name, for code that fails, and for a controller without `rate`, `delay` or `start`.
 
     Examples
     --------
@@ -102,11 +97,7 @@ def controller_named(name: str, rig: Rig) -> Controller:
 
 
 def find_controller_source(name: str) -> Path | None:
-    """Find the source file of a user's or an installed controller without importing it.
-
-    Returns None for a built-in controller. Raises InputError if the name is not that of a controller
-    (`check_controller_name`), or if there is no such file.
-    """
+    """Find the source file of a controller without importing it, None for a built-in one; InputError without a file."""
     if name in CONTROLLERS:
         return None
     check_controller_name(name)
@@ -119,10 +110,7 @@ def find_controller_source(name: str) -> Path | None:
 
 
 def _find_module_file(module: str) -> Path | None:
-    """Find the file of a module without importing the packages that contain it; return None if there is no such file.
-
-    `module`: dotted name, such as "my_package.control".
-    """
+    """Find the file, if any, of a module, such as "my_package.control", without importing its packages."""
     parts = module.split(".")
     folders = None  # folders of the package that contains the module, None for a top-level module
     for depth in range(1, len(parts) + 1):
@@ -136,10 +124,7 @@ def _find_module_file(module: str) -> Path | None:
 
 
 def _load_module(module_or_file: str) -> Any:
-    """Import a module by its name, or from the path of a Python file; raise InputError if the file does not exist.
-
-    A file is imported once, under a name that contains the hash of its text.
-    """
+    """Import a module by its name, or a Python file once under the hash of its text; InputError without a file."""
     if not module_or_file.endswith(".py"):
         return importlib.import_module(module_or_file)
     path = Path(module_or_file)

@@ -31,8 +31,7 @@ from sealscope.storage.atomic import atomic_write
 from sealscope.storage.plain_values import convert_type
 
 Version = Literal[2, 3]
-#: Methods of a soft sensor: the volume balance, from both chamber pressures, the pump's angle and the piston's
-#: position.
+#: Methods of a soft sensor: the volume balance, from chamber pressures, pump's angle and piston's position.
 Sensor = Literal["volume"]
 #: Default limit [Pa] of the rms error of a pressure, to which the solver's step in an FMU is chosen.
 ERROR = 1.0
@@ -49,8 +48,7 @@ system, with clang or `zig cc`: clang -O2 -fPIC -shared -I. -Iheaders -o NAME.so
 class Platform(NamedTuple):
     """An operating system and processor on which an FMU can run.
 
-    `triple`: name of the platform for LLVM; `target`: its name for the C compiler; `folders`: its folder in the archive
-    by FMI version; `suffix`: file suffix of a shared library.
+    `triple`, `target`: its names for LLVM and for the C compiler; `folders`: by FMI version; `suffix` of libraries.
     """
 
     triple: str
@@ -77,10 +75,7 @@ def this_platform() -> str:
 
 
 class Compiler(NamedTuple):
-    """A C compiler.
-
-    `command`: program and first arguments; `cross_compiles`: True if it also compiles for other systems.
-    """
+    """A C compiler: program with first arguments, and whether it also compiles for other systems."""
 
     command: list[str]
     cross_compiles: bool
@@ -111,8 +106,8 @@ def fmi_headers() -> Path:
 def choose_step(rig: Rig, error: float) -> tuple[float, float]:
     """Choose the solver's step with which the rms error of the pressures is at most `error` [Pa].
 
-    A run of 4 s from mid-stroke is simulated under each of `STEP_COMMANDS`, with a step that is chosen to keep this
-    limit. Returns the shortest of these steps [s], and the largest of the errors [Pa] that are estimated for the runs.
+    A run of 4 s from mid-stroke is simulated under each of `STEP_COMMANDS`. Returns the shortest of their steps [s],
+    and the largest of their estimated errors [Pa].
     """
     from sealscope.simulation.experiment import Experiment
     from sealscope.simulation.integrate import integrate_run
@@ -143,18 +138,12 @@ class MockUp(NamedTuple):
 
     @property
     def token(self) -> str:
-        """Hash of the FMU's summary, variables and code (32 hex digits).
-
-        The FMU's compiled library recognises its XML description by this hash.
-        """
+        """Hash (32 hex digits) by which the compiled library recognises its XML description."""
         texts = [self.summary, str(self.variable_list), *self.modules.values()]
         return hashlib.sha256("".join(texts).encode()).hexdigest()[:32]
 
     def write(self, path: Path, version: Version, platforms: Sequence[str]) -> None:
-        """Write the FMU's archive, with a shared library for each platform; raise InputError if the compiler fails.
-
-        `version`: FMI version; `platforms`: names in `PLATFORMS`.
-        """
+        """Write the FMU's archive with a library for each of `platforms`; raise InputError if the compiler fails."""
         name = re.sub(r"\W", "_", path.stem, flags=re.ASCII)
         identifier = name if re.match(r"[A-Za-z_]", name) else f"_{name}"  # must be valid in C
         with tempfile.TemporaryDirectory(prefix="sealscope-fmu-") as folder, atomic_write(path) as temporary:
@@ -170,10 +159,7 @@ class MockUp(NamedTuple):
                     archive.write(source, f"sources/{source.relative_to(source_folder).as_posix()}")
 
     def _write_sources(self, folder: Path, version: Version) -> list[Path]:
-        """Write the FMU's sources (C, LLVM code and headers) to a folder; return the paths of the files.
-
-        `version`: version of FMI, 2 or 3.
-        """
+        """Write the FMU's sources (C, LLVM code and headers of FMI `version`) to a folder; return the files' paths."""
         interface = files("sealscope.fmu") / "c"
         value_indices = {variable.reference - REFERENCES["value"] for variable in self.variable_list}
         # 1 for a parameter that is a variable of the FMU, 0 for one that keeps its value
@@ -189,10 +175,7 @@ class MockUp(NamedTuple):
         return [folder / name for name in texts]
 
     def _compile_library(self, folder: Path, system: str, version: Version) -> bytes:
-        """Compile the FMU's shared library for one platform from the sources in `folder`; return the library's bytes.
-
-        `system`: name in `PLATFORMS`; `version`: version of FMI, 2 or 3. Raises InputError if the compiler fails.
-        """
+        """Compile the shared library for the platform `system`; return its bytes; raise InputError if it fails."""
         platform = PLATFORMS[system]
         compiler = find_compiler()
         inputs = [folder / "unit.c", folder / f"fmi{version}.c"]
@@ -371,8 +354,7 @@ def _load_pump_controlled_rig(rig: Rig | str | os.PathLike[str]) -> Rig:
 def _choose_platforms(path: str | os.PathLike[str], fmi: int, platforms: Sequence[str] | None) -> tuple[str, ...]:
     """Choose the platforms of an FMU, `platforms` or else the present one, and check that the FMU can be built.
 
-    Raises InputError if `path` does not end in .fmu, if the FMI version `fmi` is not 2 or 3, if a platform is unknown
-    or this version lacks it, or if the compiler cannot build for the platform.
+    Raises InputError if `path` does not end in .fmu, or if the FMI version or a platform is not supported.
     """
     if Path(path).suffix != ".fmu":
         raise InputError(f"a unit's file must end in .fmu, got {path}")

@@ -30,10 +30,9 @@ def templates() -> jinja2.Environment:
 
 
 def base_units(unit: str) -> dict[str, str] | None:
-    """Express a physical unit in SI base units, as FMI describes it.
+    """Express a physical unit in SI base units, as FMI describes it; None if an exponent is not whole.
 
-    Returns the exponents by base unit, and "factor" if it is not 1, all as text: "mm" gives {"m": "1", "factor":
-    "0.001"}. Returns None if an exponent is not whole. Raises InputError for an unknown unit.
+    Returns the exponents by base unit, and "factor" if it is not 1: "mm" gives {"m": "1", "factor": "0.001"}.
     """
     parsed = parse_unit(unit)
     if any(power.denominator != 1 for _, power in parsed.powers):
@@ -44,26 +43,22 @@ def base_units(unit: str) -> dict[str, str] | None:
 
 
 def format_description(fmi: int, identifier: str, token: str, summary: str, variables: Sequence[Variable]) -> str:
-    """Format the text of modelDescription.xml, the description of an FMU.
+    """Format modelDescription.xml, the description of an FMU for version 2 or 3 of FMI.
 
-    `fmi`: version of FMI, 2 or 3; `identifier`: prefix of the C functions; `token`: hash by which the FMU's library
-    recognises this description; `summary`: one line that describes the FMU; `variables`: all its variables.
+    `identifier`: prefix of the C functions; `token`: hash by which the library recognises it; `summary`: one line.
     """
     by_name = {variable.name: variable for variable in variables}
     outputs = [variable for variable in variables if variable.causality == "output"]
     units = sorted({"s", *(variable.unit for variable in variables)} - {"1"})  # s: unit of time; 1: no unit
-    return (
-        templates()
-        .get_template(f"fmi{fmi}.xml.j2")
-        .render(
-            identifier=identifier,
-            token=token,
-            summary=summary,
-            sealscope=version("sealscope"),
-            units=[(unit, base_units(unit)) for unit in units],
-            variables=variables,
-            outputs=outputs,
-            index={variable.name: k for k, variable in enumerate(variables, 1)},
-            dependencies={output.name: [by_name[name] for name in DIRECT.get(output.name, ())] for output in outputs},
-        )
+    template = templates().get_template(f"fmi{fmi}.xml.j2")
+    return template.render(
+        identifier=identifier,
+        token=token,
+        summary=summary,
+        sealscope=version("sealscope"),
+        units=[(unit, base_units(unit)) for unit in units],
+        variables=variables,
+        outputs=outputs,
+        index={variable.name: k for k, variable in enumerate(variables, 1)},
+        dependencies={output.name: [by_name[name] for name in DIRECT.get(output.name, ())] for output in outputs},
     )

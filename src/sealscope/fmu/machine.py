@@ -45,13 +45,11 @@ from sealscope.units import P_ATM
 
 _NOT_FINITE = 1
 #: Codes that a function of an FMU returns if it fails, with their messages.
-FAILURES = MappingProxyType(
-    {
-        _NOT_FINITE: "the state is not finite: take a smaller step, or smaller gains",
-        BELOW_VACUUM: "a pressure is below vacuum, where the model does not hold",
-        BEYOND_DRIVE: "the drive cannot hold the load at standstill",
-    }
-)
+FAILURES: Mapping[int, str] = {
+    _NOT_FINITE: "the state is not finite: take a smaller step, or smaller gains",
+    BELOW_VACUUM: "a pressure is below vacuum, where the model does not hold",
+    BEYOND_DRIVE: "the drive cannot hold the load at standstill",
+}
 _N_VALUES, _N_INPUTS, _N_STATES, _N_RESULTS = len(VALUES), len(INPUTS), len(STATES), len(RESULTS)
 _N_PARAMETERS, _N_OUTPUTS = len(PARAMETERS), len(OUTPUTS)
 _G_EXT_A, _G_EXT_B = VALUES.index("cylinder.G_ext_A"), VALUES.index("cylinder.G_ext_B")
@@ -59,31 +57,23 @@ _U, _G, _C, _F, _ADDED_G_EXT_A, _ADDED_G_EXT_B = range(len(INPUTS))
 _VOLTAGE, _Q_1 = OUTPUTS.index("V"), OUTPUTS.index("Q_1")
 _electric, _hydraulic, _mechanical = law(electric_power), law(hydraulic_power), law(mechanical_power)
 #: The C types of the arguments of each function of an FMU.
-ARGUMENTS: Mapping[str, tuple[str, ...]] = MappingProxyType(
-    {
-        "start": ("double*", "double*", "double", "double*"),
-        "advance": ("double*", "double*", "double*", "double*", "double", "int64"),
-        "report": ("double*", "double*", "double*", "double*"),
-    }
-)
+ARGUMENTS: Mapping[str, tuple[str, ...]] = {
+    "start": ("double*", "double*", "double", "double*"),
+    "advance": ("double*", "double*", "double*", "double*", "double", "int64"),
+    "report": ("double*", "double*", "double*", "double*"),
+}
 
 
 @law
 def _at_rk4_nodes(a: float, b: float, t: float, h: float) -> tuple[float, float, float]:
-    """Compute an input of the rig at the three times (nodes) that an explicit Runge-Kutta step needs.
-
-    The step begins at t [s] and lasts h [s]. At the time s [s] the input is a + b s.
-    """
+    """Compute an input a + b s at the three times s [s] that a Runge-Kutta step from t over h [s] needs."""
     n = RK4_NODES  # as fractions of the step
     return a + b * (t + n[0] * h), a + b * (t + n[1] * h), a + b * (t + n[2] * h)
 
 
 @law
 def _at_imex_nodes(a: float, b: float, t: float, h: float) -> tuple[float, float, float, float, float, float]:
-    """Compute an input of the rig at the six times (nodes) that an implicit-explicit Runge-Kutta step needs.
-
-    The step begins at t [s] and lasts h [s]. At the time s [s] the input is a + b s.
-    """
+    """Compute an input a + b s at the six times s [s] that an implicit-explicit step from t over h [s] needs."""
     n = IMEX_NODES  # as fractions of the step
     at_0, at_1, at_2 = a + b * (t + n[0] * h), a + b * (t + n[1] * h), a + b * (t + n[2] * h)
     at_3, at_4, at_5 = a + b * (t + n[3] * h), a + b * (t + n[4] * h), a + b * (t + n[5] * h)
@@ -96,8 +86,7 @@ class RigChoice(NamedTuple):
     `laws`: for each entry of `physics.rig.CHOICES`, which equation the rig has, or if an optional equation is present;
     `exponent`: 1 if the closed fraction of a throttle is a fraction of its area, 2 if of its diameter;
     `literal_metering`: True if eqs. (4.9)-(4.12) of the thesis are taken as printed; `implicit`: True for the
-    implicit-explicit method, False for Runge-Kutta; `euler`: True if the speed loop's integral is computed by eq. (4.2)
-    of the thesis.
+    implicit-explicit method, False for Runge-Kutta; `euler`: True to compute the speed loop's integral by eq. (4.2).
     """
 
     laws: tuple[bool | tuple[bool, ...], ...]
@@ -108,10 +97,7 @@ class RigChoice(NamedTuple):
 
     @classmethod
     def from_rig(cls, rig: Rig) -> RigChoice:
-        """Choose the equations and the solver to compile for a rig's FMU.
-
-        The equations of load and external leakage are always included, because both are inputs of every FMU.
-        """
+        """Choose the equations and solver of a rig's FMU, always with load and external leakage, which are inputs."""
         # open_circuit: external leakage; pushed: load; (True,): present
         numbers = rig_numbers(rig)._replace(open_circuit=(True,), pushed=(True,))
         laws = tuple(numbers)[len(NUMBERS) :]  # without the numbers before the choices of equations
@@ -125,19 +111,13 @@ def _build_parameters_law(
 ) -> Callable[..., Any]:
     """Build the compiled function that computes the model's parameters `RigNumbers` from the FMU's parameter values.
 
-    That function takes the values (n,), in the order of `variables.VALUES`, and two conductances [m^3/(s Pa)] of
-    external leakage out of the chambers A and B, which are added to those of the rig. `laws`: the equations that the
-    rig has (`RigChoice`); `exponent`: 1 if the closed fraction of a throttle is a fraction of its area, 2 if of
-    its diameter; `literal_metering`: True if eqs. (4.9)-(4.12) of the thesis are taken as printed.
+    Its arguments are the values (n,), in the order of `variables.VALUES`, and two conductances [m^3/(s Pa)] of external
+    leakage out of the chambers A and B, added to the rig's. Other arguments are those of `RigChoice`.
     """
 
     @law
     def model_parameters(v: Any, G_ext_A: float, G_ext_B: float) -> Any:
-        """Compute the numbers that the equations of the model take (`RigNumbers`) from the FMU's values.
-
-        `v`: values in the order of `variables.VALUES`; `G_ext_A`, `G_ext_B`: conductances [m^3/(s Pa)] of external
-        leakage, added to those of chambers A and B.
-        """
+        """Compute `RigNumbers` from the values v, with `G_ext_A`, `G_ext_B` [m^3/(s Pa)] added to those in v."""
         derived = derived_numbers(RigValues(*to_fixed_tuple(v, _N_VALUES)), exponent, literal_metering)
         parameters = to_fixed_tuple(v, _N_PARAMETERS)
         parameters = tuple_setitem(parameters, _G_EXT_A, parameters[_G_EXT_A] + G_ext_A)
@@ -150,13 +130,12 @@ def _build_parameters_law(
 def build_functions(choice: RigChoice) -> dict[str, Callable[..., Any]]:
     """Build the functions of an FMU for a rig, which `rig_code` compiles; return them by name.
 
-    - ``start(values, inputs, x_0, y)`` sets the state `y` to standstill at the piston position x_0 [m] under the load
-      among the inputs.
+    - ``start(values, inputs, x_0, y)`` sets `y` to standstill at x_0 [m] under the load among the inputs.
     - ``advance(values, inputs, slopes, y, span, steps)`` integrates `y` over `span` [s] in `steps` equal steps, while
       the inputs change linearly by their `slopes` (per second).
     - ``report(values, inputs, y, results)`` writes the outputs to `results`.
 
-    All arguments but x_0, span and steps are pointers to arrays of doubles.
+    All arguments but x_0, span and steps are pointers to arrays of doubles, in the order of the module's docstring.
     """
     laws, exponent, literal_metering, implicit, euler = choice
     throttled = bool(laws[CHOICES.index("throttled")])
@@ -164,30 +143,18 @@ def build_functions(choice: RigChoice) -> dict[str, Callable[..., Any]]:
 
     @law
     def model_parameters(v: Any, inputs: Any) -> Any:
-        """Compute the numbers that the equations of the model take (`RigNumbers`) from the FMU's values and inputs.
-
-        `v`: the FMU's parameters in the order of `variables.VALUES`; `inputs`: its inputs in the order of
-        `variables.INPUTS`, of which the conductances of external leakage [m^3/(s Pa)] are added to those of the rig.
-        """
+        """Compute `RigNumbers` from the values v and from the external leakage among `inputs`."""
         return parameters_from_values(v, inputs[_ADDED_G_EXT_A], inputs[_ADDED_G_EXT_B])
 
     def start(values: Any, inputs: Any, x_0: float, y: Any) -> int:
-        """Set the state `y` to standstill at the piston position x_0 [m], under the load [N] among the inputs.
-
-        `values`: the FMU's parameters in the order of `variables.VALUES`; `inputs`: its inputs; `y`: the rig's state,
-        overwritten. Returns 0, or a code of `FAILURES`.
-        """
+        """Set the state `y` to standstill at x_0 [m] under the load among `inputs`; return 0 or a failure's code."""
         v, input_values, state = carray(values, _N_VALUES), carray(inputs, _N_INPUTS), carray(y, _N_STATES)
         p = model_parameters(v, input_values)
         state[:] = 0.0
         return stand_still(state, x_0, standstill_force(x_0, p) + input_values[_F], p)  # type: ignore[no-any-return]
 
     def report(values: Any, inputs: Any, y: Any, results: Any) -> int:
-        """Write the outputs of the rig to `results`, and after them the electric, hydraulic and mechanical power [W].
-
-        `values`: the FMU's parameters in the order of `variables.VALUES`; `inputs`: its inputs; `y`: the rig's state,
-        which stays as it is. Returns 0.
-        """
+        """Write the rig's outputs, and the electric, hydraulic and mechanical power [W], to `results`; return 0."""
         v, input_values, state = carray(values, _N_VALUES), carray(inputs, _N_INPUTS), carray(y, _N_STATES)
         out = carray(results, _N_RESULTS)
         p, z = model_parameters(v, input_values), state_of(state)
@@ -202,10 +169,7 @@ def build_functions(choice: RigChoice) -> dict[str, Callable[..., Any]]:
 
         @law
         def step(z: Any, h: float, t: float, a: Any, b: Any, p: Any) -> Any:
-            """Compute the state of the rig at t + h [s] from its state z at the time t [s].
-
-            The inputs at a time s are a + b s, with the arrays a and b; `p` are the model's parameters.
-            """
+            """Compute the state at t + h [s] from the state z at t [s], with inputs a + b s at a time s."""
             u, G = _at_imex_nodes(a[_U], b[_U], t, h), _at_imex_nodes(a[_G], b[_G], t, h)
             C, F = _at_imex_nodes(a[_C], b[_C], t, h), _at_imex_nodes(a[_F], b[_F], t, h)
             return imex_step(z, h, u, G, C, F, p)
@@ -214,21 +178,15 @@ def build_functions(choice: RigChoice) -> dict[str, Callable[..., Any]]:
 
         @law
         def step(z: Any, h: float, t: float, a: Any, b: Any, p: Any) -> Any:
-            """Compute the state of the rig at t + h [s] from its state z at the time t [s].
-
-            The inputs at a time s are a + b s, with the arrays a and b; `p` are the model's parameters.
-            """
+            """Compute the state at t + h [s] from the state z at t [s], with inputs a + b s at a time s."""
             u, G = _at_rk4_nodes(a[_U], b[_U], t, h), _at_rk4_nodes(a[_G], b[_G], t, h)
             C, F = _at_rk4_nodes(a[_C], b[_C], t, h), _at_rk4_nodes(a[_F], b[_F], t, h)
             return rk4_step(z, h, u, G, C, F, p, euler)
 
     def advance(values: Any, inputs: Any, slopes: Any, y: Any, span: float, steps: int) -> int:
-        """Integrate the state of the rig over `span` [s] in equal steps, while the inputs change linearly.
+        """Integrate the state `y` over `span` [s] in equal steps, while the inputs change by `slopes` per second.
 
-        `values`: the FMU's parameters in the order of `variables.VALUES`; `inputs`: the inputs at the start; `slopes`:
-        their change per second; `y`: the state at the start, which is replaced by that at the end, also after a
-        failure; `steps`: number of steps. Returns 0, or a code of `FAILURES` if the state at the end is not finite or
-        has a pressure below vacuum.
+        `y` is replaced also after a failure. Returns 0, or a code of `FAILURES`.
         """
         v, state = carray(values, _N_VALUES), carray(y, _N_STATES)
         a, b = carray(inputs, _N_INPUTS), carray(slopes, _N_INPUTS)  # the inputs at the time t are a + b t
@@ -249,19 +207,12 @@ def build_functions(choice: RigChoice) -> dict[str, Callable[..., Any]]:
 
 @lru_cache(maxsize=8)
 def rig_code(choice: RigChoice) -> Mapping[str, str]:
-    """Compile the functions of an FMU for a rig to LLVM code; return the text of each function by its name.
-
-    `choice`: the rig's equations and solver.
-    """
+    """Compile the functions of an FMU for a rig to LLVM code; return the text of each function by its name."""
     return unit_code(build_functions(choice))
 
 
 def unit_code(functions: Mapping[str, Callable[..., Any]]) -> Mapping[str, str]:
-    """Compile functions of an FMU to LLVM code; return the text of each by its name.
-
-    `functions`: Python functions by name, whose arguments have the types `ARGUMENTS`. In the code, the symbol of a
-    function is ``sealscope_NAME``.
-    """
+    """Compile functions of an FMU (arguments: `ARGUMENTS`) to LLVM code by name, with symbols ``sealscope_NAME``."""
     modules = {}
     for name, function in functions.items():
         text, symbol = plain_code(function, *ARGUMENTS[name])
@@ -273,8 +224,7 @@ def unit_code(functions: Mapping[str, Callable[..., Any]]) -> Mapping[str, str]:
 def object_code(module: str, triple: str | None = None) -> bytes:
     """Compile LLVM code to the bytes of an object file with position-independent machine code for a platform.
 
-    `module`: text of the code; `triple`: LLVM's name of the platform, such as "x86_64-pc-windows-gnu", by default
-    that of this system.
+    `module`: text of the code; `triple`: LLVM's name of the platform, such as "x86_64-pc-windows-gnu", None for this.
     """
     llvm.initialize_all_targets()
     llvm.initialize_all_asmprinters()

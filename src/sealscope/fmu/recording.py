@@ -123,10 +123,7 @@ def record_fmu(
 
 
 def _check_experiment(experiment: Experiment) -> None:
-    """Check that an FMU can run the experiment; raise InputError otherwise.
-
-    An FMU cannot take a target of the position, a fault or drift of the machine, or a leak stated as a flow.
-    """
+    """Raise InputError for what an FMU cannot run: a target, a machine's fault or drift, a leak stated as a flow."""
     if experiment.target is not None:
         raise InputError(f"an FMU must have a command, not a target, got {experiment.command}")
     if experiment.effects():
@@ -155,9 +152,9 @@ def _read_description(path: Path) -> Any:
 def _map_variables(path: Path, variables: Mapping[str, Any], names: Mapping[str, str]) -> dict[str, str]:
     """Find the FMU's variable for each channel and input; return the variables' names by channel or input.
 
-    `path`: the FMU, for messages; `variables`: all variables of the FMU by name; `names`: by channel or input, the name
-    of its variable if the names differ. Channels and inputs without a variable are left out of the result. Raises
-    InputError if `names` has an unknown channel or variable.
+    `path`: the FMU, for messages; `variables`: all its variables by name; `names`: by channel or input, the name of its
+    variable if the names differ. Channels and inputs without a variable are left out. Raises InputError if `names` has
+    an unknown channel or variable.
     """
     valid_names = {*_INPUT_NAMES, *_MEASURED_NAMES}
     for channel, variable in names.items():
@@ -176,9 +173,8 @@ def _build_input_table(
     """Build the table of inputs that FMPy takes, with a row for each communication point `t` [s].
 
     FMPy keeps an input constant during a step, so each row has the value in the middle of the step, for second-order
-    accuracy. `path`: the FMU, for messages; `names`: its variable by channel or input; `variables`: description of each
-    variable. Raises InputError if the FMU lacks the command or another input that the experiment needs, or if the
-    experiment has a load over position or velocity.
+    accuracy. `path`: the FMU, for messages; `names`: its variable by channel or input; `variables`: description of
+    each. Raises InputError for an input that the FMU lacks, or a load over position or velocity.
     """
     half_step = 0.5 * (t[1] - t[0])
     # in each step, the inputs are needed at one time only, its middle
@@ -205,19 +201,15 @@ def _build_input_table(
 def _run_unit(
     path: Path, t: Array, input_table: Array, outputs: list[str], duration: float, progress: Progress | None
 ) -> Any:
-    """Run the FMU with a table of inputs, and return its outputs at the communication points `t` [s].
+    """Run the FMU with a table of inputs; return "time" and each of `outputs` at the communication points `t` [s].
 
-    Returns a structured array with the fields "time" and each variable in `outputs`. `duration` [s]: length of the
-    recording; `progress`: function called with the task and its completed fraction, None for none. Raises
-    SimulationFailed if the FMU fails, ends early, or ends with an output that is not finite.
+    The result is a structured array. `duration` [s]: length of the recording. Raises SimulationFailed if the FMU fails,
+    ends early, or ends with an output that is not finite.
     """
     import fmpy
 
     def report_step(time: float, _recorder: Any) -> bool:
-        """Report the progress at `time` [s] after a step; return True, which tells FMPy to continue.
-
-        FMPy also passes its `_recorder` of outputs, which is not used.
-        """
+        """Report the progress at `time` [s] after a step; return True, which tells FMPy to continue."""
         if progress is not None:
             progress("running the unit", min(1.0, time / duration))
         return True

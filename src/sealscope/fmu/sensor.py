@@ -77,11 +77,9 @@ DISPLACEMENT = "pump.q_b"
 _DISPLACEMENT_INDEX = VALUES.index(DISPLACEMENT)
 #: Number of blocks of a mean, and of the baseline.
 WINDOW = 20
-#: Variance of a healthy machine's random walk in a block, relative to that of a block's noise; the oil's warming
-#: causes the walk.
+#: Variance of a healthy machine's random walk in a block, as the oil warms, relative to that of a block's noise.
 WALK = 3.0
-#: Columns of a row in the order of `_compute_increments`: the regressors, then the response, which is the pump's
-#: flow.
+#: Columns of a row in the order of `_compute_increments`: the regressors, then the response, the pump's flow.
 COLUMNS = (
     *(f"motion {way}, {side} carries" for way in ("out", "in") for side in "AB"),
     *(name for s in "AB" for name in (f"compliance {s}", f"compliance {s} over the stroke", f"free air {s}",
@@ -136,10 +134,7 @@ class SensorChoice(NamedTuple):
 
     @classmethod
     def from_rig(cls, rig: Rig, rate: float) -> SensorChoice:
-        """Choose the settings of a soft sensor for a rig and a sampling rate [Hz].
-
-        Raises InputError if the volume balance of the rig has other terms than `COLUMNS`.
-        """
+        """Choose the settings for a rig at `rate` [Hz]; InputError if its balance has other terms than `COLUMNS`."""
         (balance,) = live_equations(rig, INPUTS)  # these channels allow one balance only
         columns = ColumnRoles(balance)
         if columns.names != COLUMNS[:-1]:
@@ -149,32 +144,16 @@ class SensorChoice(NamedTuple):
         return cls(rate, size_error(rig), column_order, n_fast=len(fast))
 
 
-class _Lengths(NamedTuple):
-    """Numbers of samples and strides by which a soft sensor divides its measurements.
+def _count_samples(rate: float) -> tuple[int, int, int]:
+    """Compute the samples in a stride, the strides in a block, and the samples in half a difference, at `rate` [Hz].
 
-    A stride is the time from one row of the volume balance to the next. `stride_samples`: samples in a stride;
-    `block_strides`: strides in a block; `half_difference`: samples on either side of the central difference of the
-    position by which the direction of motion is found.
+    A stride is the time between two rows of the volume balance; a central difference shows the direction of motion.
     """
-
-    stride_samples: int
-    block_strides: int
-    half_difference: int
-
-    @classmethod
-    def from_rate(cls, rate: float) -> _Lengths:
-        """Compute the lengths of a stride, a block and half a difference from their times, at a sampling rate [Hz]."""
-        return cls(
-            stride_samples=stride_samples(rate),
-            block_strides=round(BLOCK_SECONDS / STRIDE),
-            half_difference=max(1, round(HALF_DIFFERENCE * rate)),
-        )
+    return stride_samples(rate), round(BLOCK_SECONDS / STRIDE), max(1, round(HALF_DIFFERENCE * rate))
 
 
 def memory_layout(choice: SensorChoice) -> np.dtype[Any]:
-    """Build the layout of a soft sensor's memory, as numpy's type of the record.
-
-    The memory is a record of doubles with the scalars `_SCALARS` and the following arrays.
+    """Build the layout of a soft sensor's memory: numpy's type of a record of the scalars `_SCALARS` and some arrays.
 
     A row of the volume balance is the weighted integral of all terms over `SPAN` strides, where a stride is the time
     from one row to the next. A block is open until its rows are weighted.
@@ -189,13 +168,13 @@ def memory_layout(choice: SensorChoice) -> np.dtype[Any]:
     - `history`: results of each of the last blocks (`_G` ... `_PRESSURE`)
     - `workspace`: a `Workspace`; `model`: a `Coefficients`
     """
-    # - 1: the response
-    lengths, n_slow = _Lengths.from_rate(choice.rate), len(choice.column_order) - choice.n_fast - 1
-    max_rows = SUPPORT * lengths.block_strides
+    _, block_strides, half = _count_samples(choice.rate)
+    n_slow = len(choice.column_order) - choice.n_fast - 1  # - 1: the response
+    max_rows = SUPPORT * block_strides
     workspace = workspace_shapes(max_rows, SUPPORT, len(choice.column_order), n_slow)
     return record_dtype(
         *_SCALARS,
-        ring=(len(INPUTS), 2 * lengths.half_difference + 3),  # room for all samples that `_compute_increments` reads
+        ring=(len(INPUTS), 2 * half + 3),  # room for all samples that `_compute_increments` reads
         increments=(_N_COLUMNS,),
         unfinished=(SPAN, _N_COLUMNS),
         rows=(max_rows, _N_COLUMNS),
@@ -216,9 +195,8 @@ def memory_layout(choice: SensorChoice) -> np.dtype[Any]:
 def build_functions(choice: SensorChoice) -> dict[str, Callable[..., Any]]:
     """Build the functions ``start``, ``advance`` and ``report`` of a soft sensor's FMU; return them by name.
 
-    ``start`` clears the sensor's memory `y` (`memory_layout`), ``advance`` adds the samples of a communication step to
-    it, and ``report`` writes the outputs to `results`. The three functions have the arguments of those of a rig's FMU
-    (`fmu.machine.build_functions`), pointers to arrays of doubles.
+    ``start`` clears the sensor's memory `y`, ``advance`` adds the samples of a communication step to it, and ``report``
+    writes the outputs to `results`. Their arguments are those of `fmu.machine.build_functions`.
     """
     from scipy.special import stdtrit
 
@@ -232,20 +210,14 @@ def build_functions(choice: SensorChoice) -> dict[str, Callable[..., Any]]:
     quantiles = tuple(float(stdtrit(freedom, quantile_order)) for freedom in range(1, WINDOW))  # Student's t
 
     def start(values: Any, inputs: Any, x_0: float, y: Any) -> int:
-        """Set the sensor's memory `y` to 0 at the start of a run.
-
-        `values`: parameters of the FMU, among them the pump's displacement; `inputs`, `x_0`: ignored. Returns 0, or a
-        code of `FAILURES` if the displacement is not > 0.
-        """
+        """Clear the memory `y`; return 0, or a code of `FAILURES` if the displacement in `values` is not > 0."""
         carray(y, n_memory)[:] = 0.0
         return _SUCCESS if carray(values, n_values)[_DISPLACEMENT_INDEX] > 0.0 else _NO_DISPLACEMENT
 
     def advance(values: Any, inputs: Any, slopes: Any, y: Any, span: float, steps: int) -> int:
-        """Add the samples of the next `span` [s] to the sensor's memory `y`.
+        """Add the samples of the next `span` [s] to the memory `y`; estimate the leakage of complete blocks; return 0.
 
-        When the samples complete a block, its leakage is estimated. `values`: parameters of the FMU, among them the
-        pump's displacement; `inputs`: measurements at the start of the span; `slopes`: their change per second, taken
-        as constant; `steps`: ignored. Returns 0.
+        `inputs`: measurements at the start of the span; `slopes`: their change per second, constant; `steps`: ignored.
         """
         m, displacement = memory(y), carray(values, n_values)[_DISPLACEMENT_INDEX] / (2.0 * math.pi)  # [m^3/rad]
         first, slope = carray(inputs, n_inputs), carray(slopes, n_inputs)
@@ -272,12 +244,9 @@ def build_functions(choice: SensorChoice) -> dict[str, Callable[..., Any]]:
 
 
 def _build_add_sample(choice: SensorChoice) -> Callable[..., Any]:
-    """Build the compiled function that adds one sample of the measurements to a soft sensor's memory.
-
-    A sample has one measurement of each of the channels `INPUTS`. `choice`: settings of the sensor.
-    """
+    """Build the compiled function that adds one sample of the channels `INPUTS` to a soft sensor's memory."""
     rate = choice.rate
-    n_stride, block_strides, half = _Lengths.from_rate(rate)
+    n_stride, block_strides, half = _count_samples(rate)
     n_support, n_block = SPAN * n_stride, n_stride * block_strides
     # phi = peak (1 - s^2)^4; the first value of `test_function` is in the middle of the first sampling interval, where
     # s = 1/n_support - 1
@@ -341,11 +310,10 @@ def _add_pressure_difference(m: Any, k: int, n_block: int, rate: float) -> None:
 def _compute_increments(ring: Any, k: int, half: int, rate: float, displacement: float, out: Any) -> None:
     """Compute the increments of all terms of the volume balance over the interval from sample k to k + 1.
 
-    The increments are written to `out` (n,) in the order of `COLUMNS`. For example, the increment of the response is
-    the volume that the pump displaces [m^3], and the increment of the leak the time integral of p_A - p_B [Pa s].
-    `ring`: the last samples, where sample k has the column k modulo the width of `ring`; `half`: samples on either side
-    of the central difference that shows the direction of motion; `rate` [Hz]: sampling rate; `displacement` [m^3/rad]:
-    displacement of the pump.
+    They are written to `out` (n,) in the order of `COLUMNS`: for example, that of the response is the volume that the
+    pump displaces [m^3], and that of the leak the time integral of p_A - p_B [Pa s]. `ring`: the last samples, where
+    sample k has the column k modulo the width of `ring`; `half`: samples on either side of the central difference that
+    shows the direction of motion; `rate` [Hz]: sampling rate; `displacement` [m^3/rad] of the pump.
     """
     width = ring.shape[1]
     slot, next_slot = k % width, (k + 1) % width
@@ -377,10 +345,9 @@ def _compute_increments(ring: Any, k: int, half: int, rate: float, displacement:
 
 @law
 def _find_angle_sign(m: Any, n_rows: int) -> None:
-    """Find the sign with which the pump's angle is recorded, and store it, 1 or -1, in `m.angle_sign`.
+    """Store in `m.angle_sign` the sign, 1 or -1, with which the pump's flow rises with p_A - p_B.
 
-    With the right sign the pump's flow rises with p_A - p_B, so the sign is -1 if their covariance is negative. The
-    covariance is computed from the first `n_rows` rows of the volume balance in the sensor's memory m.
+    It is the sign of their covariance in the first `n_rows` rows of the volume balance in the sensor's memory m.
     """
     mean, covariance = 0.0, 0.0
     for r in range(n_rows):
@@ -394,12 +361,11 @@ def _find_angle_sign(m: Any, n_rows: int) -> None:
 def _append_conductance(m: Any, size_error: float, n_rows: float, pressure: float, is_learned: bool) -> None:
     """Estimate the leakage conductance of the block loaded in `m.model`, and append it to the history.
 
-    The precision of an estimate is the inverse of its variance. An estimate at standstill is left out if its precision
-    is at most `MIN_REST_PRECISION` times the usual precision, and any estimate if its precision is not positive. The
-    first `WINDOW` estimates are also added to the sums of the baseline. `m`: the sensor's memory; `size_error`:
-    relative standard error of the leakage due to the machine's sizes; `n_rows`, `pressure` [Pa]: number of rows of the
-    volume balance in the block, and its mean abs(p_A - p_B); `is_learned`: True if the balance's other coefficients are
-    updated with the block.
+    An estimate at standstill is left out if its precision (1/variance) is at most `MIN_REST_PRECISION` times the usual
+    one, and any estimate if its precision is not positive. The first `WINDOW` estimates are also added to the sums of
+    the baseline. `m`: the sensor's memory; `size_error`: relative standard error of the leakage due to the machine's
+    sizes; `n_rows`, `pressure` [Pa]: number of rows of the volume balance in the block, and its mean abs(p_A - p_B);
+    `is_learned`: True if the balance's other coefficients are updated with the block.
     """
     model = m.model
     motion = relative_motion(model.block[-1, -1], n_rows, model.numbers)  # [-1, -1]: sum of the squared response
@@ -424,8 +390,8 @@ def _fit_to_waiting(m: Any, size_error: float) -> None:
     """Fit the coefficients of the volume balance to the first `LEARNED` blocks, and append the leakage of each.
 
     `m`: the sensor's memory, in which these blocks wait; afterwards no block waits. The median of the precisions of
-    their estimates becomes the usual precision, to which later estimates are compared. `size_error`: relative standard
-    error of the leakage due to the machine's sizes (displacement, piston area).
+    their estimates becomes the usual precision. `size_error`: relative standard error of the leakage due to the
+    machine's sizes (displacement, piston area).
     """
     model = m.model
     for k in range(LEARNED):
@@ -445,10 +411,7 @@ def _fit_to_waiting(m: Any, size_error: float) -> None:
 
 @law
 def _forget_standstill(m: Any) -> None:
-    """Discard all fitted coefficients and estimates in the sensor's memory m, because the machine begins to move.
-
-    Estimates from a standstill cannot be compared with later ones.
-    """
+    """Discard coefficients and estimates in the memory m: those of a standstill are not comparable with later ones."""
     model = m.model
     model.sums[:, :] = 0.0
     model.leak_products[:] = 0.0
@@ -490,10 +453,7 @@ def _update_with_block(m: Any, size_error: float, b: int, n_rows: float, pressur
 
 
 def _build_finish_block(choice: SensorChoice) -> Callable[..., Any]:
-    """Build the compiled function `finish_block` of a soft sensor, to be called when a block's last row is complete.
-
-    A block is a few seconds of measurements. `choice`: settings of the sensor.
-    """
+    """Build the compiled function of a soft sensor that is called when a block's last row is complete."""
     column_order, n_fast, size_error = choice.column_order, choice.n_fast, choice.size_error
 
     @large_law
@@ -539,10 +499,7 @@ def _build_finish_block(choice: SensorChoice) -> Callable[..., Any]:
 
 @large_law
 def _mean(history: Any, newest: int, n: int, column: int) -> float:
-    """Compute the mean of one result of a soft sensor over n blocks, the last of which is block `newest`.
-
-    `history` (WINDOW, 5): results of the last blocks, block k in row k modulo WINDOW; `column`: column of the result.
-    """
+    """Compute the mean of one `column` of `history` (block k in row k modulo WINDOW) over n blocks up to `newest`."""
     total = 0.0
     for k in range(n):
         total += history[(newest - k) % WINDOW, column] / n
@@ -551,11 +508,10 @@ def _mean(history: Any, newest: int, n: int, column: int) -> float:
 
 @large_law
 def _variance_of_mean(history: Any, newest: int, n: int) -> float:
-    """Compute the variance of the mean conductance of n >= 2 blocks, the last of which is block `newest`.
+    """Compute the variance of the mean conductance of the n >= 2 blocks up to block `newest`.
 
-    The result is the larger of two variances, divided by n: the sample variance of the blocks' estimates, and the mean
-    of the variances that the fit gives these estimates. `history` (WINDOW, 5): results of the last blocks, as in
-    `_mean`.
+    It is the larger of two variances, divided by n: the sample variance of the blocks' estimates, and the mean of the
+    variances that the fit gives these estimates. `history` (WINDOW, 5): as in `_mean`.
     """
     mean, sample_variance = _mean(history, newest, n, _COMPARABLE_G), 0.0
     for k in range(n):
@@ -572,10 +528,9 @@ def _write_results(m: Any, size_error: float, quantiles: Any, out: Any) -> None:
         leakage = (mean of p) (mean of G),
         rise = (mean of p) ((mean of g) - (mean of g in the baseline)),
 
-    where G is a block's conductance, and g the conductance that can be compared between blocks (`_COMPARABLE_G`). The
-    means are over the last `WINDOW` blocks, for the rise without those of the baseline. The leakage needs two blocks,
-    the rise two blocks after the baseline; without them their outputs are 0. The number of blocks and the misfit are
-    always written.
+    where G is a block's conductance, and g the one that can be compared between blocks (`_COMPARABLE_G`). The means are
+    over the last `WINDOW` blocks, for the rise without those of the baseline. The leakage needs two blocks, the rise
+    two blocks after the baseline; without them their outputs are 0.
 
     `m`: the sensor's memory; `size_error`: relative standard error of the leakage due to the machine's sizes;
     `quantiles`: Student's t for 1, 2, ... degrees of freedom; `out`: outputs in the order of `SENSOR_RESULTS`.

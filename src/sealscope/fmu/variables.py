@@ -14,12 +14,10 @@ from sealscope.physics.rig import VALUES as NAMES_OF_VALUES
 from sealscope.physics.state import OUTPUTS
 from sealscope.recordings.channels import CHANNEL_UNITS, LONG_NAMES
 
-#: Parameters of an FMU in the order of its code: first those that the model's equations take, then those from which
-#: other numbers are derived.
+#: Parameters of an FMU in the order of its code: those of the equations, then those of derived numbers.
 VALUES = tuple(NAMES_OF_VALUES.values())
 _TABLES: dict[str, Any] = tomllib.loads((files("sealscope.fmu") / "variables.toml").read_text("utf-8"))
-#: (unit, description) of the inputs and the outputs of a rig's FMU, and of a soft sensor's outputs, in the order of the
-#: code.
+#: (unit, description) of inputs and outputs of a rig's FMU, and of a soft sensor's outputs, in the code's order.
 INPUTS: Mapping[str, tuple[str, str]] = _TABLES["inputs"]
 RESULTS: Mapping[str, tuple[str, str]] = {
     **{name: _TABLES["outputs"].get(name) or (CHANNEL_UNITS[name], LONG_NAMES[name]) for name in OUTPUTS},
@@ -35,11 +33,7 @@ _VALVE_OUTPUTS = ("x_s", "v_s")
 
 
 class Variable(NamedTuple):
-    """A variable of a functional mock-up unit (FMU), described in the terms of the FMI standard.
-
-    `reference`: number by which a program addresses the variable; `unit`: SI unit; `start`: initial value, None for an
-    output.
-    """
+    """A variable of a functional mock-up unit in terms of the FMI standard; `unit`: SI; `start`: None for outputs."""
 
     reference: int
     name: str
@@ -51,30 +45,20 @@ class Variable(NamedTuple):
 
 
 def input_variables(rows: Mapping[str, tuple[str, str]]) -> Iterator[Variable]:
-    """Yield the input variables of an FMU, with the initial value 0.
-
-    `rows`: (unit, description) by name of the variable.
-    """
+    """Yield the input variables of an FMU, with the initial value 0, from `rows`: (unit, description) by name."""
     for k, (name, (unit, description)) in enumerate(rows.items()):
         yield Variable(REFERENCES["input"] + k, name, "input", "continuous", unit, description, start=0.0)
 
 
 def output_variables(rows: Mapping[str, tuple[str, str]]) -> Iterator[Variable]:
-    """Yield the output variables of an FMU, without the outputs of a servo valve.
-
-    `rows`: (unit, description) by name of the variable.
-    """
+    """Yield the output variables of an FMU but those of a servo valve, from `rows`: (unit, description) by name."""
     for k, (name, (unit, description)) in enumerate(rows.items()):
         if name not in _VALVE_OUTPUTS:
             yield Variable(REFERENCES["result"] + k, name, "output", "continuous", unit, description, start=None)
 
 
 def rig_variable(rig: Rig, name: str, variability: Literal["tunable", "fixed"]) -> Variable | None:
-    """Make the FMU variable of the rig's parameter `name`, such as "pump.q_b".
-
-    Returns None if the rig lacks the part that the parameter describes. `variability`: "tunable" if the variable
-    can be changed during a run, else "fixed".
-    """
+    """Make the FMU variable of the rig's parameter `name`, such as "pump.q_b"; None if the rig lacks the part."""
     value = float(attrgetter(name)(rig))
     field = dict(iter_fields(Rig))[name]
     if value == absent_of(field):  # the value that stands for an absent part

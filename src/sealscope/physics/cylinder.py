@@ -14,11 +14,7 @@ from sealscope.units import P_ATM
 
 @law
 def mid_stroke_volumes(c: Any) -> tuple[float, float]:
-    """Compute the oil volumes [m^3] of chamber and hose on sides A and B, with the piston at mid-stroke.
-
-    They are V + V_hose_A and V - V_rod + V_hose_B. `c` is a cylinder, or any object with these attributes in m^3: the
-    chamber volume V, the volume V_rod that the rod takes from side B, and the hose volumes V_hose_A and V_hose_B.
-    """
+    """Compute the oil volumes [m^3] of sides A and B at mid-stroke from those of chamber, rod and hoses in `c`."""
     return c.V + c.V_hose_A, c.V - c.V_rod + c.V_hose_B
 
 
@@ -28,8 +24,8 @@ def chamber_volumes(
 ) -> tuple[float, float]:
     """Compute the oil volumes of sides A and B [m^3] at piston position x [m] from mid-stroke.
 
-    They are V_A + A_A x and V_B - A_B x if `position_dependent`, else the mid-stroke volumes V_A and V_B (Table 4.1
-    of the thesis). `A_A`, `A_B`: piston areas [m^2].
+    They are V_A + A_A x and V_B - A_B x if `position_dependent`, else the mid-stroke volumes V_A and V_B (Table 4.1 of
+    the thesis). `A_A`, `A_B`: piston areas [m^2].
     """
     if position_dependent:
         return V_A + A_A * x, V_B - A_B * x
@@ -38,10 +34,9 @@ def chamber_volumes(
 
 @contracted
 def pressure_rate(inflow: float, volume: float, K_oil: float) -> float:
-    """Compute the rate of change dp/dt = K_oil/V Q [Pa/s] of the pressure in an oil volume, eqs. (4.16)-(4.19).
+    """Compute the rate dp/dt = K_oil/V Q [Pa/s] of the pressure in an oil volume, eqs. (4.16)-(4.19).
 
-    `inflow` Q [m^3/s]: flow in, minus flow out, minus growth of the volume; `volume` V [m^3]; `K_oil`: bulk modulus
-    [Pa].
+    `inflow` Q [m^3/s]: flow in, minus flow out, minus growth of the volume V [m^3]; `K_oil`: bulk modulus [Pa].
     """
     return K_oil / volume * inflow
 
@@ -51,7 +46,7 @@ def hard_stop_force(x: float, v: float, L: float, k_stop: float, d_stop: float) 
     """Compute the force [N] that the end stops of the cylinder exert on the piston, positive along +x.
 
     The stops are at x = +-L/2. Each is a stiff spring `k_stop` [N/m] with a damper `d_stop` [N s/m]. It acts only while
-    the piston touches it, and never pulls. `x` [m]: position of the piston from mid-stroke; `v` [m/s]: its velocity.
+    the piston touches it, and never pulls. `x` [m]: position from mid-stroke; `v` [m/s]: velocity.
     """
     side = math.copysign(1.0, x)  # the nearer stop: +1 at L/2, -1 at -L/2
     depth = abs(x) - 0.5 * L
@@ -61,10 +56,7 @@ def hard_stop_force(x: float, v: float, L: float, k_stop: float, d_stop: float) 
 
 @contracted
 def load_force(x: float, F_l: float, k_load: float) -> float:
-    """Compute the load F_l + k_load x [N] that acts on the piston against +x.
-
-    It is a constant force `F_l` [N] plus a spring of stiffness `k_load` [N/m] that is relaxed at mid-stroke, x = 0.
-    """
+    """Compute the load F_l [N] + k_load [N/m] x [m] on the piston against +x, with a spring relaxed at mid-stroke."""
     return F_l + k_load * x
 
 
@@ -87,9 +79,8 @@ def piston_acceleration(
 ) -> float:
     """Compute the piston's acceleration [m/s^2] from the forces on it, eq. (4.15) with end stops added.
 
-    It is (p_A A_A - p_B A_B - friction - load + stop)/M_eq. `p_A`, `p_B` [Pa]: chamber pressures; `A_A`, `A_B` [m^2]:
-    piston areas; `friction`, `load` [N]: forces against +x; `stop` [N]: force of the end stops along +x; `M_eq` [kg]:
-    moving mass.
+    `p_A`, `p_B` [Pa]: chamber pressures; `A_A`, `A_B` [m^2]: piston areas; `friction`, `load` [N]: forces against +x;
+    `stop` [N]: force of the end stops along +x; `M_eq` [kg]: moving mass.
     """
     return (p_A * A_A - p_B * A_B - friction - load + stop) / M_eq
 
@@ -100,16 +91,13 @@ def opposing_force(v: float, A_opp: float, p_opp: float, C_opp: float) -> float:
 
     The second cylinder, of piston area `A_opp` [m^2], moves at the piston's velocity `v` [m/s]. It is fed at the
     pressure `p_opp` [Pa] through an orifice of flow coefficient `C_opp` [m^3/(s Pa^0.5)], and its oil is taken as
-    incompressible. The orifice law, solved for the pressure in this cylinder, is p = p_opp + v |v| (A_opp/C_opp)^2,
-    here limited to at least vacuum (Merritt, Hydraulic Control Systems, 1967, section 3.4, orifice).
+    incompressible. Its pressure is p = p_opp + v |v| (A_opp/C_opp)^2, but at least vacuum (Merritt, Hydraulic Control
+    Systems, 1967, section 3.4, orifice).
     """
     drop_coefficient = A_opp / C_opp
     return A_opp * max(p_opp + v * abs(v) * drop_coefficient * drop_coefficient, -P_ATM)
 
 
 def mechanical_power(p_A: Any, p_B: Any, v: Any, A_A: float, A_B: float) -> Any:
-    """Compute the mechanical power (p_A A_A - p_B A_B) v [W] that the chamber pressures deliver to the piston.
-
-    `p_A`, `p_B` [Pa]: chamber pressures; `v` [m/s]: velocity; `A_A`, `A_B` [m^2]: piston areas.
-    """
+    """Compute the power [W] of pressures `p_A`, `p_B` [Pa] on areas `A_A`, `A_B` [m^2] at the velocity `v` [m/s]."""
     return (p_A * A_A - p_B * A_B) * v

@@ -64,11 +64,7 @@ def accumulator_compliance(p: float, p_pre: float, V_gas: float, n_acc: float) -
 
 @contracted
 def check_valve_flow(dp: float, p_crack: float, G_check: float) -> float:
-    """Compute the flow [m^3/s] >= 0 through a check valve under dp [Pa]: G_check (dp - p_crack), 0 for dp < p_crack.
-
-    `dp`: pressure drop in the free direction; `p_crack` [Pa]: drop at which the valve opens; `G_check` [m^3/(s Pa)]:
-    conductance of the open valve.
-    """
+    """Compute the flow [m^3/s] of a check valve of conductance G_check [m^3/(s Pa)] open above dp = p_crack [Pa]."""
     return G_check * max(dp - p_crack, 0.0)
 
 
@@ -94,12 +90,7 @@ def pilot_valve_flow(
 ) -> float:
     """Compute the flow [m^3/s] through a pilot-operated check valve, positive in the free direction.
 
-    It is G_check dp times the valve's opening 0..1, which `pilot_opening` computes from the other arguments.
-
-    - `dp` [Pa]: inlet minus outlet pressure, negative if oil flows backwards while the pilot holds the valve open.
-    - `dp_pilot` [Pa]: pilot pressure minus inlet pressure.
-    - `G_check` [m^3/(s Pa)]: conductance of the fully open valve.
-    - `p_crack`, `p_open` [Pa]: pressure at which the valve begins to open, and further pressure until it is fully open.
-    - `k_pilot`: pilot ratio, the factor on `dp_pilot`.
+    It is G_check dp times the valve's opening, `pilot_opening` of the other arguments. `dp` [Pa]: inlet minus outlet
+    pressure; `G_check` [m^3/(s Pa)]: conductance of the fully open valve.
     """
     return G_check * dp * pilot_opening(dp, dp_pilot, p_crack, k_pilot, p_open)

@@ -25,8 +25,7 @@ def effective_bulk_modulus(p: float, K_oil: float, air: float, n_air: float) -> 
 
     K = K_oil (1 + r)/(1 + r K_oil/(n p_abs)), with the modulus `K_oil` [Pa] of the oil without air, the polytropic
     exponent n = `n_air` of the air, and the volume r of air over the volume of oil at this pressure
-    (`air_volume_ratio`). `air` is the same ratio at atmospheric pressure. Air does not dissolve. Without air K is
-    exactly K_oil.
+    (`air_volume_ratio`). `air`: the same ratio at atmospheric pressure. Air does not dissolve.
 
     Source: H. E. Merritt, Hydraulic Control Systems, 1967, effective bulk modulus (1/K is the sum of the compliances of
     liquid and gas). The Simscape library, from which the thesis took its friction law, has the same formula.
@@ -78,11 +77,10 @@ def mixture_density_ratio(p: float, p_0: float, K_oil: float, air: float, n_air:
 
 
 def kinematic_viscosity(T: NDArray[np.float64], nu_40: float, nu_100: float) -> NDArray[np.float64]:
-    """Compute an oil's kinematic viscosity [m^2/s] at the temperatures T [K].
+    """Compute an oil's kinematic viscosity [m^2/s] at the temperatures T [K] by Walther's law.
 
-    `nu_40`, `nu_100` [m^2/s]: the oil's kinematic viscosity at 40 and 100 deg C.
-
-    Source: Walther's law, ASTM D341: log log(nu + 0.7) = A - B log T, nu in mm^2/s (for nu above 2 mm^2/s).
+    `nu_40`, `nu_100` [m^2/s]: its viscosity at 40 and 100 deg C. Source: ASTM D341, log log(nu + 0.7) = A - B log T, nu
+    in mm^2/s (for nu above 2 mm^2/s).
     """
     y_40, y_100 = (math.log(math.log(1e6 * nu + 0.7)) for nu in (nu_40, nu_100))
     B = (y_40 - y_100) / math.log(_T_100 / _T_40)

@@ -38,10 +38,10 @@ def karnopp_friction(
 ) -> float:
     """Compute Karnopp's friction force [N]: the piston sticks at velocities |v| < v_th, and slides otherwise.
 
-    While the piston sticks, friction balances `applied` [N], the sum of all other forces, up to `breakaway` [N]. While
-    the piston slides at the velocity `v` [m/s], friction is F_C (1 + (K_brk - 1) exp(-C_c |v|)) sign(v) + F_v v, eq.
-    (4.21). `F_C` [N]: Coulomb force; `K_brk`: breakaway force over Coulomb force; `C_c` [s/m]: transition coefficient;
-    `F_v` [N s/m]: viscous coefficient.
+    While it sticks, friction balances `applied` [N], the sum of all other forces, up to `breakaway` [N]. While it
+    slides at the velocity `v` [m/s], friction is F_C (1 + (K_brk - 1) exp(-C_c |v|)) sign(v) + F_v v, eq. (4.21). `F_C`
+    [N]: Coulomb force; `K_brk`: breakaway over Coulomb force; `C_c` [s/m]: transition, `F_v` [N s/m]: viscous
+    coefficient.
 
     Source: D. Karnopp, Computer simulation of stick-slip friction in mechanical dynamic systems, ASME Journal of
     Dynamic Systems, Measurement and Control 107 (1985) 100-103.
@@ -78,11 +78,10 @@ def lugre_friction(v: float, z: float, dz: float, sigma_0: float, sigma_1: float
 
     F = sigma_0 z + sigma_1 exp(-(v/v_th)^2) dz + F_v v. `v` [m/s]: velocity; `z` [m], `dz` [m/s]: the bristles' mean
     deflection and its rate (`bristle_rate`); `sigma_0` [N/m], `sigma_1` [N s/m]: stiffness and damping of the bristles;
-    `F_v` [N s/m]: viscous coefficient. The damping decays at speeds above `v_th` [m/s]; otherwise the force could drive
-    the motion.
+    `F_v` [N s/m]: viscous coefficient. The damping decays at speeds above `v_th` [m/s]; else it could drive the motion.
 
-    Source: eq. (3) of the paper cited in `bristle_rate`; the decay: H. Olsson, Control Systems with Friction, Lund
-    1996, section 5.
+    Source: eq. (3) of the paper cited in `bristle_rate`; H. Olsson, Control Systems with Friction, Lund 1996, section
+    5.
     """
     relative_v = v / v_th
     return sigma_0 * z + sigma_1 * exponential(-relative_v * relative_v) * dz + F_v * v  # type: ignore[no-any-return]
@@ -94,11 +93,11 @@ def stribeck_friction(
 ) -> float:
     """Compute the thesis's friction force [N] at the velocity v [m/s], eqs. (4.21)-(4.22).
 
-    F = F_C (1 + (K_brk - 1) exp(-C_c |v|)) sign(v) + F_v v for |v| > v_th,
-    F = v [F_C (1 + (K_brk - 1) exp(-C_c v_th)) + F_v v_th] / v_th for |v| <= v_th, which is continuous at v_th.
+    F = F_C (1 + (K_brk - 1) exp(-C_c |v|)) sign(v) + F_v v for |v| > v_th, F = v [F_C (1 + (K_brk - 1) exp(-C_c v_th))
+    + F_v v_th] / v_th for |v| <= v_th, which is continuous at v_th.
 
-    `F_C` [N]: Coulomb force; `K_brk`: breakaway force over Coulomb force; `C_c` [s/m]: transition coefficient; `F_v`
-    [N s/m]: viscous coefficient; `v_th` [m/s]: velocity below which friction is linear.
+    `F_C` [N]: Coulomb force; `K_brk`: breakaway force over Coulomb force; `C_c` [s/m]: transition coefficient; `F_v` [N
+    s/m]: viscous coefficient; `v_th` [m/s]: velocity below which friction is linear.
 
     Eq. (4.22) is printed with an unbalanced bracket. `literal_bracket` closes it after F_v v_th instead, F = v F_C [1 +
     (K_brk - 1) exp(-C_c |v|) + F_v v_th] / v_th, so that F jumps at v_th (from 73.2 N to 145 N with Table 4.1 and no

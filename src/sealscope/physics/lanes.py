@@ -36,11 +36,7 @@ class Lanes(types.Type):  # type: ignore[misc]
         super().__init__(name=f"Lanes({number}, {width})")
 
     def can_convert_from(self, typingctx: Any, source: Any) -> Any:
-        """Tell numba that any single number can be converted to lanes, a vector of equal numbers.
-
-        `source`: type of the value to convert. Returns None, which forbids the conversion, if it is not the type of a
-        number. numba requires the argument `typingctx`, which is not used.
-        """
+        """Tell numba that a single number, but no other `source`, can be converted to lanes of equal numbers."""
         from numba.core.typeconv import Conversion
 
         return Conversion.safe if isinstance(source, types.Number) else None
@@ -80,10 +76,7 @@ class _MaskModel(models.PrimitiveModel):  # type: ignore[misc]
 
 
 def _broadcast(builder: Any, scalar: Any, lanes: Lanes) -> Any:
-    """Build the LLVM instructions that copy one number into every lane of a vector; return the vector.
-
-    `builder` appends the instructions; `scalar`: the number; `lanes`: type of the vector.
-    """
+    """Build the LLVM instructions that copy the number `scalar` into every lane of a vector of the type `lanes`."""
     zero = ir.Constant(ir.IntType(32), 0)
     first_lane = builder.insert_element(ir.Constant(_vector_type(lanes), ir.Undefined), scalar, zero)
     zeros = ir.Constant(ir.VectorType(ir.IntType(32), lanes.width), [0] * lanes.width)
@@ -91,11 +84,7 @@ def _broadcast(builder: Any, scalar: Any, lanes: Lanes) -> Any:
 
 
 def _convert_to_lanes(context: Any, builder: Any, value: Any, value_type: Any, lanes: Lanes) -> Any:
-    """Build the LLVM instructions that convert a number to lanes, a vector of equal numbers.
-
-    A vector is returned unchanged. `context`: numba's target, which converts numbers; `builder` appends the
-    instructions; `value_type`: numba's type of the value; `lanes`: type of the result.
-    """
+    """Build the LLVM instructions that convert a number of the type `value_type` to lanes; lanes stay as they are."""
     if isinstance(value_type, Lanes):
         return value
     return _broadcast(builder, context.cast(builder, value, value_type, lanes.number), lanes)
@@ -103,19 +92,12 @@ def _convert_to_lanes(context: Any, builder: Any, value: Any, value_type: Any, l
 
 @lower_cast(types.Number, Lanes)  # type: ignore[untyped-decorator]
 def _cast_to_lanes(context: Any, builder: Any, value_type: Any, lanes: Any, value: Any) -> Any:
-    """Convert a number to lanes (a vector) where numba needs one type for both.
-
-    Such a place is a variable that has a number in one branch and lanes in the other.
-    """
+    """Convert a number to lanes for a variable that has a number in one branch and lanes in the other."""
     return _convert_to_lanes(context, builder, value, value_type, lanes)
 
 
 def _common_lanes_type(arg_types: tuple[Any, ...]) -> Lanes | None:
-    """Find the type of lanes to which all arguments of a call can be converted.
-
-    `arg_types`: types of the arguments, lanes (vectors of numbers) and single numbers. Returns None if there are no
-    lanes among them, lanes of different types, or a type that is neither.
-    """
+    """Find the one type of lanes among the types of a call's arguments, else numbers; None for any other types."""
     lanes = {arg_type for arg_type in arg_types if isinstance(arg_type, Lanes)}
     compatible = len(lanes) == 1 and all(isinstance(arg_type, Lanes | types.Number) for arg_type in arg_types)
     return lanes.pop() if compatible else None
@@ -125,22 +107,18 @@ def _define_on_lanes(function: Any, build: Any, *, is_test: bool = False) -> Non
     """Tell numba how a Python function or operator on lanes (vectors of numbers) is compiled.
 
     Its arguments may mix lanes with single numbers. `build(builder, *values)` adds the LLVM instructions to LLVM's
-    `builder` and returns their result; its `values` are lanes of one type. The result is lanes, or a mask of truth
-    values if `is_test`.
+    `builder` for `values` that are lanes of one type. The result is lanes, or a mask of truth values if `is_test`.
     """
 
     @infer_global(function)
     class Template(AbstractTemplate):  # type: ignore[misc]
         def generic(self, args: tuple[Any, ...], kws: Any) -> Any:
-            """Return the function's signature for arguments of the types `args`.
-
-            Returns None if they have no common type of lanes, or if keywords are used.
-            """
+            """Return the signature for arguments of the types `args`, None without a common type of lanes."""
             lanes = None if kws else _common_lanes_type(args)
             return None if lanes is None else signature(_MASKS[lanes] if is_test else lanes, *args)
 
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        """Build the LLVM instructions of one call, with single numbers first converted to lanes (vectors)."""
+        """Build the LLVM instructions of one call, with single numbers first converted to lanes."""
         lanes = _common_lanes_type(sig.args)
         assert lanes is not None
         pairs = zip(args, sig.args, strict=True)
@@ -152,10 +130,7 @@ def _define_on_lanes(function: Any, build: Any, *, is_test: bool = False) -> Non
 
 
 def _lower_division_by_number(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    """Build the LLVM instructions that divide lanes (a vector of numbers) by one number.
-
-    They multiply by the number's reciprocal, so that the compiler can move the division out of a loop.
-    """
+    """Build the LLVM instructions that divide lanes by a number, by its reciprocal, which a loop computes once."""
     lanes, number_type = sig.args
     number = context.cast(builder, args[1], number_type, types.float64)
     reciprocal = builder.fdiv(ir.Constant(ir.DoubleType(), 1.0), number)
@@ -174,16 +149,10 @@ _define_on_lanes(operator.neg, lambda builder, a: builder.fneg(a))
 
 
 def _intrinsic_builder(name: str) -> Any:
-    """Return a function for the argument `build` of `_define_on_lanes`, which calls an LLVM intrinsic.
-
-    `name`: name of the intrinsic without type, such as "sqrt".
-    """
+    """Return a `build` for `_define_on_lanes` that calls the LLVM intrinsic `name`, such as "sqrt"."""
 
     def build(builder: Any, *values: Any) -> Any:
-        """Build the call of the intrinsic with vectors of one type, and return its result, a vector.
-
-        The full name of the intrinsic ends with the vector's type, such as llvm.sqrt.v8f64.
-        """
+        """Build the call of the intrinsic, whose full name ends with the vector's type, such as llvm.sqrt.v8f64."""
         vector = values[0].type
         bits = 64 if vector.element == ir.DoubleType() else 32
         function_type = ir.FunctionType(vector, [vector] * len(values))
@@ -206,42 +175,41 @@ for _function, _name in ((operator.and_, "and_"), (operator.or_, "or_")):
     @infer_global(_function)
     class _MaskTemplate(AbstractTemplate):  # type: ignore[misc]
         def generic(self, args: tuple[Any, ...], kws: Any) -> Any:
-            """Return the signature of `&` or `|` for two masks (vectors of truth values) of one type.
-
-            Returns None for any other arguments.
-            """
+            """Return the signature of `&` or `|` for two masks of one type, None for any other arguments."""
             compatible = not kws and len(args) == 2 and isinstance(args[0], Mask) and args[0] == args[1]
             return signature(args[0], *args) if compatible else None
 
     lower_builtin(_function, Mask, Mask)(lambda context, builder, sig, args, name=_name: getattr(builder, name)(*args))
 
 
-def register_lowering(function: Any, arity: int, infer_type: Any, build: Any) -> None:
-    """Make a Python function callable in compiled code, by LLVM instructions that `build` writes.
+def register_lowering(function: Any, arity: int, infer_type: Any) -> Any:
+    """Make a Python function of `arity` arguments callable in compiled code, by the LLVM instructions of the decorated.
 
-    `arity`: number of arguments; `infer_type(arg_types)` returns the type of the result, or None if the function does
-    not take arguments of these types; `build(context, builder, arg_types, values)` builds the instructions.
+    `infer_type(arg_types)` returns the type of the result, or None if the function does not take arguments of these
+    types. The decorated function takes numba's context, LLVM's builder, and types and values of the arguments.
     """
 
     @infer_global(function)
     class Template(AbstractTemplate):  # type: ignore[misc]
         def generic(self, args: tuple[Any, ...], kws: Any) -> Any:
-            """Return the function's signature for these types of arguments, or None if it does not take them."""
+            """Return the function's signature for these types of arguments, None if it does not take them."""
             if len(args) != arity or kws:
                 return None
             result_type = infer_type(args)
             return None if result_type is None else signature(result_type, *args)
 
-    lower_builtin(function, *[types.Any] * arity)(
-        lambda context, builder, sig, args: build(context, builder, sig.args, args)
-    )
+    def register(build: Any) -> Any:
+        """Register the decorated function `build` with numba."""
+        lower_builtin(function, *[types.Any] * arity)(
+            lambda context, builder, sig, args: build(context, builder, sig.args, args)
+        )
+        return build
+
+    return register
 
 
 def select(condition: Any, yes: Any, no: Any) -> Any:
-    """Choose `yes` if the condition is true, else `no`, separately in each lane of a vector.
-
-    Both values are computed, whatever the condition.
-    """
+    """Choose `yes` if the condition is true, else `no`, in each lane of a vector; both values are computed."""
     return yes if condition else no
 
 
@@ -252,6 +220,7 @@ def _select_type(arg_types: Any) -> Any:
     return next((arg_type for arg_type in arg_types if isinstance(arg_type, Lanes)), types.float64)
 
 
+@register_lowering(select, 3, _select_type)
 def _lower_select(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
     """Build the LLVM instructions of `select`: convert both values to one type, then choose by the condition."""
     result_type = _select_type(arg_types)
@@ -263,27 +232,18 @@ def _lower_select(context: Any, builder: Any, arg_types: Any, values: Any) -> An
     return builder.select(values[0], yes, no)
 
 
-register_lowering(select, 3, _select_type, _lower_select)
-
-
 def any_lane(condition: Any) -> Any:
-    """Return True if a condition is true in any lane of a vector.
-
-    `condition`: a mask, i.e. a truth value for each lane, or the single truth value of a run without lanes, which is
-    returned unchanged.
-    """
+    """Return True if a mask of truth values, or the one truth value of a run without lanes, is true anywhere."""
     return condition
 
 
+@register_lowering(any_lane, 1, lambda _: types.boolean)
 def _lower_any_lane(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
-    """Build the LLVM instructions of `any_lane`: test that a mask's bits, taken as one integer, are not all zero."""
+    """Build the LLVM instructions of `any_lane`: test that a mask's bits, as one integer, are not all zero."""
     if not isinstance(arg_types[0], Mask):
         return values[0]
     bits = ir.IntType(arg_types[0].lanes.width)
     return builder.icmp_unsigned("!=", builder.bitcast(values[0], bits), ir.Constant(bits, 0))
-
-
-register_lowering(any_lane, 1, lambda _: types.boolean, _lower_any_lane)
 
 
 def _float_constant(value_type: Any, value: float) -> Any:
@@ -294,31 +254,23 @@ def _float_constant(value_type: Any, value: float) -> Any:
 
 
 def nearest_integer(x: Any) -> Any:
-    """Round x to the nearest whole number, returned as a float.
-
-    Adding a large constant leaves no bits for a fraction. The magnitude of x must be below 2^51, in single precision
-    below 2^22.
-    """
+    """Round x, |x| < 2^51 (single precision: 2^22), by adding a constant so large that no fraction is left."""
     return (x + _ROUNDING_DOUBLE) - _ROUNDING_DOUBLE
 
 
+@register_lowering(nearest_integer, 1, lambda arg_types: arg_types[0])
 def _lower_nearest_integer(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
     """Build the LLVM instructions of `nearest_integer`: add the constant of x's precision and subtract it again."""
     large = _float_constant(arg_types[0], _ROUNDING_SINGLE if arg_types[0] == SINGLES else _ROUNDING_DOUBLE)
     return builder.fsub(builder.fadd(values[0], large, flags=_FLAGS), large, flags=_FLAGS)
 
 
-register_lowering(nearest_integer, 1, lambda arg_types: arg_types[0], _lower_nearest_integer)
-
-
 def power_of_two(n: Any) -> Any:
-    """Compute 2^n, with n a float without fraction, or lanes (a vector) of such floats.
-
-    n must be in -1022..1023; in single precision it is limited to -126..127.
-    """
+    """Compute 2^n for a float or lanes without fraction in -1022..1023 (single precision: limited to -126..127)."""
     return math.ldexp(1.0, int(n))
 
 
+@register_lowering(power_of_two, 1, lambda arg_types: arg_types[0])
 def _lower_power_of_two(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
     """Build the LLVM instructions of `power_of_two`: shift n plus the exponent's bias to the bits of the exponent."""
     n_type, n = arg_types[0], values[0]
@@ -338,21 +290,11 @@ def _lower_power_of_two(context: Any, builder: Any, arg_types: Any, values: Any)
     return builder.bitcast(builder.shl(exponent, shift), n.type)
 
 
-register_lowering(power_of_two, 1, lambda arg_types: arg_types[0], _lower_power_of_two)
-
 _LANES_OF_DTYPE = {types.float64: LANES, types.float32: SINGLES}
 
 
-def _is_array_of_lanes(array: Any) -> bool:
-    """Return True if the rows of arrays of this numba type can be loaded as lanes (vectors of numbers)."""
-    return isinstance(array, types.Array) and array.dtype in _LANES_OF_DTYPE and array.layout == "C"
-
-
 def _row_address(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
-    """Build the LLVM instructions that compute the address of a row of an array, as a pointer to a vector (lanes).
-
-    `arg_types`, `values`: types and values of a call's arguments, of which the first two are the array and the row.
-    """
+    """Build the LLVM instructions for the address, a pointer to lanes, of a row: arguments (array, row, ...)."""
     data = context.make_array(arg_types[0])(context, builder, values[0]).data
     row = context.cast(builder, values[1], arg_types[1], types.intp)
     lanes = _LANES_OF_DTYPE[arg_types[0].dtype]
@@ -361,66 +303,47 @@ def _row_address(context: Any, builder: Any, arg_types: Any, values: Any) -> Any
 
 
 def load(array: Any, row: int) -> Any:
-    """Load one row of a C-ordered array as lanes, a vector of numbers.
+    """Load one row of a C-ordered array as lanes, a vector of numbers, in compiled code that `_lower_load` builds.
 
-    The array's shape is (..., WIDTH) of doubles, or (..., SINGLE_WIDTH) in single precision. `row` counts the rows
-    through all leading axes. Only compiled code can call this function, whose body `_lower_load` builds.
+    Its shape is (..., WIDTH) of doubles, or (..., SINGLE_WIDTH) in single precision; `row` counts through all axes.
     """
-
-
-def _lower_load(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
-    """Build the LLVM instructions of `load`, which reads a row of an array as lanes."""
-    return builder.load(_row_address(context, builder, arg_types, values), align=arg_types[0].dtype.bitwidth // 8)
 
 
 def _loaded_type(arg_types: Any) -> Any:
-    """Find the type of the vector (lanes) that `load` reads from an array.
-
-    Returns None if the arguments are not an array with loadable rows and an integer.
-    """
-    is_loadable = _is_array_of_lanes(arg_types[0]) and isinstance(arg_types[1], types.Integer)
-    return _LANES_OF_DTYPE[arg_types[0].dtype] if is_loadable else None
+    """Find the type of the vector (lanes) that `load` reads; None without an array of loadable rows and an integer."""
+    array, row = arg_types[:2]
+    is_loadable = isinstance(array, types.Array) and array.dtype in _LANES_OF_DTYPE and array.layout == "C"
+    return _LANES_OF_DTYPE[array.dtype] if is_loadable and isinstance(row, types.Integer) else None
 
 
-register_lowering(load, 2, _loaded_type, _lower_load)
+@register_lowering(load, 2, _loaded_type)
+def _lower_load(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
+    return builder.load(_row_address(context, builder, arg_types, values), align=arg_types[0].dtype.bitwidth // 8)
 
 
 def store(array: Any, row: int, value: Any) -> None:
-    """Write lanes, a vector of numbers, to one row of a C-ordered array.
-
-    `row` counts the rows through all leading axes, as in `load`. Only compiled code can call this function, whose body
-    `_lower_store` builds.
-    """
-
-
-def _lower_store(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
-    """Build the LLVM instructions of `store`, which writes lanes to a row of an array."""
-    builder.store(values[2], _row_address(context, builder, arg_types, values), align=arg_types[0].dtype.bitwidth // 8)
-    return context.get_dummy_value()
+    """Write lanes to one row of an array, numbered as in `load`, in compiled code that `_lower_store` builds."""
 
 
 def _stored_type(arg_types: Any) -> Any:
-    """Return numba's type `none`, the result of `store`, or None if the array cannot contain such a vector.
-
-    `arg_types`: types of the arguments of `store`: array, row and vector.
-    """
+    """Return numba's type `none`, the result of `store`, or None if the array cannot contain such a vector."""
     _, _, vector_type = arg_types
     return types.none if _loaded_type(arg_types) == vector_type else None
 
 
-register_lowering(store, 3, _stored_type, _lower_store)
+@register_lowering(store, 3, _stored_type)
+def _lower_store(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
+    builder.store(values[2], _row_address(context, builder, arg_types, values), align=arg_types[0].dtype.bitwidth // 8)
+    return context.get_dummy_value()
 
 
 def broadcast(value: Any) -> Any:
     """Copy one number into every lane of a vector of doubles, in compiled code that `_lower_broadcast` builds."""
 
 
+@register_lowering(broadcast, 1, lambda _: LANES)
 def _lower_broadcast(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
-    """Build the LLVM instructions of `broadcast`, which copies one number into every lane of a vector."""
     return _convert_to_lanes(context, builder, values[0], arg_types[0], LANES)
-
-
-register_lowering(broadcast, 1, lambda _: LANES, _lower_broadcast)
 
 
 _LOG2_E = 1.4426950408889634

@@ -17,8 +17,7 @@ from sealscope.physics.restrictors import orifice_flow
 def laminar_leakage(dp: float, G: float) -> float:
     """Compute the leakage Q_L = G dp [m^3/s] from chamber A to B through a laminar gap.
 
-    `dp` = p_A - p_B [Pa]; `G`: leakage conductance [m^3/(s Pa)]. Source: Merritt, Hydraulic Control Systems, 1967,
-    leakage of an actuator.
+    `dp` = p_A - p_B [Pa]; `G`: conductance [m^3/(s Pa)] (Merritt, Hydraulic Control Systems, 1967, actuator leakage).
     """
     return G * dp
 
@@ -37,10 +36,7 @@ def piston_leakage(dp: float, G: float, C: float, dp_0: float) -> float:
 
 @kernel
 def leakage_series(dp: np.ndarray, G: np.ndarray, C: np.ndarray, dp_0: float) -> np.ndarray:
-    """Compute the leakage [m^3/s] from chamber A to B at each of n samples, by `piston_leakage`.
-
-    `dp` [Pa], `G` [m^3/(s Pa)] and `C` [m^3/(s Pa^0.5)] are arrays (n,); `dp_0` [Pa] is one number.
-    """
+    """Compute `piston_leakage` (n,) [m^3/s] for arrays `dp` [Pa], `G` [m^3/(s Pa)] and `C` [m^3/(s Pa^0.5)]."""
     Q_L = np.empty(dp.size)
     for k in range(dp.size):
         Q_L[k] = piston_leakage(dp[k], G[k], C[k], dp_0)

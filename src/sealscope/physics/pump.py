@@ -27,10 +27,7 @@ def pump_flow(omega: float, dp: float, q_b: float, G_pump: float) -> float:
 
 @contracted
 def pump_torque(dp: float, q_b: float) -> float:
-    """Compute the torque q_b dp/(2 pi) [N m] with which the port pressures load the shaft, eqs. (4.5)-(4.6).
-
-    `dp` = p_1 - p_2 [Pa]; `q_b`: displacement [m^3/rev].
-    """
+    """Compute the torque [N m] on the pump's shaft under `dp` = p_1 - p_2 [Pa], eqs. (4.5)-(4.6); `q_b` [m^3/rev]."""
     return q_b / (2.0 * math.pi) * dp
 
 
@@ -48,10 +45,9 @@ def loss_coefficients(q_b: float, C_st: float, C_h: float, rho: float) -> tuple[
 
 @contracted
 def turbulent_slip(dp: float, c_slip: float, dp_0: float) -> float:
-    """Compute the pump's turbulent slip [m^3/s]: the flow that leaks back through its gaps under `dp` [Pa].
+    """Compute the pump's turbulent slip [m^3/s]: the flow that leaks back through its gaps under `dp` = p_1 - p_2 [Pa].
 
-    `dp` is the pressure difference p_1 - p_2 of the ports, and the slip has its sign. It is the flow of an orifice with
-    the coefficient `c_slip` [m^3/(s Pa^0.5)], laminar below about `dp_0` [Pa] (Schlosser 1961).
+    The flow is that of an orifice of coefficient `c_slip` [m^3/(s Pa^0.5)], laminar below about `dp_0` [Pa].
     """
     return orifice_flow(dp, c_slip, dp_0)
 
@@ -74,8 +70,5 @@ def friction_torque(omega: float, dp: float, q_b: float, T_f: float, C_f: float,
 
 
 def hydraulic_power(Q_1: Any, dp: Any) -> Any:
-    """Compute the hydraulic power Q_1 (p_1 - p_2) [W] that the pump delivers to the oil.
-
-    `Q_1` [m^3/s]: flow out of port 1; `dp` [Pa]: pressure difference p_1 - p_2 of the ports.
-    """
+    """Compute the hydraulic power [W] of a pump: flow `Q_1` [m^3/s] out of port 1 times `dp` = p_1 - p_2 [Pa]."""
     return Q_1 * dp

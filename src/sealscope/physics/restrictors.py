@@ -36,10 +36,7 @@ _series_coefficient = law(series_coefficient)
 
 @law
 def compiled_series_coefficient(c: float, c_line: float, opening: float) -> float:
-    """Compute the flow coefficient [m^3/(s Pa^0.5)] of a throttle in series with a shut-off valve, in compiled code.
-
-    Formula and arguments are those of `series_coefficient`; a fully open valve gives exactly `c`.
-    """
+    """Compute `series_coefficient` in compiled code; a fully open valve gives exactly `c`."""
     return c if opening >= 1.0 else _series_coefficient(c, c_line, opening)
 
 
@@ -56,10 +53,7 @@ def orifice_flow(dp: float, c: float, dp_0: float) -> float:
 
 @contracted
 def one_way_coefficient(dp: float, c_forward: float, c_reverse: float) -> float:
-    """Choose the flow coefficient of a one-way throttle: `c_forward` if `dp` > 0 [Pa], else `c_reverse`.
-
-    `dp`: pressure drop across the throttle in its forward direction; both coefficients are in m^3/(s Pa^0.5).
-    """
+    """Choose a one-way throttle's flow coefficient by the pressure drop `dp` [Pa] in its forward direction."""
     return select(dp > 0.0, c_forward, c_reverse)  # type: ignore[no-any-return]
 
 
@@ -69,8 +63,8 @@ def _solve_scaled_flow(b: float, a: float) -> float:
 
     w r(w) with r = sqrt((w^2 + sqrt(w^4 + 4))/2) >= 1 is the orifice's pressure difference over dp_0: `orifice_flow`
     inverted. a w is a pressure difference that grows linearly with the flow, over dp_0; b is the sum of both. The left
-    side of the equation rises and is convex, so the root is unique. Halley's method finds the root to a relative error
-    of 1e-12, in a single iteration if a >> 1, where r hardly matters.
+    side rises and is convex, so the root is unique. Halley's method finds it to a relative error of 1e-12, in a single
+    iteration if a >> 1, where r hardly matters.
     """
     w = b / (a + 1.0)  # first guess, with r = 1
     w = b / (a + select(w < 2.0, 1.0 + 0.25 * w * w, w))  # better, with r(w) approximated for small and for large w
@@ -136,8 +130,7 @@ def filtered_flow(
     The filter has the resistance `R` [Pa s/m^3], and a bypass valve of conductance `G_bypass` [m^3/(s Pa)] that opens
     at the filter's pressure drop `p_bypass` [Pa]. Q solves d + dp_f + g Q = total, with the pressure drops d of the
     throttle and dp_f of the filter. `total` [Pa]: sum of both drops if nothing flowed in the stage; `g` [Pa s/m^3]:
-    fall of this sum over the stage per unit flow; `c_forward`, `c_reverse`, `dp_0`: coefficients of the throttle as in
-    `implicit_orifice_flow`.
+    fall of this sum over the stage per unit flow; `c_forward`, `c_reverse`, `dp_0`: as in `implicit_orifice_flow`.
 
     dp_f is R Q while the bypass valve is shut; while it is open, Q = dp_f/R + G_bypass (dp_f - p_bypass). As dp_f is
     linear in Q in both cases, `implicit_orifice_flow` solves the equation for either case.
@@ -154,8 +147,8 @@ def filtered_flow(
 def flow_through_filter(Q: float, R: float, p_bypass: float, G_bypass: float) -> float:
     """Compute the part of a flow [m^3/s, >= 0] that passes a filter rather than its bypass valve.
 
-    `Q` [m^3/s]: flow through filter and bypass together, of either sign; `R` [Pa s/m^3]: resistance of the filter.
-    The bypass valve opens at the pressure drop `p_bypass` [Pa] and has the conductance `G_bypass` [m^3/(s Pa)].
+    `Q` [m^3/s]: both flows together, of either sign; `R` [Pa s/m^3]: resistance of the filter. The valve opens at the
+    pressure drop `p_bypass` [Pa] and has the conductance `G_bypass` [m^3/(s Pa)].
     """
     part_with_open_valve = (abs(Q) + G_bypass * p_bypass) / (1.0 + G_bypass * R)
     return min(abs(Q), part_with_open_valve)  # the valve is shut while the whole flow is the smaller one

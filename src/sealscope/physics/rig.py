@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import math
 from collections import namedtuple
+from collections.abc import Callable, Mapping
 from functools import cache
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any
@@ -68,51 +69,54 @@ PARAMETERS = {
 }
 #: The same, followed by the parameters from which numbers are derived.
 VALUES = {**PARAMETERS, **{name.rpartition(".")[2]: name for name in _DERIVED_ONLY}}
-#: Choices that the laws take as truth values, each with the parameter and its value that means True. A further choice,
-#: `made_up`, is True if the make-up has check valves, plain or pilot-operated.
-_CHOICES = {
-    "position_dependent": ("cylinder.volumes", "position"),
-    "coulomb_of_difference": ("friction.coulomb_pressure", "difference"),
-    "literal_bracket": ("friction.bracket", "literal"),
+#: Choices that the laws take as truth values, each with the function that decides it for a rig.
+_CHOICES: Mapping[str, Callable[[Rig], bool]] = {
+    "position_dependent": lambda rig: rig.cylinder.volumes == "position",
+    "coulomb_of_difference": lambda rig: rig.friction.coulomb_pressure == "difference",
+    "literal_bracket": lambda rig: rig.friction.bracket == "literal",
+    "made_up": lambda rig: rig.makeup.check_valves != "absent",  # plain or pilot-operated
 }
 #: Derived numbers: flow coefficients of throttles A and B towards the cylinder and back, with their shut-off valves;
 #: volumes of both sides at mid-stroke; coefficients of the pump's losses (`derived_numbers`).
 DERIVED = ("c_A_in", "c_A_out", "c_B_in", "c_B_out", "V_A", "V_B", "c_slip", "k_h")
 #: The numbers of `RigNumbers`.
 NUMBERS = (*PARAMETERS, *DERIVED)
-#: Laws that only some rigs have. Each is a tuple in `RigNumbers`, empty if the rig does not have the law: numba
-#: specialises on its length, so that the law is then not compiled in.
-LAWS = (
-    "throttled",  # throttles in the lines
-    "aerated",  # air in the oil
-    "open_circuit",  # leaking rod seals, or a make-up
-    "conserving",  # balance of mass in place of volume
-    "sticking",  # Karnopp's friction
-    "bristled",  # LuGre's friction
-    "one_sided",  # friction that differs between the directions
-    "piloted",  # pilot-operated check valves
-    "relieved",  # relief valves
-    "polytropic",  # a make-up accumulator that is not isothermal
-    "damped",  # a damper
-    "pushed",  # an additional load: (True,) over time, or tables over position and velocity (`piecewise_linear_force`)
-    "valved",  # a servo valve and its supply
-    "filtered",  # filters in the lines
-    "lossy",  # losses of motor and pump beyond the linear ones
-    "opposed",  # an opposing cylinder
-    "boiling",  # boiling oil
-    "clogging",  # filters that clog
-    "bypassed",  # filters with a bypass
-)
+#: Laws that only some rigs have, each with the function that tells whether a rig has it. Each is a tuple in
+#: `RigNumbers`, empty if the rig does not have the law: numba specialises on its length, so that the law is then not
+#: compiled in. `pushed` is an additional load, which callers add: (True,) over time, or tables over position and
+#: velocity (`piecewise_linear_force`).
+LAWS: Mapping[str, Callable[[Rig], bool]] = {
+    "throttled": lambda rig: rig.line.orifices == "present",
+    "aerated": lambda rig: rig.fluid.air > 0,
+    "open_circuit": lambda rig: (
+        rig.makeup.check_valves != "absent" or rig.cylinder.G_ext_A > 0 or rig.cylinder.G_ext_B > 0
+    ),
+    "conserving": lambda rig: rig.cylinder.volumes == "position" and rig.cylinder.balance == "mass",
+    "sticking": lambda rig: rig.friction.law == "karnopp",
+    "bristled": lambda rig: rig.friction.law == "lugre",
+    "one_sided": lambda rig: rig.friction.backward != 1.0,
+    "piloted": lambda rig: rig.makeup.check_valves == "pilot-operated",
+    "relieved": lambda rig: rig.makeup.G_relief > 0,
+    "polytropic": lambda rig: rig.makeup.check_valves != "absent" and rig.makeup.n_gas != 1.0,
+    "damped": lambda rig: rig.cylinder.d_load > 0,
+    "pushed": lambda rig: False,
+    "valved": lambda rig: rig.circuit.valve_controlled,
+    "filtered": lambda rig: rig.line.R_A > 0 or rig.line.R_B > 0,
+    "lossy": lambda rig: rig.motor.T_f > 0 or rig.pump.C_st > 0 or rig.pump.C_f > 0 or rig.pump.C_h > 0,
+    "opposed": lambda rig: rig.cylinder.A_opp > 0,
+    "boiling": lambda rig: rig.fluid.p_vap > 0,
+    "clogging": lambda rig: rig.line.k_clog_A > 0 or rig.line.k_clog_B > 0,
+    "bypassed": lambda rig: rig.line.G_bypass > 0,
+}
 #: The choices: truth values, and the laws.
-CHOICES = (*_CHOICES, "made_up", *LAWS)
+CHOICES = (*_CHOICES, *LAWS)
 
 if TYPE_CHECKING:
 
     class RigNumbers(tuple[Any, ...]):
         """A rig's parameters, and the numbers derived from them, as the compiled laws take them.
 
-        The numbers are SI floats, the choices truth values. Each optional law is a tuple, empty if the rig does not
-        have it.
+        The numbers are SI floats, the choices truth values, each optional law a tuple, empty if the rig lacks it.
         """
 
         _fields: tuple[str, ...]
@@ -130,15 +134,12 @@ else:  # plain named tuples, which numba takes apart into their fields
 
 @law
 def throttle_flow_coefficients(v: RigValues, exponent: float, literal: bool) -> tuple[float, float, float, float]:
-    """Compute the flow coefficients of the throttles in lines A and B: (c_A_in, c_A_out, c_B_in, c_B_out).
+    """Compute the throttles' flow coefficients (c_A_in, c_A_out, c_B_in, c_B_out) [m^3/(s Pa^0.5)], eqs. (4.7)-(4.12).
 
-    They are in m^3/(s Pa^0.5), eqs. (4.7)-(4.12); "in" is the flow towards the cylinder. Each throttle is in series
-    with a shut-off valve (`series_coefficient`).
-
-    `v`: the rig's parameters. `exponent`: 1 if a throttle's closed fraction is the fraction of its area (eq. 4.8), 2 if
-    it is the fraction of its diameter (the thesis's text). `literal`: if False, the flow towards the cylinder is free
-    and the return is throttled on both sides (the text and Appendix A); if True, side B is the other way round, as eqs.
-    (4.9)-(4.12) are printed.
+    "in" is the flow towards the cylinder. Each throttle is in series with a shut-off valve. `v`: the rig's parameters.
+    `exponent`: 1 if a throttle's closed fraction is that of its area (eq. 4.8), 2 if that of its diameter (the thesis's
+    text). `literal`: if False, the flow towards the cylinder is free and the return is throttled on both sides (the
+    text and Appendix A); if True, side B is the other way round, as eqs. (4.9)-(4.12) are printed.
     """
     free = restrictors.orifice_coefficient(v.C_d, math.pi / 4.0 * v.d_line**2, v.rho)  # eq. (4.7)
     throttled_A = free * (1.0 - v.closed_A) ** exponent  # eq. (4.8)
@@ -154,12 +155,7 @@ def throttle_flow_coefficients(v: RigValues, exponent: float, literal: bool) -> 
 
 @law
 def derived_numbers(v: RigValues, exponent: float, literal: bool) -> tuple[float, ...]:
-    """Compute the numbers that follow from a rig's parameters, in the order of `DERIVED`.
-
-    They are the flow coefficients of the throttles, the oil volumes of both sides at mid-stroke, and the coefficients
-    of the pump's losses. `v`: the rig's parameters; `exponent`, `literal`: how the rig reads the thesis's equations of
-    its throttles (`throttle_readings`).
-    """
+    """Compute the numbers `DERIVED` of a rig's parameters `v`; `exponent`, `literal`: its `throttle_readings`."""
     c_A_in, c_A_out, c_B_in, c_B_out = throttle_flow_coefficients(v, exponent, literal)
     V_A, V_B = cylinder.mid_stroke_volumes(v)
     c_slip, k_h = pump.loss_coefficients(v.q_b, v.C_st, v.C_h, v.rho)
@@ -167,76 +163,35 @@ def derived_numbers(v: RigValues, exponent: float, literal: bool) -> tuple[float
 
 
 def parameter_values(rig: Rig) -> RigValues:
-    """Collect the rig's parameters that the compiled model needs, in SI units.
-
-    The result is a named tuple, whose fields are the symbols of the parameters (`VALUES`).
-    """
+    """Collect the rig's parameters that the compiled model needs, in SI units, by symbol."""
     return RigValues(*(float(attrgetter(name)(rig)) for name in VALUES.values()))
 
 
 def throttle_readings(rig: Rig) -> tuple[float, bool]:
-    """Return the two options by which a rig interprets the thesis's equations of its throttles.
-
-    The first is `exponent`: 1 if a throttle's closed fraction is that of its area, 2 if that of its diameter. The
-    second is `literal`: True if eqs. (4.9)-(4.12) are taken as printed. Both are arguments of
-    `throttle_flow_coefficients`.
-    """
+    """Return the arguments `exponent` and `literal` of `throttle_flow_coefficients` for a rig."""
     return (2.0 if rig.line.closed_means == "diameter" else 1.0), rig.line.metering == "literal"
 
 
 def throttle_coefficients(rig: Rig) -> tuple[float, float, float, float]:
-    """Compute the flow coefficients of a rig's throttles, (c_A_in, c_A_out, c_B_in, c_B_out) [m^3/(s Pa^0.5)].
-
-    "in" is the flow towards the cylinder, A and B are the sides (`throttle_flow_coefficients`).
-    """
+    """Compute a rig's throttle coefficients by `throttle_flow_coefficients`."""
     return throttle_flow_coefficients(parameter_values(rig), *throttle_readings(rig))  # type: ignore[no-any-return]
 
 
 def rig_numbers(rig: Rig) -> RigNumbers:
-    """Convert a rig to the numbers and choices that the compiled physical laws take.
-
-    These are its parameters in SI units and the numbers derived from them (`DERIVED`). For each optional law
-    (`LAWS`) there is (True,) if the rig has it, else (). Raises InputError if there are no laws for the rig's circuit.
-    """
+    """Convert a rig to the numbers and choices that the laws take; raise InputError if its circuit has no laws."""
     check_circuit_property("a simulation", rig.name, rig.circuit, "simulated")
     values = parameter_values(rig)
-    choices = {name: attrgetter(parameter)(rig) == value for name, (parameter, value) in _CHOICES.items()}
-    choices["made_up"] = rig.makeup.check_valves != "absent"
-    laws = {
-        "throttled": rig.line.orifices == "present",
-        "aerated": rig.fluid.air > 0,
-        "open_circuit": choices["made_up"] or rig.cylinder.G_ext_A > 0 or rig.cylinder.G_ext_B > 0,
-        "conserving": rig.cylinder.volumes == "position" and rig.cylinder.balance == "mass",
-        "sticking": rig.friction.law == "karnopp",
-        "bristled": rig.friction.law == "lugre",
-        "one_sided": rig.friction.backward != 1.0,
-        "piloted": rig.makeup.check_valves == "pilot-operated",
-        "relieved": rig.makeup.G_relief > 0,
-        "polytropic": choices["made_up"] and rig.makeup.n_gas != 1.0,
-        "damped": rig.cylinder.d_load > 0,
-        "pushed": False,  # callers add an additional load
-        "valved": rig.circuit.valve_controlled,
-        "filtered": rig.line.R_A > 0 or rig.line.R_B > 0,
-        "lossy": rig.motor.T_f > 0 or rig.pump.C_st > 0 or rig.pump.C_f > 0 or rig.pump.C_h > 0,
-        "opposed": rig.cylinder.A_opp > 0,
-        "boiling": rig.fluid.p_vap > 0,
-        "clogging": rig.line.k_clog_A > 0 or rig.line.k_clog_B > 0,
-        "bypassed": rig.line.G_bypass > 0,
-    }
     return RigNumbers(
         *values[: len(PARAMETERS)],  # `VALUES` begins with `PARAMETERS`
         *derived_numbers(values, *throttle_readings(rig)),
-        **choices,
-        **{name: (True,) if is_present else () for name, is_present in laws.items()},
+        **{name: is_chosen(rig) for name, is_chosen in _CHOICES.items()},
+        **{name: (True,) if is_present(rig) else () for name, is_present in LAWS.items()},
     )
 
 
 @cache
 def _record_type(lengths: tuple[int, ...]) -> np.dtype[Any]:
-    """Build the NumPy dtype of the record into which `pack_numbers` packs a rig's numbers.
-
-    `lengths`: for each law in `LAWS`, the length of its tuple in `RigNumbers` (0: the rig does not have this law).
-    """
+    """Build the NumPy dtype of the record of `pack_numbers` from the length of each law's tuple in `RigNumbers`."""
     numbers = [(name, "f8") for name in NUMBERS]
     truth_values = [(name, "?") for name in CHOICES if name not in LAWS]
     laws = [(name, "f8", (length,)) for name, length in zip(LAWS, lengths, strict=True)]
@@ -244,10 +199,7 @@ def _record_type(lengths: tuple[int, ...]) -> np.dtype[Any]:
 
 
 def pack_numbers(p: RigNumbers) -> Any:
-    """Pack a rig's numbers into one record, which compiled functions pass by its address instead of 100 values.
-
-    If the rig has a load over position or velocity, whose tables do not fit into a record, `p` is returned unchanged.
-    """
+    """Pack a rig's numbers, unless tables of a load are among them, into one record, to pass it by its address."""
     if len(p.pushed) > 1:
         return p
     lengths = tuple(len(getattr(p, name)) for name in LAWS)
@@ -261,9 +213,7 @@ def limit_state(y: State, p: RigNumbers) -> State:
     - The current is limited to +-i_max, the spool's position to its stroke, and its speed to +-v_max.
     - Pressures that are no states of the rig are set: without lines p_1 = p_A and p_2 = p_B; with a servo valve p_2 is
       the return's pressure.
-    - Other states that no law of the rig changes are set to 0, so that the compiler removes them.
-
-    Returns the new state. In `p`, an optional law such as `valved` is an empty tuple if the rig does not have it.
+    - Other states that no law changes are set to 0, so that the compiler removes them. In `p`, an absent law is ().
     """
     V_up = y[MADE_UP] if len(p.open_circuit) > 0 else 0.0
     bristle = y[BRISTLE] if len(p.bristled) > 0 else 0.0
@@ -284,7 +234,7 @@ def vapour_floor(q: float, p: RigNumbers) -> float:
 
     Below the vapour pressure `p_vap` [Pa absolute] the oil boils. The state q may fall further, so that mass balances
     hold: rho(q) V is the mass of oil in the volume V, with the density rho(q) that follows from the oil's bulk modulus.
-    Of the volume V, V (1 - rho(q)/rho(p_vap)) is vapour.
+    Of V, V (1 - rho(q)/rho(p_vap)) is vapour.
 
     Source: E. B. Wylie, V. L. Streeter, Fluid Transients, 1978, chapter 8: vapour cavities at constant pressure.
     """
@@ -301,11 +251,7 @@ def pressures_of(y: State, p: RigNumbers) -> Pressures:
 
 @contracted
 def speed_error(y: State, u: float, p: RigNumbers) -> float:
-    """Compute the motor's speed error [rad/s] in the state `y`: set speed minus actual speed.
-
-    The command `u` [V] sets the speed omega_per_volt u. In a valve-controlled rig, where the motor drives the pump of
-    the supply, the set speed is `omega_P`.
-    """
+    """Compute the motor's set speed (by the command `u` [V], or `omega_P` of a supply) minus its speed [rad/s]."""
     if len(p.valved) > 0:  # an empty tuple in a rig without a servo valve
         return p.omega_P - y[OMEGA]  # type: ignore[no-any-return]
     return p.omega_per_volt * u - y[OMEGA]  # type: ignore[no-any-return]
@@ -313,10 +259,7 @@ def speed_error(y: State, u: float, p: RigNumbers) -> float:
 
 @contracted
 def pump_difference(y: State, p: RigNumbers) -> float:
-    """Compute the pressure difference across the pump [Pa] in the state `y`, port 1 minus port 2.
-
-    In a rig with neither lines nor servo valve, the ports are connected to the chambers A and B directly.
-    """
+    """Compute the pressure difference across the pump [Pa] in the state `y`, port 1 minus port 2."""
     p_A, p_B, p_1, p_2 = pressures_of(y, p)
     if len(p.throttled) > 0 or len(p.valved) > 0:  # empty tuples in a rig without lines and servo valve
         return p_1 - p_2
@@ -325,12 +268,11 @@ def pump_difference(y: State, p: RigNumbers) -> float:
 
 @contracted
 def friction_force(y: State, applied: float, p: RigNumbers) -> tuple[float, float]:
-    """Compute the friction force [N] on the piston, and the rate [m/s] at which LuGre's bristles deflect.
+    """Compute the friction force [N] on the piston, and the rate [m/s] at which LuGre's bristles deflect, or 0.
 
-    The force is that of eqs. (4.20)-(4.22), unless the rig has Karnopp's or LuGre's law instead. The rate is 0 in a rig
-    without LuGre's law. The friction of a motion along -x is multiplied by the rig's parameter `backward`. `y`: state;
-    `applied` [N]: sum of all other forces on the piston. In `p`, an optional law such as `sticking` (Karnopp's) is an
-    empty tuple if the rig does not have it.
+    The force is that of eqs. (4.20)-(4.22), unless the rig has Karnopp's or LuGre's law. The friction of a motion along
+    -x is multiplied by the rig's parameter `backward`. `applied` [N]: sum of all other forces on the piston. In `p`, an
+    optional law, such as `sticking` (Karnopp's), is an empty tuple if absent.
     """
     v = y[VELOCITY]
     F_C = friction.coulomb_friction(
@@ -351,11 +293,7 @@ def friction_force(y: State, applied: float, p: RigNumbers) -> tuple[float, floa
 
 @contracted
 def filter_resistances(y: State, p: RigNumbers) -> tuple[float, float]:
-    """Compute the resistances [Pa s/m^3] of the filters in lines A and B.
-
-    The resistance of a clogging filter grows with the oil volume that has passed it (`clogged_resistance`). The state
-    `y` contains this volume.
-    """
+    """Compute the resistances [Pa s/m^3] of the filters in lines A and B, which the oil that passes may clog."""
     if len(p.clogging) == 0:  # an empty tuple: the rig's filters do not clog
         return p.R_A, p.R_B
     R_A = restrictors.clogged_resistance(p.R_A, y[PASSED_A], p.k_clog_A, p.n_clog)
@@ -370,9 +308,9 @@ def implicit_flows(
 
     Q_A flows from line 1 to chamber A, Q_B from chamber B to line 2. On each side the throttle's pressure drop d [Pa]
     at the end of the stage solves d + g Q(d) = total (`implicit_orifice_flow`). `total_A`, `total_B` [Pa]: the drops if
-    nothing flowed in the stage; `g_A`, `g_B` [Pa s/m^3]: their fall over the stage per unit flow. A filter in series
-    with the throttle has the additional drop R Q, so that its resistance R is added to g. With a bypass valve of the
-    filter, `filtered_flow` solves the equation. `y`: state, from which the resistances follow (`filter_resistances`).
+    nothing flowed in the stage; `g_A`, `g_B` [Pa s/m^3]: their fall over the stage per unit flow. The resistance R of a
+    filter in series with the throttle, which follows from the state `y`, is added to g. With a bypass valve of the
+    filter, `filtered_flow` solves the equation.
     """
     if len(p.filtered) > 0:  # an empty tuple in a rig without filters
         R_A, R_B = filter_resistances(y, p)
@@ -402,8 +340,7 @@ def filter_flows(y: State, p: RigNumbers) -> tuple[float, float]:
 def throttle_flows(y: State, p: RigNumbers) -> tuple[float, float]:
     """Compute the flows [m^3/s] through the throttles: Q_A from line 1 to chamber A, Q_B from chamber B to line 2.
 
-    Eqs. (4.9)-(4.12). A filter in series with a throttle has the pressure drop R Q (Darcy's law), until its bypass
-    valve, if any, opens (`filtered_flow`).
+    Eqs. (4.9)-(4.12). A filter in series has the pressure drop R Q (Darcy's law), until its bypass valve opens.
     """
     p_A, p_B, p_1, p_2 = pressures_of(y, p)
     dp_A, dp_B = p_1 - p_A, p_B - p_2
@@ -432,8 +369,8 @@ def bulk_modulus(pressure: float, p: RigNumbers) -> float:
 def density_ratio(pressure: float, reference: float, p: RigNumbers) -> float:
     """Compute the ratio of the oil's densities at two pressure states, `pressure` and `reference` [Pa gauge].
 
-    A pressure state may fall below the vapour pressure, where the oil boils, so that mass is conserved
-    (`vapour_floor`). There, the density falls with the bulk modulus that holds at the vapour pressure.
+    A pressure state may fall below the vapour pressure (`vapour_floor`). There, the density falls with the bulk modulus
+    that holds at the vapour pressure.
     """
     if len(p.aerated) == 0:  # an empty tuple, no air in the oil: one bulk modulus, whether the oil boils or not
         return oil_density_ratio(pressure - reference, p.K_oil)
@@ -463,11 +400,7 @@ def flows_at_both_ends(Q: float, source: float, sink: float, p: RigNumbers) -> t
 
 @contracted
 def throttle_rates(y: State, Q_A: float, Q_B: float, p: RigNumbers) -> Pressures:
-    """Compute the pressure rates dp_A/dt, dp_B/dt, dp_1/dt, dp_2/dt [Pa/s] that the throttles' flows cause.
-
-    `Q_A` [m^3/s] flows from line 1 to chamber A, `Q_B` from chamber B to line 2 (`throttle_flows`). Eqs.
-    (4.16)-(4.19).
-    """
+    """Compute the rates of p_A, p_B, p_1, p_2 [Pa/s] by the throttles' flows `Q_A`, `Q_B`, eqs. (4.16)-(4.19)."""
     V_A, V_B = volumes_at(y[POSITION], p)
     from_1, to_A = flows_at_both_ends(Q_A, y[P_1], y[P_A], p)
     from_B, to_2 = flows_at_both_ends(Q_B, y[P_B], y[P_2], p)
@@ -481,10 +414,7 @@ def throttle_rates(y: State, Q_A: float, Q_B: float, p: RigNumbers) -> Pressures
 
 @contracted
 def makeup_pressure(y: State, p: RigNumbers) -> float:
-    """Compute the pressure [Pa gauge] of the make-up's accumulator, which replaces oil that the circuit has lost.
-
-    The state `y` contains the oil volume V_up that the accumulator has delivered.
-    """
+    """Compute the pressure [Pa gauge] of the make-up's accumulator after delivering the oil V_up in the state `y`."""
     if len(p.polytropic) > 0:  # an empty tuple if the gas is isothermal
         return external.polytropic_pressure(y[MADE_UP], p.p_charge, p.V_gas, p.n_gas)
     return external.accumulator_pressure(y[MADE_UP], p.p_charge, p.V_gas)
@@ -492,11 +422,10 @@ def makeup_pressure(y: State, p: RigNumbers) -> float:
 
 @contracted
 def make_up_flows(y: State, p: RigNumbers) -> tuple[float, float]:
-    """Compute the flows [m^3/s] from the make-up's accumulator to sides 1 (A) and 2 (B), through its valves.
+    """Compute the flows [m^3/s] from the make-up's accumulator to sides 1 (A) and 2 (B), 0 without a make-up.
 
-    The valves are check valves and, for the opposite direction, relief valves. Sides 1 and 2 are the pump's ports,
-    or the chambers A and B in a rig without lines. If the check valves are pilot-operated, the pilot pressure of each
-    is the pressure on the opposite side. Without a make-up the flows are 0.
+    They pass check valves and, in the opposite direction, relief valves. Sides 1 and 2 are the pump's ports, or the
+    chambers A and B in a rig without lines. The pilot pressure of a pilot-operated valve is that of the opposite side.
     """
     p_up = makeup_pressure(y, p)
     p_A, p_B, p_1, p_2 = pressures_of(y, p)
@@ -517,10 +446,7 @@ def make_up_flows(y: State, p: RigNumbers) -> tuple[float, float]:
 
 @contracted
 def external_pressure_rates(y: State, p: RigNumbers) -> tuple[Pressures, float]:
-    """Compute the pressure rates (dp_A/dt, dp_B/dt, dp_1/dt, dp_2/dt) [Pa/s] due to external leakage and make-up.
-
-    Also returns the volume flow [m^3/s] out of the make-up's accumulator, at the accumulator's pressure.
-    """
+    """Compute the rates of p_A, p_B, p_1, p_2 [Pa/s] by external leakage and make-up, and its outflow [m^3/s]."""
     V_A, V_B = volumes_at(y[POSITION], p)
     K_A, K_B = bulk_modulus(y[P_A], p), bulk_modulus(y[P_B], p)
     makeup_1, makeup_2 = make_up_flows(y, p)
@@ -545,8 +471,7 @@ def external_pressure_rates(y: State, p: RigNumbers) -> tuple[Pressures, float]:
 def valve_flows(y: State, p: RigNumbers) -> tuple[float, float, float, float]:
     """Compute a servo valve's flows [m^3/s] through its edges: from P to A, from A to T, from P to B, and from B to T.
 
-    P is the supply and T the return; A and B are the chambers. A spool position x_s > 0 opens the edges P-A and B-T,
-    x_s < 0 opens A-T and P-B.
+    P is the supply and T the return. A spool position x_s > 0 opens the edges P-A and B-T, x_s < 0 opens A-T and P-B.
     """
     x_s, Q_N, dp_N, x_max, dp_lam = y[SPOOL], p.Q_N, p.dp_N, p.x_max, p.dp_lam
     p_A, p_B, p_P, p_T = pressures_of(y, p)
@@ -572,11 +497,7 @@ def supply_compliance(p_1: float, p: RigNumbers) -> float:
 
 @contracted
 def valve_rates(y: State, Q_1: float, p: RigNumbers) -> Pressures:
-    """Compute the pressure rates dp_A/dt, dp_B/dt, dp_1/dt, dp_2/dt [Pa/s] that a servo valve and its supply cause.
-
-    `y`: state; `Q_1` [m^3/s]: flow of the pump into the supply, whose pressure is p_1. The return's pressure p_2 is
-    constant.
-    """
+    """Compute the rates of p_A, p_B, p_1, p_2 [Pa/s] by a servo valve and the pump's flow `Q_1` into its supply."""
     p_A, p_B, p_P, p_T = y[P_A], y[P_B], y[P_1], y[P_2]
     Q_PA, Q_AT, Q_PB, Q_BT = valve_flows(y, p)
     V_A, V_B = volumes_at(y[POSITION], p)
@@ -599,10 +520,9 @@ def valve_rates(y: State, Q_1: float, p: RigNumbers) -> Pressures:
 def rates_without_throttles(y: State, u: float, G: float, C: float, F: float, p: RigNumbers) -> State:
     """Compute the state's rates dy/dt from all physical laws but the throttles' flows.
 
-    `y`: state in the order of `STATES`; `u`: command [V]; `G` [m^3/(s Pa)] and `C` [m^3/(s Pa^0.5)]: conductance and
-    flow coefficient of the leakage past the piston, through a laminar gap and an orifice (`piston_leakage`); `F`: load
-    [N] in addition to the rig's own; `p`: the rig's numbers, in which an optional law, such as `damped`, is an empty
-    tuple if the rig does not have it.
+    `y`: state in the order of `STATES`; `u` [V]: command; `G` [m^3/(s Pa)] and `C` [m^3/(s Pa^0.5)]: conductance and
+    flow coefficient of the leakage past the piston (`piston_leakage`); `F` [N]: load in addition to the rig's own; `p`:
+    the rig's numbers, in which an optional law, such as `damped`, is an empty tuple if the rig does not have it.
     """
     p_A, p_B, x, v = vapour_floor(y[P_A], p), vapour_floor(y[P_B], p), y[POSITION], y[VELOCITY]
     if len(p.sticking) > 0:
@@ -667,8 +587,9 @@ def rates_without_throttles(y: State, u: float, G: float, C: float, F: float, p:
 def rates(y: State, u: float, G: float, C: float, F: float, p: RigNumbers) -> State:
     """Compute the rates dy/dt of all states of the rig from its physical laws.
 
-    `y`: state in the order of `STATES`; `u` [V]: command; `G` [m^3/(s Pa)], `C` [m^3/(s Pa^0.5)]: leakage coefficients
-    of the piston (`piston_leakage`); `F` [N]: load in addition to the rig's own; `p`: the rig's numbers.
+    `y`: state in the order of `STATES`; `u` [V]: command; `G` [m^3/(s Pa)], `C` [m^3/(s Pa^0.5)]: conductance and flow
+    coefficient of the leakage past the piston, through a laminar gap and an orifice (`piston_leakage`); `F` [N]: load
+    in addition to the rig's own.
     """
     dy = rates_without_throttles(y, u, G, C, F, p)
     if len(p.throttled) > 0:  # an empty tuple in a rig without throttles
@@ -679,12 +600,10 @@ def rates(y: State, u: float, G: float, C: float, F: float, p: RigNumbers) -> St
 
 @contracted
 def observe(y: State, u: float, G: float, C: float, p: RigNumbers, row: np.ndarray) -> None:
-    """Write all outputs of the rig in one state to `row` (21,), in the order of `OUTPUTS`.
+    """Write all outputs of the rig in the state `y` to `row` (21,), in the order of `OUTPUTS`.
 
-    The outputs are the states with pressures not below the vapour pressure, the flows, and the motor's voltage. `y`:
-    the state; `u` [V]: command; `G` [m^3/(s Pa)], `C` [m^3/(s Pa^0.5)]: leakage coefficients of the piston
-    (`piston_leakage`); `p`: the rig's numbers, in which an optional law, such as `lossy`, is an empty tuple if the rig
-    does not have it.
+    They are the states with pressures not below the vapour pressure, the flows, and the motor's voltage. `u` [V]:
+    command; `G` [m^3/(s Pa)], `C` [m^3/(s Pa^0.5)]: leakage coefficients of the piston (`piston_leakage`).
     """
     n = len(y)
     for m in range(n):

@@ -24,10 +24,7 @@ BELOW_VACUUM, BEYOND_DRIVE = 2, 3
 
 @law
 def standstill_force(x: float, p: RigNumbers) -> float:
-    """Compute the force [N] that the chamber pressures must carry to hold the piston at rest at x [m].
-
-    It is the load against +x, including that of an opposing cylinder, minus the force of an end stop.
-    """
+    """Compute the load [N] on a piston at rest at x [m] that the pressures must carry, minus an end stop's force."""
     # at rest, v = 0, the flow coefficient of the opposing cylinder's orifice does not matter: it is set to 1
     load = load_force(x, p.F_l, p.k_load) + opposing_force(0.0, p.A_opp, p.p_opp, 1.0)
     return load - hard_stop_force(x, 0.0, p.L, p.k_stop, p.d_stop)  # type: ignore[no-any-return]
@@ -37,9 +34,9 @@ def standstill_force(x: float, p: RigNumbers) -> float:
 def pressures_at_standstill(force: float, p: RigNumbers) -> tuple[float, float]:
     """Compute the chamber pressures p_A, p_B [Pa] that hold the piston at rest: p_A A_A - p_B A_B = force.
 
-    `force` [N]: load against +x. With a make-up the lower pressure is the charge pressure. Without a make-up the
-    circuit contains as much oil as with the charge pressure everywhere: the mean of both pressures, weighted by the oil
-    volumes of the two sides, is the charge pressure.
+    `force` [N]: load against +x. With a make-up the lower pressure is the charge pressure. Without one the circuit
+    contains as much oil as with the charge pressure everywhere, so it is the mean of both pressures, weighted by the
+    oil volumes of the two sides.
     """
     if p.made_up:  # each pressure for the case that the other one is the charge pressure
         p_B = max((p.p_charge * p.A_A - force) / p.A_B, p.p_charge)
@@ -57,14 +54,11 @@ def pressures_at_standstill(force: float, p: RigNumbers) -> tuple[float, float]:
 
 @law
 def stand_still(y: Any, x: float, force: float, p: RigNumbers) -> int:
-    """Set the state `y` (14,) to standstill of a pump-controlled rig; return 0, or a code if this is impossible.
-
-    All elements of `y` are 0 before the call.
+    """Set the state `y` (14,), all 0, to standstill of a pump-controlled rig; return 0, or a code if impossible.
 
     `x` [m]: position; `force` [N]: load against +x. The motor holds the pump with the current i = T_load/C_m, eq.
-    (4.5). The integral of the speed controller that gives this current is R_c i/K_i, eq. (4.3), or 0 if K_i = 0.
-    The code is `BELOW_VACUUM` if a pressure would be below vacuum, `BEYOND_DRIVE` if the current or voltage is
-    beyond the drive's limits.
+    (4.5), for which the speed controller's integral is R_c i/K_i, eq. (4.3), or 0 if K_i = 0. The code is
+    `BELOW_VACUUM` if a pressure would be below vacuum, `BEYOND_DRIVE` if current or voltage are.
     """
     p_A, p_B = pressures_at_standstill(force, p)
     y[POSITION] = x
@@ -83,8 +77,8 @@ def pressures_behind_valve(force: float, A_A: float, A_B: float, p_1: float, p_2
 
     `force` [N]: load against +x; `A_A`, `A_B` [m^2]: piston areas; `p_1`, `p_2` [Pa]: pressures of supply and return.
     p_A + p_B = p_1 + p_2, because the edges to supply and return are equal and have equal pressure drops (Merritt,
-    Hydraulic Control Systems, 1967, section 5.2). The same sum is assumed for an overlapped valve, although it may trap
-    oil at other pressures.
+    Hydraulic Control Systems, 1967, section 5.2). The same sum is assumed for an overlapped valve, which may trap oil
+    at others.
     """
     p_A = (force + A_B * (p_1 + p_2)) / (A_A + A_B)
     return p_A, p_1 + p_2 - p_A
@@ -93,8 +87,7 @@ def pressures_behind_valve(force: float, A_A: float, A_B: float, p_1: float, p_2
 def supply_at_standstill(force: float, x: float, p: RigNumbers) -> tuple[float, float, float]:
     """Compute the supply pressure p_1 and chamber pressures p_A, p_B [Pa] of a rig at rest with a centred servo valve.
 
-    `force` [N]: load against +x; `x` [m]: position of the piston. At standstill dp_1/dt = 0. As dp_1/dt falls with
-    rising p_1, p_1 is found by bisection.
+    `force` [N]: load against +x; `x` [m]: position. dp_1/dt = 0, which falls with rising p_1, is solved by bisection.
     """
     y = np.zeros(len(STATES))
     y[POSITION], y[P_2] = x, p.p_return
@@ -119,10 +112,8 @@ def initial_state(rig: Rig, x_0: float, push: float = 0.0) -> np.ndarray:
     """Compute the state (14,) of a rig at rest with the piston at x_0 [m].
 
     The rig's load and `push` [N] act against +x. The pressures carry both (`pressures_at_standstill`), and the motor
-    holds the pump against the pressures (`stand_still`). Without load and with equal areas all pressures are the
-    charge pressure and all other states but the position are 0. In a rig with a servo valve the valve is centred and
-    the motor runs at the supply's speed (`supply_at_standstill`). A machine that leaks, or whose valve has an
-    underlap, creeps from this state.
+    holds the pump against the pressures (`stand_still`). In a rig with a servo valve the valve is centred and the motor
+    runs at the supply's speed (`supply_at_standstill`). A machine with a leak or an underlapped valve creeps.
 
     Raises InputError if a pressure is below vacuum (in a rig with a servo valve: not between those of return and
     supply), or if the drive cannot hold the load.
@@ -148,12 +139,10 @@ def initial_state(rig: Rig, x_0: float, push: float = 0.0) -> np.ndarray:
 
 
 def _fill_standstill_state(rig: Rig, y: np.ndarray, x: float, force: float, p: RigNumbers) -> np.ndarray:
-    """Fill the state `y` (14,) with the equilibrium of a rig whose servo valve is centred; return `y`.
+    """Fill the state `y` (14,), all zeros, with the equilibrium of a rig whose servo valve is centred; return `y`.
 
-    `y` must be all zeros before the call, since only some of its elements are set.
-
-    `x` [m]: position of the piston; `force` [N]: load against +x. Raises InputError if the pressures cannot carry the
-    force, or if the drive cannot hold the supply.
+    `x` [m]: position; `force` [N]: load against +x. Raises InputError if the pressures cannot carry the force, or if
+    the drive cannot hold the supply.
     """
     m = rig.motor
     p_1, p_A, p_B = supply_at_standstill(force, x, p)

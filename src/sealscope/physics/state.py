@@ -11,8 +11,7 @@ INTEGRAL, CURRENT, OMEGA, THETA, POSITION, VELOCITY, P_A, P_B, P_1, P_2, MADE_UP
     len(STATES)
 )
 
-#: Oil [m^3] that has passed the clogging filters in lines A and B. A rig with lines has no servo valve, so that these
-#: states take the indices of the spool's.
+#: Oil [m^3] that has passed the clogging filters in lines A and B. A rig with lines has no spool, whose place it takes.
 PASSED_A, PASSED_B = SPOOL, SPOOL_SPEED
 
 #: Outputs of a run at each output instant: the states and the quantities that follow from them.
@@ -52,9 +51,6 @@ def add_step(y: State, h: float, dy: State) -> State:
 
 @contracted
 def add_to_pressures(y: State, h: float, s: Pressures) -> State:
-    """Add h s to the elements p_A, p_B, p_1 and p_2 of a state, or of its rates, `y`; `s`: rates of the four pressures.
-
-    Returns all elements.
-    """
+    """Add h s to the pressures p_A, p_B, p_1, p_2 of a state, or of its rates, `y`; return all elements."""
     p_A, p_B, p_1, p_2 = y[P_A] + h * s[0], y[P_B] + h * s[1], y[P_1] + h * s[2], y[P_2] + h * s[3]
     return y[0], y[1], y[2], y[3], y[4], y[5], p_A, p_B, p_1, p_2, y[10], y[11], y[12], y[13]

@@ -54,9 +54,9 @@ class Effect:
 
     `field`: name of a parameter of the compiled model (`RigNumbers`), or dotted name of an instrument's parameter;
     `change(t)`: addend (if `additive`) or factor at times t [s]. Several effects on one parameter give (value + sum of
-    addends) x product of factors. The solver takes parameters as constant within blocks of time. `change` must not
-    change by more than `max_change` within a block, unless the block would be shorter than `min_block` [s].
-    `breakpoints`: times [s] at which `change` jumps or changes its slope.
+    addends) x product of factors. The solver takes parameters as constant within blocks of time, in which `change` must
+    not change by more than `max_change`, unless the block would be shorter than `min_block` [s]. `breakpoints`: times
+    [s] at which `change` jumps or changes its slope.
     """
 
     field: str
@@ -73,11 +73,7 @@ class Effect:
 
 
 def apply_effects(rig_value: T, effects: Sequence[Effect], field: str, t: Array) -> T | Array:
-    """Compute one parameter at times t [s] as (value in the rig + sum of addends) x product of factors.
-
-    `rig_value`: value of the parameter in the rig, without effects; `field`: name of the parameter; `effects`: changes
-    of any parameters over time, from which those of this parameter are applied. Without any, `rig_value` is returned.
-    """
+    """Compute the parameter `field` at times t [s]: (`rig_value` + sum of addends) x product of factors, if any."""
     value: T | Array = rig_value
     for effect in sorted(effects, key=lambda effect: not effect.additive):  # sums before products
         if effect.field == field:
@@ -86,11 +82,7 @@ def apply_effects(rig_value: T, effects: Sequence[Effect], field: str, t: Array)
 
 
 def changing_values(effects: Sequence[Effect], base: RigNumbers, t: Array) -> dict[str, Array]:
-    """Compute all model parameters that the effects change, at times t (n,) [s].
-
-    Returns a mapping from the name of a parameter to its values (n,). `base`: the model's parameters without
-    effects.
-    """
+    """Compute the parameters that the effects change from `base`, at times t (n,) [s], as values (n,) by name."""
     names = dict.fromkeys(effect.field for effect in effects)
     return {name: apply_effects(np.full(t.size, float(getattr(base, name))), effects, name, t) for name in names}
 
@@ -98,15 +90,12 @@ def changing_values(effects: Sequence[Effect], base: RigNumbers, t: Array) -> di
 def block_bounds(effects: Sequence[Effect], n_out: int, rate: float) -> np.ndarray:
     """Divide a run into blocks of time within which the solver takes all parameters as constant.
 
-    Returns the bounds of the blocks (blocks + 1,) as indices of outputs, from 0 to `n_out`. Outputs are the times at
-    which the solver writes its results, `n_out` of them at `rate` [Hz]; `effects`: changes of parameters within the
-    run.
+    Returns the bounds of the blocks (blocks + 1,) as indices, 0 to `n_out`, of the solver's outputs at `rate` [Hz].
 
     The first bounds are the breakpoints of effects, to within one output interval, and times `LONGEST_BLOCK` apart.
-    Then each block between these bounds is divided into equal parts. The number of parts is the largest that any effect
-    needs: the effect changes by at most its `max_change` from part to part, unless the parts would become shorter than
-    its `min_block`. A part may therefore be shorter than the `min_block` of a slower effect, and between close
-    breakpoints shorter than that of any effect.
+    Then each block is divided into equal parts, as many as any effect needs: it changes by at most its `max_change`
+    from part to part, unless the parts would become shorter than its `min_block`. A part may therefore be shorter than
+    the `min_block` of a slower effect, and between close breakpoints shorter than that of any effect.
     """
     if not effects:
         return np.array([0, n_out], dtype=np.int64)
@@ -130,10 +119,9 @@ def block_bounds(effects: Sequence[Effect], n_out: int, rate: float) -> np.ndarr
 def step_limiting_parameters(effects: Sequence[Effect], base: RigNumbers) -> tuple[RigNumbers, ...]:
     """Collect the sets of model parameters in a run that limit the length of the solver's step.
 
-    The parameters change during the run by `effects`. A step that is short enough for each of the returned sets is
-    short enough for the whole run. The first set is `base`, the parameters without effects. The others are the
-    parameters just before and just after each breakpoint of a fast effect, such as a valve that switches
-    (`min_block` below `SHORTEST_BLOCK`). Slow effects change the parameters too little to matter.
+    A step that is short enough for each of them is short enough for the whole run. The first is `base`, without
+    effects. The others are those just before and just after each breakpoint of a fast effect, such as a valve that
+    switches (`min_block` below `SHORTEST_BLOCK`). Slow effects change the parameters too little to matter.
     """
     fast_effects = [effect for effect in effects if effect.min_block < SHORTEST_BLOCK]
     times = np.array(sorted({t for effect in fast_effects for t in effect.breakpoints if math.isfinite(t)}))
@@ -146,19 +134,14 @@ def step_limiting_parameters(effects: Sequence[Effect], base: RigNumbers) -> tup
 
 
 class Schedule:
-    """The model's parameters over a run, block by block.
+    """The model's parameters over a run of `n_out` solver outputs at `rate` [Hz], block by block.
 
-    `bounds` (n + 1,): bounds of the n blocks as output indices; `numbers`: the parameters in each block. The blocks
-    are those of `block_bounds`, merged where neighbours have equal parameters. Within a block a parameter has the
-    value that it has at the block's middle.
+    `base`: the parameters without effects; `bounds` (n + 1,): bounds of the n blocks as output indices; `numbers`: the
+    parameters in each block. The blocks are those of `block_bounds`, merged where neighbours have equal parameters.
+    Within a block a parameter has the value of the block's middle.
     """
 
     def __init__(self, effects: Sequence[Effect], base: RigNumbers, n_out: int, rate: float) -> None:
-        """Divide a run into blocks of time, and compute the model's parameters in each of them.
-
-        The run has `n_out` outputs at `rate` [Hz], the times at which the solver writes its results. `effects`: changes
-        of parameters within the run; `base`: the parameters without these changes.
-        """
         self.bounds = block_bounds(effects, n_out, rate)
         self.numbers = [base]
         if not effects:
@@ -180,10 +163,7 @@ class Schedule:
         self.numbers = [numbers._replace(**dict(zip(values, row, strict=True))) for row in rows]
 
     def blocks_between(self, first: int, last: int) -> Iterator[tuple[int, int, RigNumbers]]:
-        """Yield the blocks of constant parameters within the outputs first <= k < last.
-
-        Each item is (start, stop, parameters): the outputs start <= k < stop have these model parameters.
-        """
+        """Yield (start, stop, parameters) for the outputs start <= k < stop of each block within first <= k < last."""
         block = int(np.searchsorted(self.bounds, first, side="right")) - 1  # the block that contains output `first`
         while first < last:
             stop = min(int(self.bounds[block + 1]), last)
@@ -208,17 +188,11 @@ class Readings:
     holds: tuple[Hold, ...] = ()
 
     def value(self, parameter: str, rig_value: float, t: Array) -> Array | float:
-        """Compute a parameter of an instrument at times t [s], with the changes within the run.
-
-        `parameter`: dotted name, such as "sensors.p_A.noise"; `rig_value`: value without changes.
-        """
+        """Compute a parameter, such as "sensors.p_A.noise", at times t [s] from its value in the rig."""
         return apply_effects(rig_value, self.effects, parameter, t)
 
     def hold_readings(self, channel: str, values: Array, t: Array) -> Array:
-        """Repeat the first reading of each time span in which a channel is stuck; return all readings of the channel.
-
-        `values` (n,): readings of the channel at times `t` (n,) [s] as if it were never stuck.
-        """
+        """Repeat the first of the readings `values` (n,) at times `t` (n,) [s] while the channel is stuck."""
         for hold in self.holds:
             samples = np.flatnonzero((t >= hold.start) & (t < hold.stop))
             if hold.channel == channel and samples.size:
@@ -243,9 +217,8 @@ class Shape(Protocol):
 class Wander:
     """A smooth random walk over `duration` T [s]: slope t / T + sum of w_k sin((k - 1/2) pi t / T), k = 1, 2, ...
 
-    `weights` are the w_k. If they are normal with standard deviations 1/(k - 1/2), this is the Karhunen-Loeve
-    expansion of the Wiener process (Loeve, Probability Theory, 1955, section 34.5), truncated: with six terms the
-    shortest period is T/2.75.
+    `weights` are the w_k. If they are normal with standard deviations 1/(k - 1/2), this is the Karhunen-Loeve expansion
+    of the Wiener process (Loeve, Probability Theory, 1955, section 34.5); of six terms, the shortest period is T/2.75.
     """
 
     weights: tuple[float, ...]
@@ -257,10 +230,7 @@ class Wander:
             raise InputError(f"a wander must have finite weights and last > 0 s, got {self}")
 
     def value_at(self, t: Array) -> Array:
-        """Compute the random walk at times t [s]: slope t/T + sum of w_k sin((k - 1/2) pi t/T); 0 before t = 0.
-
-        T is the `duration`, and w_1, w_2, ... are the `weights`.
-        """
+        """Compute the random walk at times t [s]; 0 before t = 0."""
         phase = np.pi / self.duration * np.maximum(t, 0.0)
         change = np.asarray(self.slope / np.pi * phase)  # slope t / T
         if self.weights:
@@ -273,7 +243,7 @@ class Wander:
         return change
 
     def breakpoints(self) -> tuple[float, ...]:
-        """Return the times [s] at which the random walk jumps or changes its slope: none, because it is smooth."""
+        """Return no times: the walk is smooth."""
         return ()
 
     def scale_to_range(self, size: float) -> Wander:
@@ -302,11 +272,7 @@ _ABSOLUTE_MAX_CHANGES = {"F_l": 0.2}
 
 
 def is_absolute_drift(parameter: str) -> bool:
-    """Return True for a parameter that drifts by an amount in its own unit, because its value may be 0.
-
-    These are the offset, gain and scale errors of instruments, and the load `F_l`; all other parameters drift
-    relatively.
-    """
+    """Return True for errors of instruments and the load `F_l`, which drift by an amount because they may be 0."""
     return parameter.rpartition(".")[2] in ("offset", "gain_error", "scale_error", *_ABSOLUTE_MAX_CHANGES)
 
 
@@ -314,13 +280,9 @@ def is_absolute_drift(parameter: str) -> bool:
 class ParameterDrift:
     """A parameter that drifts: value(t) = value (1 + shape(t)), or value + shape(t) in its SI unit if `absolute`.
 
-    Here value is the parameter's value in the rig. `parameter` is the bare or dotted name of
-
-    - a parameter of motor, pump, lines, cylinder, friction, oil or make-up;
-    - noise, hum, offset, gain or scale error of a sensor;
-    - or `friction`, for all friction forces together.
-
-    `absolute` must be True for offsets, gain and scale errors and the load `F_l`, else False. Raises InputError for a
+    Here value is the parameter's value in the rig. `parameter`: bare or dotted name of a parameter of motor, pump,
+    lines, cylinder, friction, oil or make-up, of noise, hum, offset, gain or scale error of a sensor, or `friction`,
+    for all friction forces together. `absolute` must be `is_absolute_drift(parameter)`. Raises InputError for a
     parameter that cannot drift.
     """
 
@@ -329,7 +291,6 @@ class ParameterDrift:
     absolute: bool = False
 
     def __post_init__(self) -> None:
-        """Replace a bare name of the parameter by the dotted name; raise InputError for an impossible drift."""
         if self.parameter not in PARAMETER_GROUPS:
             from sealscope.parameters import declared_names
             from sealscope.parameters.names import resolve_name
@@ -349,17 +310,12 @@ class ParameterDrift:
         return self.parameter.startswith("sensors.") and self.parameter.rpartition(".")[2] in _INSTRUMENT_SYMBOLS
 
     def check(self, t: Array) -> None:
-        """Check that a relative drift leaves its parameter above 0 at the times t [s]; raise InputError otherwise."""
+        """Raise InputError if a relative drift does not leave its parameter above 0 at the times t [s]."""
         if not self.absolute and (lowest := float(np.min(self.shape.value_at(t), initial=0.0))) <= -1.0:
             raise InputError(f"a relative drift must stay above -100 %, got {100 * lowest:.4g} % ({self.parameter})")
 
     def effects(self) -> tuple[Effect, ...]:
-        """Build the changes over time that the drift causes, one for each parameter of instrument or model.
-
-        A drift of an instrument changes that parameter of the instrument. A drift of the machine changes every
-        parameter of the compiled model that is proportional to a power of the drifting parameter
-        (`model_parameters_derived_from`).
-        """
+        """Build the changes that the drift causes: of an instrument's parameter, or of all that depend on a rig's."""
         breakpoints = self.shape.breakpoints()
 
         def build_effect(name: str, power: float) -> Effect:
@@ -380,8 +336,7 @@ class ParameterDrift:
 def model_parameters_derived_from(parameter: str) -> tuple[tuple[str, float], ...]:
     """List the model parameters that are proportional to a power of a rig parameter, as (name, exponent).
 
-    `parameter`: dotted name, or a group such as `friction`. Returns () if no model parameter is proportional to a power
-    of the parameter, or if the parameter cannot drift.
+    `parameter`: dotted name, or a group such as `friction`. Returns () if there are none, or if it cannot drift.
     """
     from sealscope.physics.rig import NUMBERS
 

@@ -19,11 +19,9 @@ _MAX_OUTPUTS_PER_SAMPLE = 64
 
 
 def outputs_per_sample(rate: float, controller_rate: float, min_outputs: int) -> int:
-    """Find the fewest solver outputs per recorded sample for which every controller sample falls on an output.
+    """Find the fewest solver outputs (>= `min_outputs`) per recorded sample that hit every controller sample.
 
-    An output is a time at which the solver writes its results. `rate`, `controller_rate` [Hz]: sampling rates of
-    recording and controller; `min_outputs`: lower limit of the result. Raises InputError if no number up to 64 suits
-    both rates.
+    `rate`, `controller_rate` [Hz] of the samples. Raises InputError if no number up to 64 suits both.
     """
     for outputs in range(min_outputs, _MAX_OUTPUTS_PER_SAMPLE + 1):
         spacing = rate * outputs / controller_rate  # outputs per controller sample: must be a whole number >= 1
@@ -36,19 +34,16 @@ def outputs_per_sample(rate: float, controller_rate: float, min_outputs: int) ->
 
 
 class Feedback:
-    """A controller in feedback with the rig over a run, which the solver calls through its `loop`.
+    """A controller in feedback with the rig over a run of `duration` [s], which the solver calls through its `loop`.
 
     The controller measures position and angle in whole counts of the rig's encoders, and pressures with the
-    transducers' noise. A controller in machine code (`compiled`) is called directly, one in Python through C.
+    transducers' noise. A controller in machine code (`compiled`) is called directly, one in Python through C. `rate`
+    [Hz] of the solver's outputs; `seed` of the noise.
     """
 
     def __init__(
         self, rig: Rig, target: Position, controller: Controller, *, duration: float, rate: float, seed: int
     ) -> None:
-        """Prepare a run of `duration` [s] on `rig` in which `controller` follows `target`.
-
-        `rate` [Hz]: rate at which the solver writes its outputs; `seed`: seed of the noise in the measured pressures.
-        """
         self._controller = controller
         self._spacing = round(rate / controller.rate)  # solver outputs per sample of the controller
         samples = round(duration * rate) // self._spacing + 1
@@ -87,11 +82,7 @@ class Feedback:
         )
 
     def raise_failure(self) -> None:
-        """Raise the exception that stopped the run at a sample of the controller.
-
-        If the controller is written in Python and raised an exception, this exception is raised again. Otherwise
-        SimulationFailed states that the voltage is not finite.
-        """
+        """Raise the exception of a controller in Python, else SimulationFailed: the voltage is not finite."""
         reraise_python_error(self._law)
         t = self._inputs[self.loop.counters[SAMPLED], 0]
         raise SimulationFailed(
@@ -103,10 +94,7 @@ class Feedback:
         return np.asarray(self.loop.volts[np.arange(outputs) // self._spacing])
 
     def compensated_flow(self, outputs: int) -> Array | None:
-        """Return the compensated leakage flow [m^3/s] at the first `outputs` solver outputs, (outputs,).
-
-        Returns None if the controller does not report this flow.
-        """
+        """Return the compensated leakage flow [m^3/s] at the first `outputs` solver outputs; None if unreported."""
         if not self.loop.counters[REPORTED]:
             return None
         return np.asarray(self.loop.compensated[np.arange(outputs) // self._spacing])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -73,11 +73,7 @@ class MultiSine:
 
 @dataclass(frozen=True)
 class Trapezoid:
-    """A periodic command between 0 and `level` [V].
-
-    It rises within `rise` [s] at the beginning of each `period` [s], and falls within the same time half a period
-    later.
-    """
+    """A periodic command that rises from 0 to `level` [V] within `rise` [s], and falls half a `period` [s] later."""
 
     level: float
     rise: float
@@ -102,10 +98,7 @@ class Trapezoid:
 
 @dataclass(frozen=True)
 class Alternating:
-    """A command of several sines in turn, repeated without end.
-
-    `parts`: (periods, sine) of each part, which lasts this whole number of the sine's periods and starts at zero.
-    """
+    """A command of several sines in turn, repeated without end; each part is a whole number of a sine's periods."""
 
     parts: tuple[tuple[int, Sine], ...]
 
@@ -133,8 +126,8 @@ class Alternating:
 class Polyline:
     """A signal over time that is linear between points, and constant before the first and after the last.
 
-    `t` (n,): times [s], which never decrease; `y` (n,): values at these times. Two points at one time are a jump.
-    `words`: text of the signal, such as "step 5 at 1 s". Two polylines are equal if their points and texts are.
+    `t` (n,): times [s], which never decrease; `y` (n,): values. Two points at one time are a jump. `words`: text of the
+    signal, such as "step 5 at 1 s". Two polylines are equal if their points and texts are.
     """
 
     t: Array
@@ -150,17 +143,11 @@ class Polyline:
         return self.value_at(t)
 
     def breakpoints(self) -> tuple[float, ...]:
-        """Return the times [s] at which the slope changes or the value jumps; () for 1000 points or more.
-
-        The solver divides a run at these times, and too many of them would slow it.
-        """
+        """Return the times [s] at which slope or value jump, to divide a run; () for 1000 points or more."""
         return tuple(map(float, np.unique(self.t))) if self.t.size < _MAX_BREAKPOINTS else ()
 
     def onset(self) -> float:
-        """Find the time [s] at which the signal begins to rise above 0: the last point before the first positive value.
-
-        It is 0 if the first value is positive, and infinity if no value is positive.
-        """
+        """Find the time [s] of the last point before the first positive value, 0 if none; inf if never positive."""
         if not np.any(self.y > 0):
             return math.inf
         first_positive = int(np.argmax(self.y > 0))
@@ -194,11 +181,7 @@ def polyline(points: Sequence[tuple[float, float]], words: str) -> Polyline:
 
 
 def polyline_from_table(t: Array, y: Array, what: str = "a table") -> Polyline:
-    """Make the polyline through the points of a table: times `t` (n,) [s] and values `y` (n,).
-
-    `what`: name of the table in error messages. Raises InputError if the times fall, a number is not finite, or the
-    sizes differ.
-    """
+    """Make the polyline through the points `t` [s], `y` of a table (`what` in messages); InputError if unsuitable."""
     if t.ndim != 1 or t.shape != y.shape or t.size < 1 or np.any(np.diff(t) < 0):
         raise InputError(f"{what} must have one value for each time, and its times must rise")
     if not (np.all(np.isfinite(t)) and np.all(np.isfinite(y))):
@@ -254,8 +237,7 @@ GOLDEN, MIX, LAST_SHIFT = 0x9E3779B97F4A7C15, ((30, 0xBF58476D1CE4E5B9), (27, 0x
 class PseudoRandom:
     """A pseudo-random binary command: +amplitude or -amplitude [V], drawn anew every `hold` [s] from `seed`.
 
-    The sign in the k-th interval is a bit of the generator SplitMix64 (Steele, Lea, Flood, OOPSLA 2014) at its k-th
-    state. This state is computed directly, without the earlier ones.
+    The sign in interval k is a bit of the k-th state of SplitMix64 (Steele, Lea, Flood, OOPSLA 2014).
     """
 
     amplitude: float
@@ -284,8 +266,7 @@ class PseudoRandom:
 def sampled_signal(t: Array, u: Array, origin: str = "recorded") -> Polyline:
     """Make the polyline through the samples of a recorded signal, `u` (n,) at the times `t` (n,) [s].
 
-    `origin` names the signal in error messages and in the polyline's text. Raises InputError for fewer than two
-    samples or for two samples at one time.
+    `origin`: its name in messages and text. Raises InputError for fewer than two samples or two at one time.
     """
     if t.size < 2 or np.any(np.diff(t) == 0):
         raise InputError(f"a recorded signal must have two samples or more, one at a time, got {t.size} ({origin})")
@@ -293,10 +274,7 @@ def sampled_signal(t: Array, u: Array, origin: str = "recorded") -> Polyline:
 
 
 def recorded_command(recording: Recording, origin: str) -> Polyline:
-    """Make a command of the channel `u` [V] of a recording, shifted so that its first sample is at t = 0.
-
-    `origin` names the recording in error messages and in the command's text.
-    """
+    """Make a command of the channel `u` [V] of a recording, from t = 0 on; `origin`: its name in messages and text."""
     return sampled_signal(recording.t - recording.t[0], recording["u"], origin)
 
 
@@ -305,11 +283,7 @@ _CHECK_CHUNK = 1_000_000
 
 
 def check_command(command: Command, t: Array, limit: float) -> None:
-    """Check that a command is within +-`limit` [V] at the times `t` [s].
-
-    Raises InputError otherwise, with the first voltage beyond the limit and its time. A voltage that is NaN is
-    beyond the limit.
-    """
+    """Raise InputError unless a command is within +-`limit` [V], and not NaN, at the times `t` [s]."""
     for start in range(0, t.size, _CHECK_CHUNK):
         times = t[start : start + _CHECK_CHUNK]
         u = command.volts(times)
@@ -321,34 +295,20 @@ def check_command(command: Command, t: Array, limit: float) -> None:
             )
 
 
-#: Patterns in texts of commands, leaks and faults: a number without and with a sign, and a time ("90", "90 s",
-#: "1.5[min]").
+#: Patterns of a number without and with a sign, and of a time ("90", "90 s", "1.5[min]").
 UNSIGNED = r"(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?"
 NUMBER = rf"[-+]?{UNSIGNED}"
 TIME = rf"{UNSIGNED}\s*(?:\[\s*\w+\s*\]|(?:s|ms|min|h)\b)?"
 _N, _T = NUMBER, rf"[-+]?{TIME}"
 _SIGNED = rf"[-+]\s*{UNSIGNED}"
-#: Pattern of each form of a command but sines, and the function that makes the command from the pattern's groups.
-_FORMS: tuple[tuple[str, Callable[..., Command]], ...] = (
-    (
-        rf"trapezoid\s+({_N})\s*v?\s+within\s+({_T})\s+every\s+({_T})",
-        lambda level, rise, period: Trapezoid(_parse_number(level), parse_seconds(rise), parse_seconds(period)),
-    ),
-    (rf"step\s+({_N})\s*v?(?:\s+at\s+({_T}))?", lambda level, start: step(_parse_number(level), parse_seconds(start))),
-    (
-        rf"ramp\s+({_N})\s*v?\s+(?:from\s+({_T})\s+)?(?:to|over)\s+({_T})",
-        lambda level, start, stop: ramp(_parse_number(level), parse_seconds(start), parse_seconds(stop)),
-    ),
-    (
-        rf"chirp\s+({_N})\s*v?\s+from\s+({_N})\s*(?:hz)?\s+to\s+({_N})\s*(?:hz)?\s+over\s+({_T})",
-        lambda level, f_0, f_1, duration: Chirp(
-            _parse_number(level), _parse_number(f_0), _parse_number(f_1), parse_seconds(duration)
-        ),
-    ),
-    (
-        rf"prbs\s+({_N})\s*v?\s+every\s+({_T})(?:\s+seed\s+(\d+))?",
-        lambda level, hold, seed: PseudoRandom(_parse_number(level), parse_seconds(hold), int(seed or 0)),
-    ),
+#: Pattern of each form of a command but sines, the kinds of its groups (n: number, t: time, s: seed), and the function
+#: that makes the command from their values.
+_FORMS: tuple[tuple[str, str, Callable[..., Command]], ...] = (
+    (rf"trapezoid\s+({_N})\s*v?\s+within\s+({_T})\s+every\s+({_T})", "ntt", Trapezoid),
+    (rf"step\s+({_N})\s*v?(?:\s+at\s+({_T}))?", "nt", step),
+    (rf"ramp\s+({_N})\s*v?\s+(?:from\s+({_T})\s+)?(?:to|over)\s+({_T})", "ntt", ramp),
+    (rf"chirp\s+({_N})\s*v?\s+from\s+({_N})\s*(?:hz)?\s+to\s+({_N})\s*(?:hz)?\s+over\s+({_T})", "nnnt", Chirp),
+    (rf"prbs\s+({_N})\s*v?\s+every\s+({_T})(?:\s+seed\s+(\d+))?", "nts", PseudoRandom),
 )
 
 
@@ -358,10 +318,7 @@ def parse_seconds(text: str | None) -> float:
 
 
 def _parse_number(text: str | None, default: float = 0.0) -> float:
-    """Parse a number in the text of a command; return `default` for None.
-
-    Raises InputError if the number is not finite.
-    """
+    """Parse a number in the text of a command, None as `default`; raise InputError if it is not finite."""
     if text is None:
         return default
     value = float(text.replace(" ", ""))
@@ -370,14 +327,17 @@ def _parse_number(text: str | None, default: float = 0.0) -> float:
     return value
 
 
+#: Parsers of the groups in `_FORMS` by their kind.
+_PARSERS: Mapping[str, Callable[[str | None], float]] = {
+    "n": _parse_number,
+    "t": parse_seconds,
+    "s": lambda text: int(text or 0),
+}
 _MAX_CHARACTERS = 1000
 
 
 def normalize_blanks(text: str, what: str) -> str:
-    """Replace each run of blanks in an option's text by one blank, except in a path after ``file``.
-
-    Raises InputError for a text of more than 1000 characters; `what` names the option.
-    """
+    """Replace blanks in a text by single ones, but not in a path after ``file``; `what` names too long a text."""
     if len(text) > _MAX_CHARACTERS:
         raise InputError(f"{what} must be of at most {_MAX_CHARACTERS} characters, got {len(text)}")
     if file := re.fullmatch(r"(?:(position)\s+)?(file)\s+(.*)", text.strip(), re.IGNORECASE):
@@ -389,10 +349,7 @@ _SINES = re.compile(rf"\s*([-+])?\s*({_N})?\s*\*?\s*sin\(\s*({_N})?\s*\*?\s*t\s*
 
 
 def _parse_sines(text: str) -> Sine | MultiSine | None:
-    """Parse a sine such as "3 sin(4t)", or a sum of sines, with or without an offset at its end.
-
-    Returns None for any other text.
-    """
+    """Parse a sine such as "3 sin(4t)", or a sum of sines, with or without an offset; return None for other texts."""
     parts: list[Sine] = []
     end = 0
     # each sine but the first must have a sign, match[1]
@@ -409,10 +366,7 @@ def _parse_sines(text: str) -> Sine | MultiSine | None:
 
 
 def parse_command(text: str) -> Command:
-    """Parse the text of a command, such as "3 sin(4t)", "step 5 at 1 s" or "file LOG" (channel u of a recording).
-
-    Raises InputError, which lists all forms, if the text has another form.
-    """
+    """Parse a command such as "3 sin(4t)", "step 5 at 1 s" or "file LOG" (channel u); InputError lists all forms."""
     stripped = text.strip()
     if stripped.lower().startswith("file "):
         from sealscope.recordings import read
@@ -428,10 +382,9 @@ def parse_command(text: str) -> Command:
             return Alternating(tuple(parts))  # type: ignore[arg-type]
     if (sines := _parse_sines(stripped)) is not None:
         return sines
-    for pattern, make in _FORMS:
-        match = re.fullmatch(pattern, stripped, re.IGNORECASE)
-        if match:
-            return make(*match.groups())
+    for pattern, kinds, make in _FORMS:
+        if match := re.fullmatch(pattern, stripped, re.IGNORECASE):
+            return make(*(_PARSERS[kind](group) for kind, group in zip(kinds, match.groups(), strict=True)))
     raise InputError(
         "command must be like '3 sin(4t)', '3 sin(4t) + 1 sin(9t)', '6 periods of 5 sin(2t), 10 periods of 3 sin(4t)' "
         "(in turn, again and again), 'step 5 at 1 s', 'ramp 5 from 1 s to 3 s', 'trapezoid 3 within 1 s every 8 s', "

@@ -40,10 +40,9 @@ _Kind = TypeVar("_Kind", Leak, Fault)
 
 
 def choose_method(rig: Rig, method: Method) -> Literal["rk4", "imex"]:
-    """Choose the integration method of a rig: `method` as stated, or for `auto` the method that suits the rig.
+    """Choose the integration method of a rig: `method` as stated, or for `auto` imex with throttles, rk4 without.
 
-    The implicit-explicit method (imex) suits a rig with throttles, the explicit method (rk4) a rig without. Raises
-    InputError for imex without throttles, for imex with motor.integrator = euler, and for an unknown method.
+    Raises InputError for imex (implicit-explicit) without throttles or with motor.integrator = euler.
     """
     if method not in ("auto", "rk4", "imex"):
         raise InputError(f"method must be auto, rk4 or imex, got {method!r}")
@@ -59,10 +58,7 @@ def choose_method(rig: Rig, method: Method) -> Literal["rk4", "imex"]:
 
 
 def check_target(target: Position, t: Array, half_stroke: float) -> None:
-    """Check that a position target stays within the stroke, +-`half_stroke` [m], at the times `t` [s].
-
-    Raises InputError otherwise.
-    """
+    """Raise InputError unless a position target stays within +-`half_stroke` [m] at the times `t` [s]."""
     x = np.broadcast_to(target.value_at(t), t.shape)
     is_outside = ~(np.abs(x) <= half_stroke)
     if is_outside.any():
@@ -74,15 +70,13 @@ def check_target(target: Position, t: Array, half_stroke: float) -> None:
 
 
 def check_circuit(rig: Rig) -> None:
-    """Check that a single-rod cylinder in a closed circuit has pilot-operated check valves or a relief valve.
+    """Raise InputError for a single-rod cylinder in a closed circuit without pilot-operated check or relief valves.
 
-    The two chambers of such a cylinder take up unequal volumes of oil; the difference must leave and enter the circuit
-    through these valves. Raises InputError if there are none.
+    Only through these can the difference between the oil volumes of its chambers leave and enter the circuit.
     """
     cylinder, makeup = rig.cylinder, rig.makeup
-    if not rig.circuit.pump_feeds_chambers:
-        return
-    if cylinder.A_A != cylinder.A_B and not (makeup.check_valves == "pilot-operated" or makeup.G_relief > 0):
+    is_single_rod = rig.circuit.pump_feeds_chambers and cylinder.A_A != cylinder.A_B
+    if is_single_rod and makeup.check_valves != "pilot-operated" and not makeup.G_relief > 0:
         raise InputError(
             f"a single-rod cylinder (A_A = {1e6 * cylinder.A_A:g} mm^2, A_B = {1e6 * cylinder.A_B:g} mm^2) must "
             "have makeup.check_valves = pilot-operated or makeup.G_relief > 0, through which its rod displaces oil, "
@@ -133,7 +127,6 @@ class Experiment:
     controller: Controller | None = None
 
     def __post_init__(self) -> None:
-        """Raise InputError if a number is out of its range, or if the inputs do not fit together."""
         if not (math.isfinite(self.duration) and self.duration > 0):
             raise InputError(f"duration must be > 0 s and finite, got {self.duration}")
         samples = self.duration * self.rate
@@ -239,36 +232,27 @@ class Experiment:
 
     @property
     def voltage_command(self) -> Command:
-        """The voltage command of the run, including the changes of its amplitude and frequency by faults.
-
-        Raises InputError if the experiment has a position target instead.
-        """
+        """The voltage command with its changes by faults; InputError if there is a position target instead."""
         if isinstance(self.command, Position):
             raise InputError(f"what a controller sends is known after its run only, got {self.command}")
         return self._with_duty_changes(self.command)
 
     @property
     def target(self) -> Position | None:
-        """The position target of the run, including the changes of its amplitude and frequency by faults.
-
-        None if the experiment has a voltage command instead.
-        """
+        """The position target of the run, including the changes by faults; None for a voltage command."""
         if not isinstance(self.command, Position):
             return None
         return replace(self.command, signal=self._with_duty_changes(self.command.signal))
 
     def _with_duty_changes(self, command: Command) -> Command:
-        """Apply all faults that change a command's amplitude and frequency (`Fault.change_command`) to `command`."""
+        """Apply the faults that change a command's amplitude and frequency."""
         for fault in self.faults:
             command = fault.change_command(command)
         return command
 
     @property
     def active_controller(self) -> Controller | None:
-        """The controller that follows the position target, by default a PI controller for the rig.
-
-        None if the experiment has a voltage command.
-        """
+        """The controller that follows the position target, by default a PI controller; None for a voltage command."""
         if not isinstance(self.command, Position):
             return None
         from sealscope.control import PositionPI
@@ -285,10 +269,9 @@ class Experiment:
         return (*drift_effects, *(effect for fault in self.faults for effect in fault.effects(self.rig)))
 
     def scale_with_viscosity(self, leaks: tuple[Leak, ...]) -> tuple[Leak, ...]:
-        """Let laminar leaks grow as a fault warms the oil: divide their openings by the oil's viscosity over time.
+        """Divide the openings of laminar leaks by the oil's relative viscosity over time, if a fault warms the oil.
 
-        The viscosity is relative to the viscosity at the rig's oil temperature, for which the leaks' coefficients hold.
-        Returns all leaks; without a fault of the oil's temperature they are unchanged.
+        It is 1 at the rig's oil temperature, for which the leaks' coefficients hold.
         """
         for fault in self.faults:
             if (viscosity := fault.viscosity_ratio(self.rig)) is not None:
@@ -304,10 +287,7 @@ class Experiment:
         return any(fault.viscosity_ratio(self.rig) is not None for fault in self.faults)
 
     def readings(self) -> Readings:
-        """Collect all changes of the instruments within the run by drifts and faults.
-
-        These are the changes of sensors' parameters, and the time spans in which a sensor is stuck.
-        """
+        """Collect the changes of instruments within the run, and the spans in which a sensor is stuck."""
         effects = tuple(effect for effect in self._all_effects() if effect.changes_instrument)
         return Readings(effects, tuple(hold for fault in self.faults for hold in fault.holds()))
 
@@ -332,10 +312,7 @@ class Experiment:
         return max(0.0, min(onsets)) if onsets else None
 
     def describe(self) -> dict[str, Any]:
-        """Describe the experiment by plain values, which the recording keeps in its provenance.
-
-        Leaks, faults and drifts are left out, because a diagnosis must find them by itself.
-        """
+        """Describe the experiment for the provenance, without leaks, faults and drifts: a diagnosis must find them."""
         overrides = [row for row in self.rig.table() if row.source.startswith("set by")]
         return {
             "rig": self.rig.name,
@@ -364,9 +341,7 @@ class Experiment:
 def identity_values(value: Any) -> Any:
     """Convert a command, leak or other object to plain values that are equal only for equal objects.
 
-    - An array becomes a hash of its bytes.
-    - A dataclass becomes a list of its name and its fields' values, converted in the same way.
-    - Any other object becomes its `repr`.
+    An array becomes a hash of its bytes, a dataclass a list of its name and converted fields, any other its `repr`.
     """
     if isinstance(value, np.ndarray):
         return hashlib.sha256(np.ascontiguousarray(value, dtype=np.float64).tobytes()).hexdigest()
@@ -380,9 +355,8 @@ def _parse_several(
 ) -> tuple[_Kind, ...]:
     """Parse an argument that states one or several leaks or faults.
 
-    `argument`: a text, an object of the class `kind`, or an iterable of these; None gives an empty tuple. `parse`:
-    function that parses one text, and returns None for a text such as ``none``, which is left out; `name`: name of the
-    argument in messages. Raises InputError for any other argument.
+    `argument`: a text, an object of the class `kind`, an iterable of these, or None. `parse` returns None for a text
+    such as ``none``, which is left out; `name` of the argument, for the InputError if it is anything else.
     """
     if argument is None:
         return ()

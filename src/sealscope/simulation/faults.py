@@ -41,8 +41,7 @@ GAIN_PARAMETERS = {**dict.fromkeys(PRESSURES, "gain_error"), "x": "scale_error",
 #: Shortest block [s] for a moving valve: as short as one output of the solver.
 _VALVE_BLOCK = 0.0
 _SPAN = rf"(?:\s+from\s+(?P<since>{TIME})(?:\s+to\s+(?P<until>{TIME}))?)?"
-#: Times of a fault in its text: `from 60 s` or `growing from ..`; `from 60 s to 90 s` for a stuck sensor; with `within
-#: 0.5 s` for an operated valve.
+#: Times of a fault in its text: `from 60 s`, `growing from ..`, `from 60 s to 90 s`, and with `within 0.5 s`.
 _WHEN = {"grows": WHEN, "lasts": _SPAN, "operated": rf"{_SPAN}(?:\s+within\s+(?P<ramp>{TIME}))?"}
 #: Patterns that are inserted for the names in braces in `faults.toml`.
 _PATTERNS = {
@@ -57,16 +56,13 @@ _PATTERNS = {
 
 
 def _parse_number(text: str | None) -> float:
-    """Convert a text such as "3", "-1.5" or "+ 20" to a number; return 0 for None."""
+    """Convert a text such as "3", "-1.5" or "+ 20" to a number; None to 0."""
     return float((text or "0").replace(" ", ""))
 
 
 @dataclass(frozen=True)
 class FaultRow:
-    """An entry of `faults.toml`, which describes a kind of fault: the pattern of its text, and its effects.
-
-    The comment at the head of `faults.toml` explains the fields.
-    """
+    """A kind of fault: an entry of `faults.toml`, whose head explains the fields."""
 
     name: str
     kind: str
@@ -109,11 +105,9 @@ class FaultRow:
         )
 
     def _parse_value(self, groups: Groups) -> float:
-        """Read the size of a fault from the named groups of its matched text.
+        """Read the size of a fault from the named groups of its matched text, in SI units.
 
-        A number with a unit is converted to SI units. "x3" gives the factor 3, "+20 %" the factor 1.2, and "1 %" of a
-        gain or of air the fraction 0.01. Without a number the result is 1 for a kind of fault that is stated by a
-        factor, else 0.
+        "x3" gives the factor 3, "+20 %" 1.2, "1 %" of a gain or of air 0.01, no number 1 for a factor, else 0.
         """
         if groups.get("size") is not None:
             unit = CHANNEL_UNITS.get(groups["at"] or "", "Pa") if self.is_sensor_fault else self.unit
@@ -130,9 +124,8 @@ class Fault:
     """A fault of machine, sensor or duty (the commanded motion) other than a leak across the piston.
 
     `name`: its key in `FAULTS`; `value`: a factor on the faulty parameter, or an addend in SI units; `at`: side (A or
-    B) or channel that is faulty, "" for faults with neither; `opening`: extent of the fault over time, 0 (healthy) to 1
-    (full size); `frequency_factor`: factor on the frequency of the command. `str` gives the text that `parse_fault`
-    reads.
+    B) or channel that is faulty, "" for neither; `opening`: extent of the fault over time, 0 (healthy) to 1 (full
+    size); `frequency_factor`: factor on the frequency of the command. `str` gives the text that `parse_fault` reads.
     """
 
     name: str
@@ -142,7 +135,6 @@ class Fault:
     frequency_factor: float = 1.0
 
     def __post_init__(self) -> None:
-        """Raise InputError if side, channel, value, frequency factor or opening break a rule of this kind of fault."""
         row = self.row
         if row.is_sensor_fault and self.at not in GAIN_PARAMETERS:
             raise InputError(f"a faulty sensor must be one of {', '.join(GAIN_PARAMETERS)}, got {self.at!r}")
@@ -173,9 +165,8 @@ class Fault:
     def effects(self, rig: Rig) -> tuple[Effect, ...]:
         """Build the changes of the machine's or a sensor's parameters over time that the fault causes.
 
-        The fault multiplies each of `row.parameters` or adds to it, in proportion to its opening; without parameters,
-        as for the duty, the result is (). Shut-off valves and the oil's temperature have functions of their own
-        (`_EFFECTS`). Raises InputError if this rig cannot have the fault: a part is absent, or a needed parameter is 0.
+        The fault multiplies each of `row.parameters` or adds to it, in proportion to its opening, or has a function in
+        `_EFFECTS`. Raises InputError if this rig cannot have it: a part is absent, or a needed parameter is 0.
         """
         row = self.row
         if row.needs is not None:
@@ -203,11 +194,7 @@ class Fault:
         )
 
     def _addend(self, rig: Rig) -> float:
-        """Compute the number that the fault at full size adds to its parameters.
-
-        It is the value of the rig's parameter that `row.adds` names. Without `row.adds`, it is the fault's value,
-        divided by the rig's parameter that `row.over` names, if any.
-        """
+        """Compute what the fault at full size adds: the rig's `row.adds`, or its value (over the rig's `row.over`)."""
         if self.row.adds:
             return float(rig[self.row.adds])
         return self.value / float(rig[self.row.over]) if self.row.over else self.value
@@ -221,18 +208,11 @@ class Fault:
         return (Hold(self.at, self.onset(), stop),)
 
     def change_command(self, command: Command) -> Command:
-        """Apply the fault to a command, and return the result.
-
-        A fault of the duty (the commanded motion) changes the command's amplitude and frequency over time. For any
-        other fault the command is returned unchanged.
-        """
+        """Apply a fault of the duty to a command's amplitude and frequency; return it unchanged for any other fault."""
         return ChangedDuty(command, self) if self.name == "duty" else command
 
     def viscosity_ratio(self, rig: Rig) -> Callable[[Array], Array] | None:
-        """Build a function of times [s] that computes the oil's dynamic viscosity over that at the rig's temperature.
-
-        Returns None unless this is a fault of the oil's temperature.
-        """
+        """Build the function of times [s] for the oil's relative dynamic viscosity, None if it is constant."""
         if self.name != "oil":
             return None
         from sealscope.physics.fluid import kinematic_viscosity, thermal_density_ratio
@@ -241,10 +221,7 @@ class Fault:
         rig_nu = float(kinematic_viscosity(np.asarray(oil.T_oil), oil.nu_40, oil.nu_100))
 
         def dynamic_viscosity_ratio(t: Array) -> Array:
-            """Compute the oil's dynamic viscosity at times t [s] over that at the rig's oil temperature.
-
-            Dynamic viscosity is kinematic viscosity times density.
-            """
+            """Compute kinematic viscosity times density at times t [s], over those at the rig's temperature."""
             T = self._oil_temperature(rig, t)
             nu_ratio = kinematic_viscosity(T, oil.nu_40, oil.nu_100) / rig_nu
             return np.asarray(nu_ratio * thermal_density_ratio(T, oil.T_oil, oil.alpha))
@@ -256,7 +233,6 @@ class Fault:
         return np.asarray(rig.fluid.T_oil + self.value * self.opening.value_at(t))
 
     def __str__(self) -> str:
-        """Format the fault as the text that `parse_fault` reads."""
         template = self.row.words
         if self.name == "duty":
             changes_frequency = self.frequency_factor != 1.0
@@ -271,20 +247,13 @@ class Fault:
 
 @dataclass(frozen=True)
 class ChangedDuty:
-    """A command whose amplitude and frequency a fault changes, without a jump of its phase.
-
-    `before`: the original command; `change`: the fault.
-    """
+    """A command, `before`, whose amplitude and frequency a fault, `change`, changes without a jump of its phase."""
 
     before: Command
     change: Fault
 
     def original_time(self, t: Array) -> Array:
-        """Compute the times [s] at which to evaluate the original command, so that its frequency changes smoothly.
-
-        They are t + (frequency_factor - 1) times the integral of the fault's opening up to t. The opening is the extent
-        of the fault over time, 0 to 1.
-        """
+        """Compute t + (frequency_factor - 1) times the integral of the fault's opening, for a smooth frequency."""
         start, stop = self.change.opening.rise or (math.inf, math.inf)  # a fault of the duty always has a rise
         opening_integral = np.maximum(t - start, 0.0)  # for a jump of the opening at `start`
         if stop > start:
@@ -302,11 +271,7 @@ class ChangedDuty:
 
 
 def _shut_off_effects(fault: Fault, rig: Rig) -> tuple[Effect, ...]:
-    """Build the changes of the model's parameters by a shut-off valve that a fault opens or closes within a run.
-
-    The valve's line has one flow coefficient for each flow direction, and each effect changes one of them. Raises
-    InputError for a rig without throttles in its lines.
-    """
+    """Build the changes of a line's flow coefficients as its shut-off valve moves; InputError without throttles."""
     from sealscope.physics.restrictors import orifice_coefficient, series_coefficient
     from sealscope.physics.rig import throttle_coefficients
 
@@ -318,14 +283,11 @@ def _shut_off_effects(fault: Fault, rig: Rig) -> tuple[Effect, ...]:
     initial_opening = line.open_A if fault.at == "A" else line.open_B
 
     def build_effect(name: str, c_open: float) -> Effect:
-        """Build the effect on the throttle's flow coefficient `name`.
-
-        `c_open` [m^3/(s Pa^0.5)]: value of this coefficient with a fully open valve.
-        """
+        """Build the effect on the coefficient `name`, `c_open` [m^3/(s Pa^0.5)] with a fully open valve."""
         c_initial = c_open if initial_opening >= 1.0 else series_coefficient(c_open, c_line, initial_opening)
 
         def change(t: Array) -> Array:
-            """Compute the change of the coefficient [m^3/(s Pa^0.5)] at times t [s] as the valve opens or closes."""
+            """Compute the change of the coefficient [m^3/(s Pa^0.5)] at times t [s]."""
             opening = initial_opening + (fault.value - initial_opening) * fault.opening.value_at(t)
             return np.asarray(np.where(opening >= 1.0, c_open, series_coefficient(c_open, c_line, opening)) - c_initial)
 
@@ -339,23 +301,14 @@ def _shut_off_effects(fault: Fault, rig: Rig) -> tuple[Effect, ...]:
 
 
 def _oil_temperature_effects(fault: Fault, rig: Rig) -> tuple[Effect, ...]:
-    """Build the changes of the model's parameters over time that a fault of the oil's temperature causes.
-
-    - Viscous friction and filter resistances are proportional to the oil's viscosity.
-    - The conductances of the leaks of pump and rod seals are proportional to 1/viscosity.
-    - The bulk modulus depends on the temperature.
-    - Parameters that contain the oil's density are proportional to a power of it.
-    """
+    """Build the changes of the model's parameters over time that a fault of the oil's temperature causes."""
     from sealscope.physics.fluid import thermal_density_ratio, thermal_stiffness_ratio
 
     viscosity, T_0 = fault.viscosity_ratio(rig), rig.fluid.T_oil
     assert viscosity is not None
 
     def density_power(power: float) -> Callable[[Array], Array]:
-        """Build a function of times [s] that computes a power of the oil's relative density.
-
-        The density is relative to that at the rig's oil temperature, and raised to `power`.
-        """
+        """Build a function of times [s]: a power of the oil's density over that at the rig's oil temperature."""
         alpha = rig.fluid.alpha
         return lambda t: np.asarray(thermal_density_ratio(fault._oil_temperature(rig, t), T_0, alpha) ** power)
 
@@ -383,7 +336,7 @@ def parse_fault(text: str) -> Fault | None:
     """Parse the text of a fault, such as "pump leak x3 from 90 s"; return None for ``none``.
 
     The flow stated for a leaking rod seal is the one at the charge pressure. Operations of the rig, such as
-    `circulation`, are stated in the same way. Raises InputError, which lists the forms, if the text has another form.
+    `circulation`, are faults, too. Raises InputError, which lists the forms, for any other text.
     """
     stripped = normalize_blanks(text, "fault")
     if stripped.lower() in ("none", "no fault"):

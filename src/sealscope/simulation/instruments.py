@@ -32,12 +32,11 @@ class Outputs(Protocol):
 
 
 def anti_alias_taps(factor: int, delay: float = 0.0) -> Array:
-    """Compute the coefficients of the anti-alias filter, (2 FILTER_REACH factor + 1,).
+    """Compute the anti-alias filter's coefficients (2 FILTER_REACH factor + 1,), a Kaiser-windowed sinc of unit gain.
 
-    The filter is a Kaiser-windowed sinc of unit gain. The coefficients are not reversed when they are applied: the
-    first multiplies the earliest value, the middle one the value at the time of the output. `factor`: the signal's rate
-    over the recording's; `delay`: lag of the output behind the signal as a fraction of the signal's sampling interval,
-    0 for zero phase. For `factor` 1 without a delay there is a single coefficient, 1.
+    They are applied unreversed: the first multiplies the earliest value, the middle one the value at the time of the
+    output. `factor`: the signal's rate over the recording's; `delay`: lag of the output behind the signal as a fraction
+    of the signal's sampling interval. For `factor` 1 without a delay there is a single coefficient, 1.
     """
     if factor == 1 and delay == 0.0:
         return np.ones(1)
@@ -53,9 +52,8 @@ def anti_alias_taps(factor: int, delay: float = 0.0) -> Array:
 def decimate(values: Array, factor: int, n: int, delay: float = 0.0) -> Array:
     """Filter a signal against aliasing (`anti_alias_taps`), and return `n` samples of it, one in `factor` values.
 
-    `values` must continue for FILTER_REACH x `factor` values after the last returned one. Before their beginning the
-    signal is taken as constant. `delay` >= 0: lag of the samples behind the signal in intervals of `values`, not
-    necessarily whole.
+    `values` must continue for FILTER_REACH x `factor` values after the last sample, and count as constant before their
+    beginning. `delay` >= 0: lag of the samples behind the signal in intervals of `values`, not necessarily whole.
     """
     if factor == 1 and delay == 0.0:
         return np.array(values[:n])
@@ -72,8 +70,7 @@ def decimate(values: Array, factor: int, n: int, delay: float = 0.0) -> Array:
 def filter_first_order(values: Array, lag: float, rate: float) -> Array:
     """Compute the output y of a first-order transducer for a signal at `rate` [Hz]: lag dy/dt + y = signal.
 
-    `lag` [s]: time constant; for 0 the signal is returned unchanged. The result is exact for a signal that is linear
-    between its values and constant before the first.
+    `lag` [s]. It is exact for a signal that is linear between its values and constant before the first.
     """
     if lag == 0.0:
         return values
@@ -90,9 +87,9 @@ def filter_first_order(values: Array, lag: float, rate: float) -> Array:
 def sample_with_jitter(sample: Callable[[Array], Array], values: Array, lateness: Array | None) -> Array:
     """Compute the samples (n,) of a signal that a clock with jitter takes.
 
-    `sample(values)` takes the samples (n,) of a signal with a clock without jitter; `values` (any length) is the
-    signal. `lateness` (n,): delay of each sample in intervals of `values`, -1 .. 1, or None for no jitter. The signal
-    is interpolated by a parabola through three of its values.
+    `sample(values)` takes the samples (n,) of the signal `values` (any length) with a clock without jitter. `lateness`
+    (n,): delay of each sample in intervals of `values`, -1 .. 1, None for no jitter. The signal is interpolated by a
+    parabola through three of its values.
     """
     center = sample(values)
     if lateness is None:
@@ -108,10 +105,7 @@ def volts_per_pascal(sensor: PressureTransducer, daq: Daq) -> float:
 
 
 def digitize(pressure: Array, sensor: PressureTransducer, daq: Daq) -> Array:
-    """Compute the pressure [Pa] that is read back from the analog-digital converter, whose step is `daq.step` [V].
-
-    The transducer saturates at the ends of its range.
-    """
+    """Compute the pressure [Pa] read back from a transducer, which saturates, by an analog-digital converter."""
     sensitivity = volts_per_pascal(sensor, daq)
     saturated = np.clip(pressure, sensor.range_lo, sensor.range_hi)
     volts = daq.sensor_volts_lo + (saturated - sensor.range_lo) * sensitivity
@@ -131,16 +125,10 @@ def read_pressure(
 ) -> Array:
     """Compute the readings [Pa] of one pressure channel from the filtered `pressure` [Pa] at `rate` [Hz].
 
-    These errors are applied in turn:
-
-    1. gain;
-    2. offset, drift, mains hum, noise of the channel, and noise of all channels (`common_noise` [Pa]), all added;
-    3. saturation and conversion to digits (`digitize`);
-    4. stuck samples, which repeat a reading, and lost samples, which are NaN.
-
-    `sensor`, `daq`: the rig's transducer and data acquisition; `random`: random numbers of this channel.
-    `parameter(symbol, value)` computes a parameter of the sensor over time from its `value` in the rig, because faults
-    and drifts may change the parameter within the run.
+    The errors are, in turn: gain; offset, drift, mains hum, noise of the channel and of all channels (`common_noise`
+    [Pa]); saturation and conversion to digits (`digitize`); stuck samples, which repeat a reading; lost samples, NaN.
+    `random`: random numbers of this channel. `parameter(symbol, value)` computes a parameter of the sensor over time
+    from its `value` in the rig, because faults and drifts may change it within the run.
     """
     n = pressure.size
     t = np.arange(n) / rate
@@ -160,10 +148,9 @@ def read_pressure(
 
 
 def _hum_harmonics(sensor: PressureTransducer, t: Array, random: np.random.Generator) -> Array:
-    """Compute the sum of the harmonics 2 to `HUM_HARMONICS` of a mains hum at times t [s].
+    """Compute the harmonics 2 to `HUM_HARMONICS` of a mains hum at times t [s], over the fundamental's amplitude.
 
-    The sum is relative to the amplitude of the fundamental, which is harmonic 1. Each harmonic has a random phase and
-    `sensor.hum_harmonics` times the amplitude of the harmonic before it.
+    Each harmonic has a random phase and `sensor.hum_harmonics` times the amplitude of the harmonic before it.
     """
     orders = np.arange(2, HUM_HARMONICS + 1)
     phases = random.random(orders.size)
@@ -172,7 +159,7 @@ def _hum_harmonics(sensor: PressureTransducer, t: Array, random: np.random.Gener
 
 
 def _quantize(values: Array, resolution: float) -> Array:
-    """Round values down to multiples of an encoder's resolution; a resolution of 0 leaves them unchanged."""
+    """Round values down to multiples of an encoder's resolution, 0 for none."""
     return values if resolution == 0 else np.floor(values / resolution) * resolution
 
 
@@ -181,13 +168,12 @@ def record(
 ) -> Recording:
     """Record a simulated run with the rig's instruments.
 
-    `trajectory` has `factor` outputs per sample and continues for FILTER_REACH samples after the end of the
-    recording; `u` (n,): command [V] at the samples; `readings`: changes of the instruments within the run.
+    `trajectory` has `factor` outputs per sample and continues for FILTER_REACH samples after the end of the recording;
+    `u` (n,): command [V] at the samples; `readings`: changes of the instruments within the run.
 
     The analog channels (pressures, flow meter) pass the anti-alias filter; the encoders are read without a filter. The
     clock of all channels but the command may jitter. Each channel has its own random numbers, drawn from `seed`, so
-    that its noise does not depend on the settings of other channels. In a valve-controlled rig the motor drives the
-    supply and has no encoder: its angle and speed are not recorded.
+    that its noise does not depend on the settings of other channels.
     """
     n = u.size
     rate = rig.daq.sample_rate
@@ -200,10 +186,7 @@ def record(
     readings = readings or Readings()
 
     def parameters_of(channel: str) -> Callable[[str, float], Array | float]:
-        """Build the function that computes a parameter of the channel's sensor over time.
-
-        It takes the parameter's symbol and its value in the rig.
-        """
+        """Build the function that computes a parameter of the channel's sensor over time, from its symbol and value."""
         return lambda symbol, rig_value: readings.value(f"sensors.{channel}.{symbol}", rig_value, t)
 
     jitter_steps = None
@@ -211,14 +194,11 @@ def record(
         jitter_steps = np.clip(rig.daq.jitter * rate * factor * random["clock"].standard_normal(n), -1.0, 1.0)
 
     def read_instantly(values: Array) -> Array:
-        """Read a signal at the sampling times without a filter, as an encoder does."""
+        """Read a signal without a filter, as an encoder does."""
         return sample_with_jitter(lambda signal: signal[at_samples], values, jitter_steps)
 
     def read_filtered(values: Array, delay: float = 0.0) -> Array:
-        """Read a signal at the sampling times behind the anti-alias filter.
-
-        `delay`: lag of the readings in intervals of the signal.
-        """
+        """Read a signal behind the anti-alias filter, with a lag of `delay` intervals of the signal."""
         return sample_with_jitter(lambda signal: decimate(signal, factor, n, delay), values, jitter_steps)
 
     angle_resolution = 2.0 * np.pi / sensors.theta.counts

@@ -58,12 +58,11 @@ _OVERSAMPLING = 4
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Result of an integration: times `t` (n,) [s] and outputs `rows` (n, 21) in the order of `OUTPUTS`.
+    """Result of an integration: times `t` (n,) [s] and outputs `rows` (n, 21) in the order of `physics.state.OUTPUTS`.
 
-    `OUTPUTS` are the names in `physics.state`, by which `trajectory[name]` gives one output (n,). `method`: rk4 or
-    imex; `step` [s]: the solver's step; `error`: estimated rms error [Pa] of the pressures, NaN if it was not
-    checked. `volts` (n,): voltages [V] of the controller, None without a controller; `compensated` (n,): leakage flow
-    [m^3/s] that the controller compensates, None without a controller or if the controller does not report this flow.
+    `trajectory[name]` gives one output (n,). `method`: rk4 or imex; `step` [s]: the solver's step; `error`: estimated
+    rms error [Pa] of the pressures, NaN if it was not checked. `volts` (n,): voltages [V] of the controller,
+    `compensated` (n,): leakage flow [m^3/s] that it compensates; None without a controller or report.
     """
 
     t: Array
@@ -84,44 +83,36 @@ class RunInputs:
     """Inputs of a run over time: the voltage command, and the leakage coefficients summed over all leaks.
 
     The coefficients are G [m^3/(s Pa)] of laminar leaks, Q = G dp, and C [m^3/(s Pa^0.5)] of orifices, Q = C sign(dp)
-    sqrt|dp|. Under a position target the command is 0, because the controller sets the voltage (`Feedback`).
+    sqrt|dp|. `leaks`, all with coefficients, replace those of the experiment.
     """
 
     def __init__(self, experiment: Experiment, leaks: tuple[Leak, ...]) -> None:
-        """Prepare the voltage command of an experiment and its leaks as inputs of the solver.
-
-        `leaks` replace those of the experiment; their leakage coefficients must be known.
-        """
         self._leaks = experiment.scale_with_viscosity(leaks)
         # under a target the controller sets the voltage (`Feedback`), and this command is not used
         self._command = experiment.voltage_command if experiment.target is None else Sine(amplitude=0.0, omega=0.0)
         self._duration, self._limit = experiment.duration, experiment.rig.daq.u_max
 
     def at_nodes(self, start: Array, offsets: Array) -> tuple[Array, Array, Array]:
-        """Compute the voltage command and the leakage coefficients at the nodes of some solver steps.
+        """Compute the command [V], G [m^3/(s Pa)] and C [m^3/(s Pa^0.5)], each (steps, nodes), for some solver steps.
 
-        The nodes are the times `offsets` (nodes,) [s] after the beginning of a step at which the solver needs its
-        inputs. `start` (steps,): beginnings of the steps [s]. Returns the command [V], G [m^3/(s Pa)] and C [m^3/(s
-        Pa^0.5)], each (steps, nodes). Raises InputError for a command beyond the converter's limit.
+        `start` (steps,): beginnings of the steps [s]; `offsets` (nodes,): times [s] after each at which the solver
+        needs its inputs. Raises InputError for a command beyond the converter's limit within the run.
         """
         t = start[:, None] + offsets
-        return self._check_and_clip(self._command.volts(t), t), *self._leakage(t)
+        u = self._command.volts(t)
+        if not np.abs(u).max(initial=0.0) <= self._limit:  # also for NaN
+            check_command(self._command, t[t <= self._duration], self._limit)
+            # the solver continues after the end, because the anti-alias filter looks ahead
+            u = np.clip(u, -self._limit, self._limit)
+        return u, *self._leakage(t)
 
     def max_leakage(self, t: Array) -> tuple[float, float]:
-        """Compute the largest leakage coefficients that occur at the times t [s].
-
-        Returns the largest G [m^3/(s Pa)], summed over the laminar leaks, and the largest C [m^3/(s Pa^0.5)], summed
-        over the orifices.
-        """
+        """Compute the largest G [m^3/(s Pa)] and the largest C [m^3/(s Pa^0.5)] that occur at the times t [s]."""
         G, C = self._leakage(t)
         return float(G.max(initial=0.0)), float(C.max(initial=0.0))
 
     def _leakage(self, t: Array) -> tuple[Array, Array]:
-        """Compute the leakage coefficients at times t [s], summed over all leaks.
-
-        Returns G [m^3/(s Pa)] of the laminar leaks and C [m^3/(s Pa^0.5)] of the orifices, each with the shape of
-        t.
-        """
+        """Compute G [m^3/(s Pa)] and C [m^3/(s Pa^0.5)] at times t [s], each with the shape of t."""
         G, C = np.zeros(t.shape), np.zeros(t.shape)
         latest = t.max(initial=-math.inf)
         for leak in self._leaks:
@@ -133,24 +124,9 @@ class RunInputs:
                     C = C + coefficient
         return G, C
 
-    def _check_and_clip(self, u: Array, t: Array) -> Array:
-        """Clip the command `u` [V] at the times `t` [s] to the limit of the converter.
-
-        Raises InputError for a value beyond the limit within the duration of the run. Only later values are clipped:
-        the solver continues after the end because the anti-alias filter looks ahead.
-        """
-        if np.abs(u).max(initial=0.0) <= self._limit:
-            return u
-        check_command(self._command, t[t <= self._duration], self._limit)
-        return np.clip(u, -self._limit, self._limit)
-
 
 def oversampling(experiment: Experiment) -> int:
-    """Compute the number of solver outputs per recorded sample that an experiment needs.
-
-    An output is a time at which the solver writes its results. The anti-alias filter needs a minimum
-    (`oversampling_of`), and every sample of a controller must fall on an output.
-    """
+    """Compute the solver outputs per recorded sample for the anti-alias filter and a controller's samples."""
     max_step = experiment.step or DEFAULT_STEP[choose_method(experiment.rig, experiment.method)]
     min_outputs = oversampling_of(experiment.rate, max_step)
     controller = experiment.active_controller
@@ -158,11 +134,7 @@ def oversampling(experiment: Experiment) -> int:
 
 
 def oversampling_of(rate: float, step: float) -> int:
-    """Compute the number of solver outputs per recorded sample that the anti-alias filter needs.
-
-    It is 4, or the number of solver steps in a sample if that is smaller. `rate` [Hz]: sampling rate of the
-    recording; `step` [s]: longest step of the solver.
-    """
+    """Compute the solver outputs per sample at `rate` [Hz] for the anti-alias filter: 4, or one each `step` [s]."""
     return min(_OVERSAMPLING, steps_per_output(rate, step))
 
 
@@ -182,10 +154,9 @@ def integrate_run(
 ) -> Trajectory:
     """Integrate an experiment from standstill, with outputs at the rate that its instruments need.
 
-    `leaks`, all with coefficients, replace the leaks of the experiment. `step` [s] and `error` [Pa] replace the
-    experiment's step and error unless they are None; with a `step` stated here the error is not checked. `duration`
-    [s]: length of the run, by default that of the recording plus the reach of the anti-alias filter. `progress` is
-    called with the simulated time reached [s].
+    `leaks`, all with coefficients, replace those of the experiment. `step` [s] and `error` [Pa] replace the
+    experiment's unless None; with a `step` stated here the error is not checked. `duration` [s]: by default that of the
+    recording plus the reach of the anti-alias filter.
     """
     if duration is None:
         duration = (round(experiment.duration * experiment.rate) + FILTER_REACH) / experiment.rate
@@ -235,12 +206,9 @@ def run_with_sized_leaks(
 ) -> tuple[tuple[Leak, ...], Trajectory]:
     """Integrate an experiment with leaks of the stated mean flows; return the leaks with coefficients, and the run.
 
-    The coefficients are found by repeated simulation (`size_leaks`). During this search `progress(task, fraction)`
-    is called. If no mean flow is stated, there is no search, and `report_time(t)` is called with the time reached
-    [s].
-
-    Raises InputError for a leak larger than the pump's mean flow |Q_1| or never open within the run;
-    SimulationFailed if the search does not converge.
+    During the search for the coefficients (`size_leaks`), `progress(task, fraction)` is called; without a stated mean
+    flow, `report_time(t)` with the time reached [s]. Raises InputError for a leak larger than the pump's mean flow
+    |Q_1| or never open within the run; SimulationFailed if the search does not converge.
     """
     leaks, dp_0 = experiment.leaks, experiment.rig.line.dp_0
     initial_leaks = _start_of_search(leaks)
@@ -249,10 +217,9 @@ def run_with_sized_leaks(
     is_first_run = True  # it has the sought coefficients 0, so that these leaks do not change the pump's flow
 
     def measure(coefficients: Array) -> tuple[Array, tuple[tuple[Leak, ...], Trajectory]]:
-        """Simulate the n leaks with `coefficients` (n,), and compute each leak's mean flow per unit of coefficient.
+        """Simulate the leaks with `coefficients` (n,); return the flows per unit of coefficient, the leaks and the run.
 
-        The first result, (n,) [m^3/s], has the mean flows that leaks with the coefficient 1 would have under the
-        pressures of this run, 0 for leaks without a stated mean flow. The second has the simulated leaks and the run.
+        The flows (n,) [m^3/s] are mean flows under the pressures of this run, 0 for leaks without a stated mean flow.
         """
         nonlocal is_first_run
         pairs = zip(initial_leaks, coefficients, strict=True)
@@ -299,16 +266,14 @@ def integrate(
 ) -> Trajectory:
     """Integrate a rig from standstill over `duration` [s], with outputs at `rate` [Hz].
 
-    `inputs`: command and leakage; `x_0` [m]: position at the start; `load`: load in addition to the rig's own;
-    `feedback`: a controller whose voltage replaces the command; `effects`: changes of the model's parameters within the
-    run (`Schedule`); `method`: integration method (`choose_method`); `progress` is called with the simulated time
-    reached [s].
+    `x_0` [m]: position at the start; `load`: load in addition to the rig's own; `feedback`: a controller whose voltage
+    replaces the command; `effects`: changes of the model's parameters within the run.
 
     A stated `step` [s] is rounded down to a divisor of the output interval. If `step` is None, ever shorter steps are
-    tried until a step passes a check. The first is the longest that resolves the rig, at most `LONGEST_STEP`; the last
-    is `LONGEST_STEP` / `MAX_STEP_REFINEMENT`, which is taken even if it fails. The check integrates short windows of
-    the run (`comparison_windows`) at half the step as well: no pressure may change by more than `error` [Pa rms], and
-    the RMS of no wavelet detail by more than 0.1 % (`StepErrorCheck`). A stated step is not checked if `error` is None.
+    tried until one passes a check: from the longest that resolves the rig, at most `LONGEST_STEP`, to `LONGEST_STEP` /
+    `MAX_STEP_REFINEMENT`, which is taken even if it fails. The check integrates short windows of the run
+    (`comparison_windows`) at half the step as well: no pressure may change by more than `error` [Pa rms], and the RMS
+    of no wavelet detail by more than 0.1 % (`StepErrorCheck`). A stated step is not checked if `error` is None.
 
     Raises InputError for a step or an error that is not positive. Raises SimulationFailed if
 
@@ -330,17 +295,8 @@ def integrate(
         raise InputError(f"error must be > 0 Pa, got {error}")
     n_out = round(duration * rate)
     schedule = Schedule(effects, base, n_out, rate)
-    run = _Integration(
-        inputs=inputs,
-        schedule=schedule,
-        rate=rate,
-        method=choose_method(rig, method),
-        euler=rig.motor.integrator == "euler",
-        allow_unresolved=allow_unresolved,
-        progress=progress,
-        load=load,
-        feedback=feedback,
-    )
+    chosen_method, euler = choose_method(rig, method), rig.motor.integrator == "euler"
+    run = _Integration(inputs, schedule, rate, chosen_method, euler, allow_unresolved, progress, load, feedback)
     windows = [] if error is None else comparison_windows(n_out, rate)
     bounds = {0, n_out}  # outputs at which the run stops
     max_steps = steps_per_output(rate, LONGEST_STEP / MAX_STEP_REFINEMENT)  # most steps per output that are tried
@@ -352,7 +308,10 @@ def integrate(
     else:
         n_steps = steps_per_output(rate, step)
     while True:
-        run.refuse_unresolved(n_steps)
+        h = 1.0 / (rate * n_steps)
+        if not allow_unresolved:  # leaks and end stops are checked during the run
+            for p in schedule.numbers:
+                refuse_unresolved(p, h, run.method)
         check = StepErrorCheck(rig, rate, error or PRESSURE_TOLERANCE)  # without `error` nothing is checked
         excess = 0.0  # largest ratio of an error to its tolerance
         rows = np.empty((n_out, len(OUTPUTS)))
@@ -366,7 +325,6 @@ def integrate(
                     excess = max(excess, run.compare_with_half_step(rows, first, end, n_steps, check))
             if excess > 1.0 and n_steps < max_steps and step is None:
                 break  # a shorter step is tried at once
-        h = 1.0 / (rate * n_steps)
         if excess <= 1.0 or n_steps >= max_steps or (step is not None and allow_unresolved):
             volts = None if feedback is None else feedback.volts(n_out)
             compensated = None if feedback is None else feedback.compensated_flow(n_out)
@@ -385,11 +343,9 @@ def integrate(
 
 @dataclass
 class _Integration:
-    """The integration of one run with its inputs and settings.
+    """The integration of one run with its inputs and settings; `reached` [s]: time last reported to `progress`.
 
-    `euler`: True to advance the integral of the motor's speed error once a step, as eq. (4.2) is printed, instead of
-    with the other states (`rk4_step`); `rate` [Hz]: rate of the outputs; `reached` [s]: time last reported to
-    `progress`.
+    `euler`: True to advance the integral of the motor's speed error once a step, as eq. (4.2) is printed (`rk4_step`).
     """
 
     inputs: RunInputs
@@ -403,23 +359,11 @@ class _Integration:
     feedback: Feedback | None = None
     reached: float = 0.0
 
-    def refuse_unresolved(self, n_steps: int) -> None:
-        """Raise SimulationFailed if `n_steps` solver steps per output are too few to resolve the rig without its leaks.
-
-        The step, 1/(rate n_steps), is checked with the parameters of every block of the run (function
-        `refuse_unresolved`). Leaks and end stops are checked during the run (`advance`). Nothing is checked if the
-        experiment allows unresolved runs.
-        """
-        if not self.allow_unresolved:
-            for p in self.schedule.numbers:
-                refuse_unresolved(p, 1.0 / (self.rate * n_steps), self.method)
-
     def advance(self, y: Array, start: int, stop: int, n_steps: int, rows: Array, origin: int = 0) -> None:
-        """Integrate the state `y` (14,) in place from output `start` to output `stop`; write the outputs to `rows`.
+        """Integrate the state `y` (14,) in place from output `start` to `stop`, with `n_steps` steps per output.
 
-        Output k is written to rows[k - origin]. `n_steps`: number of solver steps from one output to the next.
-        Raises SimulationFailed if a state is not finite. Without `allow_unresolved`, also raises SimulationFailed if
-        the step is too long for a leak or an end stop, or if a pressure is below vacuum.
+        Output k is written to rows[k - origin]. Raises SimulationFailed if a state is not finite, and without
+        `allow_unresolved` also if the step is too long for a leak or an end stop, or if a pressure is below vacuum.
         """
         from sealscope.physics.rig import pack_numbers
         from sealscope.physics.solvers.advance import EXPLICIT, IMPLICIT, advance, advance_closed, step_nodes
@@ -473,12 +417,10 @@ class _Integration:
         return check.add_window(rows[first:end, pressures], fine[:, pressures])
 
     def _check_rows(self, p: RigNumbers, h: float, rows: Array, first: int) -> None:
-        """Check outputs that were integrated with steps of h [s].
+        """Check outputs `rows` (n, 21), from number `first` of the run on, that were integrated with steps of h [s].
 
-        `rows` (n, 21): the outputs, of which the first has the index `first` in the run; `p`: the model's parameters at
-        these outputs. Raises SimulationFailed if
-        an output is not finite. Unless the experiment allows unresolved runs, also raises it if a pressure is below
-        vacuum or if the step is too long for an end stop that was hit.
+        `p`: the model's parameters at these outputs. Raises SimulationFailed if an output is not finite and, unless
+        unresolved runs are allowed, if a pressure is below vacuum or the step is too long for an end stop that was hit.
         """
         from sealscope.physics.solvers.limits import longest_step_on_stop
         from sealscope.physics.state import OUTPUTS, P_2, P_A, POSITION
@@ -504,23 +446,16 @@ class _Integration:
 
 
 def refuse_long(h: float, limit: float, what: str) -> None:
-    """Raise SimulationFailed if the solver's step h [s] is longer than `limit` [s].
-
-    `what`: the part of the rig that needs this limit, for the message.
-    """
+    """Raise SimulationFailed if the step h [s] exceeds the `limit` [s] that resolves `what`, a part of the rig."""
     if h > limit * (1.0 + 1e-9):
         raise SimulationFailed(f"step must be <= {limit:.2g} s to resolve {what}, got {h:.3g} s; take a smaller step")
 
 
 def refuse_unresolved(p: RigNumbers, h: float, method: str) -> None:
-    """Raise SimulationFailed if solver steps of h [s] are too long to resolve a rig without its leaks.
+    """Raise SimulationFailed if steps of h [s] by `method` are too long for a rig `p` without its leaks.
 
-    `p`: parameters of the rig; `method`: "rk4" or "imex". There are two limits:
-
-    - `longest_step`, for all parts but leaks, throttles and end stops: an oscillation may advance by one radian per
-      step, and a decay must be stable.
-    - 2.785/lambda for "rk4" with throttles, where lambda [1/s] is the fastest rate at which the pressures on both sides
-      of a throttle equalise (`stiffest_rate`).
+    All parts but leaks, throttles and end stops need `longest_step`. With throttles, rk4 also needs 2.785/lambda, where
+    lambda [1/s] is the fastest rate at which pressures equalise across a throttle (`stiffest_rate`).
     """
     from sealscope.physics.solvers.limits import DECAY_LIMIT, longest_step, stiffest_rate
 
@@ -538,8 +473,8 @@ def refuse_unresolved(p: RigNumbers, h: float, method: str) -> None:
 def comparison_windows(n_out: int, rate: float) -> list[tuple[int, int]]:
     """Choose the time windows in which the solver's step is checked, as pairs (start, stop) of output indices.
 
-    They are the first 2 s of the run, and 1 s from 50 % and from 90 % of the run on. A window that would overlap the
-    window before it or exceed the run is left out. `n_out`: number of outputs of the run; `rate` [Hz]: rate of outputs.
+    They are the first 2 s, and 1 s from 50 % and from 90 % of the run on, unless this would overlap the window before
+    or exceed the run. `n_out`: number of outputs of the run; `rate` [Hz] of the outputs.
     """
     windows = [(0, min(n_out, round(FIRST_WINDOW * rate)))]
     length = round(LATER_WINDOW * rate)
@@ -553,16 +488,12 @@ def comparison_windows(n_out: int, rate: float) -> list[tuple[int, int]]:
 class StepErrorCheck:
     """Comparison of a run at one solver step with the same run at half that step, window by window.
 
-    `pressure_error` [Pa]: largest rms difference of a pressure in a window so far, times `SAFETY`; `detail_error`:
-    largest relative difference of the RMS of a wavelet detail so far.
+    `rate` [Hz] of the solver's outputs; `tolerance` [Pa rms]: allowed difference of a pressure. `pressure_error` [Pa]:
+    largest rms difference of a pressure in a window so far, times `SAFETY`; `detail_error`: largest relative difference
+    of the RMS of a wavelet detail so far.
     """
 
     def __init__(self, rig: Rig, rate: float, tolerance: float) -> None:
-        """Prepare the comparison of a run with the same run at half the solver's step.
-
-        `rig`: the simulated rig; `rate` [Hz]: rate of the solver's outputs; `tolerance` [Pa rms]: allowed
-        difference of a pressure.
-        """
         self._tolerance = tolerance
         self._outputs_per_sample = max(1, round(rate / rig.daq.sample_rate))  # for samples of the recording
         sensors = [getattr(rig.sensors, name) for name in CHAMBERS]
@@ -573,9 +504,7 @@ class StepErrorCheck:
         self.pressure_error = self.detail_error = 0.0
 
     def add_window(self, coarse: Array, fine: Array) -> float:
-        """Compare a run with the same run at half the step, in one more window of time.
-
-        Returns the largest ratio of an error to its tolerance; the step is short enough if this ratio is at most 1.
+        """Compare both runs in one more window; return the largest ratio of an error to its tolerance.
 
         `coarse`, `fine` (n, 4): p_A, p_B, p_1, p_2 [Pa] at the step and at half the step. The error of a pressure is
         the rms difference within the window, times `SAFETY`. If all pressures are within their tolerance, the RMS of
@@ -596,20 +525,16 @@ class StepErrorCheck:
         return max(pressure_error / self._tolerance, detail_error / DETAIL_TOLERANCE)
 
     def describe_worst(self) -> str:
-        """Describe the worst difference that halving the step made: of a pressure, or of the RMS of a wavelet detail.
-
-        The worst is the larger one relative to its tolerance.
-        """
+        """Describe the worst difference, relative to its tolerance: of a pressure, or of a wavelet detail's RMS."""
         if self.pressure_error / self._tolerance >= self.detail_error / DETAIL_TOLERANCE:
             return f"a pressure by {self.pressure_error:.4g} Pa rms, which must be <= {self._tolerance:.4g} Pa"
         error, tolerance = 100 * self.detail_error, 100 * DETAIL_TOLERANCE
         return f"the RMS of a detail by {error:.3g} %, which must be <= {tolerance:.3g} %"
 
     def _add_detail_squares(self, coarse: Array, fine: Array) -> None:
-        """Add the squared wavelet details of p_A and p_B of both runs in a window to the sums over all windows.
+        """Add the squared details of p_A and p_B of both runs (`coarse`, `fine`, each (n, 4)) in a window to the sums.
 
-        `coarse`, `fine` (n, 4): the pressures, as in `add_window`. Samples near the ends of the window, where the
-        wavelet's filters reach beyond it, are left out. A window without any other samples changes nothing.
+        Samples near the window's ends, where the wavelet's filters reach beyond it, are left out.
         """
         import pywt
 

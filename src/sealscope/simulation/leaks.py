@@ -35,8 +35,7 @@ _LEAK = rf"(?:{_MEAN}|(?P<letter>[GC])\s*=\s*(?P<coefficient>{UNSIGNED}))(?:\s+(
 def opening_from(start: float = 0.0, stop: float = math.inf, ramp: float = 0.0) -> Polyline:
     """Make the opening of a leak or fault, 0 (shut) to 1 (full), that begins at `start` and ends at `stop` [s].
 
-    It rises from 0 to 1 within `ramp` [s] from `start` on, and falls back to 0 within `ramp` from `stop` on; an
-    infinite `stop` means that it stays at 1. Raises InputError if the times do not fit together.
+    It rises and falls within `ramp` [s]; `stop` may be infinite. Raises InputError if the times do not fit together.
     """
     if not (math.isfinite(ramp) and ramp >= 0.0):
         raise InputError(f"a ramp must be >= 0 s and finite, got {ramp:g} s")
@@ -53,10 +52,7 @@ def opening_from(start: float = 0.0, stop: float = math.inf, ramp: float = 0.0) 
 
 
 def growing_opening(start: float, stop: float) -> Polyline:
-    """Make the opening of a leak or fault that grows linearly from 0 (shut) at `start` to 1 (full) at `stop` [s].
-
-    It stays at 1 afterwards. Raises InputError unless `stop` is after `start`.
-    """
+    """Make the opening of a leak or fault that grows linearly from 0 (shut) at `start` to 1 (full) at `stop` [s]."""
     if not stop > start:
         raise InputError(f"a growing leak must stop growing after it starts, got {start:g} s to {stop:g} s")
     text = f"growing from {format_number(start)} s to {format_number(stop)} s"
@@ -65,9 +61,8 @@ def growing_opening(start: float, stop: float) -> Polyline:
 
 @dataclass(frozen=True, eq=False)
 class Thinned:
-    """The opening of a laminar leak in oil of changing viscosity: `opening` divided by the oil's relative viscosity.
+    """The opening of a laminar leak in oil whose relative `viscosity` changes over time t [s]: `opening` divided by it.
 
-    `viscosity(t)`: the oil's viscosity at times t [s], relative to the one that the leak's coefficient assumes;
     `rise`: None, because the result is not a single linear rise (`Polyline.rise`).
     """
 
@@ -97,8 +92,8 @@ class Leak:
 
     `law`: "laminar", Q = G dp with G [m^3/(s Pa)] (worn seal), or "orifice", Q = C sign(dp) sqrt(abs(dp)) with C
     [m^3/(s Pa^0.5)] (needle valve); `opening`: how far the leak is open over time, 0 to 1. The size at full opening is
-    stated by one of `coefficient`, which is G or C, and `mean` [m^3/s], which is the mean of abs(Q) while the leak is
-    open (`sizing.mean_while_open`). For a stated mean, `sizing.size_leaks` finds the coefficient.
+    stated by one of `coefficient`, G or C, and `mean` [m^3/s], the mean of abs(Q) while the leak is open
+    (`sizing.mean_while_open`), for which `sizing.size_leaks` finds the coefficient.
     """
 
     law: Literal["laminar", "orifice"] = "laminar"
@@ -118,17 +113,13 @@ class Leak:
             raise InputError(f"openings of a leak must be in 0..1, got {self.opening}")
 
     def __str__(self) -> str:
-        """Format the leak as the text that `parse_leak` reads."""
         if self.mean is not None:
             return f"{self.mean / LITRE_PER_MINUTE:g} L/min {self.law} {self.opening}"
         return f"{'G' if self.law == 'laminar' else 'C'} = {self.coefficient:g} {self.opening}"
 
 
 def parse_opening(groups: Groups) -> Polyline:
-    """Build the opening of a leak or fault from the times in its text; without times it is fully open from t = 0 on.
-
-    `groups`: the named groups of a regular expression's match, such as of `WHEN`.
-    """
+    """Build an opening from the times, if any, in the named groups of a text's match, such as of `WHEN`."""
     if groups.get("start") is not None:
         return growing_opening(parse_seconds(groups["start"]), parse_seconds(groups["stop"]))
     until = groups.get("until")
@@ -142,9 +133,9 @@ def parse_opening(groups: Groups) -> Polyline:
 def parse_leak(text: str) -> Leak | None:
     """Parse the text of a leak across the piston, such as "0.0042 L/min from 90 s"; return None for ``none``.
 
-    ``table FILE`` names a file with the columns `t [s]` and `q_leak [L/min]`. The leak is then laminar: the largest
-    `q_leak` is its mean flow at full opening, and `q_leak` over this maximum is its opening, linear between the times.
-    Raises InputError, which lists all forms, if the text has another form.
+    ``table FILE`` names a file with the columns `t [s]` and `q_leak [L/min]`: a laminar leak, with the largest `q_leak`
+    as its mean flow at full opening, and `q_leak` over this maximum as its opening, linear between the times. Raises
+    InputError, which lists all forms, for any other text.
     """
     stripped = text.strip()
     if stripped.lower() in ("none", "0", "no leak"):

@@ -7,6 +7,7 @@ import math
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -50,9 +51,9 @@ _STATES = {"omega": "rad/s", "theta": "rad", "x": "m", "v": "m/s"}
 class Truth:
     """The true leaks, faults, drifts and noise-free outputs of a run, which its recording does not contain.
 
-    `leaks`: leaks across the piston with their coefficients; `onset_s`: time [s] at which the first leak across the
-    piston opens, None if none does; `mean_leak_lpm`: sum of the leaks' mean flows while open [L/min]; `outputs`:
-    outputs by name at the samples' times `t` [s].
+    `leaks`: leaks across the piston with their coefficients; `onset_s`: time [s] at which the first of them opens, None
+    if none does; `mean_leak_lpm`: sum of the leaks' mean flows while open [L/min]; `outputs`: by name at the samples'
+    times `t` [s].
     """
 
     leaks: tuple[Leak, ...]
@@ -66,11 +67,7 @@ class Truth:
 
 @dataclass(frozen=True)
 class Difference:
-    """The change of one quantity of a run when the solver's step is halved.
-
-    `name`: the quantity; `difference` and `tolerance`, the largest difference allowed, are in `unit`. A `tolerance`
-    of None sets no limit.
-    """
+    """The change of a quantity `name`, in `unit`, when the step is halved; `tolerance`: its limit, or None."""
 
     name: str
     difference: float
@@ -79,17 +76,13 @@ class Difference:
 
     @property
     def resolved(self) -> bool:
-        """True if the difference is within its tolerance, or if there is no tolerance."""
+        """True if the difference is within its tolerance, or if there is none."""
         return self.tolerance is None or self.difference <= self.tolerance
 
 
 @dataclass(frozen=True)
 class Proof:
-    """Comparison of an experiment's run at a solver step with its run at half that step.
-
-    `step`, `halved` [s]: both steps; `method`: integration method, rk4 or imex; `differences`: the change of each
-    compared quantity (`compare_trajectories`).
-    """
+    """Comparison of a run at a `step` [s] with one at the step `halved` [s], by `method` (rk4 or imex)."""
 
     method: str
     step: float
@@ -111,10 +104,7 @@ class Proof:
         return "\n".join(lines)
 
     def worst(self) -> Difference:
-        """Find the quantity whose difference between the two runs is largest relative to its tolerance.
-
-        Quantities without a tolerance are left out.
-        """
+        """Find the quantity with the largest difference relative to its tolerance, among those with a tolerance."""
         limited = [row for row in self.differences if row.tolerance]
         return max(limited, key=lambda row: row.difference / (row.tolerance or math.inf))  # `or`: for the type checker
 
@@ -128,11 +118,7 @@ class Run:
     proof: Proof | None = None
 
     def lines(self) -> list[str]:
-        """Describe the run in lines of text: solver and step, each leak and fault, and the mean flow of the leaks.
-
-        If a controller reports the leakage flow that it compensates, the last line states the mean of this flow over
-        the last second [L/min].
-        """
+        """Describe the run in lines: solver, leaks, faults, and the flow that a controller compensates at the end."""
         solver = self.recording.provenance["solver"]
         lines = [f"{solver['method']}, h = {solver['step_s']:.3g} s"]
         lines += [f"leak: {leak}" for leak in self.truth.leaks] + [f"fault: {fault}" for fault in self.truth.faults]
@@ -174,20 +160,16 @@ def simulate_experiment(experiment: Experiment, progress: Progress | None = None
     if not isinstance(experiment, Experiment):
         raise InputError(f"experiment must be an Experiment (Experiment.of(...) makes one), got {experiment!r}")
 
-    def make_reporter(task: str) -> Callable[[float], None]:
-        """Build the function that reports the progress of `task`, called with the simulated time reached [s]."""
+    def report(task: str, time: float) -> None:
+        """Report the completed fraction of a task at the simulated time `time` [s]."""
+        if progress is not None:
+            progress(task, min(1.0, time / experiment.duration))
 
-        def report(time: float) -> None:
-            """Report the completed fraction of the task at the simulated time `time` [s]."""
-            if progress is not None:
-                progress(task, min(1.0, time / experiment.duration))
-
-        return report
-
-    leaks, run = run_with_sized_leaks(experiment, progress, make_reporter("simulating"))
+    leaks, run = run_with_sized_leaks(experiment, progress, partial(report, "simulating"))
     proof = None
     if prove:
-        fine = integrate_run(experiment, leaks, step=run.step / 2, progress=make_reporter("proving: half the step"))
+        report_proof = partial(report, "proving: half the step")
+        fine = integrate_run(experiment, leaks, step=run.step / 2, progress=report_proof)
         proof = Proof(run.method, run.step, fine.step, compare_trajectories(experiment, run, fine))
         if not (proof.resolved or experiment.allow_unresolved):
             worst = proof.worst()
@@ -247,7 +229,7 @@ def powers(outputs: Mapping[str, Array], rig: Rig) -> dict[str, Array]:
     """Compute the powers [W] of a run: electrical into the motor, hydraulic from the pump, mechanical on the piston.
 
     `outputs`: outputs of the run by name (`TRUE_OUTPUTS`). Returns arrays by the names P_electric, P_hydraulic and
-    P_mechanical. In a rig with a servo valve, P_electric and P_hydraulic belong to the motor and pump of the supply.
+    P_mechanical. In a rig with a servo valve, the first two belong to the motor and pump of the supply.
     """
     from sealscope.physics.cylinder import mechanical_power
     from sealscope.physics.motor import electric_power
@@ -326,14 +308,7 @@ def prove(experiment: Experiment, progress: Progress | None = None) -> Proof:
 
 
 def write_truth(truth: Truth, path: str | os.PathLike[str]) -> None:
-    """Write the truth about a run as JSON, without its outputs.
-
-    The file contains:
-
-    - the leaks with their coefficients, the onset [s], and the mean leak while open [L/min];
-    - the other faults with their onsets [s], null for a fault that never begins;
-    - the range of each drift and its change from start to end, in per cent or in the SI unit.
-    """
+    """Write the truth about a run as JSON: leaks, onset [s], mean leak [L/min], faults and drifts, but no outputs."""
     tree: dict[str, Any] = {
         "onset_s": truth.onset_s,
         "mean_leak_lpm": truth.mean_leak_lpm,
@@ -342,10 +317,9 @@ def write_truth(truth: Truth, path: str | os.PathLike[str]) -> None:
         ],
     }
     if truth.faults:
-        onsets = [fault.onset() for fault in truth.faults]
         tree["faults"] = [
             {"kind": fault.kind, "words": str(fault), "onset_s": onset if math.isfinite(onset) else None}
-            for fault, onset in zip(truth.faults, onsets, strict=True)
+            for fault, onset in [(fault, fault.onset()) for fault in truth.faults]
         ]
     if truth.drifts:
         tree["drifts"] = [_describe_drift(drift, truth.t) for drift in truth.drifts]
@@ -354,10 +328,7 @@ def write_truth(truth: Truth, path: str | os.PathLike[str]) -> None:
 
 
 def _describe_drift(drift: ParameterDrift, t: Array) -> dict[str, Any]:
-    """Describe a drift over the times t [s] by its range (maximum minus minimum) and its change from start to end.
-
-    Returns a dict for JSON. A relative drift is in per cent, an absolute one in the parameter's SI unit.
-    """
+    """Describe a drift over times t [s] for JSON by range and net change, in per cent if relative, else in SI units."""
     change = drift.shape.value_at(t)
     span, net_change = float(np.ptp(change)), float(change[-1] - change[0])
     if drift.absolute:

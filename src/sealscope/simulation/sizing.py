@@ -26,8 +26,8 @@ _MIN_SLOPE = 0.1
 def leak_flow(leak: Leak, t: Array, dp: Array, dp_0: float) -> Array:
     """Compute the flow |Q_L| (n,) [m^3/s] of a leak at times `t` (n,) [s] under `dp` (n,) = p_A - p_B [Pa].
 
-    The flow is s G |dp| for a laminar leak and s C sqrt|dp| for an orifice, with the leak's opening s at t, 0 to 1, and
-    its coefficient G or C. The flow of an orifice is linear in dp for |dp| below about `dp_0` [Pa].
+    The flow is s G |dp| for a laminar leak and s C sqrt|dp| for an orifice, with the leak's opening s, 0 to 1, and its
+    coefficient G or C. That of an orifice is linear in dp for |dp| below about `dp_0` [Pa].
     """
     from sealscope.physics.leakage import laminar_leakage, leakage_series
 
@@ -39,11 +39,9 @@ def leak_flow(leak: Leak, t: Array, dp: Array, dp_0: float) -> Array:
 
 
 def mean_while_open(leak: Leak, t: Array, flow: Array) -> float:
-    """Compute the mean flow [m^3/s] that a leak has while it is open, scaled to an opening of 1.
+    """Compute the mean flow [m^3/s] of a leak while it is open, sum(flow) / sum(opening); 0 if it never opens.
 
-    It is sum(flow) / sum(opening). `flow` (n,): |Q_L| [m^3/s] at the times `t` (n,) [s]; the leak's opening at these
-    times is between 0 (shut) and 1 (full). A leak that is half open has about half the flow, and its time counts half.
-    The result is 0 if the leak never opens.
+    `flow` (n,): |Q_L| [m^3/s] at the times `t` (n,) [s]. The time of a half open leak, with half the flow, counts half.
     """
     opening = leak.opening.value_at(t)
     opening_sum = float(opening.sum())
@@ -54,12 +52,10 @@ def next_coefficient(mean: float, previous: tuple[float, float], latest: tuple[f
     """Compute the next leakage coefficient to try in the search for a stated mean flow.
 
     `mean` [m^3/s]: the mean flow to reach; `previous`, `latest`: (coefficient, mean flow) of the last two runs, (0, 0)
-    for no run. For a `latest` coefficient of 0, the flow is the one that a coefficient of 1 would have under the
-    pressures of this run.
+    for no run. For a `latest` coefficient of 0, the flow is that of a coefficient of 1 under the pressures of this run.
 
-    The next coefficient is on the straight line through both runs on logarithmic scales. The slope of this line is
-    limited to 0.1 .. 1, the range that leaks have. It is taken as 1 without a previous run with a leak, and for two
-    coefficients that are too close.
+    The next coefficient is on the straight line through both runs on logarithmic scales. Its slope is limited to 0.1 ..
+    1, the range that leaks have, and is 1 without a previous run with a leak, and for two close coefficients.
     """
     c_0, q_0 = previous
     c_1, q_1 = latest
@@ -80,14 +76,12 @@ def size_leaks(
     """Find the leakage coefficients (n,) that give the leaks' stated mean flows, by repeated simulation.
 
     A coefficient has the unit m^3/(s Pa) for a laminar leak, m^3/(s Pa^0.5) for an orifice. `coefficients`: start
-    values, which are kept for leaks without a stated mean flow. `measure(coefficients)` simulates the rig. It returns
+    values, which are kept for leaks without a stated mean flow. `measure(coefficients)` simulates the rig; it returns
     the mean flow [m^3/s] of each leak per unit of its coefficient (n,), also where the coefficient is 0, and the run in
-    any form. Returns the coefficients found, and the run with them. `progress` is called with the task and its
-    completed fraction.
+    any form. Returns the coefficients found, and the run with them. `progress(task, fraction)` is called.
 
     A small leak's flow is proportional to its coefficient, because friction sets the pressure difference. A large
-    leak's flow grows less, and its coefficient is found step by step (`next_coefficient`). Raises SimulationFailed
-    if the search does not converge.
+    leak's grows less (`next_coefficient`). Raises SimulationFailed if the search does not converge.
     """
     means = np.array([leak.mean or 0.0 for leak in leaks])
     indices = np.flatnonzero(means > 0.0)

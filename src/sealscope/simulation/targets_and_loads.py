@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -41,11 +41,7 @@ Breakpoints = tuple[tuple[float, float], ...]
 
 @dataclass(frozen=True)
 class Position:
-    """A target for the piston's position over time, which a controller follows.
-
-    `signal`: the position [m] from mid-stroke, as a command whose method `volts` computes metres; `words`: text of the
-    target.
-    """
+    """A target for the piston's position: `signal`, a command whose `volts` are metres from mid-stroke; `words`."""
 
     signal: Command
     words: str
@@ -77,12 +73,7 @@ class Force:
         return self.signal.volts(t)  # the value of the signal, here in newtons
 
     def tables(self) -> tuple[Array, Array] | None:
-        """Build the tables of the load over position and over velocity that the compiled model takes.
-
-        Returns two arrays (rows, 2) with the pairs of `over_x` and `over_v`, for `piecewise_linear_force`. An empty
-        `over_x` or `over_v` gives the single row (0, 0), which is no load. Returns None if the load depends on time
-        only.
-        """
+        """Build the load over position and velocity for `piecewise_linear_force`, or None if it has neither."""
         if not (self.over_x or self.over_v):
             return None
         no_load: Breakpoints = ((0.0, 0.0),)
@@ -93,10 +84,9 @@ class Force:
 
 
 def loaded_rig_numbers(rig: Rig, load: Force | None) -> RigNumbers:
-    """Build the parameters of a rig for the compiled model, including a load in addition to the rig's own.
+    """Build a rig's parameters for the compiled model, with a load in addition to the rig's own as `pushed`, if any.
 
-    `load`: the additional load, None for none. Its functions of position and velocity become the parameter `pushed`.
-    A load that depends on time only is an input of the solver, and `pushed` states only that there is one.
+    Of a load that depends on time only, which is an input of the solver, `pushed` states only that there is one.
     """
     from sealscope.physics.rig import rig_numbers
 
@@ -105,10 +95,7 @@ def loaded_rig_numbers(rig: Rig, load: Force | None) -> RigNumbers:
 
 
 def loaded_standstill_state(rig: Rig, load: Force | None, x: float) -> Array:
-    """Compute the state (14,) of the compiled model at t = 0 with the piston at rest at `x` [m].
-
-    `load`: load in addition to the rig's own, None for none.
-    """
+    """Compute the model's state (14,) at rest at `x` [m], under a load in addition to the rig's own."""
     from sealscope.physics.cylinder import piecewise_linear_force
     from sealscope.physics.standstill import initial_state
 
@@ -122,11 +109,10 @@ def loaded_standstill_state(rig: Rig, load: Force | None, x: float) -> Array:
 
 
 def breakpoints_through(s: Array, F: Array) -> Breakpoints:
-    """Convert points (s, F) of a load to breakpoints (s_k, c_k) of F_0 + sum of c_k max(s - s_k, 0).
+    """Convert points (s, F) of a load to `Breakpoints`, linear between the points and constant beyond the outer ones.
 
-    `s` (n,), rising: positions [m] or velocities [m/s]; `F` (n,) [N]. The force is linear between the points and
-    constant beyond the outer points. The first returned pair is (F_0, 0): the force and the slope before the first
-    point. The next pairs are (s_k, c_k), where c_k is the change of the slope at s_k (`piecewise_linear_force`).
+    `s` (n,), rising: positions [m] or velocities [m/s]; `F` (n,) [N]. The first pair returned is (F_0, 0): the force
+    and the slope before the first point. The next pairs are (s_k, c_k), where c_k is the change of the slope at s_k.
     """
     slopes = np.concatenate([[0.0], np.diff(F) / np.diff(s), [0.0]])
     return (float(F[0]), 0.0), *zip(s.tolist(), np.diff(slopes).tolist(), strict=True)
@@ -135,11 +121,9 @@ def breakpoints_through(s: Array, F: Array) -> Breakpoints:
 def _parse_signal(text: str, units: Mapping[str, float], what: str) -> Command:
     """Parse a signal over time that is written like a command but with units, such as "step 100 mm at 1 s".
 
-    `units`: allowed units, each with its factor to SI units; `what`: name of the quantity in messages. Raises
-    InputError for a missing unit or another form.
+    `units`: allowed units, with factors to SI; `what` names it in the InputError for a missing unit or another form.
     """
-    names = "|".join(sorted(units, key=len, reverse=True))
-    number_with_unit = re.compile(rf"({UNSIGNED})\s*\[?({names})\b\]?")
+    number_with_unit = re.compile(rf"({UNSIGNED})\s*\[?({_unit_pattern(units)})\b\]?")
     if not number_with_unit.search(text):
         example = f"step 100 {next(iter(units))}"
         raise InputError(f"{what} must have its unit ({', '.join(units)}), such as '{example}', got {text!r}")
@@ -155,10 +139,9 @@ def _parse_signal(text: str, units: Mapping[str, float], what: str) -> Command:
 
 
 def parse_position(text: str) -> Position | None:
-    """Parse a position target such as ``position 50 mm sin(2t)`` or ``position step 100 mm at 1 s``.
+    """Parse a position target, such as ``position 50 mm sin(2t)`` or ``position step 100 mm at 1 s``, if it is one.
 
-    The signal is written as in `parse_command`, with lengths in mm, cm or m; ``position file LOG`` takes the channel
-    x of a recording. Returns None if the text does not begin with ``position``.
+    The signal is written as in `parse_command`, in mm, cm or m; ``position file LOG`` takes channel x of a recording.
     """
     normalized = normalize_blanks(text, "command")
     if not normalized.lower().startswith("position "):
@@ -180,40 +163,31 @@ def command_or_target(text: str) -> Command | Position:
     return parse_position(text) or parse_command(text)
 
 
-class _Column(NamedTuple):
-    """A column of a table: its index in a row, from 0, and its unit as the heading states it."""
-
-    position: int
-    unit: str
-
-
 def _read_force(path: str, words: str) -> Force:
-    """Read a load from a CSV file with the column ``F [N]`` and one of ``t [s]``, ``x [m]`` and ``v [m/s]``.
+    """Read a load from a CSV file with the column ``F [N]`` and one of ``t [s]``, ``x [m]``, ``v [m/s]``, in any unit.
 
-    `words`: text of the load. Other units are converted. The load is linear between the rows and constant beyond them.
-    If there is a column of times, columns of x and v are ignored, and the first time becomes t = 0. Raises InputError
-    for any other table.
+    The load is linear between the rows and constant beyond them. If there is a column of times, columns of x and v are
+    ignored, and the first time becomes t = 0. Raises InputError for any other table.
     """
     with open_regular(path, "a recorded load") as file:
         first_line = file.readline(4096).decode("utf-8-sig", "replace")
         headings = [re.fullmatch(r"\s*(\w+)\s*\[([^\]]+)\]\s*", cell) for cell in first_line.split(",")]
-        columns = {match[1]: _Column(k, match[2]) for k, match in enumerate(headings) if match}
-        arguments = [name for name in ("t", "x", "v") if name in columns]  # columns over which F may be stated
-        if "F" not in columns or not arguments or arguments == ["x", "v"]:
+        indices = {match[1]: k for k, match in enumerate(headings) if match}
+        units = {match[1]: match[2] for match in headings if match}
+        arguments = [name for name in ("t", "x", "v") if name in units]  # columns over which F may be stated
+        if "F" not in units or not arguments or arguments == ["x", "v"]:
             raise InputError(
                 "a recorded load must have the columns t [s] and F [N], or F [N] with one of x [m] and v [m/s], got "
                 f"{first_line.strip()[:80]!r} ({path})"
             )
         try:
-            table = np.loadtxt(
-                file, delimiter=",", usecols=[columns[arguments[0]].position, columns["F"].position], ndmin=2
-            )
+            table = np.loadtxt(file, delimiter=",", usecols=[indices[arguments[0]], indices["F"]], ndmin=2)
         except ValueError as error:
             raise InputError(f"a recorded load must hold numbers, got a table of which {error} ({path})") from None
     argument = arguments[0]
     unit = {"t": "s", "x": "m", "v": "m/s"}[argument]
-    s = to_si(table[:, 0], columns[argument].unit, unit, name=argument, place=path)
-    F = to_si(table[:, 1], columns["F"].unit, "N", name="F", place=path)
+    s = to_si(table[:, 0], units[argument], unit, name=argument, place=path)
+    F = to_si(table[:, 1], units["F"], "N", name="F", place=path)
     if argument == "t":
         return Force(sampled_signal(s - s[:1], F, path), words)  # s[:1], not s[0]: the table may be empty
     if s.size > 1 and s[0] > s[-1]:  # a falling table is the same curve
@@ -227,7 +201,7 @@ def _read_force(path: str, words: str) -> Force:
 
 
 def _unit_pattern(units: Mapping[str, float]) -> str:
-    """Build the regular expression that matches any of the units, the longest first; their blanks may be left out."""
+    """Build the regular expression of any of the units, the longest first, with or without their blanks."""
     return "|".join(re.escape(unit).replace("\\ ", r"\s*") for unit in sorted(units, key=len, reverse=True))
 
 
@@ -255,11 +229,9 @@ def parse_force(text: str) -> Force:
 
 
 def _extract_terms(text: str, letter: str) -> tuple[Breakpoints, str]:
-    """Parse the terms over x or v (`letter`) in the text of a load, such as ``- 5 kN/mm over x from 50 mm``.
-
-    Returns their sum as a piecewise linear function, () if there are no such terms, and the text without them.
-    """
+    """Parse the terms over x or v (`letter`) in a load's text as a function; return it and the text without them."""
     slope_units, start_units = _TERM_UNITS[letter]
+    factors = {unit.replace(" ", ""): factor for unit, factor in slope_units.items()}  # the text may lack blanks
     number = rf"({UNSIGNED})\s*\[?({_unit_pattern(slope_units)})\b\]?"
     start_and_unit = rf"(?:\s+from\s+([-+]?{UNSIGNED})\s*\[?({_unit_pattern(start_units)})\b\]?)?"
     pattern = re.compile(rf"(?:^|([-+]))\s*{number}\s+over\s+{letter}\b{start_and_unit}\s*")
@@ -269,15 +241,10 @@ def _extract_terms(text: str, letter: str) -> tuple[Breakpoints, str]:
     common_slope = 0.0  # sum of the slopes of the terms without a start
     breakpoints = []
     for sign, magnitude, unit, start, start_unit in terms:
-        slope = float(f"{sign}{magnitude}") * slope_units[_match_unit(unit, slope_units)]
+        slope = float(f"{sign}{magnitude}") * factors[unit.replace(" ", "")]
         if start:
             breakpoints.append((float(start) * start_units[start_unit], slope))
         else:
             common_slope += slope
     # (force at 0, slope at first), then (position or velocity, change of the slope) for each term with a start
     return ((0.0, common_slope), *breakpoints), pattern.sub("", text)
-
-
-def _match_unit(unit: str, units: Mapping[str, float]) -> str:
-    """Return the key of `units` that equals the text `unit` when blanks are ignored."""
-    return next(name for name in units if name.replace(" ", "") == unit.replace(" ", ""))

@@ -18,10 +18,9 @@ IMPLICIT: Implicit = (True,)
 
 
 def step_nodes(implicit: Implicit, h: float) -> np.ndarray:
-    """Compute the times [s] within a step of h [s] at which the integration method needs its inputs, (nodes,).
+    """Compute the times (nodes,) within a step of h [s] at which a method, `IMPLICIT` or `EXPLICIT`, needs its inputs.
 
-    `implicit`: `IMPLICIT` or `EXPLICIT`, the integration method. The first and last time lie just inside the step, so
-    that an input that jumps between two steps is taken on the right side of the jump.
+    The first and last lie just inside the step, on the right side of an input's jump between two steps.
     """
     nodes = np.array(IMEX_NODES if implicit else RK4_NODES)
     nodes[0], nodes[-1] = 1e-9, 1.0 - 1e-9
@@ -87,8 +86,7 @@ def advance_closed(
     - `numbers`: parameters of the model. `rows` (n // every, 21): receives the outputs. `start`: number of the output
       in rows[0], counted from the beginning of the run.
 
-    If the controller returns a voltage that is not finite, the integration stops there, with fewer outputs than `rows`
-    has.
+    If the controller returns a voltage that is not finite, the integration stops there, with fewer outputs.
     """
     spacing, n_rows = loop.counters[SPACING], rows.shape[0]  # outputs per sample of the controller; all outputs
     u = np.empty((spacing * every, G.shape[1]))

@@ -61,8 +61,8 @@ W = (82889 / 524892, 0.0, 15625 / 83664, 69875 / 102672, -2260 / 8211, GAMMA)
 def _add_stage(z: State, h: float, e: float, f: State, i: float, s: Pressures) -> State:
     """Add the contribution h (e f + i s) of one Runge-Kutta stage to the state z; return the sum.
 
-    `f`: explicit rates of all states; `s`: implicit rates of the four pressures; `e`, `i`: coefficients of `f` and `s`
-    in the method's tableau; `h` [s]: length of the step.
+    `f`: explicit rates of all states; `s`: implicit rates of the four pressures; `e`, `i`: their coefficients in the
+    method's tableau; `h` [s]: length of the step.
     """
     return add_to_pressures(add_step(z, h * e, f), h * i, s)
 
@@ -114,10 +114,9 @@ def _solve_stage(z: State, h: float, p: RigNumbers) -> tuple[State, Pressures]:
 def imex_step(y: State, h: float, u: Nodes, G: Nodes, C: Nodes, F: Nodes, p: RigNumbers) -> State:
     """Integrate the state `y` over one step of h [s] by the implicit-explicit method; return the new state.
 
-    The tuples hold the inputs at the six `IMEX_NODES` of the step: command `u` [V], leakage coefficients `G`
-    [m^3/(s Pa)] and `C` [m^3/(s Pa^0.5)], and load `F` [N]. Stage k solves for its state z and its implicit rates
-    s_k, then evaluates its explicit rates f_k. E_k and I_k are the rows of the tableaus, W the weights. `p`: the rig's
-    parameters.
+    The tuples hold the inputs at the six `IMEX_NODES` of the step: command `u` [V], leakage coefficients `G` [m^3/(s
+    Pa)] and `C` [m^3/(s Pa^0.5)], and load `F` [N]. Stage k solves for its state z and its implicit rates s_k, then
+    evaluates its explicit rates f_k. E_k and I_k are the rows of the tableaus, W the weights.
     """
     Q_A, Q_B = rig.throttle_flows(y, p)
     s1 = rig.throttle_rates(y, Q_A, Q_B, p)
@@ -151,7 +150,7 @@ def implicit_step(
     """Integrate the state `z` over step number `step` by the implicit-explicit method; return the new state.
 
     `h` [s]: length of the step. `u`, `G`, `C` and `F` (n, 6) hold the inputs of n steps at the `IMEX_NODES`, one step
-    in a row (`imex_step`). `F` is read only if the rig has an additional load. `p`: the rig's parameters.
+    in a row (`imex_step`). `F` is read only if the rig has an additional load.
     """
     volts = (u[step, 0], u[step, 1], u[step, 2], u[step, 3], u[step, 4], u[step, 5])
     laminar = (G[step, 0], G[step, 1], G[step, 2], G[step, 3], G[step, 4], G[step, 5])

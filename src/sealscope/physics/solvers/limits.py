@@ -15,25 +15,18 @@ DECAY_LIMIT = 2.785
 
 
 def _end_volumes(p: RigNumbers) -> tuple[tuple[float, float], ...]:
-    """Compute the oil volumes (V_A, V_B) [m^3] at each end of the stroke.
-
-    Returns two pairs, or the one pair of mid-stroke volumes if the rig's volumes do not depend on the position.
-    """
+    """Compute the oil volumes (V_A, V_B) [m^3] at each end of the stroke, one pair if they are constant."""
     if not p.position_dependent:
         return ((p.V_A, p.V_B),)
-    half_stroke = 0.5 * p.L
-    return (p.V_A - p.A_A * half_stroke, p.V_B + p.A_B * half_stroke), (
-        p.V_A + p.A_A * half_stroke,
-        p.V_B - p.A_B * half_stroke,
-    )
+    return tuple((p.V_A + p.A_A * x, p.V_B - p.A_B * x) for x in (-0.5 * p.L, 0.5 * p.L))
 
 
 def _longest_mode_step(damping: float, stiffness: float) -> float:
     """Compute the longest step [s] that resolves the two modes of s^2 + damping s + stiffness = 0.
 
-    `damping` [1/s], `stiffness` [1/s^2]. If the modes oscillate, they may advance by one radian a step: the result is
-    1/sqrt(stiffness). If they decay, the faster one, of rate lambda, must be stable: 2.785/lambda, the limit of the
-    Runge-Kutta method of order four. The result is infinite if the modes neither oscillate nor decay.
+    `damping` [1/s], `stiffness` [1/s^2]. Modes that oscillate may advance by one radian a step: 1/sqrt(stiffness). If
+    they decay, the faster one, of rate lambda, must be stable: 2.785/lambda, the limit of the Runge-Kutta method of
+    order four. The result is infinite if they do neither.
     """
     discriminant = damping * damping - 4.0 * stiffness
     if discriminant < 0.0:
@@ -147,8 +140,5 @@ def _longest_valve_step(p: RigNumbers, end_volumes: tuple[tuple[float, float], .
 
 
 def longest_step_on_stop(p: RigNumbers) -> float:
-    """Compute the longest step [s] that resolves the piston while it touches an end stop.
-
-    The mass M_eq then moves on the stop's spring k_stop and damper d_stop.
-    """
+    """Compute the longest step [s] that resolves the mass M_eq on spring and damper of an end stop."""
     return _longest_mode_step(p.d_stop / p.M_eq, p.k_stop / p.M_eq)

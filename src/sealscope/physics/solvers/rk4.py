@@ -18,11 +18,7 @@ Nodes = tuple[float, float, float]
 
 @contracted
 def freeze_integral(dy: State, euler_integral: bool) -> State:
-    """Return the state's rates `dy`, with the rate of the controller's integral set to 0 if `euler_integral`.
-
-    The caller then updates the integral once per step instead, which is eq. (4.2) of the thesis taken literally
-    (`rk4_step`).
-    """
+    """Return the state's rates `dy`, that of the controller's integral as 0 if `euler_integral` (`rk4_step`)."""
     dI = 0.0 * dy[0] if euler_integral else dy[0]  # 0.0 * dy[0]: a zero of the rate's type, a number or lanes
     return dI, dy[1], dy[2], dy[3], dy[4], dy[5], dy[6], dy[7], dy[8], dy[9], dy[10], dy[11], dy[12], dy[13]
 
@@ -32,10 +28,10 @@ def rk4_step(y: State, h: float, u: Nodes, G: Nodes, C: Nodes, F: Nodes, p: RigN
     """Integrate the state `y` over one step of h [s] by the Runge-Kutta method of order four; return the new state.
 
     The tuples hold the inputs at the beginning, middle and end of the step: command `u` [V], leakage coefficients `G`
-    [m^3/(s Pa)] and `C` [m^3/(s Pa^0.5)], and load `F` [N]. `p`: the rig's parameters. With `euler_integral` the
-    integral of the speed controller is constant within the step and then grows by h (omega_d - omega), as eq. (4.2) of
-    the thesis is printed: omega_d is the speed that the command sets, omega that of the motor, both [rad/s] at the
-    beginning of the step. Otherwise the integral is a state like the others.
+    [m^3/(s Pa)] and `C` [m^3/(s Pa^0.5)], and load `F` [N]. With `euler_integral` the integral of the speed controller
+    is constant within the step and then grows by h (omega_d - omega), as eq. (4.2) of the thesis is printed: omega_d is
+    the speed that the command sets, omega that of the motor, both [rad/s] at the beginning of the step. Otherwise the
+    integral is a state like the others.
     """
     first = rates(y, u[0], G[0], C[0], F[0], p)
     k1 = freeze_integral(first, euler_integral)
@@ -63,7 +59,7 @@ def explicit_step(
     """Integrate the state `z` over step number `step` by the Runge-Kutta method of order four; return the new state.
 
     `h` [s]: length of the step. `u`, `G`, `C` and `F` (n, 3) hold the inputs of n steps at the `RK4_NODES`, one step in
-    a row (`rk4_step`). `F` is read only if the rig has an additional load. `p`, `euler_integral`: as for `rk4_step`.
+    a row (`rk4_step`). `F` is read only if the rig has an additional load.
     """
     volts = (u[step, 0], u[step, 1], u[step, 2])
     laminar, orifice = (G[step, 0], G[step, 1], G[step, 2]), (C[step, 0], C[step, 1], C[step, 2])

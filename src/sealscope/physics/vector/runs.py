@@ -35,21 +35,14 @@ FLOW, OPENING, MAX_TRAVEL, MIN_PRESSURE, DIVERGED = range(N_TOTALS)
 
 
 def _compile(text: str, **scope: Any) -> Any:
-    """Compile a function from its source text, in which it has the name `law`.
-
-    `scope`: by name, the objects that the source uses in addition to `load`. The source is generated as text because
-    numba needs each element of a tuple written out.
-    """
+    """Compile the function `law` from its source, in which numba needs each element of a tuple written out."""
     scope["load"] = load
     exec(text, scope)
     return contracted(scope["law"])
 
 
 def _row_loader(count: int) -> Any:
-    """Compile a function (array, row) that loads `count` successive rows of an array as a tuple, from row `row` on.
-
-    Each row holds one number for each run of a group, and is loaded as lanes.
-    """
+    """Compile a function (array, row) that loads `count` successive rows from `row` on as a tuple of lanes."""
     elements = ", ".join(f"load(array, row + {k})" for k in range(count))
     return _compile(f"def law(array, row):\n    return ({elements})")
 
@@ -62,10 +55,7 @@ load_numbers = _compile(f"def law(table, row, p):\n    return RigNumbers({', '.j
 
 @contracted
 def leak_opening(leak: Leak, t: float) -> float:
-    """Compute the opening of a leak, 0 to 1, at t [s].
-
-    It rises linearly from the leak's start on and then stays at 1. `leak`: the numbers of the leak, by `LEAK_ROWS`.
-    """
+    """Compute the opening of a `leak` (`LEAK_ROWS`) at t [s]: 0 to 1, rising linearly from the leak's start on."""
     return min(max((t - leak[2]) * leak[3], 0.0), 1.0)  # [2]: start [s]; [3]: slope [1/s]
 
 
@@ -82,10 +72,7 @@ def _build_inputs_law(count: int) -> Any:
     """
 
     def for_nodes(text: str) -> str:
-        """Repeat a piece of source text for each node, with the node's number in place of `{n}`.
-
-        `{load_column}` becomes the number of the column of `shape` that has the load at this node.
-        """
+        """Repeat source text for each node `{n}`, with the column `{load_column}` of its load in `shape`."""
         return ", ".join(text.format(n=n, load_column=count + n) for n in range(count))
 
     return _compile(
@@ -109,8 +96,8 @@ _rk4_inputs, _imex_inputs = _build_inputs_law(3), _build_inputs_law(6)
 def _add_output(z: State, leak: Leak, t: float, totals: Totals, q: RigNumbers) -> Totals:
     """Add one output of a group of runs to the totals of these runs, which `N_TOTALS` lists; return the new totals.
 
-    `z`: states of the runs at the output; `leak`: numbers of their leaks (`LEAK_ROWS`), of which the last two are the
-    coefficients G and C of the summed flow; `t` [s]: time of the output; `q`: numbers of the runs' rigs.
+    `z`: states of the runs; `leak`: numbers of their leaks (`LEAK_ROWS`), of which the last two are the coefficients G
+    and C of the summed flow; `t` [s]: time of the output; `q`: numbers of the runs' rigs.
     """
     flow_sum, opening_sum, max_travel, min_pressure, diverged = totals
     opening = leak_opening(leak, t)
@@ -190,17 +177,11 @@ def advance(
 
 @kernel
 def advance_lanes_rk4(*run: Any) -> None:
-    """Integrate groups of runs by the explicit Runge-Kutta method in compiled code.
-
-    `run`: all arguments of `advance` in this module but the first, `implicit`, which states the method.
-    """
+    """Run `advance` by the explicit Runge-Kutta method in compiled code; `run`: its arguments but `implicit`."""
     advance(EXPLICIT, *run)
 
 
 @kernel
 def advance_lanes_imex(*run: Any) -> None:
-    """Integrate groups of runs of rigs with throttles by the implicit-explicit method in compiled code.
-
-    `run`: all arguments of `advance` in this module but the first, `implicit`, which states the method.
-    """
+    """Run `advance` by the implicit-explicit method in compiled code; `run`: its arguments but `implicit`."""
     advance(IMPLICIT, *run)

@@ -39,8 +39,8 @@ class Batch:
 
     `rms` (runs, 2, segments, 5): RMS by run, chamber pressure (`CHAMBERS`: p_A, p_B), segment and wavelet detail
     (`QUANTITIES`: d1, d2, d3, d4 [Pa], d3d4 [Pa^2]); `bounds` (segments + 1,): limits of the segments [s];
-    `mean_leak_lpm` (runs,): mean leakage flow abs(Q) while the leak is open [L/min]; `coefficients` (runs,): G
-    [m^3/(s Pa)] or C [m^3/(s Pa^0.5)] of the leaks; `steps` (runs,): solver's step [s].
+    `mean_leak_lpm` (runs,): mean leakage flow abs(Q) while the leak is open [L/min]; `coefficients` (runs,): G [m^3/(s
+    Pa)] or C [m^3/(s Pa^0.5)] of the leaks; `steps` (runs,): solver's step [s].
     """
 
     rms: Array
@@ -58,10 +58,7 @@ class Batch:
 
     @checked_call
     def rms_of(self, channel: str, detail: str) -> Array:
-        """Return the RMS of one wavelet detail of one channel, (runs, segments).
-
-        `channel`: p_A or p_B; `detail`: d1, d2, d3, d4 [Pa] or d3d4 [Pa^2].
-        """
+        """Return the RMS (runs, segments) of a detail, d1 to d4 [Pa] or d3d4 [Pa^2], of p_A or p_B (`channel`)."""
         channel_index = _index_of(channel, CHAMBERS, "channel")
         detail_index = _index_of(detail, QUANTITIES, "detail")
         return np.asarray(self.rms[:, channel_index, :, detail_index])
@@ -86,10 +83,8 @@ class Batch:
     def to_pandas(self) -> pd.DataFrame:
         """Convert the batch to a pandas table with one row for each run and segment.
 
-        The columns are run, segment, start [s], stop [s], the RMS of each wavelet detail of each channel (such as
-        `d3 of p_A [Pa]`), mean_leak [L/min], coefficient and step [s].
-
-        Raises MissingExtra if pandas is not installed.
+        Its columns are run, segment, start [s], stop [s], the RMS of each wavelet detail of each channel (such as `d3
+        of p_A [Pa]`), mean_leak [L/min], coefficient and step [s]. Raises MissingExtra if pandas is not installed.
         """
         try:
             import pandas as pd
@@ -131,9 +126,9 @@ def simulate_batch(
     run may have one leak, which opens abruptly or linearly.
 
     Runs with the same choices of the rig (such as the friction law), command waveform, load, method, step and error are
-    a set, which is integrated together. If the runs of a set state no step, one is chosen for the set, by the error
-    that they state or else by `error`. The results of a run do not depend on `threads`. They depend on the other runs
-    of its set only through
+    a set, which is integrated together. If its runs state no step, one is chosen for the set, by the error that they
+    state or else by `error`. The results of a run do not depend on `threads`. They depend on the other runs of its set
+    only through
 
     - the step;
     - the blocks of time in which changing parameters are taken as constant;
@@ -194,11 +189,7 @@ def simulate_batch(
         set_fraction = len(experiment_set.members) / n
 
         def report(fraction: float, before: float = completed, set_fraction: float = set_fraction) -> None:
-            """Report the completed fraction of the batch, from the completed `fraction` of the current set.
-
-            `before`: fraction of the batch completed before this set; `set_fraction`: fraction of the batch in this
-            set. Both are defaults so that they keep the values of this pass of the loop.
-            """
+            """Report the batch's progress from the set's; the defaults keep the values of this pass."""
             if progress is not None:
                 progress(min(1.0, before + fraction * set_fraction))
 
@@ -211,10 +202,7 @@ def simulate_batch(
 def _run_set(
     experiment_set: ExperimentSet, batch: Batch, error: float, threads: int, progress: Callable[[float], None]
 ) -> None:
-    """Simulate a set of experiments on `threads` threads, and write the results into their rows of `batch`.
-
-    `error` [Pa]: allowed rms error of a pressure; `progress` is called with the completed fraction of the set.
-    """
+    """Simulate a set within `error` [Pa rms] of a pressure on `threads` threads, and write its rows of `batch`."""
     members, stated_step = experiment_set.members, experiment_set.experiment.step
     rows = [member.row for member in members]
     coefficients = np.array([member.leak.coefficient or 0.0 for member in members])
@@ -234,9 +222,8 @@ def _run_set(
 def choose_step(experiment_set: ExperimentSet, coefficients: Array, error: float) -> float:
     """Choose the solver's step [s] for a set of experiments that are integrated together.
 
-    For the first 4 s of up to four runs of the set, `integrate` finds a step so short that half the step changes no
-    pressure by more than `error` [Pa rms]. The result is the shortest of these steps, but no longer than the rigs and
-    leaks of all runs allow (`longest_allowed_step`). `coefficients` (runs,): leakage coefficients.
+    It is the shortest of the steps that `integrate` finds for `error` [Pa rms] in the first 4 s of up to four runs, and
+    no longer than the rigs and leaks (`coefficients` (runs,)) of all runs allow (`longest_allowed_step`).
     """
     members, steps = experiment_set.members, [longest_allowed_step(experiment_set, coefficients)]
     for k in np.unique(np.linspace(0, len(members) - 1, _N_SAMPLE_RUNS).round().astype(int)):
@@ -249,8 +236,7 @@ def choose_step(experiment_set: ExperimentSet, coefficients: Array, error: float
 def longest_allowed_step(experiment_set: ExperimentSet, coefficients: Array) -> float:
     """Compute the longest step [s] that resolves the rig and the leak of every run in a set of experiments.
 
-    `coefficients` (runs,): leakage coefficients, G [m^3/(s Pa)] of a laminar leak or C [m^3/(s Pa^0.5)] of an orifice.
-    The result is no shorter than the shortest step that `integrate` tries, `LONGEST_STEP` / `MAX_STEP_REFINEMENT`.
+    `coefficients` (runs,): G [m^3/(s Pa)] or C [m^3/(s Pa^0.5)]. No result is shorter than `integrate` tries.
     """
     from sealscope.physics.solvers.limits import longest_step
 
@@ -262,19 +248,17 @@ def longest_allowed_step(experiment_set: ExperimentSet, coefficients: Array) -> 
 
 
 def _size_leaks(experiment_set: ExperimentSet, step: float, coefficients: Array, threads: int) -> Array:
-    """Find the leakage coefficients (runs,) that give the stated mean flows of a set's leaks.
+    """Find the leakage coefficients (runs,) that give the stated mean flows of a set's leaks, by `size_leaks`.
 
-    The search starts from `coefficients`, which are kept for leaks without a stated mean flow, and simulates the set on
-    `threads` threads. `step` [s]: longest step of the solver if the set does not state one.
+    `coefficients`: start values; `step` [s]: longest step of the solver if the set does not state one.
     """
     members, stated_step = experiment_set.members, experiment_set.experiment.step
     mean_flows = np.array([member.leak.mean or 0.0 for member in members])
 
     def measure_unit_flows(coefficients: Array) -> tuple[Array, None]:
-        """Simulate the set; return each leak's mean flow [m^3/s] per unit coefficient (runs,), and None.
+        """Simulate the set; return each leak's mean flow [m^3/s] per unit of coefficient (runs,), and None for the run.
 
-        `coefficients` (runs,): leakage coefficients. For a coefficient of 0, the flow that a leak of coefficient 1
-        would have under the pressures of the run is returned. None stands for the run, which is not needed.
+        For a coefficient of 0, it is the flow that a leak of coefficient 1 would have under the pressures of the run.
         """
         flow_coefficients = np.where(coefficients > 0, coefficients, 1.0)
         run_step = stated_step or min(step, longest_allowed_step(experiment_set, coefficients))

@@ -31,29 +31,27 @@ def _integer_constant(value: int) -> Any:
     return ir.Constant(_INTEGERS, [value] * WIDTH)
 
 
-def noise_keys(seeds: list[int]) -> Array:
-    """Compute the 64-bit key of each run's noise from its seed, (runs,).
+def _result_type(arg_types: Any) -> Any:
+    """Return the type of the first argument if it is that of lanes (a vector) of doubles, else None."""
+    return LANES if arg_types[0] == LANES else None
 
-    The bits are stored as doubles, so that compiled code can load the keys of several runs as one vector.
-    """
+
+def noise_keys(seeds: list[int]) -> Array:
+    """Compute the 64-bit key of each run's noise from its seed, (runs,), stored in doubles for loading as vectors."""
     states = [np.random.SeedSequence(seed).generate_state(1, np.uint64) for seed in seeds]
     return np.concatenate(states).view(np.float64)
 
 
 def uniform(key: Any, position: int) -> Any:
-    """Draw uniform random numbers in (0, 1] for a vector of runs, in compiled code.
+    """Draw uniform random numbers in (0, 1] for a vector of runs, in code that `_lower_uniform` builds.
 
-    `key`: keys of the runs' noise (`noise_keys`); `position` >= 0: position in the sequences of random numbers. The
-    compiled body is built by `_lower_uniform`.
+    `key`: keys of the runs' noise (`noise_keys`); `position` >= 0: position in the sequences of random numbers.
     """
 
 
+@register_lowering(uniform, 2, _result_type)
 def _lower_uniform(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
-    """Build the LLVM instructions of `uniform`, which evaluate SplitMix64 (`commands.PseudoRandom`).
-
-    The generator's state at position k is key + (k + 1) GOLDEN. The bits of the state, mixed by shifts and products,
-    become the mantissa of a number in (0, 1].
-    """
+    """Build the LLVM instructions of `uniform`: SplitMix64's bits become the mantissa of a number in (0, 1]."""
     key, position = values
     int64 = ir.IntType(64)
     k = context.cast(builder, position, arg_types[1], types.int64)
@@ -73,6 +71,7 @@ def _exponent(x: Any) -> Any:
     """Extract the binary exponent of positive normal doubles, as doubles, in code that `_lower_exponent` builds."""
 
 
+@register_lowering(_exponent, 1, _result_type)
 def _lower_exponent(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
     """Build the LLVM instructions of `_exponent`: the bits above the mantissa, minus the exponent's bias."""
     biased_exponent = builder.lshr(builder.bitcast(values[0], _INTEGERS), _integer_constant(_MANTISSA_BITS))
@@ -83,26 +82,19 @@ def _fraction(x: Any) -> Any:
     """Extract the significand 1 <= m < 2 of positive normal doubles, in code that `_lower_fraction` builds."""
 
 
+@register_lowering(_fraction, 1, _result_type)
 def _lower_fraction(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
     """Build the LLVM instructions of `_fraction`: the bits of the mantissa with the exponent of 1."""
     bits = builder.and_(builder.bitcast(values[0], _INTEGERS), _integer_constant(_MANTISSA_MASK))
     return builder.bitcast(builder.or_(bits, _integer_constant(_ONE_BITS)), _DOUBLES)
 
 
-for _function, _arity, _build in (
-    (uniform, 2, _lower_uniform),
-    (_exponent, 1, _lower_exponent),
-    (_fraction, 1, _lower_fraction),
-):
-    register_lowering(_function, _arity, lambda arg_types: arg_types[0] if arg_types[0] == LANES else None, _build)
-
-
 @contracted
 def logarithm(x: Any) -> Any:
     """Compute ln x for a vector of numbers x > 0, none of them subnormal.
 
-    ln x = e ln 2 + 2 artanh((m - 1)/(m + 1)) with x = 2^e m and m in sqrt(1/2)..sqrt(2), by the series of artanh.
-    The error is 2e-15, absolute near 1 and relative elsewhere.
+    ln x = e ln 2 + 2 artanh((m - 1)/(m + 1)) with x = 2^e m and m in sqrt(1/2)..sqrt(2), by the series of artanh. The
+    error is 2e-15, absolute near 1 and relative elsewhere.
     """
     e, m = _exponent(x), _fraction(x)
     above_sqrt_2 = m > _SQRT_2
@@ -130,8 +122,8 @@ def half_turn_sine(v: Any) -> Any:
 def normals(key: Any, pair: int) -> tuple[Any, Any]:
     """Draw two independent standard normal random numbers for each of a vector of runs, in compiled code.
 
-    They are computed by the method of Box and Muller (Annals of Mathematical Statistics 29 (1958) 610-611) from the
-    uniform numbers at positions 2 `pair` and 2 `pair` + 1 of the sequences that `key` selects (`uniform`).
+    They follow from the uniform numbers at positions 2 `pair` and 2 `pair` + 1 of the sequences that `key` selects by
+    the method of Box and Muller (Annals of Mathematical Statistics 29 (1958) 610-611).
     """
     radius = math.sqrt(-2.0 * logarithm(uniform(key, 2 * pair)))
     s = half_turn_sine(uniform(key, 2 * pair + 1) - 0.5)

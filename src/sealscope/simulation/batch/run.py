@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -36,9 +36,8 @@ ABRUPT = 1e15
 class Member:
     """One experiment of a set of experiments that are integrated together.
 
-    `row`: index of the experiment in the batch; `numbers`: parameters of the model; `effects`: changes of parameters
-    within the run. The command is `gain` times the waveform that the set shares (`ExperimentSet.shape`), plus `offset`
-    [V].
+    `row`: index in the batch; `numbers`: parameters of the model; `effects`: their changes within the run. The command
+    is `gain` times the waveform that the set shares (`ExperimentSet.shape`), plus `offset` [V].
     """
 
     row: int
@@ -50,48 +49,31 @@ class Member:
 
     @property
     def leak(self) -> Leak:
-        """The leak of the experiment, or a leak with the coefficient 0 if the experiment has none."""
+        """The leak of the experiment, with the coefficient 0 if there is none."""
         leaks = self.experiment.leaks
         return leaks[0] if leaks else Leak("laminar", coefficient=0.0)
 
     @cached_property
     def step_limiting_parameters(self) -> tuple[RigNumbers, ...]:
-        """The sets of model parameters in the run that limit the length of the solver's step.
-
-        A step that is short enough for each of these sets is short enough for the whole run. The first set has the
-        parameters without any change. The others have the parameters just before and just after each fast change, such
-        as the switching of a valve.
-        """
+        """The sets of parameters in the run that limit the solver's step: without changes, and at each fast change."""
         return step_limiting_parameters(self.effects, self.numbers)
 
 
 @dataclass(frozen=True)
 class ExperimentSet:
-    """Experiments that are integrated together: command waveform (`shape`), load and solver settings are equal.
-
-    The rigs are equal in their choices, such as the friction law; their parameters may differ.
-    """
+    """Experiments integrated together: waveform (`shape`), load, solver and choices of the rig are equal."""
 
     members: tuple[Member, ...]
     shape: Command
 
     @property
     def experiment(self) -> Experiment:
-        """The first experiment of the set, from which the settings that all members share are read."""
+        """The first experiment, which has the settings that all members share."""
         return self.members[0].experiment
 
 
 def refuse_unbatchable(experiment: Experiment, row: int) -> None:
-    """Raise InputError for an experiment that cannot be part of a batch, with the first rule that it breaks.
-
-    `row`: index of the experiment in the batch, for the message. These rules hold:
-
-    - a voltage command;
-    - at most one leak, which opens abruptly or linearly, and no leak while the oil's temperature changes;
-    - the integrator "state" of the motor;
-    - no fault of a sensor, and no clock jitter;
-    - chamber pressure sensors without lag, harmonics of the hum, and stuck or lost samples.
-    """
+    """Raise InputError, with the first rule broken, for an experiment (number `row`) that cannot be in a batch."""
     rig, leaks = experiment.rig, experiment.leaks
     violated_rules = []
     if experiment.active_controller is not None:
@@ -117,33 +99,8 @@ def refuse_unbatchable(experiment: Experiment, row: int) -> None:
         raise InputError(f"a run of a batch must have {violated_rules[0]} (run {row}); simulate it by itself")
 
 
-class _ScaledCommand(NamedTuple):
-    """A command as gain times waveform (`shape`) plus offset [V]; `key` is a text that is equal for equal shapes."""
-
-    key: str
-    shape: Command
-    gain: float
-    offset: float
-
-
-def _split_command(command: Command) -> _ScaledCommand:
-    """Split a command into gain, waveform and offset, so that commands of equal waveform can be simulated together.
-
-    The waveform of a sine is the sine of amplitude 1. Any other command is its own waveform, with gain 1 and offset 0.
-    """
-    if isinstance(command, Sine):
-        shape = Sine(amplitude=1.0, omega=command.omega, phase=command.phase)
-        return _ScaledCommand(str(identity_values(shape)), shape, command.amplitude, command.offset)
-    return _ScaledCommand(str(identity_values(command)), command, gain=1.0, offset=0.0)
-
-
 def group_experiments(experiments: Sequence[Experiment]) -> list[ExperimentSet]:
-    """Group experiments into sets that can be integrated together.
-
-    The experiments of a set have equal choices of the rig (such as the friction law), command waveforms, loads, and
-    solver settings. The waveform is the command without gain and offset. Raises InputError if an experiment cannot be
-    in a batch, or if experiments differ in duration or sampling rate.
-    """
+    """Group experiments into sets (`ExperimentSet`); raise InputError for any that cannot be in this batch."""
     from sealscope.physics.rig import CHOICES
 
     if not experiments:
@@ -168,29 +125,27 @@ def group_experiments(experiments: Sequence[Experiment]) -> list[ExperimentSet]:
             numbers = numbers._replace(open_circuit=(True,))
         if any(effect.field == "air" for effect in effects):
             numbers = numbers._replace(aerated=(True,))
-        scaled_command = _split_command(experiment.voltage_command)
+        shape, gain, offset = experiment.voltage_command, 1.0, 0.0
+        if isinstance(shape, Sine):  # sines of one frequency and phase share a waveform
+            gain, offset, shape = shape.amplitude, shape.offset, replace(shape, amplitude=1.0, offset=0.0)
         # without "pushed", the tables of the load, which `load` identifies
         choices = tuple(getattr(numbers, name) for name in CHOICES if name != "pushed")
         method = choose_method(experiment.rig, experiment.method)
-        kind = (scaled_command.key, load, choices, method, experiment.step, experiment.error)
-        shapes[kind] = scaled_command.shape
-        member = Member(row, experiment, numbers, effects, scaled_command.gain, scaled_command.offset)
-        members_by_kind.setdefault(kind, []).append(member)
+        kind = (str(identity_values(shape)), load, choices, method, experiment.step, experiment.error)
+        shapes[kind] = shape
+        members_by_kind.setdefault(kind, []).append(Member(row, experiment, numbers, effects, gain, offset))
     return [ExperimentSet(tuple(members), shapes[kind]) for kind, members in members_by_kind.items()]
 
 
 def pack_lanes(values: Array, width: int) -> Array:
-    """Rearrange an array (runs, ...) in groups of `width` runs, (groups, ..., width), for vector registers.
-
-    If the last group is not full, copies of the last run fill it.
-    """
+    """Rearrange (runs, ...) in groups, (groups, ..., width), for vector registers; copies of the last run fill up."""
     groups = math.ceil(len(values) / width)
     padded = np.concatenate([values, np.repeat(values[-1:], groups * width - len(values), axis=0)])
     return np.ascontiguousarray(np.moveaxis(padded.reshape(groups, width, *values.shape[1:]), 1, -1))
 
 
 def unpack_lanes(lanes: Array, runs: int) -> Array:
-    """Rearrange an array (groups, ..., width) as (runs, ...), the inverse of `pack_lanes`; `runs`: number of runs."""
+    """Rearrange an array (groups, ..., width) as (runs, ...), the inverse of `pack_lanes`."""
     lanes_second = np.moveaxis(lanes, -1, 1)
     return lanes_second.reshape(-1, *lanes_second.shape[2:])[:runs]
 
@@ -198,14 +153,9 @@ def unpack_lanes(lanes: Array, runs: int) -> Array:
 def build_leak_rows(members: Sequence[Member], coefficients: Array, flow_coefficients: Array) -> Array:
     """Build the table (runs, LEAK_ROWS) of the leaks' parameters that the compiled model takes.
 
-    The columns are:
-
-    - G and C of the leak that acts in the run, from `coefficients` (runs,): one of them is 0;
-    - start [s] and slope [1/s] of the leak's opening;
-    - G and C of the leak whose mean flow is computed, from `flow_coefficients` (runs,).
-
-    Both arguments differ only in the search for a coefficient that gives a stated mean flow. The search starts with a
-    run without a leak, in which the mean flow of a leak with the coefficient 1 is computed.
+    The columns are G and C of the leak that acts in the run, from `coefficients` (runs,), start [s] and slope [1/s] of
+    its opening, and G and C of the leak whose mean flow is computed, from `flow_coefficients` (runs,). Both differ only
+    in the search for a coefficient, whose first run is without a leak.
     """
     rows = []
     for member, coefficient, flow_coefficient in zip(members, coefficients, flow_coefficients, strict=True):
@@ -221,12 +171,10 @@ def build_leak_rows(members: Sequence[Member], coefficients: Array, flow_coeffic
 
 @dataclass(frozen=True)
 class Cells:
-    """Model parameters of the runs of a set over time, constant within cells.
+    """Model parameters of the runs of a set over time, constant within cells, which are spans of the solver's outputs.
 
-    A cell is a span of outputs, which are the times at which the solver writes its results. All runs have the same
-    cells. `bounds` (cells + 1,): outputs at which the cells begin, and the end of the last; `base` (runs, parameters):
-    parameters without changes; `changing`: indices of the parameters that change; `values` (runs, changing, cells):
-    values of the changing parameters.
+    `bounds` (cells + 1,): outputs at which the cells begin, and the end of the last; `base` (runs, parameters): without
+    changes; `changing`: indices of the parameters that change; `values` (runs, changing, cells): their values.
     """
 
     bounds: np.ndarray
@@ -235,10 +183,7 @@ class Cells:
     values: Array
 
     def table(self, first: int, last: int, width: int) -> Array:
-        """Build the table of the model's parameters in the cells first <= cell < last, for compiled code.
-
-        Returns an array (groups, cells, parameters, width), with `width` runs in a group.
-        """
+        """Build the table (groups, cells, parameters, width) of the cells first <= cell < last."""
         table = np.repeat(self.base[:, None, :], last - first, axis=1)
         for k, parameter in enumerate(self.changing):
             table[:, :, parameter] = self.values[:, k, first:last]
@@ -246,12 +191,7 @@ class Cells:
 
 
 def build_cells(members: Sequence[Member], n_out: int, rate: float) -> Cells:
-    """Compute the model's parameters over time for a set of runs.
-
-    Time is divided into cells in which the parameters are constant, so short that they change little from one cell
-    to the next (`block_bounds`). All runs have the same cells. A run has `n_out` outputs at `rate` [Hz], the times at
-    which the solver writes its results.
-    """
+    """Compute the model's parameters for runs of `n_out` outputs at `rate` [Hz] in cells where they are constant."""
     from sealscope.physics.rig import NUMBERS
 
     # most members share their parameters: convert each distinct object once
@@ -270,22 +210,18 @@ def build_cells(members: Sequence[Member], n_out: int, rate: float) -> Cells:
 
 
 def with_leak_coefficient(experiment: Experiment, coefficient: float) -> Experiment:
-    """Return the experiment with a leak of this coefficient in place of the stated mean flow or coefficient.
-
-    An experiment without a leak is returned unchanged.
-    """
+    """Return the experiment with this coefficient of its leak, if any, in place of the stated size."""
     if not experiment.leaks:
         return experiment
     return replace(experiment, leaks=(replace(experiment.leaks[0], mean=None, coefficient=coefficient),))
 
 
 def build_instrument_rows(members: Sequence[Member], first: int, last: int) -> Array:
-    """Build the table of the parameters of the instruments of p_A and p_B for the samples first <= sample < last.
+    """Build the parameters of the instruments of p_A and p_B for the samples first <= sample < last.
 
-    Returns an array (runs, 2, INSTRUMENT_ROWS) for compiled code; the last axis has the quantities whose indices are
-    constants of `batch.signals` (`GAIN` to `MAX_CODE`). Gain, offset and noises may change within a run; they are
-    stored as the value at sample `first` (such as `GAIN`) and the mean change per sample until sample `last` (such as
-    `GAIN_RISE`).
+    Returns an array (runs, 2, INSTRUMENT_ROWS); constants of `batch.signals` (`GAIN` to `MAX_CODE`) index the last
+    axis. Gain, offset and noises may change within a run; they are stored as the value at sample `first` (such as
+    `GAIN`) and the mean change per sample until sample `last` (such as `GAIN_RISE`).
     """
     from sealscope.simulation.batch.signals import HUM, HUM_PHASE
 
@@ -301,13 +237,7 @@ def build_instrument_rows(members: Sequence[Member], first: int, last: int) -> A
 
 
 def _pressure_instruments(rig: Rig, readings: Readings, ends: Array, samples: int) -> Array:
-    """Build the parameters (2, INSTRUMENT_ROWS) of one run's pressure instruments for a span of time.
-
-    `ends` (2,): start and end of the span [s]; `samples`: number of samples in the span; `readings`: changes of the
-    instruments. The first axis is p_A and p_B; the second has the quantities whose indices are constants of
-    `batch.signals` (`GAIN` to `MAX_CODE`). Gain, offset and noises are stored as the value at the start and the mean
-    change per sample.
-    """
+    """Build one run's part (2, INSTRUMENT_ROWS) of `build_instrument_rows`; `ends` (2,) [s] of `samples` samples."""
     from sealscope.simulation.batch import signals
 
     rows, daq = np.zeros((len(CHAMBERS), signals.INSTRUMENT_ROWS)), rig.daq
@@ -331,27 +261,12 @@ def _pressure_instruments(rig: Rig, readings: Readings, ends: Array, samples: in
     return rows
 
 
-class _Chunk(NamedTuple):
-    """A part of a run that is integrated at once: first_cell <= cell < end_cell, start <= output < stop.
-
-    A cell is a span of time with constant parameters, an output a time at which the solver writes its results.
-    """
-
-    first_cell: int
-    end_cell: int
-    start: int
-    stop: int
-
-
 #: Most steps of a chunk, which bounds the memory of its arrays. Chunks end at cells unless a cell is longer.
 MAX_CHUNK_STEPS = 4096
 
 
 class SetRun:
-    """The simulation of all runs of an `ExperimentSet`, on several threads.
-
-    `run_all` simulates the runs; `rms` and `mean_flow` then compute the results.
-    """
+    """The simulation of all runs of an `ExperimentSet` on several threads: `run_all`, then `rms`, `mean_flow`."""
 
     #: Runs of a group.
     width: ClassVar[int] = 8
@@ -367,10 +282,10 @@ class SetRun:
     ) -> None:
         """Prepare the runs of a set at standstill, to be integrated with a step of at most `step` [s].
 
-        `coefficients` (runs,): leakage coefficients that act in the runs; `flow_coefficients` (runs,): coefficients of
-        the leaks whose mean flow is computed (`build_leak_rows`); `bounds` [s]: limits of the segments over which the
-        RMS of the wavelet details is computed, None to compute mean flows only. Raises SimulationFailed if the step
-        cannot resolve one of the runs.
+        `coefficients` (runs,): leakage coefficients that act in the runs; `flow_coefficients` (runs,): those of the
+        leaks whose mean flow is computed (`build_leak_rows`); `bounds` [s]: limits of the segments over which the RMS
+        of the wavelet details is computed, None to compute mean flows only. Raises SimulationFailed if a run is
+        unresolved.
         """
         from sealscope.physics.solvers.advance import EXPLICIT, IMPLICIT, step_nodes
         from sealscope.physics.solvers.limits import longest_step
@@ -414,8 +329,8 @@ class SetRun:
     def _prepare_filters(self, rate: float) -> None:
         """Set `taps` to the coefficients of each run's anti-alias filter, which includes the transducers' delays.
 
-        The solver writes `oversampling` outputs per sample of the recording, at `rate` [Hz]. The filter computes a
-        sample at output n from the outputs n - `taps_before` to n + `taps_after`; both numbers are set, too.
+        The solver writes `oversampling` outputs per sample of the recording, at `rate` [Hz]. A sample at output n is
+        computed from the outputs n - `taps_before` to n + `taps_after`; both numbers are set, too.
         """
         sensors = [member.experiment.rig.sensors for member in self.experiment_set.members]
         delays = np.array([[getattr(group, name).delay * rate for name in CHAMBERS] for group in sensors])
@@ -431,11 +346,7 @@ class SetRun:
         self.taps = pack_lanes(filters, self.width)
 
     def _prepare_statistics(self, bounds: Array) -> None:
-        """Prepare empty sums of squared wavelet details over the segments, and the keys of the runs' noise.
-
-        `bounds` [s]: limits of the segments. Samples near the ends of the record, where the wavelet's filters reach
-        beyond it, are left out.
-        """
+        """Prepare empty sums of squared details between `bounds` [s], without the record's ends, and the noise keys."""
         from sealscope.signals.filters import reach
         from sealscope.simulation.batch.noise import noise_keys
         from sealscope.simulation.batch.signals import QUANTITIES
@@ -448,17 +359,13 @@ class SetRun:
         self.noise_keys = pack_lanes(noise_keys(seeds), self.width)
 
     def run_all(self, threads: int, progress: Callable[[float], None] | None) -> None:
-        """Simulate all runs of the set on `threads` threads.
-
-        `progress` is called with the completed fraction of the set. The threads run in parallel because compiled
-        code releases Python's lock.
-        """
+        """Simulate all runs on threads, in parallel because compiled code releases Python's lock."""
         # a thread simulates the groups between two successive bounds
         bounds = np.unique(np.linspace(0, self.n_groups, min(threads, self.n_groups) + 1).round().astype(int)).tolist()
         lock, completed = threading.Lock(), 0.0
 
         def add_progress(fraction: float) -> None:
-            """Add `fraction` to the completed fraction of the set of runs, and report the sum; for all threads."""
+            """Add `fraction` to the completed fraction of the set, and report the sum; for all threads."""
             nonlocal completed
             if progress is not None:
                 with lock:
@@ -469,11 +376,10 @@ class SetRun:
             # `list` waits for all threads, and raises an exception of any of them
             list(pool.map(lambda groups: self._run_groups(groups, add_progress), itertools.pairwise(bounds)))
 
-    def _chunks(self) -> list[_Chunk]:
-        """Divide the run into chunks, spans of time that are integrated by one call of compiled code.
+    def _chunks(self) -> list[tuple[int, int, int, int]]:
+        """Divide the run into chunks of whole cells up to `MAX_CHUNK_STEPS`, or of parts of a longer cell.
 
-        A chunk covers as many whole cells (spans of constant parameters) as `MAX_CHUNK_STEPS` allows, or a part of one
-        longer cell.
+        Returns the first cell, the cell after the last, the first output and the output after the last of each.
         """
         max_outputs = max(1, MAX_CHUNK_STEPS // self.steps_per_output)
         edges = self.cells.bounds
@@ -486,26 +392,15 @@ class SetRun:
                 end += 1
             stop = int(edges[end])
             starts = range(int(edges[first]), stop, max_outputs)
-            chunks += [_Chunk(first, end, start, min(start + max_outputs, stop)) for start in starts]
+            chunks += [(first, end, start, min(start + max_outputs, stop)) for start in starts]
             first = end
         return chunks
-
-    def _readable_samples(self, stop: int) -> int:
-        """Count the samples of the recording that the anti-alias filter can compute from the outputs before `stop`.
-
-        An output is a time at which the solver writes its results. Sample m needs the outputs up to number
-        m `oversampling` + `taps_after`.
-        """
-        if stop == self.n_outputs:
-            return self.n_samples
-        return min(max(0, (stop - self.taps_after - 1) // self.oversampling + 1), self.n_samples)
 
     def _run_groups(self, groups: tuple[int, int], add_progress: Callable[[float], None]) -> None:
         """Simulate the groups of runs groups[0] <= g < groups[1], chunk by chunk from standstill to the end.
 
-        A group of runs fills a vector register. If there are segments, the squared wavelet details of the readings are
-        added to the sums after each chunk. `add_progress` is called with the fraction of the set that each chunk
-        completes.
+        A group of runs fills a vector register. If there are segments, the readings' squared wavelet details are added
+        to the sums after each chunk. `add_progress` is called with a chunk's fraction of the set.
         """
         from sealscope.physics.vector.runs import advance_lanes_imex, advance_lanes_rk4
         from sealscope.signals.streams import DetailStream
@@ -518,7 +413,7 @@ class SetRun:
         table, cells = np.empty((0, 0, 0, 0)), (-1, -1)
         chunks = self._chunks()
         history = self.taps_before + self.taps_after + self.oversampling  # earlier outputs that later samples need
-        longest = max(chunk.stop - chunk.start for chunk in chunks)
+        longest = max(stop - start for _, _, start, stop in chunks)
         # (groups, outputs of history and chunk, channels, width)
         pressures = np.zeros((b - a, history + longest, self.channels, self.width))
         offset_drifts = np.zeros((b - a, self.channels, self.width))
@@ -537,7 +432,9 @@ class SetRun:
             if self.bounds is not None:
                 if start == 0:
                     pressures[:, :history] = pressures[:, history : history + 1]  # constant before the beginning
-                end_sample = self._readable_samples(stop)
+                end_sample = self.n_samples
+                if stop < self.n_outputs:  # else the samples that the anti-alias filter can compute so far
+                    end_sample = min(max(0, (stop - self.taps_after - 1) // self.oversampling + 1), end_sample)
                 if end_sample > n_read:
                     # index in `pressures` of the first output that sample `n_read` needs; index 0 is start - history
                     first_tap = n_read * self.oversampling - self.taps_before - (start - history)
@@ -552,11 +449,9 @@ class SetRun:
             add_progress((stop - start) / self.n_outputs * (b - a) / self.n_groups)
 
     def _inputs_at_nodes(self, start: int, stop: int) -> Array:
-        """Compute the command waveform and the load [N] at the nodes of the solver's steps in a chunk.
+        """Compute the command waveform and the load [N], if any, at the times (nodes) within the steps of a chunk.
 
-        The nodes are the times within a step at which the solver needs its inputs. All runs share the waveform; a run's
-        command is gain times waveform plus offset. The chunk has the outputs start <= output < stop. Returns an array
-        (steps, nodes), or (steps, 2 nodes) with the load in the last columns if there is a load.
+        Returns (steps, nodes), or (steps, 2 nodes) with the load last, for the outputs start <= output < stop.
         """
         t = np.arange(start * self.steps_per_output, stop * self.steps_per_output, dtype=np.float64) * self.step
         times = t[:, None] + self.nodes
@@ -566,11 +461,7 @@ class SetRun:
         return np.ascontiguousarray(np.hstack([waveform, np.broadcast_to(load.value_at(times), times.shape)]))
 
     def _sensors(self, groups: tuple[int, int], first: int, last: int) -> Array:
-        """Build the parameters of the pressure instruments for the samples first <= sample < last of some groups.
-
-        The groups are groups[0] <= g < groups[1], of `width` runs each. Returns an array (groups, 2, INSTRUMENT_ROWS,
-        width); the second axis is p_A and p_B, the third has the quantities of `build_instrument_rows`.
-        """
+        """Build the rows of `build_instrument_rows` for some groups of runs, (groups, 2, INSTRUMENT_ROWS, width)."""
         if self._constant_sensors is not None:
             return self._constant_sensors[groups[0] : groups[1]]
         members = self.experiment_set.members[groups[0] * self.width : groups[1] * self.width]
@@ -578,10 +469,7 @@ class SetRun:
 
     @cached_property
     def _constant_sensors(self) -> Array | None:
-        """The parameters of the pressure instruments of all groups of runs, (groups, 2, INSTRUMENT_ROWS, width).
-
-        None if any of them change within a run. The axes are those of `_sensors`.
-        """
+        """The instruments' parameters of all groups, as in `_sensors`; None if any of them change within a run."""
         if any(member.experiment.readings().effects for member in self.experiment_set.members):
             return None
         return pack_lanes(build_instrument_rows(self.experiment_set.members, 0, self.n_samples), self.width)
@@ -589,8 +477,7 @@ class SetRun:
     def _check_groups(self, groups: tuple[int, int], stop: int) -> None:
         """Raise SimulationFailed if a run of the groups groups[0] <= g < groups[1] has diverged before output `stop`.
 
-        Unless the experiment allows unresolved runs, also raises SimulationFailed if a run fell below vacuum, or if it
-        hit an end stop that the step cannot resolve.
+        Unless unresolved runs are allowed, also if it fell below vacuum, or hit an end stop too hard for the step.
         """
         from sealscope.physics.solvers.limits import longest_step_on_stop
         from sealscope.physics.vector.runs import DIVERGED, MAX_TRAVEL, MIN_PRESSURE
@@ -625,20 +512,16 @@ class SetRun:
                 )
 
     def rms(self) -> Array:
-        """Compute the RMS of the wavelet details of p_A and p_B in each segment, (runs, 2, segments, 5).
-
-        The details are d1, d2, d3, d4 [Pa] and the product d3 d4 [Pa^2]. A segment without samples gives NaN.
-        """
+        """Compute the RMS (runs, 2, segments, 5) of the details d1 .. d4 [Pa] and d3 d4 [Pa^2]; NaN without samples."""
         n_samples = np.diff(self.segments)[:, None]
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.sqrt(unpack_lanes(self.sums, self.n_runs) / n_samples)
 
     def mean_flow(self) -> Array:
-        """Compute the mean flow |Q_L| (runs,) [m^3/s] of each run's leak while it is open.
+        """Compute the mean flow |Q_L| (runs,) [m^3/s] of each run's leak while it is open, 0 if it never opens.
 
-        The mean is the sum of |Q_L| over the output times of the run, divided by the sum of the leak's opening (0 to 1)
-        over the same times: a time at which the leak is half open counts half. The leaks have the coefficients
-        `flow_coefficients`. The result is 0 for a leak that never opens.
+        It is the sum of |Q_L| over the outputs, for the coefficients `flow_coefficients`, divided by the sum of the
+        leak's opening (0 to 1): a time at which the leak is half open counts half.
         """
         from sealscope.physics.vector.runs import FLOW, OPENING
 

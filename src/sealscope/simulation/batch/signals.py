@@ -33,9 +33,8 @@ INSTRUMENT_ROWS = 18
 def convert_lanes(pressure: Any, sensor: np.ndarray, row: int) -> Any:
     """Compute the pressures [Pa] that are read back from analog-digital converters, for a group of runs at once.
 
-    The transducer saturates at its range, as in `instruments.digitize`. `pressure`: pressures before conversion
-    [Pa]; `sensor`: table of the parameters of the instruments; `row`: index of the first of the `INSTRUMENT_ROWS`
-    rows for this channel.
+    The transducer saturates at its range, as in `instruments.digitize`. `pressure` [Pa]; `sensor`: table of the
+    parameters of the instruments; `row`: first of the `INSTRUMENT_ROWS` rows for this channel.
     """
     range_min, max_code = load(sensor, row + RANGE_MIN), load(sensor, row + MAX_CODE)
     volts_at_min, volts_per_pascal = load(sensor, row + VOLTS_AT_MIN), load(sensor, row + VOLTS_PER_PASCAL)
@@ -50,8 +49,8 @@ def convert_lanes(pressure: Any, sensor: np.ndarray, row: int) -> Any:
 def _mains_hum(sensor: np.ndarray, row: int, sample: int) -> Any:
     """Compute the mains hum [Pa] of a pressure channel at the sample number `sample`, for a group of runs at once.
 
-    The hum is a sine, computed as 2 sin a cos a, where a is half its phase. `sensor`: table of the parameters of the
-    instruments; `row`: index in this table of the first of the `INSTRUMENT_ROWS` rows for this channel.
+    It is a sine, computed as 2 sin a cos a, where a is half its phase. `sensor`: table of the parameters of the
+    instruments; `row`: first of the `INSTRUMENT_ROWS` rows for this channel.
     """
     cycles = load(sensor, row + HUM_PHASE) + load(sensor, row + HUM_CYCLES) * sample
     cycles = cycles - nearest_integer(cycles)  # -1/2 .. 1/2
@@ -73,10 +72,9 @@ def _read_pressure(
 ) -> Any:
     """Compute the readings [Pa] of a pressure channel in a group of runs from the filtered `pressure` [Pa].
 
-    `sensor`: table of the parameters of the instruments; `row`: index in this table of the first of the
-    `INSTRUMENT_ROWS` rows for this channel; `channel_noise`, `common_noise`: standard normal numbers; `drift` [Pa]:
-    drift of the offset so far; `sample`: number of the sample; `samples_since`: number of samples since the sample for
-    which the table was built.
+    `sensor`: table of the parameters of the instruments; `row`: first of the `INSTRUMENT_ROWS` rows for this channel;
+    `channel_noise`, `common_noise`: standard normal numbers; `drift` [Pa]: drift of the offset so far; `sample`: number
+    of the sample; `samples_since`: samples since the one for which the table was built.
     """
     gain = load(sensor, row + GAIN) + samples_since * load(sensor, row + GAIN_RISE)
     offset = load(sensor, row + OFFSET) + samples_since * load(sensor, row + OFFSET_RISE)
@@ -92,9 +90,8 @@ def _read_pressure(
 def _add_squares(details: np.ndarray, first: int, n: int, bounds: np.ndarray, sums: np.ndarray, sums_row: int) -> None:
     """Add the squared wavelet details of n samples, and the squares of d3 d4, to the sums of their segments.
 
-    `details` (LEVELS, CHUNK, WIDTH): details of the samples from `first` on; `bounds` (segments + 1,): samples at
-    which the segments begin, and the end of the last. The sums of segment k are QUANTITIES rows of `sums`, beginning
-    with row `sums_row` + k QUANTITIES.
+    `details` (LEVELS, CHUNK, WIDTH): details of the samples from `first` on; `bounds` (segments + 1,): samples at which
+    the segments begin, and the end of the last. Segment k has the QUANTITIES rows from `sums_row` + k QUANTITIES on.
     """
     for segment in range(bounds.size - 1):
         row = sums_row + segment * QUANTITIES
@@ -181,5 +178,5 @@ def add_reading_squares(
 
 @kernel
 def sense_lanes(*run: Any) -> None:
-    """Call `add_reading_squares` from Python as compiled code; `run`: its arguments."""
+    """Run `add_reading_squares` with its arguments as compiled code."""
     add_reading_squares(*run)

@@ -33,9 +33,9 @@ class BenchMachine:
     """One healthy machine in one recording: how it deviates from the designed rig, its drifts, its command and load.
 
     `profile`, `seed`: from which the machine was drawn; `rig`: the designed rig; `overrides`: parameters in which the
-    machine deviates, by dotted name, in SI units; `duration` [s]: length of the recording, over which the drifts have
-    their sizes; `closed`: closed fraction of both throttles; `command`: voltage command or position target;
-    `controller`: name of the controller that follows a position target, with the parameters of the designed rig.
+    machine deviates, by dotted name, in SI units; `duration` [s] of the recording; `closed`: closed fraction of both
+    throttles; `command`: voltage command or position target; `controller`: name of the controller that follows a
+    target, with the parameters of the designed rig.
     """
 
     profile: str
@@ -52,9 +52,8 @@ class BenchMachine:
     def experiment(self, **arguments: Any) -> Experiment:
         """Make the experiment of this machine, with a start position from which its strokes are centred.
 
-        `arguments`: those of `Experiment.of`, such as leak and fault. The machine's seed, duration, command, load and
-        drifts are used unless stated. Raises InputError as `Experiment.of` does, also if a drawn parameter is out of
-        its range.
+        `arguments`: those of `Experiment.of`, such as leak and fault; seed, duration, command, load and drifts are the
+        machine's unless stated. Raises InputError as `Experiment.of` does, also if a drawn parameter is out of range.
         """
         machine = self.rig.with_overrides(self.overrides, source=f"drawn from profile {self.profile}, seed {self.seed}")
         names = ("load", "seed", "duration", "command", "drifts")
@@ -68,10 +67,9 @@ class BenchMachine:
 
 
 def centred_start(rig: Rig, command: Command | Position | str, duration: float) -> float:
-    """Estimate the start position [m] from which the strokes under a command are centred at mid-stroke.
+    """Estimate the start position [m] that centres the strokes under a command over `duration` [s] at mid-stroke.
 
-    Under a position target, the start position is the target's first value. The result is limited to the stroke.
-    `duration` [s]: length of the run.
+    Under a position target, it is the target's first value. The result is limited to the stroke.
 
     The piston moves with the pump's flow, A v = q_b omega/(2 pi), and the motor is taken as unloaded and without
     inertia in its PI loop: (k_p + C_e) omega = k_p omega_d + K_i I, dI/dt = omega_d - omega (eqs. 4.2-4.5). Behind a
@@ -101,19 +99,15 @@ def centred_start(rig: Rig, command: Command | Position | str, duration: float) 
 
 
 def _random_stream(seed: int, name: str) -> np.random.Generator:
-    """Make the random generator from which the nuisance `name` (a difference between machines) is drawn.
-
-    The generator depends on `seed` and `name` only, so that what is drawn for one nuisance does not depend on the
-    others in the profile.
-    """
+    """Make the random generator of a nuisance (a difference between machines), independent of others in the profile."""
     return np.random.default_rng([seed, zlib.crc32(name.encode())])
 
 
 def _draw_path(random: np.random.Generator, shapes: tuple[str, ...], duration: float, *, warms: bool = False) -> Wander:
     """Draw the course of a drift over `duration` [s]: linear with an end value of +-1, or a walk with a range of 1.
 
-    The range is maximum minus minimum. `shapes`: names of the courses to choose from, "linear" and "wander" (a smooth
-    random walk); `warms`: True for a linear course that always rises, False for one that rises or falls at random.
+    The range is maximum minus minimum. `shapes`: courses to choose from, "linear" and "wander" (a smooth random walk);
+    `warms`: True for a linear course that always rises.
     """
     # all numbers are drawn for either shape, so that later draws do not depend on the shape
     shape = shapes[int(random.integers(len(shapes)))]
@@ -125,11 +119,9 @@ def _draw_path(random: np.random.Generator, shapes: tuple[str, ...], duration: f
 
 
 def _draw_drift(random: np.random.Generator, drift: DriftRange, oil: Wander) -> Wander:
-    """Draw the course of a parameter's drift: a mixture of the oil temperature's course and an independent course.
+    """Draw the course of a drift: w oil + sqrt(1 - w^2) path, with w = `drift.oil` and an independent path.
 
-    The mixture is w oil + sqrt(1 - w^2) path, with the weight w = `drift.oil`, the course `oil` of the oil's
-    temperature, and a path that is drawn. It is scaled to a range (maximum minus minimum) drawn uniformly from
-    `drift.size`.
+    It is scaled to a range (maximum minus minimum) drawn uniformly from `drift.size`.
     """
     path = _draw_path(random, drift.shapes, oil.duration)
     weight = drift.oil
@@ -139,10 +131,9 @@ def _draw_drift(random: np.random.Generator, drift: DriftRange, oil: Wander) -> 
 
 
 def _draw_nuisance(nuisance: Nuisance, seed: int, oil: Wander) -> tuple[dict[str, float], list[ParameterDrift]]:
-    """Draw the values and the drifts of a nuisance, which is a difference between machines.
+    """Draw the values by parameter, and the drifts, of a nuisance, which is a difference between machines.
 
-    Returns the values by parameter, and the list of drifts. A value is in SI units, or a factor on the rig's value if
-    `nuisance.scales`. `seed`: seed of the machine; `oil`: course of the oil temperature, which drifts may follow.
+    A value is in SI units, or a factor if `nuisance.scales`; `oil`: course of the oil temperature, for the drifts.
     """
     values: dict[str, float] = {}
     drifts: list[ParameterDrift] = []
@@ -169,9 +160,9 @@ def draw(
 ) -> BenchMachine:
     """Draw a healthy machine like `rig` at random from a profile; equal seeds give equal machines.
 
-    `profile`: a profile, its name or its file; `duration` [s]: length of the recording, over which the drifts have
-    their sizes; `family`: one of the profile's families of machines, "" for none. Raises InputError for a seed below
-    0, a duration that is not positive and finite, or an unknown rig, profile or family.
+    `profile`: a profile, its name or its file; `duration` [s] of the recording, over which the drifts have their sizes;
+    `family`: one of the profile's families of machines, "" for none. Raises InputError for a seed below 0, a duration
+    that is not positive and finite, or an unknown rig, profile or family.
     """
     from sealscope.parameters import load_rig
 
@@ -200,7 +191,7 @@ def draw(
     random, duty = _random_stream(seed, "duty"), distribution.duty
 
     def draw_one(options: Sequence[T]) -> T:
-        """Draw one of the options at random, each with the same probability."""
+        """Draw one of the options, each with the same probability."""
         return options[int(random.integers(len(options)))]
 
     command, closed = command_or_target(draw_one(duty.commands)), draw_one(duty.closed)
@@ -213,14 +204,5 @@ def draw(
     load = parse_force(draw_one(duty.loads)) if duty.loads else None
     controller = draw_one(duty.controllers) if duty.controllers else "pi"
     return BenchMachine(
-        profile=distribution.name,
-        seed=seed,
-        rig=designed_rig,
-        duration=duration,
-        overrides=overrides,
-        drifts=tuple(drifts),
-        command=command,
-        closed=closed,
-        load=load,
-        controller=controller,
+        distribution.name, seed, designed_rig, duration, overrides, tuple(drifts), command, closed, load, controller
     )

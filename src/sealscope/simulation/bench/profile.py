@@ -27,10 +27,7 @@ _Entries = TypeVar("_Entries", bound=tuple[Any, ...])
 
 
 def _check_rising(pair: tuple[float, float]) -> tuple[float, float]:
-    """Check that a pair is [low, high] with low <= high, and return it (a pydantic validator).
-
-    Raises ValueError otherwise.
-    """
+    """Return a pair [low, high]; raise ValueError if low > high (a pydantic validator)."""
     if pair[0] > pair[1]:
         raise ValueError(f"must be [low, high] with low <= high, got {list(pair)}")
     return pair
@@ -44,16 +41,14 @@ _Flag = Annotated[bool, Field(strict=True)]
 _Closed = Annotated[_Number, Field(ge=0.0, le=99.0), AfterValidator(lambda percent: percent / 100.0)]
 
 
-class _DriftEntry(BaseModel):
-    model_config = _KNOWN_ONLY
+class _DriftEntry(BaseModel, extra="forbid"):
     size: _Pair
     unit: _Text
     shapes: Annotated[tuple[Literal["linear", "wander"], ...], Field(min_length=1)] | None = None
     oil: Annotated[_Number, Field(ge=-1.0, le=1.0)] | None = None
 
 
-class _NuisanceEntry(BaseModel):
-    model_config = _KNOWN_ONLY
+class _NuisanceEntry(BaseModel, extra="forbid"):
     name: _Text
     parameters: _Names
     range: _Pair | None = None
@@ -69,9 +64,8 @@ class _NuisanceEntry(BaseModel):
 class DriftRange:
     """The distribution from which a parameter's drift is drawn.
 
-    `size`: low and high limit of the drift's maximum minus minimum, in SI units if `absolute`, else relative to the
-    parameter; `shapes`: courses to choose from ("linear", "wander"); `oil`: weight of the oil temperature's course in
-    the drift, -1 .. 1, 0 for a drift that does not depend on the oil.
+    `size`: limits of the drift's maximum minus minimum, in SI units if `absolute`, else relative to the parameter;
+    `shapes`: courses to choose from ("linear", "wander"); `oil`: weight of the oil temperature's course, -1 .. 1.
     """
 
     size: tuple[float, float]
@@ -85,8 +79,7 @@ class Nuisance:
     """A difference between healthy machines, distributed uniformly between `low` and `high`.
 
     `low`, `high`: SI values, or factors on the rig's values if `scales`; `each`: True to draw a value for each
-    parameter, False to draw one value for all; `drift`: distribution of the drift of the parameters, None if they do
-    not drift; `why`: the reason for the range.
+    parameter, False to draw one for all; `drift`: distribution of their drift, if any; `why`: the reason for the range.
     """
 
     name: str
@@ -101,11 +94,7 @@ class Nuisance:
 
 @dataclass(frozen=True)
 class NuisanceChoice:
-    """A difference between healthy machines with a few possible values.
-
-    A machine has one of the `values` for all `parameters`. `values`: numbers in SI units, or texts if the parameters
-    have texts as values, such as "present"; `why`: the reason for the values.
-    """
+    """A difference between machines, one of some `values` (SI or texts) for all `parameters`; `why`: the reason."""
 
     name: str
     parameters: tuple[str, ...]
@@ -117,14 +106,9 @@ class NuisanceChoice:
 class Duty:
     """The commands and loads of a profile's machines, of which each machine draws one.
 
-    A machine draws one of each:
-
-    - `commands`, with a factor on the amplitude from the range `amplitude`;
-    - `closed`: closed fractions of both throttles (in the file: per cent);
-    - `loads` on the rod, without a load if there are none to choose from;
-    - `controllers` that follow a position target (default: PI).
-
-    `why`: the reason for this duty.
+    A factor on the amplitude of `commands` is drawn from the range `amplitude`. `closed`: closed fractions of both
+    throttles (in the file: per cent); `loads` on the rod, if any; `controllers` that follow a position target (default:
+    PI); `why`: the reason for this duty.
     """
 
     __pydantic_config__ = _KNOWN_ONLY
@@ -157,10 +141,7 @@ AnyNuisance = Nuisance | NuisanceChoice
 
 
 def _parse_nuisance(table: Any) -> AnyNuisance:
-    """Parse an entry of a profile's file as a nuisance, which is a difference between healthy machines.
-
-    Raises InputError with the entry's name if the entry breaks a rule.
-    """
+    """Parse an entry of a profile's file as a difference between machines; InputError names a wrong one."""
     entry = _NuisanceEntry.model_validate(table)
     try:
         return _convert_to_si(entry)
@@ -169,10 +150,7 @@ def _parse_nuisance(table: Any) -> AnyNuisance:
 
 
 def _convert_to_si(entry: _NuisanceEntry) -> AnyNuisance:
-    """Convert an entry of a profile's file to a nuisance (a difference between healthy machines) in SI units.
-
-    Raises InputError if the fields of the entry do not fit together.
-    """
+    """Convert an entry of a profile's file to SI units; raise InputError if its fields do not fit together."""
     parameters = tuple(resolve_name(name, declared_names()) for name in entry.parameters)
     declarations = [declared_fields()[parameter] for parameter in parameters]
     kinds = {(choices_of(declaration), unit_of(declaration)) for declaration in declarations}
@@ -203,11 +181,7 @@ def _convert_to_si(entry: _NuisanceEntry) -> AnyNuisance:
 
 
 def _convert_values(entry: _NuisanceEntry, choices: tuple[str, ...], si_unit: str) -> tuple[float | str, ...]:
-    """Convert the possible values of a parameter in a profile's entry to SI units; texts are returned unchanged.
-
-    `choices`: texts that the parameter may have, () for a number; `si_unit`: its SI unit. Raises InputError for any
-    other value.
-    """
+    """Convert a parameter's possible values to SI units, unless they are `choices`; raise InputError for others."""
     values = entry.values or ()
     for value in values:
         if choices and value not in choices:
@@ -220,11 +194,7 @@ def _convert_values(entry: _NuisanceEntry, choices: tuple[str, ...], si_unit: st
 
 
 def _parse_drift(entry: _DriftEntry, parameters: tuple[str, ...], si_unit: str) -> DriftRange:
-    """Convert the drift in a profile's entry to SI units.
-
-    The size of a relative drift becomes a fraction of the parameter. `si_unit`: SI unit of the parameters. Raises
-    InputError for a drift that the parameters cannot have.
-    """
+    """Convert a drift to `si_unit` or to a fraction of its parameters; raise InputError if they cannot have it."""
     absolute = is_absolute_drift(parameters[0])
     for parameter in parameters:
         ParameterDrift(parameter, linear_path(0.0, 1.0), absolute)  # raises InputError if it cannot drift
@@ -239,10 +209,7 @@ def _parse_drift(entry: _DriftEntry, parameters: tuple[str, ...], si_unit: str) 
 
 
 def _check_distinct(nuisances: tuple[AnyNuisance, ...]) -> tuple[AnyNuisance, ...]:
-    """Check that no two nuisances (differences between machines) share a parameter or a name, and return them.
-
-    Raises InputError otherwise.
-    """
+    """Return the nuisances; raise InputError if two of them share a parameter or a name."""
     owner: dict[str, str] = {}
     for nuisance in nuisances:
         for parameter in nuisance.parameters:
@@ -252,10 +219,7 @@ def _check_distinct(nuisances: tuple[AnyNuisance, ...]) -> tuple[AnyNuisance, ..
 
 
 def _check_distinct_names(entries: _Entries) -> _Entries:
-    """Check that all entries of a profile have different names, and return them.
-
-    Raises InputError otherwise.
-    """
+    """Return the entries of a profile; raise InputError if two have the same name."""
     if len({entry.name for entry in entries}) < len(entries):
         raise InputError("they must have names of their own")
     return entries
@@ -307,11 +271,7 @@ class Profile:
         raise InputError(f"a family of {self.name} must be one of its own ({names}), got {name!r} ({self.place})")
 
     def of_family(self, name: str) -> Profile:
-        """Build the profile of one family's machines from this profile.
-
-        The nuisances (differences between machines) and the duty (commands and loads) of the family replace those of
-        this profile.
-        """
+        """Build the profile of a family, whose nuisances and duty replace those of this profile."""
         family = self.family(name)
         nuisances = _replace_nuisances(self.nuisances, family.nuisances)
         return replace(self, duty=family.duty or self.duty, nuisances=nuisances, families=())
@@ -320,11 +280,7 @@ class Profile:
 def _replace_nuisances(
     nuisances: tuple[AnyNuisance, ...], replacing: tuple[AnyNuisance, ...]
 ) -> tuple[AnyNuisance, ...]:
-    """Replace some nuisances (differences between healthy machines) of a profile, and return all nuisances.
-
-    The parameters of `replacing` are removed from `nuisances`, which may leave a nuisance without parameters: it is
-    dropped. Then `replacing` is appended.
-    """
+    """Remove the parameters of `replacing` from `nuisances` (differences between machines), and append it."""
     replaced_parameters = {parameter for nuisance in replacing for parameter in nuisance.parameters}
     remaining: list[AnyNuisance] = []
     for nuisance in nuisances:
@@ -339,11 +295,7 @@ def profile_names() -> tuple[str, ...]:
 
 
 def load_profile(name_or_path: str | os.PathLike[str] = "bench") -> Profile:
-    """Read a profile, which describes how healthy machines differ from each other.
-
-    `name_or_path`: name of a packaged profile, or path of a TOML file laid out like `profiles/bench.toml`. Raises
-    InputError if the file cannot be read, a name or unit is unknown, a range is empty or a reason is missing.
-    """
+    """Read a profile of how healthy machines differ, by its packaged name or path; InputError if it breaks a rule."""
     text = os.fspath(name_or_path)
     if text in profile_names():
         return _read_profile(_PACKAGED / f"{text}.toml", f"profiles/{text}.toml")
@@ -352,16 +304,14 @@ def load_profile(name_or_path: str | os.PathLike[str] = "bench") -> Profile:
     return _read_profile(Path(text), text)
 
 
-class _Head(BaseModel):
-    model_config = _KNOWN_ONLY
+class _Head(BaseModel, extra="forbid"):
     name: _Text
     title: _Text
     seeds: str = ""
     extends: Literal[profile_names()] | None = None  # type: ignore[valid-type]
 
 
-class _File(BaseModel):
-    model_config = _KNOWN_ONLY
+class _File(BaseModel, extra="forbid"):
     profile: _Head
     duty: Duty | None = None
     nuisance: _Nuisances = ()
@@ -369,11 +319,10 @@ class _File(BaseModel):
 
 
 def _read_profile(path: Path, place: str) -> Profile:
-    """Read a profile of machines from its TOML file.
+    """Read a profile of machines from its TOML file; `place` names the file in messages.
 
     A file may name a packaged profile that it extends. It then inherits that profile's nuisances, and also the duty
-    (commands and loads) if it does not state one, but not the families. `place` names the file in messages. Raises
-    InputError if the file breaks a rule.
+    (commands and loads) if it does not state one, but not the families. Raises InputError if the file breaks a rule.
     """
     tree = read_toml(path, "a profile", place)
     try:
