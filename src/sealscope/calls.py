@@ -24,16 +24,15 @@ _MAX_WORD = 200
 def nearest(word: str, known: Iterable[str], count: int = 1, share: float = 0.5) -> list[str]:
     """Find up to `count` words of `known` that resemble `word`, the most similar first.
 
-    `share` (0 to 1): lowest similarity of these words to `word`, by the `ratio` of difflib. The list is empty if no
-    known word is similar enough, or if `word` is longer than 200 characters.
+    `share` (0 to 1): lowest similarity, by the `ratio` of difflib. A `word` longer than 200 characters has none.
     """
     return difflib.get_close_matches(word, known, n=count, cutoff=share) if len(word) <= _MAX_WORD else []
 
 
 def suggestion(word: str, known: Iterable[str]) -> str:
-    """Format the end of an error message that suggests the known name nearest to `word`.
+    """Format the end of an error message that suggests the known name nearest to `word`, in upper or lower case.
 
-    The text is ``; did you mean NAME?``, or empty if no known name is similar. Upper and lower case count as equal.
+    It is ``; did you mean NAME?``, or empty if no known name is similar.
     """
     name_by_folded = {name.casefold(): name for name in known}
     similar = nearest(word.casefold(), name_by_folded)
@@ -44,7 +43,7 @@ def checked_call(function: Callable[P, R]) -> Callable[P, R]:
     """Wrap `function` to raise InputError for wrong arguments; the wrapper has the same signature and docstring.
 
     The error for an unknown keyword suggests the nearest known one: ``simulate has no argument 'comand'; did you mean
-    'command'?``. Missing and surplus arguments raise InputError too. Errors of the function itself pass unchanged.
+    'command'?``.
     """
     signature = inspect.signature(function)
     parameters = signature.parameters.values()
@@ -74,9 +73,8 @@ def checked_call(function: Callable[P, R]) -> Callable[P, R]:
 def argument(default: Any, kind: str, text: str, *, unit: str = "") -> Any:
     """Declare an argument of a function as a dataclass field with a default value and documentation.
 
-    `kind`: type of the argument in words, such as "float"; `text`: meaning of the argument; `unit`: SI unit of a
-    number, empty for other values. The field's metadata contain `kind`, `text` and `unit`, with the unit appended to
-    the text. The decorator `take_fields_of` makes the function's signature and docstring from such fields.
+    `kind`: type of the argument in words, such as "float"; `text`: its meaning; `unit`: SI unit of a number. The
+    decorator `take_fields_of` makes the function's signature and docstring from such fields.
     """
     full_text = f"{text} [{unit}]." if unit else f"{text}."
     return field(default=default, metadata={"kind": kind, "text": full_text, "unit": unit})

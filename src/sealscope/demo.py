@@ -24,11 +24,9 @@ LEAK = "0.0042 L/min from 30 s"
 
 @dataclass(frozen=True)
 class Demo:
-    """Results of the demo.
+    """Results of the demo: the commissioned machine, two diagnoses, the simulated leak, and the files written.
 
-    - `machine`: the commissioned machine; `truth`: the simulated leak.
-    - `healthy`, `diagnosis`: diagnoses of a healthy recording and of the leaking recording.
-    - `machine_file`, `recording`, `page`: paths of the machine's file, the leaking recording and the page on it.
+    `healthy`, `diagnosis`: of a healthy recording and of the leaking recording; `page`: on the latter.
     """
 
     machine: CommissionedMachine
@@ -43,8 +41,7 @@ class Demo:
 def run_demo(folder: Path, seed: int = 1, progress: Progress | None = None) -> Demo:
     """Simulate recordings, commission a machine on healthy ones, and diagnose a healthy and a leaking one.
 
-    All files are written into `folder`, with a page on the leaking recording. `seed`: seed of the simulated noise;
-    `progress`: called with the name of a task and the task's completed fraction.
+    All files are written into `folder`. `progress`: called with the name of a task and its completed fraction.
     """
     update = progress or (lambda task, share: None)
     names = [*(f"healthy/run{k + 1}.nc" for k in range(N_HEALTHY)), "healthy.nc"]

@@ -56,8 +56,7 @@ _simulation_lock = Lock()
 def make_simulated_sources(settings: MonitorSettings, say: Callable[[str], None]) -> list[Source]:
     """Build a source of samples for each actuator whose settings contain `simulate`.
 
-    `say`: called with a message when a simulation begins, and when all its samples are delivered. Raises InputError
-    if the settings of an actuator do not describe a valid experiment.
+    `say`: called with a message when a simulation begins, and when all its samples are delivered. Raises InputError.
     """
     return [
         _make_source(actuator.name, _make_experiment(actuator, actuator.simulate), actuator.simulate, say)
@@ -69,8 +68,7 @@ def make_simulated_sources(settings: MonitorSettings, say: Callable[[str], None]
 def _make_experiment(actuator: ActuatorSettings, settings: SimulateSettings) -> Experiment:
     """Build the experiment that simulates an actuator.
 
-    Raises InputError, with the actuator's name, for invalid settings, and for an experiment longer than
-    `MAX_IDENTITIES` blocks of 1 s, the largest number of blocks that the monitor's database can recognise as stored.
+    Raises InputError for invalid settings, and for more blocks than the monitor's database can tell apart.
     """
     try:
         experiment = Experiment.of(rig=actuator.rig, **settings.model_dump(exclude={"speed"}))
@@ -82,17 +80,16 @@ def _make_experiment(actuator: ActuatorSettings, settings: SimulateSettings) -> 
 
 
 def _make_source(name: str, experiment: Experiment, settings: SimulateSettings, say: Callable[[str], None]) -> Source:
-    """Build a source that simulates an actuator and submits its samples to the monitor in blocks of 1 s.
+    """Build a source that simulates the actuator `name` and submits its samples to the monitor in blocks of 1 s.
 
-    The blocks arrive at `settings.speed` times real time; blocks that the monitor has already stored are left out.
-    `name`: the actuator's name; `say`: called with a message at the start and at the end.
+    The blocks arrive at `settings.speed` times real time; those that the monitor has already stored are left out.
+    `say`: called with a message at the start and at the end.
     """
 
     def play(receiver: BlockReceiver) -> None:
-        """Simulate the actuator, and submit each block of samples to `receiver` when its time is over.
+        """Simulate the actuator, unless all blocks are stored, and submit each block when its time is over.
 
-        Blocks that the receiver's store already has are skipped; if it has all of them, nothing is simulated. Returns
-        early if the receiver is stopping.
+        Returns early if the receiver is stopping.
         """
         blocks = range(math.floor(experiment.duration / BLOCK_S))
         # number of the first block to submit: the store has all blocks before it, and none from it on

@@ -14,8 +14,8 @@ WIDTH = 80
 def paragraph(text: str, head: str = "", indent: int | None = None, width: int = WIDTH) -> str:
     """Wrap a text to lines of at most `width` columns, the first of which begins with the text `head`.
 
-    Lines after the first are indented by `indent` columns, by default the length of `head`. Words are not broken,
-    even if they are longer than a line. Unprintable characters in the text are replaced.
+    Lines after the first are indented by `indent` columns, by default the length of `head`. Words are not broken.
+    Unprintable characters in the text are replaced.
     """
     indentation = " " * (len(head) if indent is None else indent)
     return fill(
@@ -29,10 +29,7 @@ def paragraph(text: str, head: str = "", indent: int | None = None, width: int =
 
 
 def paragraphs(rows: Iterable[tuple[str, str | None]], columns: int, width: int = WIDTH) -> list[str]:
-    """Format rows (label, text) as paragraphs, with the labels in a column of `columns` characters on the left.
-
-    Rows without a text are omitted. `width`: longest line in characters. Returns one string for each paragraph.
-    """
+    """Format rows (label, text) with a text as paragraphs, with labels in a column of `columns` characters."""
     return [paragraph(text, f"  {label}".ljust(columns), indent=columns, width=width) for label, text in rows if text]
 
 
@@ -43,9 +40,9 @@ def format_count(count: int, noun: str) -> str:
 
 
 def join_names(names: Iterable[str], most: int = 12) -> str:
-    """Join up to `most` names by commas, followed by the number of further names: ``a, b and 3 more``.
+    """Join up to `most` names, each cut to `WIDTH` characters, with the number of further names: ``a, b and 3 more``.
 
-    Each name is cut to `WIDTH` characters. The text is "none" if there are no names.
+    The text is "none" if there are no names.
     """
     names = list(names)
     joined = ", ".join(name if len(name) <= WIDTH else f"{name[: WIDTH - 3]}..." for name in names[:most])

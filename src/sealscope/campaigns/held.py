@@ -6,12 +6,9 @@ together,
     d(p_A - p_B)/dt = -G (1/V_A + 1/V_B) K (p_A - p_B),
 
 with the leak's conductance G, the chambers' volumes V_A and V_B, and the bulk modulus K of the oil. Such holds are
-simulated with the noise of the rig's sensors and judged like the holds of a recording (`HeldChambers`, `held_rise`),
-by comparison with `N_HEALTHY` leak-free holds. The planned leak is the smallest one that is detected in the wanted
-fraction of the holds.
-
-A hold distinguishes a leak past the piston from a leak of the pump, which is shut off, and from a leak of a rod seal,
-which lowers one pressure only.
+simulated with the noise of the rig's sensors and judged like the holds of a recording (`HeldChambers`, `held_rise`), by
+comparison with `N_HEALTHY` leak-free holds. A hold tells a piston leak from a leak of the pump, which is shut off, and
+from a leak of a rod seal, which lowers one pressure only.
 """
 
 from __future__ import annotations
@@ -48,8 +45,8 @@ _TRIED_LOSSES = (1e-4, 10.0)
 class PlannedHold(NamedTuple):
     """A locked hold, in which valves shut the cylinder off from its pump, and the smallest piston leak that it finds.
 
-    `duration` [s]: time with shut valves; `pressure_A`, `pressure_B` [Pa]: absolute pressures of the chambers when the
-    valves shut; `conductance` [m^3/(s Pa)]: conductance of the smallest leak that is found, inf if none is found.
+    `duration` [s]: time with shut valves; `pressure_A`, `pressure_B` [Pa]: absolute pressures when the valves shut;
+    `conductance` [m^3/(s Pa)] of the smallest leak that is found, inf if none is found.
     """
 
     duration: float
@@ -83,11 +80,7 @@ class PlannedHold(NamedTuple):
         }
 
     def text(self, stated_pressure: float) -> str:
-        """Format the planned hold as text, with the smallest leak that it detects.
-
-        The leak is stated as a flow [L/min] at the pressure difference `stated_pressure` [Pa]. Chamber A has the higher
-        pressure, which presses the piston against the stop.
-        """
+        """Format the planned hold as text, with the flow of its leak at the difference `stated_pressure` [Pa]."""
         found = f"{self._lpm(stated_pressure):.2g} L/min" if self.finds_a_leak else "no leak, however large"
         high, low = self.pressure_A / 1e6, self.pressure_B / 1e6
         return (
@@ -99,10 +92,7 @@ class PlannedHold(NamedTuple):
 
 
 def has_shut_off(rig: Rig) -> bool:
-    """Return True if a rig has valves that shut the cylinder off from its pump.
-
-    The openings of the valves must be stated parameters; assumed ones do not count.
-    """
+    """Return True if a rig has valves, with stated openings, that shut the cylinder off from its pump."""
     sources = [rig.entry(name).source for name in ("line.open_A", "line.open_B")]
     return rig.line.orifices == "present" and not any(source.startswith(("absent", "assumed")) for source in sources)
 
@@ -112,10 +102,9 @@ def plan_hold(
 ) -> PlannedHold:
     """Find the shortest locked hold under a load [N] that detects a leak of the conductance `find` [m^3/(s Pa)].
 
-    In a locked hold, valves shut the cylinder off from its pump. If no duration in `HOLD_DURATIONS` suffices, the
-    longest is planned. If `find` is None, a hold of `DEFAULT_DURATION` is planned. `flow` [m^3/s]: mean flow of the
-    pump under the usual command and load; `false_alarm`: probability of the verdict `leak` without a leak; `detection`:
-    probability of this verdict with the leak. Raises InputError if the load is not > 0.
+    If no duration in `HOLD_DURATIONS` suffices, the longest is planned; if `find` is None, `DEFAULT_DURATION`. `flow`
+    [m^3/s]: mean flow of the pump under the usual duty; `false_alarm`, `detection`: probability of the verdict `leak`
+    without and with a leak. Raises InputError if the load is not > 0.
     """
     if not load > 0.0:
         raise InputError(f"a locked hold must be under a load > 0 N, got {load:g} N")
@@ -126,20 +115,14 @@ def plan_hold(
 
 
 class _HoldDraws:
-    """Simulated locked holds of one duration, which show the smallest leak that such holds detect.
-
-    In a locked hold, valves shut the cylinder off from its pump.
-    """
+    """Simulated locked holds of one duration, which show the smallest leak that such holds detect."""
 
     def __init__(
         self, rig: Rig, load: float, flow: float, duration: float, false_alarm: float, detection: float
     ) -> None:
-        """Set the pressures of a hold with shut valves, and the limits on false alarms and missed leaks.
+        """Set chamber B to the charge pressure and A higher by load / A_A, and limit false alarms and missed leaks.
 
-        Chamber B is at the charge pressure; the pressure of chamber A is higher by load / A_A. `load` [N]: load that
-        the cylinder holds; `flow` [m^3/s]: mean flow of the pump under the usual command and load; `duration` [s]: time
-        with shut valves; `false_alarm`: probability of the verdict `leak` without a leak; `detection`: probability of
-        this verdict with the leak.
+        The arguments are those of `plan_hold`; `duration` [s]: time with shut valves.
         """
         self._rig, self._flow = rig, flow
         pressure_B = rig.fluid.p_charge + P_ATM  # absolute
@@ -151,14 +134,14 @@ class _HoldDraws:
 
     @cached_property
     def _healthy(self) -> list[RecordingSums]:
-        """Summaries (`RecordingSums`) of `N_HEALTHY` simulated holds without a leak, to compare leaky holds with."""
+        """Summaries of `N_HEALTHY` simulated holds without a leak, to compare leaky holds with."""
         return [draw_hold(self._rig, self._hold, conductance=0.0, flow=self._flow, seed=k) for k in range(N_HEALTHY)]
 
     def detects(self, conductance: float) -> bool:
         """Return True if at least the fraction `detection` of `_N_DRAWS` simulated holds detects a leak.
 
-        `conductance` [m^3/(s Pa)]: conductance of the leak. A hold detects the leak if, judged by the healthy holds,
-        the probability that a leak-free hold leaks as much is below the allowed false-alarm probability.
+        `conductance` [m^3/(s Pa)] of the leak. A hold detects it if, judged by the healthy holds, the probability that
+        a leak-free hold leaks as much is below the allowed false-alarm probability.
         """
         n_missed = 0
         for seed in range(N_HEALTHY, N_HEALTHY + _N_DRAWS):  # the healthy holds have the seeds before
@@ -171,7 +154,7 @@ class _HoldDraws:
     def with_smallest_leak(self) -> PlannedHold:
         """Find by bisection the smallest leak that the hold detects; return the hold with the leak's conductance.
 
-        The conductance [m^3/(s Pa)] is inf if even the largest leak that is tried (`_TRIED_LOSSES`) is not detected.
+        It is inf if even the largest leak that is tried (`_TRIED_LOSSES`) is not detected.
         """
         loss_per_conductance = _decay_per_conductance(self._rig) * self._hold.duration
         low, high = np.log(np.array(_TRIED_LOSSES) / loss_per_conductance)  # logarithms of conductances
@@ -186,8 +169,7 @@ class _HoldDraws:
 def _decay_per_conductance(rig: Rig) -> float:
     """Compute the decay rate of p_A - p_B [1/s] per unit of leak conductance, in Pa/m^3, for a piston at mid-stroke.
 
-    The result is K (1/V_A + 1/V_B), with the oil's usual bulk modulus K and the chambers' volumes V at mid-stroke,
-    which include an assumed dead volume.
+    It is K (1/V_A + 1/V_B), with the oil's usual bulk modulus K and the chambers' volumes V, dead volume included.
     """
     oil, cylinder = INFERENCE.held_oil, rig.cylinder
     length = cylinder.L * (0.5 + oil.dead)  # half the stroke, and the dead volume of a chamber
@@ -197,10 +179,8 @@ def _decay_per_conductance(rig: Rig) -> float:
 def draw_hold(rig: Rig, hold: PlannedHold, conductance: float, flow: float, seed: int) -> RecordingSums:
     """Simulate a locked hold with a leak past the piston and with sensor noise; measure the leak as in a recording.
 
-    `conductance` [m^3/(s Pa)]: conductance of the leak; `flow` [m^3/s]: mean flow of the pump under the usual command
-    and load; `seed`: seed of the noise. Returns the summary of a recording with this hold: the leak measured in the
-    hold, the pump's flow and the pressure difference. The summary's Gram matrix, which is for data from the motion of
-    the piston, is 0.
+    `conductance` [m^3/(s Pa)] of the leak; `flow` [m^3/s]: mean flow of the pump under the usual duty. Returns the
+    summary of a recording with this hold, whose Gram matrix, for data from the motion of the piston, is 0.
     """
     random = np.random.default_rng(seed)
     cylinder, sensors = rig.cylinder, rig.sensors

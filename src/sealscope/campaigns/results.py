@@ -21,9 +21,8 @@ from sealscope.storage.folders import make_folder
 class CampaignResult:
     """A campaign and its results.
 
-    `rows`: result of each record; `missing`: number of the plan's records without a row; `judgement`: statistics of the
-    verdicts; `mode`: how a simulated campaign was run, "run by run" or "in batches", "" for recordings; `known`: by
-    detector, the information that it was given.
+    `missing`: number of the plan's records without a row; `judgement`: statistics of the verdicts; `mode`: how a
+    simulated campaign was run, "" for recordings; `known`: by detector, the information that it was given.
     """
 
     plan: AnyPlan
@@ -37,9 +36,8 @@ class CampaignResult:
 def prior_knowledge(plan: SimulatedPlan | RecordedPlan) -> dict[str, PriorKnowledge]:
     """Collect the information that a plan gives to each of its detectors, by the detector's name.
 
-    A scorer, which only computes a score, may compare two parts of a record. Such a scorer knows the true onset of
-    simulated records, because they are split at the onset; recordings are split in the middle. Detectors that are not
-    scorers assume the plan's rig.
+    A scorer that compares two parts of a record knows the true onset of simulated records, because they are split
+    there. Detectors that are not scorers assume the plan's rig.
     """
     is_simulated = isinstance(plan, SimulatedPlan)
     rig = "" if plan.assumed is None else plan.assumed.name
@@ -92,10 +90,7 @@ def judge_simulated_campaign(plan: SimulatedPlan, folder: Path) -> CampaignResul
 def judge_recorded_campaign(
     plan: RecordedPlan, folder: Path, progress: ProgressCallback | None = None
 ) -> CampaignResult:
-    """Judge the recordings in a folder with the detectors of a plan.
-
-    `progress`: called after each recording with the numbers of recordings done, of all recordings, and of failed ones.
-    """
+    """Judge the recordings in a folder with the detectors of a plan; `progress` is called after each recording."""
     rows = judge_recordings(plan, folder, progress)
     return CampaignResult(plan, tuple(rows), missing=0, judgement=_judge(plan, rows), known=prior_knowledge(plan))
 

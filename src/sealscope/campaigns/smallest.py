@@ -1,15 +1,14 @@
 """Plan a recording: the command, load and duration with which `diagnose` detects a leak of a given size on a rig.
 
-Leak-free recordings of the rig and its instruments are simulated under each duty, that is under each combination of a
-command and a load. The smallest step of the leak's conductance that is detected with the probability `detection`
-follows from the test that `diagnose` uses (`StepTest.detectable_step`),
+Leak-free recordings of the rig and its instruments are simulated under each duty, a combination of a command and a
+load. The smallest step of the leak's conductance that is detected with the probability `detection` follows from the
+test that `diagnose` uses (`StepTest.detectable_step`),
 
     detectable step = (threshold^(1/2) + z_detection) s,
 
 with the standard error s of a step at the median onset, the threshold of the likelihood ratio at the false-alarm
-probability, and the quantile z_detection of the standard normal distribution at the probability `detection`. Duties
-are compared by the conductance of the leak; flows are stated at the mean pressure difference of the usual duty. The
-smallest step that can be told from a step of the pump's leakage follows from the Fisher information of both steps.
+probability, and the normal quantile z_detection. Flows are stated at the mean pressure difference of the usual duty.
+The smallest step that can be told from a step of the pump's leakage follows from the Fisher information of both.
 """
 
 from __future__ import annotations
@@ -46,10 +45,7 @@ _MAX_CENTRING_SECONDS = 1000.0
 
 
 class PlannedDuty(NamedTuple):
-    """The duty of a planned recording: its command, a text such as '3 sin(4t)' [V], and its load, such as '2 kN'.
-
-    The load "" means no load.
-    """
+    """The duty of a planned recording: its command, a text such as '3 sin(4t)' [V], and its load, '2 kN' or ""."""
 
     command: str
     load: str = ""
@@ -58,17 +54,14 @@ class PlannedDuty(NamedTuple):
         return self.command + (f" under {self.load}" if self.load else "")
 
 
-#: The usual duty of a machine if none is stated.
 USUAL = PlannedDuty(COMMANDS[0])
 
 
 class DetectableLeak(NamedTuple):
     """The smallest leaks that are detected with the wanted probability in recordings of one duty and duration.
 
-    - `duty`: command and load
     - `duration` [s]
-    - `conductance` [m^3/(s Pa)]: smallest step (sudden increase) of the leak's conductance that is detected, inf if no
-      step is detected
+    - `conductance` [m^3/(s Pa)]: smallest step of the leak's conductance that is detected, inf if none is
     - `separable` [m^3/(s Pa)]: smallest step that can also be told from a step of the pump's leakage, inf if none can
     - `pressure` [Pa]: mean |p_A - p_B|
     - `note`: reason why the numbers could not be computed, "" if they could
@@ -87,7 +80,6 @@ class DetectableLeak(NamedTuple):
 class RecordingPlan(NamedTuple):
     """A planned recording, and the duties (commands and loads) that were compared for it.
 
-    - `rig`: name of the rig
     - `target` [m^3/(s Pa)]: conductance of the leak to detect, None to detect the smallest possible leak
     - `for_detection`: the shortest recording that detects this leak, or the last one tried if none does
     - `for_separation`: the shortest recording that also tells this leak from a leak of the pump, or the last one tried
@@ -120,7 +112,7 @@ class RecordingPlan(NamedTuple):
         """Convert the planned recording to plain JSON values, with leaks as flows [L/min] at the usual pressure."""
 
         def leak_dict(leak: DetectableLeak) -> dict[str, Any]:
-            """Convert the smallest leaks under one command and load to JSON values; infinite numbers become None."""
+            """Convert the smallest leaks under one duty to JSON values; infinite numbers become None."""
             return {
                 **leak.duty._asdict(),
                 "duration_s": leak.duration,
@@ -176,10 +168,9 @@ class RecordingPlan(NamedTuple):
 
 
 def duty_experiment(rig: Rig, duty: PlannedDuty, duration: float, seed: int = 0) -> Experiment:
-    """Build a leak-free experiment with the command and load of a duty; the piston's motion is centred in the stroke.
+    """Build a leak-free experiment of `duration` [s] with a duty, the piston's motion centred in the stroke.
 
-    `duration` [s]: length of the recording; `seed`: seed of the sensor noise. Raises InputError if the command is a
-    target of the position and not a voltage.
+    `seed`: seed of the sensor noise. Raises InputError if the command is a target of the position and not a voltage.
     """
     command = command_or_target(duty.command)
     if isinstance(command, Position):
@@ -194,9 +185,8 @@ def detectable_leak(
 ) -> DetectableLeak:
     """Compute the smallest leak that is detected in recordings with the command and load `duty`, of `duration` [s].
 
-    The numbers are medians of `N_RECORDS` simulated recordings. `false_alarm`: probability of an alarm without a leak;
-    `detection`: probability of an alarm with the leak. If a recording cannot be simulated, or its volume balance cannot
-    be computed, the smallest leak is inf, with the reason in `note`.
+    The numbers are medians of `N_RECORDS` simulated recordings. `false_alarm`, `detection`: probability of an alarm
+    without and with the leak. If the recording or its volume balance fails, the leak is inf, with the reason in `note`.
     """
     steps = []
     try:
@@ -205,29 +195,18 @@ def detectable_leak(
             steps.append(_detectable_steps(recording, rig, false_alarm, detection))
     except SealscopeError as error:
         return DetectableLeak(duty, duration, conductance=np.inf, separable=np.inf, pressure=np.nan, note=str(error))
-    median = _DetectableSteps(*(float(np.median(values)) for values in zip(*steps, strict=True)))
-    return DetectableLeak(duty, duration, median.step, median.separable, median.pressure, flow=median.flow)
+    step, separable, pressure, flow = (float(np.median(values)) for values in zip(*steps, strict=True))
+    return DetectableLeak(duty, duration, step, separable, pressure, flow=flow)
 
 
-class _DetectableSteps(NamedTuple):
-    """The smallest sudden increases (steps) of the leakage conductance that are detected in one recording.
+def _detectable_steps(
+    recording: Recording, rig: Rig, false_alarm: float, detection: float
+) -> tuple[float, float, float, float]:
+    """Compute from a leak-free recording the smallest step of the leakage conductance that would be detected.
 
-    `step` [m^3/(s Pa)]: smallest step that is detected; `separable` [m^3/(s Pa)]: smallest step that can also be told
-    from a step of the pump's leakage; `pressure` [Pa]: mean |p_A - p_B|; `flow` [m^3/s]: mean flow of the pump.
-    """
-
-    step: float
-    separable: float
-    pressure: float
-    flow: float
-
-
-def _detectable_steps(recording: Recording, rig: Rig, false_alarm: float, detection: float) -> _DetectableSteps:
-    """Compute from a leak-free recording the smallest sudden increase (step) of the leak that would be detected.
-
-    Also computes the smallest step that can be told from a step of the pump's leakage. `false_alarm`: probability of
-    an alarm without a leak; `detection`: probability of an alarm with the leak. Raises InputError if the volume balance
-    cannot be computed from the recording.
+    Returns this step and the smallest one that can be told from a step of the pump's leakage [m^3/(s Pa)], the mean
+    |p_A - p_B| [Pa], and the mean flow of the pump [m^3/s]. `false_alarm`, `detection`: probability of an alarm without
+    and with the leak. Raises InputError if the volume balance cannot be computed.
     """
     detector = VolumeBalance(rig)
     if reason := detector.usable(recording):
@@ -241,17 +220,17 @@ def _detectable_steps(recording: Recording, rig: Rig, false_alarm: float, detect
     scale = balance.size.scale  # conductances and flows of the balance are relative to the size of the machine
     step = balance.test.detectable_step(step_false_alarm, detection) * scale
     separable_step = step * _separation_ratio(balance.blocks, balance.columns)
-    return _DetectableSteps(step, separable_step, balance.mean_pressure(), balance.mean_flow * scale)
+    return step, separable_step, balance.mean_pressure(), balance.mean_flow * scale
 
 
 def _separation_ratio(blocks: Blocks, columns: Sequence[ColumnRoles]) -> float:
     """Compute the factor by which an unknown step of the pump's leakage raises the standard error of the leak's step.
 
-    The factor is sqrt(I_11 / (I_11 - I_12^2 / I_22)), with the Fisher information I (2, 2) of the leak's step (1) and
-    the pump's step (2). Both steps are at the middle block of the recording; the constant coefficients of the volume
-    balance are unknown, too. `blocks`: Gram matrices of the balance's columns, one for each block of time; `columns`:
-    for each equation of the balance, the roles of its columns. The factor is inf if the balance has several equations
-    or no column for the pump's leakage, or if the two steps cannot be told apart.
+    It is sqrt(I_11 / (I_11 - I_12^2 / I_22)), with the Fisher information I (2, 2) of the leak's step (1) and the
+    pump's step (2), both at the middle block of the recording, given the unknown constant coefficients of the volume
+    balance. `blocks`: Gram matrices of the balance's columns, one for each block of time; `columns`: for each equation
+    of the balance, the roles of its columns. The factor is inf if the balance has several equations or no column for
+    the pump's leakage, or if the two steps cannot be told apart.
     """
     column = columns[0]
     if PUMP not in column.names or len(columns) > 1:
@@ -285,9 +264,7 @@ def plan_recording(
 
     All duties are first compared in recordings of `COMPARISON_SECONDS`; the best duty is then tried for `DURATIONS`.
 
-    - `find`: flow of the leak at the mean |p_A - p_B| of the usual duty; None to plan the recording of
-      `COMPARISON_SECONDS` that detects the smallest leak
-    - `usual`: usual duty (command and load) of the machine
+    - `find`: at the mean |p_A - p_B| of the `usual` duty; None to find the smallest leak in `COMPARISON_SECONDS`
     - `duties`: other duties to try, by default all combinations of `COMMANDS` and `LOADS`
     - `false_alarm`, `detection`: probabilities of an alarm without the leak and with it
     - `held` [N]: force that the cylinder holds in a locked hold, with its valves shut; None for the last of `LOADS` if
@@ -310,8 +287,7 @@ def plan_recording(
     for field in ("conductance", "separable"):
         best = min(compared, key=lambda leak: float(getattr(leak, field)))
         if target is not None and np.isfinite(getattr(best, field)):
-            # the standard error of a step falls with the square root of the duration; durations far below the
-            # predicted one are not tried
+            # a step's standard error falls with the square root of the duration; far shorter ones are not tried
             predicted_duration = COMPARISON_SECONDS * (getattr(best, field) / target) ** 2
             durations = [seconds for seconds in DURATIONS if seconds >= 0.5 * predicted_duration] or DURATIONS[-1:]
             for duration in durations:

@@ -75,11 +75,8 @@ def _root(
 def normalise_arguments(arguments: Sequence[str]) -> list[str]:
     """Rearrange the arguments of a call to the form that typer understands.
 
-    - `-v` is moved to the beginning, once.
-    - `--baseline` is repeated before each baseline (`spread_baselines`).
-    - `monitor FILE` becomes `monitor run FILE`.
-
-    Raises InputError if no file follows `--baseline`.
+    `-v` is moved to the beginning, once; `--baseline` is repeated before each baseline (`spread_baselines`); and
+    `monitor FILE` becomes `monitor run FILE`. Raises InputError if no file follows `--baseline`.
     """
     end = list(arguments).index("--") if "--" in arguments else len(arguments)  # after `--` there are no options
     verbose = [argument for argument in arguments[:end] if argument in ("-v", "--verbose")]
@@ -91,12 +88,11 @@ def normalise_arguments(arguments: Sequence[str]) -> list[str]:
 
 
 def spread_baselines(arguments: Sequence[str]) -> list[str]:
-    """Repeat the option `--baseline` before each of the files after it, as typer requires.
+    """Repeat the option `--baseline` of diagnose and report before each of the files after it, as typer requires.
 
-    In this way `--baseline FILE...` of the commands diagnose and report accepts wildcards; the arguments of other
-    commands stay unchanged. All arguments after `--baseline` up to the next option are baselines. If the call has no
-    other files, only the first file after each `--baseline` is a baseline, and the other files after it are diagnosed.
-    Raises InputError if no file follows `--baseline`.
+    All arguments after `--baseline` up to the next option are baselines. If the call has no other files, only the first
+    file after each `--baseline` is a baseline, and the other files after it are diagnosed. Raises InputError without a
+    file.
     """
     if "--baseline" not in arguments or arguments[0] not in ("diagnose", "report"):
         return list(arguments)
@@ -136,8 +132,8 @@ def _click_command() -> Any:
 def main() -> None:
     """Run the command line, and end the process with an exit status.
 
-    The status is that of the command, 0 by default; 1 for a failure; 2 for a wrong call; or 130 for an interrupt
-    (Ctrl-C). An error that the caller can act on is printed as one line on standard error, without a traceback.
+    It is that of the command, 0 by default; 1 for a failure; 2 for a wrong call; or 130 for an interrupt (Ctrl-C). An
+    error that the caller can act on is printed as one line on standard error.
     """
     # some versions of typer contain a copy of click: take the exception of the module in which BadParameter is defined
     wrong_call: type[Any] = sys.modules[typer.BadParameter.__module__].ClickException
@@ -181,11 +177,7 @@ def _repeating_lost_interrupts() -> Iterator[None]:
     original_hook = sys.unraisablehook
 
     def repeat_interrupt(unraisable: Any) -> None:
-        """Send SIGINT to this process again if the ignored exception was a KeyboardInterrupt.
-
-        `unraisable`: description of the exception, as Python passes it to `sys.unraisablehook`. Other exceptions are
-        handled as before.
-        """
+        """Send SIGINT to this process again if the ignored exception `unraisable` was a KeyboardInterrupt."""
         if unraisable.exc_type is not KeyboardInterrupt:
             original_hook(unraisable)
             return

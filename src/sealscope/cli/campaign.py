@@ -137,10 +137,7 @@ def _format_progress(state: CampaignProgress) -> str:
 
 @contextmanager
 def _show_progress() -> Iterator[ProgressCallback]:
-    """Show the progress of a campaign on standard error; yield a function that updates it.
-
-    The function takes the numbers of records that are done, planned and failed.
-    """
+    """Show the progress of a campaign on standard error; yield a function of (done, planned, failed) records."""
     with opt.counted_progress("records") as update:
         yield lambda done, total, failures: update(done, total, f"{failures} failed" if failures else "")
 
@@ -148,9 +145,7 @@ def _show_progress() -> Iterator[ProgressCallback]:
 def _write_report(plan: AnyPlan, folder: Path, data: Path | None) -> int:
     """Write the tables and the page of a campaign, print its main table, and return the number of failed records.
 
-    The first five failed records are also printed, on standard error. `folder`: folder of the campaign, which receives
-    the files, and contains the results of simulated records; `data`: folder of the recordings that a plan over
-    recordings needs, else None.
+    The first five failed records are also printed, on standard error. `folder` of the campaign receives the files.
     """
     from sealscope.campaigns.results import write_result
     from sealscope.reporting.campaign.page import PAGE, campaign_text, write_campaign_page
@@ -166,10 +161,9 @@ def _write_report(plan: AnyPlan, folder: Path, data: Path | None) -> int:
 
 
 def _load_result(plan: AnyPlan, folder: Path, data: Path | None) -> CampaignResult:
-    """Judge the detectors of a campaign by its records, and return the result.
+    """Judge a campaign by the results of a simulated plan in `folder`, or by the recordings in the folder `data`.
 
-    A simulated plan is judged by the results stored in `folder`, any other plan by the recordings in `data`. Raises
-    InputError if the recordings are needed but `data` is None or not a folder.
+    Raises InputError if the recordings are needed but `data` is None or not a folder.
     """
     from sealscope.campaigns.plans.model import SimulatedPlan
     from sealscope.campaigns.results import judge_recorded_campaign, judge_simulated_campaign

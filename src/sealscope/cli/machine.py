@@ -60,11 +60,7 @@ def commission(
         paths = recordings_in(files)
 
         def add_recordings(machine: CommissionedMachine) -> CommissionedMachine:
-            """Add the files to the healthy recordings of a machine, and return the changed machine.
-
-            If `--since` states the date of a repair, the repair is noted in the machine, and recordings before the
-            repair are dropped.
-            """
+            """Add the files to the healthy recordings of a machine; after a repair, note it and drop earlier ones."""
             if repair_s is not None:
                 repair_mark = JudgedAlarm(alarm="", mark="repaired", date_s=repair_s, onset_s=repair_s)
                 machine = replace(machine, alarms=(*machine.alarms, repair_mark))

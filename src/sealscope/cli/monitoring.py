@@ -105,8 +105,7 @@ def dashboard(file: FileOption = Path("grafana.json")) -> None:
 def _serve(file: Path, *, once: bool = False) -> None:
     """Run the monitor with a file of settings until this process receives SIGTERM or SIGINT.
 
-    Without a page the monitor also ends when all its sources of samples have ended. `once`: sources end when standard
-    input and folders contain nothing new. The address of the page, if there is one, is printed on standard error.
+    Without a page it also ends with all its sources of samples; `once`: sources end when nothing new has come in.
     """
     from sealscope.monitor.service import Service
     from sealscope.monitor.settings import read_settings

@@ -57,10 +57,7 @@ def _rig_names() -> Sequence[str]:
 
 
 def _override_names() -> list[str]:
-    """List the parameters of a rig as `NAME=`, for completion by the shell.
-
-    The list has the dotted names, and each symbol (last part of a dotted name) that belongs to only one parameter.
-    """
+    """List the dotted names of a rig's parameters, and unique last parts of them, as `NAME=`, for completion."""
     from sealscope.parameters import declared_names
 
     names = declared_names()
@@ -75,8 +72,8 @@ complete_rigs = make_completion(_rig_names)
 def declared_option(name: str, *, option: str = "", several: bool = False, **settings: Any) -> Any:
     """Build the command-line option for an argument of `Experiment.of`, with the help text declared in `Arguments`.
 
-    `name`: name of the argument; `option`: the flag, by default made from the name; `several`: the option may be
-    repeated; `settings`: further arguments of `typer.Option`.
+    `option`: the flag, by default made from the name; `several`: the option may be repeated; `settings`: further
+    arguments of `typer.Option`.
     """
     text = _argument_text(name) + (" Repeat for several." if several else "")
     return Option(option or f"--{name.replace('_', '-')}", help=text, **settings)
@@ -169,10 +166,9 @@ class StatedMachine:
         limit: LimitOption = None,
         baseline: BaselineOption = None,
     ) -> StatedMachine:
-        """Build the machine from the values of the options of a command, which are None if they are not given.
+        """Build the machine from the values of a command's options, which the types of the parameters declare.
 
-        The types of the parameters declare the command-line options and their help texts. Raises InputError for an
-        invalid option, and for any other option together with `--machine`.
+        Raises InputError for an invalid option, and for any other option together with `--machine`.
         """
         from sealscope.diagnosis.verdict.severity import RepairLimit
         from sealscope.recordings.formats.columns import check_request
@@ -203,15 +199,14 @@ class StatedMachine:
 
     @property
     def has_map(self) -> bool:
-        """True if the options of the call, or the file of the rig, state the columns of channels (a channel map)."""
+        """True if the options of the call, or the file of the rig, state the columns of channels."""
         return bool(self.channel_map or self._rig_map)
 
     def read(self, file: Path) -> Recording:
         """Read the recording in a file, or on standard input for the file `-`.
 
-        A commissioned machine reads the file by the channel map and rate in the machine's file. Otherwise the options
-        of the call apply. Without `--map`, the channel map of the rig is used for files that have its columns. Raises
-        UnreadableFile for a folder or an unreadable file.
+        A commissioned machine reads it by the map and rate in the machine's file, else the options of the call apply.
+        Without `--map`, the rig's map is used for files with its columns. Raises UnreadableFile, also for a folder.
         """
         if self.commissioned is not None:
             return self.commissioned.read(file)
@@ -230,10 +225,7 @@ class StatedMachine:
                 raise UnreadableFile(str(error).replace(str(path), path.name)) from error
 
     def _read(self, file: Path) -> Recording:
-        """Read the recording in a file by the channel map of the call or, if the call has none, of the rig's file.
-
-        The channel map of the rig is applied only to files that have the columns of this map.
-        """
+        """Read the recording in a file by the map of the call or, if it has the columns, by that of the rig's file."""
         if not self._rig_map:
             from sealscope.recordings import read
 
@@ -245,8 +237,7 @@ class StatedMachine:
     def read_all(self, files: Sequence[Path], *, joined: bool = False) -> Iterator[tuple[Path, Recording | None]]:
         """Yield each file with its recording, or with None after a message on standard error if it is unreadable.
 
-        `joined`: the files are parts of one recording. Only the first file is then yielded, with the whole recording,
-        or with None if a part is unreadable.
+        `joined`: yield the first file with the recording of which the files are parts, None if one is unreadable.
         """
         recordings = ((file, attempt(file, partial(self.read, file))) for file in files)
         if not joined:
@@ -259,11 +250,9 @@ class StatedMachine:
         yield files[0], join(parts, names=[file.name for file in files]) if is_complete else None
 
     def diagnose(self, recording: Recording, baseline: Sequence[Recording], file: Path, **settings: Any) -> Diagnosis:
-        """Diagnose a recording of this machine.
+        """Diagnose a recording of this machine, compared with the healthy recordings `baseline`, which may be empty.
 
-        `baseline`: healthy recordings, may be empty; a commissioned machine uses the healthy recordings in its own file
-        instead. `file`: name of the recording in the diagnosis; `settings`: further arguments of `sealscope.diagnose`,
-        or of the commissioned machine's `diagnose`.
+        A commissioned machine uses those in its own file. `file`: name in the diagnosis; `settings`: of `diagnose`.
         """
         from dataclasses import replace
 
@@ -276,10 +265,7 @@ class StatedMachine:
 
 
 def with_machine_options(*names: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Build a decorator that replaces the parameter `stated` of a command by options that describe a machine.
-
-    `names`: parameters of `StatedMachine.of` that become options; by default all of them.
-    """
+    """Build a decorator that replaces a command's parameter `stated` by the options `names`, by default all."""
     options = inspect.signature(StatedMachine.of, eval_str=True).parameters
     return _replace_parameter("stated", StatedMachine.of, [options[name] for name in names or options])
 
@@ -310,11 +296,7 @@ def with_experiment_options(command: Callable[..., None]) -> Callable[..., None]
 
 
 def _build_experiment(rig: str, set: Sequence[str] | None, **arguments: Any) -> Experiment:
-    """Build the simulated experiment of a call from the values of its options.
-
-    `rig`: name or file of the rig; `set`: values that replace its parameters, as `NAME=VALUE[unit]`; `arguments`:
-    further arguments of `Experiment.of`.
-    """
+    """Build the simulated experiment of a call from its options, for `Experiment.of`, with the rig changed by `set`."""
     from sealscope.simulation.experiment import Experiment
 
     return Experiment.of(rig=load_rig_with(rig, set), **arguments)
@@ -323,10 +305,7 @@ def _build_experiment(rig: str, set: Sequence[str] | None, **arguments: Any) -> 
 def _replace_parameter(
     name: str, make: Callable[..., Any], options: Sequence[Parameter]
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Build a decorator that replaces the parameter `name` of a command by `options`.
-
-    `make`: function that builds the parameter's value from the values of the options.
-    """
+    """Build a decorator that replaces the parameter `name` of a command by options, from which `make` builds it."""
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
         """Wrap the command with a signature that has the options in place of the parameter."""
@@ -352,9 +331,7 @@ def _replace_parameter(
 def _build_assumed_rig(name: str | None, area: Sequence[str] | None, displacement: str | None) -> Rig | None:
     """Build the rig that `--rig`, `--area` and `--displacement` describe; return None without these options.
 
-    `name`: name or file of a rig; `area`: text of the piston area, or of those of sides A and B; `displacement`: text
-    of the pump's displacement; each is None if not given. Without `--rig` all other values are assumed. Raises
-    InputError for an invalid option.
+    `area`: text of the piston area, or of those of sides A and B. Raises InputError for an invalid option.
     """
     from sealscope.diagnosis.verdict.machine import unstated_rig
     from sealscope.parameters import load_rig
@@ -374,10 +351,7 @@ def _build_assumed_rig(name: str | None, area: Sequence[str] | None, displacemen
 
 
 def load_rig_with(name: str, overrides: Sequence[str] | None) -> Rig:
-    """Load a rig by its name or file, and replace the parameters that the options `--set` state.
-
-    `overrides`: texts `NAME=VALUE[unit]`, None for none.
-    """
+    """Load a rig by its name or file, with the parameters of the options `--set`, `NAME=VALUE[unit]`."""
     from sealscope.parameters import load_rig, parse_overrides
 
     rig = load_rig(name)
@@ -387,9 +361,9 @@ def load_rig_with(name: str, overrides: Sequence[str] | None) -> Rig:
 def parse_channel_map(options: Sequence[str] | None) -> ChannelMap:
     """Parse the `--map` options to a channel map, which states the columns of channels.
 
-    An option is `CHANNEL=COLUMN`, such as `p_A=PG_1` or `p_A=PG_1[psi]`, or the word `auto`, by which the remaining
-    channels are found by the names of the columns. If all options are `auto`, the result is "auto"; without options it
-    is empty. Raises InputError for an option of another form, an unknown channel, or a channel that is given twice.
+    An option is `CHANNEL=COLUMN`, such as `p_A=PG_1[psi]`, or `auto`, by which the remaining channels are found by the
+    names of the columns; only `auto` gives "auto". Raises InputError for another form, an unknown channel, or one given
+    twice.
     """
     from sealscope.recordings import split_map_option
     from sealscope.recordings.formats.columns import REST
@@ -414,10 +388,7 @@ def say(text: str) -> None:
 
 
 def say_wrapped(text: str, head: str = "") -> None:
-    """Print a paragraph on standard output, which begins with `head`, wrapped at 80 columns.
-
-    Lines after the first are indented by the length of `head`, or by 2 columns without a head.
-    """
+    """Print a paragraph on standard output, which begins with `head`, wrapped at 80 columns and indented after it."""
     say(paragraph(text, head, indent=len(head) or 2))
 
 
@@ -427,10 +398,7 @@ def complain(message: object) -> None:
 
 
 def attempt(file: Path, work: Callable[[], T]) -> T | None:
-    """Return the result of `work`, or print a message on standard error and return None if it fails.
-
-    The command can then go on with other files. `file`: the file that `work` reads or writes, for the message.
-    """
+    """Return the result of `work`, or print a message on `file` on standard error and return None if it fails."""
     try:
         return work()
     except SealscopeError as error:
@@ -444,10 +412,7 @@ def attempt(file: Path, work: Callable[[], T]) -> T | None:
 
 
 def check_folder(file: Path) -> None:
-    """Check before a long run that the folder of the file to write exists; raise InputError otherwise.
-
-    Also remove the temporary files of earlier calls that were stopped while they wrote this file.
-    """
+    """Check that the folder of the file to write exists; also remove temporary files of stopped calls."""
     from sealscope.storage import atomic
 
     atomic.check_folder(file)
@@ -464,10 +429,7 @@ def write_text(file: Path, text: str) -> None:
 
 
 def say_jobs(jobs: int | None) -> None:
-    """Warn on standard error if fewer processes will be started than the option `--jobs` requests.
-
-    `jobs`: value of the option, None if it is not given.
-    """
+    """Warn on standard error if fewer processes will be started than the option `--jobs` requests."""
     from sealscope.campaigns.execution.workers import process_count
 
     if jobs is not None and jobs > (n_processes := process_count(jobs)):
@@ -478,8 +440,8 @@ def say_jobs(jobs: int | None) -> None:
 def progress(noun: str = "") -> Iterator[Callable[[str, float], None]]:
     """Show progress bars on standard error within the `with` block; yield a function of (task, fraction done).
 
-    A task is a text; each has its own bar. If `noun`, the name of counted things, is given, all texts describe the same
-    bar. If standard error is not a terminal, there are no bars; with a `noun` a line is printed once a minute instead.
+    Each task, a text, has its own bar, or all the same if `noun`, the name of counted things, is given. If standard
+    error is not a terminal, there are no bars; with a `noun` a line is printed once a minute instead.
     """
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -508,10 +470,7 @@ def _minute_reporter() -> Callable[[str, float], None]:
     start_fraction: float | None = None
 
     def update(task: str, fraction: float) -> None:
-        """Print the task and the time left, unless a line was printed within the last minute.
-
-        `fraction` (0 to 1): completed part of the task, from which the time left is estimated.
-        """
+        """Print the task and the time left, estimated from the fraction done, at most once a minute."""
         nonlocal last_print, start_fraction
         now = time.monotonic()
         if start_fraction is None:

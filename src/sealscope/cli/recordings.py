@@ -110,11 +110,10 @@ def diagnose(
 def _diagnose_in_parallel(
     work: Callable[[Sequence[Path]], Iterator[DatedDiagnosis | None]], files: Sequence[Path]
 ) -> Iterator[tuple[str, Iterable[DatedDiagnosis | None]]]:
-    """Diagnose files in parallel processes, and yield the results in the order of the files.
+    """Diagnose files in parallel processes; yield messages and dated diagnoses in the order of the files.
 
-    `work`: function that yields the dated diagnoses of some files, with None for an unreadable file. Each result is a
-    pair of the messages for standard error and the list of the file's dated diagnoses, which is [None] if the process
-    died. On a single core this process diagnoses all files, and yields one pair for all of them.
+    `work` yields the dated diagnoses of some files, with None for an unreadable file. The list of a file is [None] if
+    its process died. On a single core this process diagnoses all files, and yields one pair for all of them.
     """
     from sealscope.campaigns.execution.workers import cores, iter_results_in_order
 
@@ -132,9 +131,8 @@ def _diagnose_in_parallel(
 def _format_diagnosis(diagnosis: Diagnosis, form: str, start_s: float | None) -> str:
     """Format a diagnosis for printing.
 
-    `form`: "jsonl" for a JSON object, "short" for a short text, "line" for the first line of the short text, "whole"
-    for a text with all methods, or "table" for a line with the start of the recording. `start_s` [s since 1970]: this
-    start, None if unknown.
+    `form`: "jsonl" for a JSON object, "short" for a short text, "line" for its first line, "whole" for a text with all
+    methods, or "table" for a line with the start `start_s` of the recording [s since 1970], None if unknown.
     """
     from sealscope.reporting.messages import diagnosis_text, short_text, table_line
 
@@ -147,10 +145,7 @@ def _format_diagnosis(diagnosis: Diagnosis, form: str, start_s: float | None) ->
 
 
 def _matches_fail_on(reason: str, diagnosis: Diagnosis) -> bool:
-    """Return True if a value of `--fail-on` applies to a diagnosis.
-
-    `reason`: the value, either a verdict or a level of severity (`_LEVELS`), which the leak must reach or exceed.
-    """
+    """Return True if a value of `--fail-on`, a verdict or the least level of severity, applies to a diagnosis."""
     level = None if diagnosis.severity is None else diagnosis.severity.level
     if reason in _LEVELS:  # in rising order
         return level in _LEVELS[_LEVELS.index(reason) :]
@@ -158,10 +153,9 @@ def _matches_fail_on(reason: str, diagnosis: Diagnosis) -> bool:
 
 
 def _is_time_series(files: Sequence[Path], starts: Sequence[float | None]) -> bool:
-    """Return True if files are recordings of one machine over time.
+    """Return True if files are recordings of one machine over time: names differ in numbers, `starts` [s] by an hour.
 
-    There must be at least `_MIN_SERIES_FILES` files, whose names differ only in numbers. All `starts` of recordings [s
-    since 1970] must be known and at least an hour apart.
+    All starts must be known, and there must be at least `_MIN_SERIES_FILES` files.
     """
     known = sorted(start for start in starts if start is not None)
     if len(known) < max(_MIN_SERIES_FILES, len(files)):
@@ -184,9 +178,9 @@ def _iter_diagnoses(
     """Yield each recording with its diagnosis, or None if the file cannot be read or diagnosed.
 
     If a baseline, i.e. a leak-free recording for comparison, cannot be read, None is yielded first, once. A file never
-    serves as its own baseline. `machine`: the machine that the options describe, with its baselines; `joined`: True if
-    the files are parts of a single recording; `settings`: further arguments of `sealscope.diagnose`. Raises InputError
-    if the only baseline of a file is the file itself, and UnreadableFile if no baseline can be read.
+    serves as its own baseline. `joined`: True if the files are parts of a single recording; `settings`: further
+    arguments of `sealscope.diagnose`. Raises InputError if the only baseline of a file is the file itself, and
+    UnreadableFile if no baseline can be read.
     """
     baseline = machine.baseline
     for file in files:
@@ -210,20 +204,13 @@ def _iter_diagnoses(
 
 
 def _iter_dated_diagnoses(files: Sequence[Path], **options: Any) -> Iterator[DatedDiagnosis | None]:
-    """Yield the start [s since 1970] and the diagnosis of each recording, or None where `_iter_diagnoses` yields None.
-
-    The start is None if it is unknown. `options`: further arguments of `_iter_diagnoses`.
-    """
+    """Yield start [s since 1970], None if unknown, and diagnosis, or None where `_iter_diagnoses` yields None."""
     for result in _iter_diagnoses(files, **options):
         yield None if result is None else (_start_seconds(result), result.diagnosis)
 
 
 def _start_seconds(result: DiagnosedRecording) -> float | None:
-    """Find the time of the first sample of a diagnosed recording [s since 1970].
-
-    The time is taken from the recording, the name of its file, or the time of the file's last change. Returns None if a
-    recording from standard input states no date.
-    """
+    """Find when a recording starts [s since 1970], by itself, its file's name or last change; None if unknown."""
     from sealscope.recordings.joining import file_seconds, start_seconds
 
     path = Path(result.diagnosis.file)
@@ -233,10 +220,7 @@ def _start_seconds(result: DiagnosedRecording) -> float | None:
 def _run_collecting_messages(
     work: Callable[[Sequence[Path]], Iterator[DatedDiagnosis | None]], files: Sequence[Path]
 ) -> tuple[str, list[DatedDiagnosis | None]]:
-    """Diagnose files by the function `work`, and collect the messages that it prints on standard error.
-
-    Returns the messages as text, and the list of the dated diagnoses, with None for an unreadable file.
-    """
+    """Diagnose files by the function `work`; return its messages on standard error, and its dated diagnoses."""
     with redirect_stderr(StringIO()) as messages:
         dated_diagnoses = list(work(files))
     return messages.getvalue(), dated_diagnoses
@@ -306,9 +290,8 @@ def report(
 def _report_machine(files: Sequence[Path], machine: opt.StatedMachine, output: Path, false_alarm: float) -> None:
     """Write the page of a commissioned machine, with its newest verdict and all its recordings over time.
 
-    `files`: recordings and folders of them; `output`: the page; `false_alarm`: probability of the verdict `leak` for a
-    leak-free recording. Raises UnreadableFile if no recording can be read, and ends the command with the exit status 1
-    if some recordings cannot be read.
+    `files`: recordings and folders of them; `false_alarm`: probability of the verdict `leak` for a leak-free recording.
+    Raises UnreadableFile if no recording can be read, and ends with the exit status 1 if some cannot be read.
     """
     from sealscope.diagnosis.commissioned.machine import recordings_in
     from sealscope.paragraphs import format_count
@@ -375,11 +358,10 @@ def inspect(
 
 
 def _resolve_map(channel_map: ChannelMap, file: Path, recording: Recording) -> dict[str, str]:
-    """Return the columns of a channel map, in which `auto` is replaced by the columns that were found by their names.
+    """Return the column of each channel of a map, with `auto` replaced by the columns that it found by their names.
 
-    The result is the column of each channel; a map without `auto` is returned unchanged. `recording`: the recording
-    read from `file` by this map. With `auto` the result is empty if the file was converted from another one, because
-    the recording then states the columns of that other file.
+    `recording`: read from `file` by this map. With `auto` the result is empty if the file was converted from another
+    one, whose columns the recording states.
     """
     from sealscope.recordings.formats.columns import explicit_columns, reconstruct_map, uses_names
 
@@ -416,10 +398,7 @@ def convert(
 
 
 def _convert_parts(source: Path, folder: Path, stated: opt.StatedMachine, every: str) -> None:
-    """Write a long recording as parts of the length `every`, such as 1h, to files in a new or empty folder.
-
-    `source`: file of the recording; `stated`: its channel map and sampling rate.
-    """
+    """Write a long recording as parts of the length `every`, such as 1h, to files in a new or empty folder."""
     from sealscope.paragraphs import format_count
     from sealscope.recordings import inspect, read_parts, write
     from sealscope.units import parse_quantity

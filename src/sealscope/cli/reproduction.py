@@ -14,7 +14,7 @@ from sealscope.errors import InputError
 
 
 def _item_names() -> list[str]:
-    """List all names that `reproduce` accepts, for completion by the shell: tables and figures, chapters and `all`."""
+    """List all names that `reproduce` accepts, for completion: tables and figures, chapters and `all`."""
     from sealscope.thesis.engine.items import load_items
 
     items = load_items()
@@ -75,11 +75,7 @@ def reproduce(
 
 
 def _list_items(patterns: Sequence[str], sheet: Path | None) -> None:
-    """Print the ids and titles of the thesis's tables and figures whose ids match one of the `patterns`.
-
-    If the thesis's data sheet is missing, the items that need it are marked. `sheet`: folder of the data sheet, None
-    for the default folder.
-    """
+    """Print the ids and titles of the items that match `patterns`; without the sheet, mark those that need it."""
     from sealscope.thesis.engine.items import load_items, select_items
     from sealscope.thesis.sheet import MISSING, find_sheet
 

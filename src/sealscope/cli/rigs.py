@@ -14,7 +14,6 @@ from sealscope.errors import InputError
 rigs = Typer(
     name="rigs", help="List the packaged rigs; `rigs new` writes another machine's file, `rigs margins` rates a loop."
 )
-_MM2, _MM, _CM3 = "mm^2", "mm", "cm^3/rev"
 
 
 @rigs.callback(invoke_without_command=True)
@@ -59,20 +58,18 @@ def new(
         if value is not None and kind != required_kind:
             raise InputError(f"{option} must stand with --kind {required_kind}, got --kind {kind}")
     if bore is not None:
-        bore_m = _parse_size(bore, "m", _MM, "--bore")
-        rod_m = _parse_size(rod or "0", "m", _MM, "--rod")
+        bore_m = _parse_size(bore, "m", "mm", "--bore")
+        rod_m = _parse_size(rod or "0", "m", "mm", "--rod")
         areas = piston_areas(bore_m, rod_m, double_rod=double_rod)
     else:
-        text_A = area_A or _ask_size("Piston area on side A", _MM2)
-        m2_A = _parse_size(text_A, "m^2", _MM2, "--area-A")
-        text_B = area_B or _ask_size("... on side B", _MM2)
-        areas = m2_A, _parse_size(text_B, "m^2", _MM2, "--area-B")
-    length = _parse_size(stroke or _ask_size("Stroke", _MM), "m", _MM, "--stroke")
+        m2_A = _parse_size(area_A, "m^2", "mm^2", "--area-A", "Piston area on side A")
+        areas = m2_A, _parse_size(area_B, "m^2", "mm^2", "--area-B", "... on side B")
+    length = _parse_size(stroke, "m", "mm", "--stroke", "Stroke")
     if kind == "pump":
-        volume = displacement or _ask_size("Displacement of the pump", _CM3)
-        text = rig_text(name, *areas, length, _parse_size(volume, "m^3/rev", _CM3, "--displacement"))
+        volume = _parse_size(displacement, "m^3/rev", "cm^3/rev", "--displacement", "Displacement of the pump")
+        text = rig_text(name, *areas, length, volume)
     else:
-        flow = _parse_size(valve or _ask_size("Rated flow of the valve", "L/min"), "m^3/s", "L/min", "--valve")
+        flow = _parse_size(valve, "m^3/s", "L/min", "--valve", "Rated flow of the valve")
         edge_drop = None if drop is None else _parse_size(drop, "Pa", "bar", "--drop")
         supply_pressure = None if supply is None else _parse_size(supply, "Pa", "bar", "--supply")
         text = valve_rig_text(name, *areas, length, flow, edge_drop, supply_pressure)
@@ -87,21 +84,16 @@ def new(
     echo(f"replace what is assumed (grep 'assumed:' {path}), then:\nsealscope simulate --rig {path} -o run.nc")
 
 
-def _ask_size(label: str, unit: str) -> str:
-    """Ask the user at the terminal for a size of the machine, such as the stroke; return the answer as text.
-
-    `label`: name of the size; `unit`: unit of an answer that states none. Both are shown to the user.
-    """
-    return str(prompt(f"{label} [{unit}]"))
-
-
-def _parse_size(text: str, si_unit: str, default_unit: str, option: str) -> float:
+def _parse_size(text: str | None, si_unit: str, default_unit: str, option: str, label: str = "") -> float:
     """Parse the text of an option to a number in `si_unit`; a text without a unit is in `default_unit`.
 
-    `option`: name of the option for the error message. Raises InputError if the text does not begin with a finite
-    number, or if its unit is unknown or has another dimension than `si_unit`.
+    Without a text, the user is asked for the size `label`, if stated, at the terminal. Raises InputError if the text
+    does not begin with a finite number, or has a unit of another dimension.
     """
     from sealscope.units import parse_quantity
+
+    if not text:
+        text = str(prompt(f"{label} [{default_unit}]")) if label else ""
 
     with suppress(ValueError):  # a text with a unit, which `float` refuses, stays unchanged
         text = f"{float(text)}[{default_unit}]"

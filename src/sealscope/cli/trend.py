@@ -98,8 +98,7 @@ def trend(
 def _count_known(readings: Sequence[LeakReading], machine: CommissionedMachine) -> int:
     """Count the first recordings, in the order of their dates, that the machine's file lists as healthy.
 
-    `readings`: leakage in each recording; `machine`: the machine of this file. The count ends at the first recording
-    that is not listed. Recordings without a date come before all others, and copies of a recording count once.
+    The count ends at the first one not listed. Recordings without a date come first, and copies count once.
     """
     known = {recording.digest for recording in machine.healthy}
     by_date = sorted(readings, key=lambda reading: -math.inf if reading.start is None else reading.start)
@@ -107,10 +106,7 @@ def _count_known(readings: Sequence[LeakReading], machine: CommissionedMachine) 
 
 
 def _check_output(output: Path, files: Sequence[Path]) -> None:
-    """Raise InputError if a trend cannot be written to `output`, or would replace one of the recordings `files`.
-
-    Also remove the temporary files of earlier calls that were stopped while they wrote this file.
-    """
+    """Check that a trend can be written to `output` and replaces none of the `files`, or raise InputError."""
     from sealscope.reporting.template import parse_page_path
 
     if output.suffix.lower() not in (".json", ".csv"):

@@ -11,11 +11,7 @@ Array = npt.NDArray[np.float64]
 
 
 def as_numbers(values: npt.ArrayLike, what: str) -> Array:
-    """Convert `values` to an array (n,) of finite numbers.
-
-    Raises InputError if the values are not numbers in one flat list, if the list is empty, or if a value is not
-    finite. `what` names the values in the message.
-    """
+    """Convert `values` to an array (n,) of finite numbers; raise InputError for others, several dimensions, or none."""
     try:
         array = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError):
@@ -31,11 +27,7 @@ def as_numbers(values: npt.ArrayLike, what: str) -> Array:
 
 
 def as_sizes(values: npt.ArrayLike, what: str = "leak sizes") -> Array:
-    """Convert `values` to an array (n,) of leak sizes in any unit; raise InputError for a size that is not positive.
-
-    Records without a leak have no size; they are counted for false alarms instead. `what` names the values in the
-    message.
-    """
+    """Convert `values` to an array (n,) of leak sizes in any unit; raise InputError for a size that is not positive."""
     array = as_numbers(values, what)
     wrong = np.flatnonzero(array <= 0.0)
     if wrong.size:
@@ -44,10 +36,7 @@ def as_sizes(values: npt.ArrayLike, what: str = "leak sizes") -> Array:
 
 
 def as_flags(values: npt.ArrayLike, n: int, what: str) -> npt.NDArray[np.bool_]:
-    """Convert `values`, True/False or 1/0, to an array (n,) of booleans.
-
-    Raises InputError for other values, or if the number of values is not `n`. `what` names the values in the message.
-    """
+    """Convert `values`, `n` times True/False or 1/0, to an array (n,) of booleans; raise InputError for others."""
     array = as_numbers(np.asarray(values, dtype=np.float64), what)
     if array.size != n:
         raise InputError(f"{what} must be as many as the records, got {array.size} for {n}")
@@ -62,10 +51,7 @@ MIN_PROBABILITY = 1e-15
 
 
 def as_probability(value: float, what: str) -> float:
-    """Return `value` as a float if it is a probability from 1e-15 to below 1; raise InputError otherwise.
-
-    The lower limit is `MIN_PROBABILITY`. `what` names the value in the message.
-    """
+    """Return `value` as a float if it is a probability from 1e-15 to below 1; raise InputError otherwise."""
     if not 0.0 < value < 1.0:
         raise InputError(f"{what} must be between 0 and 1, got {value}")
     if value < MIN_PROBABILITY:

@@ -21,12 +21,8 @@ class EstimateErrors:
     ----------
     n, without : int
         Number of records with and without an estimate.
-    bias : IntervalEstimate
-        Mean error.
-    rmse : IntervalEstimate
-        Root mean square error.
-    median : IntervalEstimate
-        Median of the signed error.
+    bias, rmse, median : IntervalEstimate
+        Mean error, root mean square error, and median of the signed error.
     median_size, ninety_size : IntervalEstimate
         50 % and 90 % quantile of the absolute error.
     coverage : Proportion
@@ -46,11 +42,11 @@ class EstimateErrors:
 def order_ranks(n: int, order: float, confidence: float = 0.95) -> tuple[int, int]:
     """Compute the ranks (r, s) of the two sorted sample values that enclose a quantile of the distribution.
 
-    The quantile lies between them with at least the probability `confidence`. `n` is the number of values, and `order`
-    the order of the quantile, such as 0.9. r is the largest rank with ``P(X <= r - 1) <= alpha/2`` and s the smallest
-    with ``P(X >= s) <= alpha/2``, where X is binomial (n, order) and alpha = 1 - confidence. r = 0 and s = n + 1 mean
-    that there is no bound. Raises InputError for an impossible order or confidence. Source: Conover, Practical
-    Nonparametric Statistics, 3rd ed. (1999), section 3.2.
+    The quantile of the given `order`, such as 0.9, lies between them with at least the probability `confidence`. Of `n`
+    values, r is the largest rank with ``P(X <= r - 1) <= alpha/2`` and s the smallest with ``P(X >= s) <= alpha/2``,
+    where X is binomial (n, order) and alpha = 1 - confidence. r = 0 and s = n + 1 mean that there is no bound. Raises
+    InputError for an impossible order or confidence. Source: Conover, Practical Nonparametric Statistics, 3rd ed.
+    (1999), section 3.2.
     """
     from scipy.special import betainc
 
@@ -66,10 +62,9 @@ def order_ranks(n: int, order: float, confidence: float = 0.95) -> tuple[int, in
 def estimate_quantile(values: npt.ArrayLike, order: float, confidence: float = 0.95) -> IntervalEstimate:
     """Estimate a quantile of the distribution that a sample `values` (n,) comes from, with a confidence interval.
 
-    `order` is the order of the quantile, such as 0.9. The estimate is the sorted value ``x_(ceil(n order))``, and the
-    ends of the interval are sorted values, too (`order_ranks`). The interval is valid for any distribution, and
-    infinite if the sample is too small to bound the quantile. `values` may contain inf for values beyond all others.
-    Raises InputError for an empty sample or nan.
+    The estimate is the sorted value ``x_(ceil(n order))``, with `order` such as 0.9, and the ends of the interval are
+    sorted values, too (`order_ranks`). It is valid for any distribution, and infinite if the sample is too small.
+    `values` may contain inf for values beyond all others. Raises InputError for an empty sample or nan.
     """
     array = np.sort(np.asarray(values, dtype=np.float64).ravel())
     if array.size == 0 or np.isnan(array).any():
@@ -101,26 +96,8 @@ def estimate_mean(values: npt.ArrayLike, confidence: float = 0.95) -> IntervalEs
     return IntervalEstimate(n, value, value - half_width, value + half_width)
 
 
-def _interval_coverage(
-    low: npt.ArrayLike | None, high: npt.ArrayLike | None, truth: Array, confidence: float
-) -> Proportion:
-    """Compute the proportion of stated intervals, from `low` to `high`, that contain the true value.
-
-    All arrays are (n,), one value per record. A record whose `low` or `high` is nan has no interval and is not
-    counted; None stands for no intervals at all. `confidence`: confidence level of the proportion's interval.
-    """
-    low = _as_matching(low, truth.size, "lower limits")
-    high = _as_matching(high, truth.size, "upper limits")
-    has_interval = ~(np.isnan(low) | np.isnan(high))
-    covered = (low <= truth) & (truth <= high) & has_interval
-    return proportion(int(np.count_nonzero(covered)), int(has_interval.sum()), confidence)
-
-
 def _as_matching(values: npt.ArrayLike | None, n: int, what: str) -> Array:
-    """Convert `values` to an array (n,), all nan for None; raise InputError for values of another shape.
-
-    `n`: number of true values; `what`: name of the values in the message.
-    """
+    """Convert `values` to an array (n,), all nan for None; raise InputError for values of another shape."""
     array = np.full(n, math.nan) if values is None else np.asarray(values, dtype=np.float64)
     if array.shape != (n,):
         raise InputError(f"{what} must be as many as the true values, got {array.shape} for {n}")
@@ -136,10 +113,9 @@ def estimate_errors(
 ) -> EstimateErrors:
     """Compute the errors of estimates, such as leaks [L/min] or onsets [s], with confidence intervals.
 
-    `estimates` and `truth` (n,) have the same unit, and so have `low` and `high` (n,), the ends of the stated
-    intervals. A missing estimate or interval is nan. The confidence interval of the rmse is the square root of
-    Student's interval of the mean square error, cut off at 0. The intervals of quantiles hold for any distribution.
-    Raises InputError if no record has an estimate.
+    `estimates`, `truth` and the ends `low` and `high` of the stated intervals, all (n,), have the same unit. A missing
+    estimate or interval is nan. The confidence interval of the rmse is the square root of Student's interval of the
+    mean square error, cut off at 0. Raises InputError if no record has an estimate.
     """
     true_values = as_numbers(truth, "true values")
     n_records = true_values.size
@@ -151,6 +127,9 @@ def estimate_errors(
     absolute_error = np.abs(error)
     mean_square = estimate_mean(error**2, confidence)
     rmse, low_rmse, high_rmse = (math.sqrt(max(x, 0.0)) for x in (mean_square.value, mean_square.low, mean_square.high))
+    low, high = _as_matching(low, n_records, "lower limits"), _as_matching(high, n_records, "upper limits")
+    has_interval = ~(np.isnan(low) | np.isnan(high))
+    covered = (low <= true_values) & (true_values <= high) & has_interval
     return EstimateErrors(
         n=error.size,
         without=n_records - error.size,
@@ -159,5 +138,5 @@ def estimate_errors(
         median=estimate_quantile(error, 0.5, confidence),
         median_size=estimate_quantile(absolute_error, 0.5, confidence),
         ninety_size=estimate_quantile(absolute_error, 0.9, confidence),
-        coverage=_interval_coverage(low, high, true_values, confidence),
+        coverage=proportion(int(np.count_nonzero(covered)), int(has_interval.sum()), confidence),
     )

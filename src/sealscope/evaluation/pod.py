@@ -1,7 +1,6 @@
 """Estimate the probability of detection (POD) as a function of the size of the leak.
 
-Two estimates are computed: proportions at each size, and a logistic curve fitted to hits and misses. The curve yields
-a50, a90 and a90/95 as in MIL-HDBK-1823A.
+These are proportions at each size, and a logistic curve with a50, a90 and a90/95 as in MIL-HDBK-1823A.
 """
 
 from __future__ import annotations
@@ -36,8 +35,7 @@ class SizeDetection:
 def detection_by_size(leaks: npt.ArrayLike, hits: npt.ArrayLike, confidence: float = 0.95) -> list[SizeDetection]:
     """Compute the proportion of detected leaks of each size, in the order of rising size, with confidence bounds.
 
-    `leaks` (n,) are the sizes in any unit; `hits` (n,) are True for the detected leaks. The bounds are those of
-    Clopper and Pearson. Raises InputError for a size that is not positive.
+    `leaks` (n,): sizes in any unit; `hits` (n,): True for the detected leaks. Raises InputError for a size <= 0.
     """
     sizes = as_sizes(leaks)
     is_hit = as_flags(hits, sizes.size, "hits")
@@ -52,10 +50,9 @@ def detection_by_size(leaks: npt.ArrayLike, hits: npt.ArrayLike, confidence: flo
 def proven_size(rows: list[SizeDetection], detection: float = 0.9) -> float:
     """Find the smallest tested size such that this and all larger tested sizes are proven to be detected.
 
-    `rows`: results for each size; `detection`: the probability of detection to be proven. A size is proven if the
-    lower confidence bound of its proportion is at least `detection`. For example, 29 hits of 29 prove 90 % at 95 %
-    confidence: this is a90/95 without a model. The confidence applies to each size separately. Returns infinity if the
-    largest size is not proven. Source: Clopper and Pearson (1934), doi 10.1093/biomet/26.4.404.
+    A size is proven if the lower confidence bound of its proportion is at least `detection`; the confidence applies to
+    each size separately. For example, 29 hits of 29 prove 90 % at 95 % confidence: this is a90/95 without a model.
+    Returns infinity if the largest size is not proven. Source: Clopper and Pearson (1934), doi 10.1093/biomet/26.4.404.
     """
     as_probability(detection, "the probability of detection")
     proven = math.inf
@@ -74,8 +71,7 @@ def _log_odds(p: float) -> float:
 def _information(design: Array, n: Array, eta: Array) -> Array:
     """Compute the Fisher information (2, 2) of intercept and slope of the logistic curve.
 
-    `design` (m, 2) has the columns 1 and logarithm of size, `n` (m,) are the numbers of trials, and `eta` (m,) the
-    log odds of detection.
+    `design` (m, 2): columns 1 and logarithm of size; `n` (m,): numbers of trials; `eta` (m,): log odds of detection.
     """
     odds = np.exp(-np.abs(eta))  # does not overflow; p (1 - p) is even in eta
     weight = n * odds / (1.0 + odds) ** 2  # n p (1 - p)
@@ -85,8 +81,8 @@ def _information(design: Array, n: Array, eta: Array) -> Array:
 def _log_likelihood(design: Array, n: Array, k: Array, eta: Array, *, firth: bool) -> float:
     """Compute the log-likelihood of `k` hits in `n` trials at m sizes with the log odds `eta` of a hit, all (m,).
 
-    The result is ``sum of k eta - n ln(1 + exp eta)``. With `firth`, half the log determinant of the Fisher information
-    is added as a penalty, for which `design` (m, 2) has the columns 1 and logarithm of size.
+    It is ``sum of k eta - n ln(1 + exp eta)``. With `firth`, half the log determinant of the Fisher information is
+    added as a penalty; `design` (m, 2) has the columns 1 and logarithm of size.
     """
     value = float(np.sum(k * eta - n * np.logaddexp(0.0, eta)))
     if not firth:
@@ -104,10 +100,7 @@ def _fit_coefficients(design: Array, n: Array, k: Array, *, firth: bool) -> Arra
     from scipy.special import expit
 
     def loss(beta: Array) -> tuple[float, Array]:
-        """Compute the negative log-likelihood of the logistic curve, and its gradient (2,).
-
-        `beta` (2,): intercept and slope of the curve.
-        """
+        """Compute the negative log-likelihood of the curve `beta` (2,), intercept and slope, and its gradient (2,)."""
         eta = design @ beta
         p = expit(eta)
         residual = k - n * p
@@ -123,8 +116,7 @@ def _fit_coefficients(design: Array, n: Array, k: Array, *, firth: bool) -> Arra
 def _is_separated(n: Array, k: Array) -> bool:
     """Return True if all leaks above one size are hits and all below it are misses, or the reverse.
 
-    At the size itself there may be hits and misses. The likelihood of the logistic curve then has no finite maximum.
-    `n` and `k` (m,) are trials and hits at rising sizes.
+    The likelihood of the logistic curve then has no finite maximum. `n`, `k` (m,): trials and hits at rising sizes.
     """
     hit_fraction = k / n
     n_mixed_sizes = np.count_nonzero((hit_fraction > 0.0) & (hit_fraction < 1.0))
@@ -162,19 +154,15 @@ class HitMiss:
     hits: Array
 
     def detection(self, size: npt.ArrayLike) -> Array:
-        """Compute the probability of detection (k,) that the fitted curve gives for the sizes `size` (k,).
-
-        Raises InputError for a size that is not positive.
-        """
+        """Compute the fitted probability of detection at each `size`; raise InputError for one that is not positive."""
         from scipy.special import expit
 
         return np.asarray(expit(self.intercept + self.slope * _log_sizes(size)), dtype=np.float64)
 
     def detection_band(self, size: npt.ArrayLike, confidence: float = 0.95) -> tuple[Array, Array]:
-        """Compute a two-sided confidence interval (low, high) of the probability of detection at each size.
+        """Compute a two-sided confidence interval (low, high) of the probability of detection at each `size`.
 
-        `size` (k,): positive sizes; low and high are (k,). The interval is Wald's for the log odds. The confidence
-        applies to each size separately.
+        The interval is Wald's for the log odds; the confidence applies to each size separately.
         """
         from scipy.special import expit, ndtri
 
@@ -186,10 +174,9 @@ class HitMiss:
         return np.asarray(expit(eta - margin), dtype=np.float64), np.asarray(expit(eta + margin), dtype=np.float64)
 
     def size_at(self, detection: float) -> float:
-        """Compute the size that is detected with the probability `detection`, such as a90 for 0.9.
+        """Compute the size that is detected with the probability p = `detection`, such as a90 for 0.9.
 
-        The result follows from ``ln(size) = (ln(p/(1-p)) - intercept)/slope`` with p the probability, and is infinite
-        if the detection does not rise with the size.
+        It is ``ln(size) = (ln(p/(1-p)) - intercept)/slope``, and infinite if the detection does not rise with the size.
         """
         as_probability(detection, "the probability of detection")
         return _exp_size((_log_odds(detection) - self.intercept) / self.slope) if self.slope > 0.0 else math.inf
@@ -197,11 +184,11 @@ class HitMiss:
     def size_bound(self, detection: float = 0.9, confidence: float = 0.95) -> float:
         """Compute the one-sided upper confidence bound of the size detected with the probability `detection`.
 
-        By default it is a90/95. The bound is the largest size whose profile log-likelihood is within ``z^2/2`` of the
-        maximum, with z the normal quantile of `confidence` (chi square with one degree of freedom). The bound is
-        infinite if there is no such largest size, or if the detection does not rise with the size. Raises InputError
-        unless `confidence` is from 0.5 to below 1. Source: MIL-HDBK-1823A (2009), appendix G. Cheng and Iles,
-        Technometrics 25 (1983) 77-86, doi 10.1080/00401706.1983.10487822, give simultaneous bounds, which are wider.
+        By default it is a90/95. It is the largest size whose profile log-likelihood is within ``z^2/2`` of the maximum,
+        with z the normal quantile of `confidence` (chi square with one degree of freedom), and infinite if there is no
+        such size, or if the detection does not rise with the size. Raises InputError unless `confidence` is from 0.5 to
+        below 1. Source: MIL-HDBK-1823A (2009), appendix G. Cheng and Iles, Technometrics 25 (1983) 77-86, doi
+        10.1080/00401706.1983.10487822, give simultaneous bounds, which are wider.
         """
         from scipy.optimize import brentq
         from scipy.special import ndtri
@@ -215,10 +202,7 @@ class HitMiss:
             return math.inf
 
         def excess_drop(log_size: float) -> float:
-            """Compute how far the profile log-likelihood is below its maximum at a size, minus the allowed drop.
-
-            `log_size`: natural logarithm of the size. The result is 0 at the bound.
-            """
+            """Compute how far the profile log-likelihood is below its maximum at a size, minus the allowed drop."""
             return self.log_likelihood - self._profile_log_likelihood(log_odds, log_size) - allowed_drop
 
         # bracket the root with growing steps from the estimate upwards
@@ -250,20 +234,14 @@ class HitMiss:
         return self.size_bound()
 
     def _profile_log_likelihood(self, log_odds: float, log_size: float) -> float:
-        """Compute the largest log-likelihood of all logistic curves that pass through one given point.
-
-        `log_odds`: log odds of detection at the point; `log_size`: natural logarithm of its size.
-        """
+        """Compute the largest log-likelihood of all logistic curves through one point (log size, log odds)."""
         from scipy.optimize import minimize_scalar
 
         x = _log_sizes(self.size)
         design = np.column_stack([np.ones(x.size), x])
 
         def loss(slope: float) -> float:
-            """Compute the negative log-likelihood of the curve with this slope through the given point.
-
-            The result is 1e300 instead of infinity, which the search for the minimum cannot use.
-            """
+            """Compute the negative log-likelihood of the curve with this slope; 1e300, not infinity, for the search."""
             eta = log_odds + slope * (x - log_size)
             value = _log_likelihood(design, self.tested, self.hits, eta, firth=self.estimator == "firth")
             return -value if math.isfinite(value) else 1e300
@@ -285,13 +263,12 @@ def _exp_size(log_size: float) -> float:
 def fit_hit_miss(leaks: npt.ArrayLike, hits: npt.ArrayLike) -> HitMiss:
     """Fit a logistic curve of the probability of detection to hits and misses over the logarithm of the leak's size.
 
-    `leaks` (n,) are positive sizes in any unit; `hits` (n,) are True for the detected leaks. The fit is by maximum
-    likelihood. If hits and misses are separated by size, the likelihood has no finite maximum, and Firth's penalised
-    likelihood is used instead (`HitMiss.estimator`), both for the curve and for the confidence bound of a size, such as
-    a90/95 (`HitMiss.size_bound`). The curve goes to 0 for small leaks, as it does not include the false-alarm rate.
-    Raises InputError for a single size, only hits or only misses. Source: MIL-HDBK-1823A (2009), appendix G; Firth,
-    Biometrika 80 (1993) 27-38, doi 10.1093/biomet/80.1.27; Heinze and Schemper, Stat. Med. 21 (2002) 2409-2419, doi
-    10.1002/sim.1047.
+    `leaks` (n,): positive sizes in any unit; `hits` (n,): True for the detected leaks. The fit is by maximum likelihood
+    or, if hits and misses are separated by size so that this has no finite maximum, by Firth's penalised likelihood
+    (`HitMiss.estimator`), also for bounds of a size (`HitMiss.size_bound`). The curve goes to 0 for small leaks, as it
+    does not include the false-alarm rate. Raises InputError for a single size, only hits or only misses. Source:
+    MIL-HDBK-1823A (2009), appendix G; Firth, Biometrika 80 (1993) 27-38, doi 10.1093/biomet/80.1.27; Heinze and
+    Schemper, Stat. Med. 21 (2002) 2409-2419, doi 10.1002/sim.1047.
     """
     x = np.log(as_sizes(leaks))
     is_hit = as_flags(hits, x.size, "hits")

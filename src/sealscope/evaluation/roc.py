@@ -19,10 +19,8 @@ class Roc:
 
     Attributes
     ----------
-    threshold : ndarray, shape (k,)
-        Thresholds; an alarm is raised if the score is at least the threshold.
-    false_alarm, detection : ndarray, shape (k,)
-        Fractions of the leak-free and of the leaky scores that raise an alarm.
+    threshold, false_alarm, detection : ndarray, shape (k,)
+        Thresholds, and fractions of the leak-free and of the leaky scores that reach them and raise an alarm.
     low, high : ndarray, shape (k,)
         Simultaneous confidence band of the detection at each false-alarm probability.
     """
@@ -62,9 +60,9 @@ def _count_alarms(scores: Array, thresholds: Array) -> Array:
 def kolmogorov_margin(n: int, confidence: float) -> float:
     """Compute the half width of a confidence band around the empirical distribution of `n` samples.
 
-    The half width is ``sqrt(ln(2/alpha) / (2n))`` with alpha = 1 - confidence. The band contains the whole true
-    distribution with at least the probability `confidence`, for any n and any distribution. Source: Massart, Ann.
-    Probab. 18 (1990) 1269-1283, doi 10.1214/aop/1176990746.
+    It is ``sqrt(ln(2/alpha) / (2n))`` with alpha = 1 - confidence. The band contains the whole true distribution with
+    at least the probability `confidence`. Source: Massart, Ann. Probab. 18 (1990) 1269-1283, doi
+    10.1214/aop/1176990746.
     """
     return math.sqrt(math.log(2.0 / (1.0 - as_probability(confidence, "confidence"))) / (2.0 * n))
 
@@ -72,11 +70,11 @@ def kolmogorov_margin(n: int, confidence: float) -> float:
 def roc_curve(leak_free: npt.ArrayLike, leaky: npt.ArrayLike, confidence: float = 0.95) -> Roc:
     """Compute the ROC curve of a score that is high for leaks, from the scores of leak-free and of leaky records.
 
-    If scores of both groups are equal, the curve has a slanted step there. The confidence band contains the whole
-    true curve with at least the probability `confidence`. The band is the envelope of the curve's points, each moved by
-    +-d in false alarms and by +-e in detections. Here d and e are the `kolmogorov_margin` of the leak-free and of the
-    leaky scores, both at the confidence sqrt(`confidence`). Raises InputError unless there are scores of both groups.
-    Source: Campbell, Stat. Med. 13 (1994) 499-508, doi 10.1002/sim.4780130512.
+    If scores of both groups are equal, the curve has a slanted step there. The confidence band contains the whole true
+    curve with at least the probability `confidence`: it is the envelope of the curve's points, each moved by +-d in
+    false alarms and by +-e in detections, the `kolmogorov_margin` of the leak-free and of the leaky scores at the
+    confidence sqrt(`confidence`). Raises InputError unless there are scores of both groups. Source: Campbell, Stat.
+    Med. 13 (1994) 499-508, doi 10.1002/sim.4780130512.
     """
     a, b = _as_scores(leak_free, leaky)
     as_probability(confidence, "confidence")
@@ -94,8 +92,8 @@ def roc_curve(leak_free: npt.ArrayLike, leaky: npt.ArrayLike, confidence: float 
 def placements(leak_free: Array, leaky: Array) -> tuple[Array, Array]:
     """Compute for each score the fraction of correctly ordered pairs that it forms with the other group's scores.
 
-    A pair is ordered correctly if the leaky score is the higher one; equal scores count half. Returns the fractions
-    for the leak-free scores (n,) and for the leaky scores (m,).
+    The leaky score of a pair should be the higher one; equal scores count half. Returns the fractions for the leak-free
+    scores (n,) and for the leaky scores (m,).
     """
     a, b = np.sort(leak_free), np.sort(leaky)
     # "left" counts smaller scores, "right" smaller and equal ones: their mean counts equal scores half
@@ -107,10 +105,10 @@ def placements(leak_free: Array, leaky: Array) -> tuple[Array, Array]:
 def _newcombe_interval(value: float, n: int, m: int, z: float) -> tuple[float, float]:
     """Compute Newcombe's confidence interval (low, high) of an area A = `value` under the ROC curve.
 
-    The ends of the interval are the solutions t of ``|t - A| = z SE(t)``, with Hanley and McNeil's standard error
-    ``SE(t)^2 = t (1 - t) (1 + (N - 1) q)/(n m)``, where ``q = (1 - t)/(2 - t) + t/(1 + t)`` and N is the mean of n and
-    m. `n`, `m`: numbers of leak-free and of leaky scores; `z`: normal quantile. The interval has a width even if A is 0
-    or 1. Source: Newcombe, Stat. Med. 25 (2006) 559-573, doi 10.1002/sim.2324, method 5.
+    Its ends are the solutions t of ``|t - A| = z SE(t)``, with Hanley and McNeil's standard error ``SE(t)^2 = t (1 - t)
+    (1 + (N - 1) q)/(n m)``, where ``q = (1 - t)/(2 - t) + t/(1 + t)`` and N is the mean of the numbers n and m of
+    leak-free and of leaky scores; `z`: normal quantile. It has a width even if A is 0 or 1. Source: Newcombe, Stat.
+    Med. 25 (2006) 559-573, doi 10.1002/sim.2324, method 5.
     """
     from scipy.optimize import brentq
 
@@ -130,11 +128,11 @@ def _newcombe_interval(value: float, n: int, m: int, z: float) -> tuple[float, f
 def auc(leak_free: npt.ArrayLike, leaky: npt.ArrayLike, confidence: float = 0.95) -> Area:
     """Compute the area under the ROC curve with a confidence interval.
 
-    `leak_free` are scores a (n,) and `leaky` scores b (m,), which are high for leaks. The area is ``sum of (b > a) +
-    (b = a)/2`` over all pairs, divided by n m. The interval is DeLong's normal approximation, cut off at 0 and 1. If
-    the scores are completely separated or all equal, DeLong's interval has no width, and Newcombe's is used instead.
-    Raises InputError for fewer than 2 records of either group. Source: DeLong, DeLong and Clarke-Pearson, Biometrics
-    44 (1988) 837-845, doi 10.2307/2531595, eq. (5)-(8).
+    With scores a (n,) of leak-free and b (m,) of leaky records, high for leaks, the area is ``sum of (b > a) + (b =
+    a)/2`` over all pairs, divided by n m. The interval is DeLong's normal approximation, cut off at 0 and 1, or
+    Newcombe's if that has no width, as the scores are completely separated or all equal. Raises InputError for fewer
+    than 2 records of either group. Source: DeLong, DeLong and Clarke-Pearson, Biometrics 44 (1988) 837-845, doi
+    10.2307/2531595, eq. (5)-(8).
     """
     from scipy.special import ndtri
 

@@ -1,8 +1,6 @@
 """Find roots and minima of functions of one variable, for commands that must start fast.
 
 `scipy.optimize` finds the same, but its import loads 200 modules, which takes a fifth of the time of a diagnosis.
-Used wherever a probability is converted to a threshold or a bound.
-
 Sources: T. R. Chandrupatla, Adv. Eng. Softw. 28 (1997) 145 (roots); J. Kiefer, Proc. Amer. Math. Soc. 4 (1953) 502
 (golden section).
 """
@@ -64,10 +62,9 @@ def find_near_root(
 ) -> float | None:
     """Find a zero of a smooth rising function near `start` by the secant method; None if it does not converge.
 
-    `slope` is the approximate slope of the function at `start`. The iteration has converged at x if the next step is
-    at most 1e-9 max(1, |x|), so x should be of the order of one. Returns None if this takes more than 12 steps, if the
-    iteration leaves the range from `low` to `high`, or if it meets a slope that is not positive. If `start` is within a
-    few per cent of the zero, the search takes a third of the evaluations of `find_root`.
+    `slope`: approximate slope at `start`. The iteration has converged at x if the next step is at most 1e-9 max(1,
+    |x|), so x should be of the order of one. Returns None if it takes more than 12 steps, leaves the range from `low`
+    to `high`, or meets a slope that is not positive. Near the zero it takes a third of the evaluations of `find_root`.
     """
     x, f_x = start, function(start)
     for _ in range(_MAX_SECANTS):
@@ -86,8 +83,7 @@ def find_near_root(
 def find_minimum(function: Callable[[float], float], low: float, high: float, tolerance: float) -> tuple[float, float]:
     """Find the minimum of a function with a single minimum between `low` and `high`, by golden section search.
 
-    `tolerance` is the largest error of the position. Returns the position of the minimum and the function's value
-    there.
+    `tolerance`: largest error of the position. Returns the position, and the function's value there.
     """
     left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
     f_left, f_right = function(left), function(right)

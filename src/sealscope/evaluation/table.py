@@ -53,10 +53,8 @@ class Confusion:
     ----------
     rows, columns : tuple of str
         Names of the true faults and of the verdicts.
-    counts : ndarray, shape (rows, columns)
-        Number of records with this fault and this verdict.
-    shares : tuple of tuple of Proportion
-        Fraction of the records of each row with this verdict.
+    counts, shares : ndarray, tuple of tuple of Proportion, shape (rows, columns)
+        Number of records with this fault and this verdict, and their fraction of the records of the row.
     accuracy : Proportion
         Fraction of correct verdicts among all records, "cannot tell" counted as incorrect.
     """
@@ -73,10 +71,9 @@ def confusion_matrix(
 ) -> Confusion:
     """Count the verdicts for each true fault, with Clopper-Pearson intervals of their fractions.
 
-    `truth` and `verdicts` are the true fault and the verdict of each record. `faults` are the names of all faults,
-    including the name for no fault, in the order of rows and columns; `confidence`: confidence level of the intervals.
-    Raises InputError for a name that is not in `faults`, if "cannot tell" is among the faults, if there are no records,
-    or if `truth` and `verdicts` differ in length.
+    `truth`, `verdicts`: true fault and verdict of each record; `faults`: names of all faults, including that for no
+    fault, in the order of rows and columns. Raises InputError for a name that is not in `faults`, if "cannot tell" is
+    among the faults, if there are no records, or if `truth` and `verdicts` differ in length.
     """
     if len(truth) != len(verdicts) or not truth:
         raise InputError(f"verdicts must be as many as the true faults, got {len(verdicts)} for {len(truth)}")

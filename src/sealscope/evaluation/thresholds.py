@@ -26,8 +26,6 @@ class Threshold:
 
     Attributes
     ----------
-    value : float
-        The threshold.
     false_alarm_probability : float
         The requested false-alarm probability.
     promise : {"average", "bound"}
@@ -55,10 +53,9 @@ class Threshold:
 def records_needed(false_alarm: float, confidence: float | None = None) -> int:
     """Compute the smallest number of leak-free records that can set a threshold for a false-alarm probability p.
 
-    Without `confidence`, p is kept on average, which takes ``ceil(1/p) - 1`` records. With `confidence`, p is kept as
-    a bound, which takes the smallest n with ``1 - (1 - p)^n >= confidence``, for example 299 for 1 % at 95 %. Raises
-    InputError for an impossible probability or confidence. Source: Wilks, Ann. Math. Stat. 12 (1941) 91-96, doi
-    10.1214/aoms/1177731788.
+    Without `confidence`, p is kept on average, which takes ``ceil(1/p) - 1`` records; with it, as a bound, which takes
+    the smallest n with ``1 - (1 - p)^n >= confidence``, for example 299 for 1 % at 95 %. Raises InputError for an
+    impossible probability or confidence. Source: Wilks, Ann. Math. Stat. 12 (1941) 91-96, doi 10.1214/aoms/1177731788.
     """
     as_probability(false_alarm, "the false-alarm probability")
     if confidence is None:
@@ -71,10 +68,8 @@ def _threshold_rank(n: int, false_alarm: float, promise: Promise, confidence: fl
     """Find which of `n` leak-free scores is the lowest possible threshold; return its rank, 1 for the highest score.
 
     With the score of rank r as the threshold, the true false-alarm probability is distributed as Beta(r, n + 1 - r).
-    The result is the largest r that keeps the `promise`, or 0 if no rank keeps it, as n is too small:
-
-    - "average": the mean r/(n + 1) of this distribution is at most `false_alarm`;
-    - "bound": the true probability is at most `false_alarm` with at least the probability `confidence`.
+    The result is the largest r whose mean r/(n + 1) is at most `false_alarm` ("average"), or with which the true
+    probability is at most `false_alarm` with at least the probability `confidence` ("bound"); 0 if n is too small.
     """
     from scipy.special import betainc
 
@@ -91,11 +86,11 @@ def quantile_threshold(
     """Compute the lowest threshold that keeps a false-alarm probability p, from scores of leak-free records.
 
     `scores` (n,) are high for a leak, and `false_alarm` is p. With the promise "average", the threshold is the
-    ``floor(p (n + 1))``-th highest score; the next leak-free record exceeds it with a probability of at most p (split
-    conformal). With "bound", the threshold is the lowest score whose true false-alarm probability is at most p with
-    the probability `confidence` (tolerance limit). Both are exact for independent records of any continuous
-    distribution. Raises InputError if there are too few records; the message states the number needed. Source: Wilks
-    (1941), doi 10.1214/aoms/1177731788; Vovk, Proc. Mach. Learn. Res. 25 (2012) 475-490, proposition 2.
+    ``floor(p (n + 1))``-th highest score, which the next leak-free record exceeds with a probability of at most p
+    (split conformal). With "bound", it is the lowest score whose true false-alarm probability is at most p with the
+    probability `confidence` (tolerance limit). Both are exact for independent records of any continuous distribution.
+    Raises InputError, with the number needed, if there are too few records. Source: Wilks (1941), doi
+    10.1214/aoms/1177731788; Vovk, Proc. Mach. Learn. Res. 25 (2012) 475-490, proposition 2.
     """
     from scipy.special import betaincinv
 

@@ -46,10 +46,9 @@ def noise_free_mean_squares(
 ) -> Array:
     """Simulate a test of Appendix C without noise, and compute the mean squares of its wavelet details.
 
-    Returns the mean squares of d1..d4 [psi^2] and of the product d3d4 [psi^4] as (chambers, 5). The pressures are
-    sampled at the rig's rate behind its anti-alias filter, from 7.2 s on (`SETTLING`) for 4 pi s (`ANALYSED`).
-    `condition`: inputs of the test; `leak`: text of the leak, None for no leak; `x_0` [m]: position of the piston at
-    the start; `values`: parameters that override the test's. Raises the errors of the simulation.
+    Returns the mean squares of d1..d4 [psi^2] and of the product d3d4 [psi^4] as (chambers, 5), sampled at the rig's
+    rate behind its anti-alias filter, from 7.2 s on (`SETTLING`) for 4 pi s (`ANALYSED`). `leak`: text of the leak,
+    None for no leak; `x_0` [m]: start of the piston; `values`: parameters that override the test's.
     """
     duration = ANALYSED + SETTLING + 128.0 / rig.daq.sample_rate  # 128: more than the 120 later samples of d4
     values = {**experiment_values(condition), **(values or {})}
@@ -63,11 +62,11 @@ def noise_free_mean_squares(
 
 
 def log_rms(squares: Array, sigma: float) -> Array:
-    """Compute the natural logarithm of the RMS of the wavelet details d1..d4 and d3d4 of pressures with white noise.
+    """Compute the logarithm of the RMS (..., 5) of the wavelet details d1..d4 and d3d4 of pressures with white noise.
 
-    `squares` (..., 5): mean squares m_1 to m_4 [psi^2] of the details and m_34 [psi^4] of their product d3d4 without
-    noise; `sigma` [psi]: standard deviation of the noise in the pressure. Returns (..., 5): ``log(m_j + sigma^2) / 2``
-    for d_j, and ``log(m_34 + sigma^2 m_3 + sigma^2 m_4 + sigma^4) / 2`` for the product d3d4.
+    It is ``log(m_j + sigma^2) / 2`` for d_j, and ``log(m_34 + sigma^2 m_3 + sigma^2 m_4 + sigma^4) / 2`` for the
+    product d3d4, with the noise-free mean `squares` (..., 5) m_1 to m_4 [psi^2] and m_34 [psi^4], and the standard
+    deviation `sigma` [psi] of the noise in the pressure.
     """
     variance = np.square(sigma)
     d1, d2, d3, d4, d3d4 = np.moveaxis(squares, -1, 0)
@@ -79,8 +78,8 @@ def log_rms(squares: Array, sigma: float) -> Array:
 def pressure_noise(rig: Rig, chamber: str) -> float:
     """Compute the standard deviation [psi] of the noise in one sample of a chamber's pressure.
 
-    The result is ``sqrt(sensor^2 + common^2 + step^2/12)``, from the noise of the sensor, the noise common to all
-    sensors, and the step of the quantisation.
+    It is ``sqrt(sensor^2 + common^2 + step^2/12)``, from the noise of the sensor, the common noise, and the step of the
+    quantisation.
     """
     sensor, daq = getattr(rig.sensors, chamber), rig.daq
     step = daq.step * (sensor.range_hi - sensor.range_lo) / (daq.sensor_volts_hi - daq.sensor_volts_lo)
@@ -88,10 +87,9 @@ def pressure_noise(rig: Rig, chamber: str) -> float:
 
 
 def log_residuals(rig: Rig, sheet: DataSheet) -> Array:
-    """Compare the rig's simulated leak-free RMS with the measured one in every test of Appendix C.
+    """Compute log(simulated/measured leak-free RMS) of d1..d4 and d3d4 in each test of Appendix C.
 
-    Returns log(simulated/measured) as (tests, chambers, 5) for the wavelet details d1..d4 and d3d4. The rig is
-    simulated at its own sampling rate. `sheet`: the measured data sheet.
+    Returns (tests, chambers, 5); the rig is simulated at its own sampling rate.
     """
     group_squares = {}
     for command, closed_pct in groups():
@@ -109,11 +107,10 @@ def log_residuals(rig: Rig, sheet: DataSheet) -> Array:
 class Hypothesis:
     """A possible difference between the real rig and the rig that was fitted to the tests of Appendix C.
 
-    The fitted rig is symmetric: both chamber pressures ring alike, and a leak damps both. In Appendix C, however, the
-    RMS of the wavelet detail d3 of p_A falls with the leak while the RMS of d4 of p_B rises. A test has a half without
-    and a half with the leak.
+    The fitted rig is symmetric: a leak damps both pressures alike. In Appendix C, however, the RMS of the wavelet
+    detail d3 of p_A falls with the leak while the RMS of d4 of p_B rises.
 
-    - `overrides`, `factors`: values of parameters, and factors on parameters, in both halves
+    - `overrides`, `factors`: values of parameters, and factors on parameters, in both halves of a test
     - `leaking_factors`: further factors in the half with the leak
     - `x_0`, `x_0_leaking` [m]: start of the piston in the half without and in the half with the leak
     - `extra_closing_B`: closed fraction of throttle B minus that of A
@@ -139,15 +136,13 @@ HYPOTHESES = tuple(Hypothesis(name, **values) for name, values in load_texts("hy
 def predicted_sheet(
     rig: Rig, hypothesis: Hypothesis = HYPOTHESES[0], conditions: tuple[Condition, ...] = APPENDIX_C
 ) -> DataSheet:
-    """Simulate the tests of Appendix C on a rig that is changed according to a hypothesis; return the data sheet.
-
-    `conditions`: inputs of the tests, each of which is simulated without and with its leak. The sheet has the RMS of
-    the wavelet details d1..d4 [psi] and of the product d3d4 [psi^2].
-    """
+    """Simulate the tests of Appendix C, without and with their leaks, on a rig changed according to a hypothesis."""
     h = hypothesis
     healthy_rig = _scale_parameters(rig.with_overrides(h.overrides) if h.overrides else rig, h.factors)
     leaking_rig = _scale_parameters(healthy_rig, h.leaking_factors)
     leak_free: dict[tuple[str, float], Array] = {}  # mean squares by operating condition, which several tests share
+    # d1..d4 squared scale with the gain of sensor B squared, d3d4 squared with its fourth power
+    scales = np.array([[1.0] * 5, [h.gain_B**2] * 4 + [h.gain_B**4]])
     rms = np.empty((len(conditions), 2, len(CHAMBERS), len(QUANTITIES)))  # 2: without and with the leak
     for row, condition in enumerate(conditions):
         # at most 0.99, as a closed throttle would stop the flow
@@ -158,11 +153,7 @@ def predicted_sheet(
         leaking = noise_free_mean_squares(leaking_rig, condition, leak=leak, x_0=h.x_0_leaking, values=closed)
         for half, squares in enumerate((leak_free[condition.group], leaking)):
             for k, chamber in enumerate(CHAMBERS):
-                scaled = squares[k]
-                if chamber == "p_B":  # d1..d4 squared scale with the gain squared, d3d4 squared with its fourth power
-                    scaled = squares[k] * np.array([h.gain_B**2] * 4 + [h.gain_B**4])
-                rms[row, half, k] = np.exp(log_rms(scaled, pressure_noise(rig, chamber)))
-    # by chamber and detail, the RMS (tests, 2) without and with the leak
+                rms[row, half, k] = np.exp(log_rms(squares[k] * scales[k], pressure_noise(rig, chamber)))
     return DataSheet({c: {q: rms[:, :, k, j] for j, q in enumerate(QUANTITIES)} for k, c in enumerate(CHAMBERS)})
 
 
@@ -172,11 +163,7 @@ def _scale_parameters(rig: Rig, factors: Mapping[str, float]) -> Rig:
 
 
 def parameters_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
-    """Tabulate the parameters in which the rig fitted to Appendix C differs from the thesis's rig, with their sources.
-
-    The columns are name, meaning, value in the thesis's rig, value in the fitted rig, and source. `item`: entry of
-    `items.toml` for which the table is made; `context` is not used.
-    """
+    """Tabulate the parameters in which the rig fitted to Appendix C differs from the thesis's, with sources."""
     fitted = load_rig(BENCH_RIG)
     thesis_rows = {row.name: row for row in load_rig("thesis").table()}
     rows = [
@@ -191,9 +178,8 @@ def parameters_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
 def fit_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Tabulate the ratio of simulated to measured leak-free RMS of each wavelet detail, for the fitted rig.
 
-    Returns two tables. The first has the geometric mean over all tests of Appendix C, "yes" if this is within 25 % of
-    1, and the geometric standard deviation. The second has the geometric means over the tests of each operating
-    condition (command and closing of the throttles).
+    The first table has the geometric mean over all tests, "yes" if this is within 25 % of 1, and the geometric standard
+    deviation; the second the geometric mean over the tests of each operating condition.
     """
     assert context.sheet is not None  # the item needs the measured data sheet
     residuals = log_residuals(load_rig(BENCH_RIG), context.sheet)
@@ -215,13 +201,9 @@ def fit_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
 def hypotheses_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Tabulate how well the fitted rig, changed as each hypothesis says, agrees with the measured data sheet.
 
-    The columns are, for some wavelet details of each chamber:
-
-    - the geometric mean of simulated over measured leak-free RMS;
-    - the geometric mean change of the simulated RMS with the leak [%];
-    - the number of tests in which simulated and measured change have the same sign.
-
-    The first row is the measured sheet itself. A quick reproduction simulates only the first two hypotheses.
+    For some wavelet details of each chamber the columns are the geometric mean of simulated over measured leak-free
+    RMS, the geometric mean change of the simulated RMS with the leak [%], and the number of tests in which the
+    simulated and the measured change have the same sign. The first row is the measured sheet itself.
     """
     assert context.sheet is not None  # the item needs the measured data sheet
     sheet = context.sheet

@@ -9,7 +9,7 @@ import csv
 import hashlib
 import math
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.resources import files
 from itertools import product
@@ -22,7 +22,6 @@ from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array
 from sealscope.signals.details import QUANTITIES
 
-#: Chamber and quantity of each column.
 COLUMNS = tuple(product(CHAMBERS, QUANTITIES))
 #: Units of the columns. The sheet states none; psi is assumed.
 UNITS = {name: "psi^2" if name == "d3d4" else "psi" for name in QUANTITIES}
@@ -62,9 +61,8 @@ class Condition:
 def experiment_values(condition: Condition) -> dict[str, str | float]:
     """Return the rig's parameters in a test of Appendix C by name, as `Experiment.of` takes them in `set`.
 
-    `condition`: inputs of the test. Both throttles are closed equally. If they are fully open, `line.orifices` is not
-    set, so that the rig's value holds: absent in the thesis's model (section 4.2.1), present in a rig that includes the
-    open valves.
+    For open throttles `line.orifices` is not set, so that the rig's value holds: absent in the thesis's model (section
+    4.2.1), present in a rig that includes the open valves.
     """
     closed = condition.closed_pct / 100.0
     values: dict[str, str | float] = {"line.closed_A": closed, "line.closed_B": closed}
@@ -73,16 +71,14 @@ def experiment_values(condition: Condition) -> dict[str, str | float]:
     return values
 
 
-def _read_conditions() -> Iterator[Condition]:
-    """Read the inputs of the tests of Appendix C from `appendix_c.csv`, one by one."""
-    _, *lines = files(__package__).joinpath("appendix_c.csv").read_text(encoding="utf-8").splitlines()
-    for number, (command, closed_pct, leak, level) in enumerate(csv.reader(lines), 1):
-        yield Condition(number, command, float(closed_pct), float(leak), level)
+_, *_LINES = files(__package__).joinpath("appendix_c.csv").read_text(encoding="utf-8").splitlines()
 
 
-#: The tests of Appendix C of "Understanding Effect and Diagnosis of Internal Leakage in Hydrostatic Actuation
-#: Systems", in its order.
-APPENDIX_C: tuple[Condition, ...] = tuple(_read_conditions())
+#: The tests of Appendix C of the thesis, in its order.
+APPENDIX_C: tuple[Condition, ...] = tuple(
+    Condition(number, command, float(closed_pct), float(leak), level)
+    for number, (command, closed_pct, leak, level) in enumerate(csv.reader(_LINES), 1)
+)
 
 
 def groups(conditions: tuple[Condition, ...] = APPENDIX_C) -> tuple[tuple[str, float], ...]:
@@ -100,8 +96,7 @@ class DataSheet:
     """The data sheet of Appendix C, measured or simulated.
 
     `rms[chamber][quantity]` (tests, 2): RMS without and with the leak, for the chamber pressures "p_A" and "p_B" and
-    the wavelet details "d1" .. "d4" [psi] and their product "d3d4" [psi^2]; the tests are in the order of
-    `APPENDIX_C`.
+    the wavelet details "d1" .. "d4" [psi] and their product "d3d4" [psi^2]; tests as in `APPENDIX_C`.
     """
 
     rms: Mapping[str, Mapping[str, Array]]
@@ -112,19 +107,15 @@ class DataSheet:
         return len(self.rms["p_A"]["d3"])
 
     def log_change(self, chamber: str, quantity: str) -> Array:
-        """Compute log(RMS with the leak / RMS without it) of a wavelet detail in each test, (tests,).
-
-        `chamber`: "p_A" or "p_B"; `quantity`: the detail, such as "d3".
-        """
+        """Compute log(RMS with / RMS without the leak) of a wavelet detail, such as "d3", in each test, (tests,)."""
         pairs = self.rms[chamber][quantity]
         return np.asarray(np.log(pairs[:, 1] / pairs[:, 0]))
 
 
 def find_sheet(folder: str | os.PathLike[str] | None = None) -> Path | None:
-    """Find the folder of the measured data sheet.
+    """Find the folder of the measured data sheet: `folder`, else that named by SEALSCOPE_SHEET, else `./data`.
 
-    The result is `folder`, else the folder that the environment variable SEALSCOPE_SHEET names, else `./data`. Returns
-    None if no folder is named and `./data` has no sheet. Raises InputError if a named folder lacks a file.
+    Returns None if no folder is named and `./data` has no sheet. Raises InputError if a named folder lacks a file.
     """
     named_folder = folder if folder is not None else os.environ.get(VARIABLE) or None
     candidate = Path(named_folder if named_folder is not None else "data")
@@ -139,9 +130,8 @@ def find_sheet(folder: str | os.PathLike[str] | None = None) -> Path | None:
 def read_sheet(folder: Path) -> tuple[DataSheet, str]:
     """Read the measured data sheet in `folder`; return it with a SHA-256 digest of its two files.
 
-    Raises UnreadableFile if a file cannot be read. Raises InputError if a column is missing, if there is not one row
-    for each test, if a value is not a positive number (only the closing may be 0), or if row k and test k in
-    `APPENDIX_C` differ in command, closing, leak or level.
+    Raises UnreadableFile if a file cannot be read, and InputError if a column is missing, if a value is not a positive
+    number (only the closing may be 0), or if the rows are not the tests of `APPENDIX_C`.
     """
     rms: dict[str, dict[str, Array]] = {}
     digest = hashlib.sha256()
@@ -172,8 +162,7 @@ def read_sheet(folder: Path) -> tuple[DataSheet, str]:
 def _parse_number(row: dict[str, str], column: str, number: int, path: Path, *, allow_zero: bool = False) -> float:
     """Parse the number in a column of a row of the data sheet.
 
-    `number`, `path`: row number and file, for messages. Raises InputError unless the value is > 0, or >= 0 if
-    `allow_zero`.
+    `number`, `path`: row number and file, for messages. Raises InputError unless it is > 0, or >= 0 if `allow_zero`.
     """
     try:
         value = float(row[column] or "nan")  # an empty cell is no number > 0
@@ -186,11 +175,7 @@ def _parse_number(row: dict[str, str], column: str, number: int, path: Path, *, 
 
 
 def _check_condition(row: dict[str, str], condition: Condition, path: Path) -> None:
-    """Check that a row of the data sheet states the same test as `condition`; raise InputError otherwise.
-
-    The command, the closing of the throttles [%], the mean leak [L/min], and the leak's level, such as "large", must be
-    equal. `path`: the file, for messages.
-    """
+    """Check that a row of the data sheet states the same test as `condition`; raise InputError otherwise."""
     leak, amplitude, omega = (_parse_number(row, column, condition.number, path) for column in _POSITIVE_COLUMNS)
     closed = _parse_number(row, _CLOSED_COLUMN, condition.number, path, allow_zero=True)
     command = f"{amplitude:g} sin({'' if omega == 1 else f'{omega:g}'}t)"  # such as "3 sin(4t)"

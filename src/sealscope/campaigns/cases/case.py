@@ -37,14 +37,9 @@ _NOT_IN_ROWS = (
 
 @dataclass(frozen=True, kw_only=True)
 class CaseInputs:
-    """The inputs of one record of a campaign.
+    """The inputs of one record of a campaign; `use`, `leak_lpm`, `law` and `fault` are those of its `RecordGroup`.
 
-    - `use`: `calibrate` if thresholds are set from the record, `judge` if it is to be judged
-    - `leak_lpm` [L/min]: mean flow of the leak after the plan's onset, 0 for none
-    - `law`: relation of the leak's flow and pressure
-    - `fault`: text of a fault other than this leak, "" for none
-    - `levels`: value (level) of each factor of the plan
-    - `replicate`: number of the record, from 0, among those that agree in all other inputs
+    `levels`: value (level) of each factor; `replicate`: number, from 0, among records that agree in all other inputs.
     """
 
     id: str
@@ -60,9 +55,8 @@ class CaseInputs:
 class CampaignCase(CaseInputs):
     """One record to simulate and judge.
 
-    `machine_seed`: seed by which the record's machine is drawn from the plan's profile; `noise_seed`: seed of the
-    sensors' noise. The seeds and `id` are computed from a hash of the record's own inputs and of the inputs that all
-    records of the plan share (`shared_inputs`).
+    `machine_seed`: seed by which its machine is drawn from the plan's profile; `noise_seed`: seed of the sensors'
+    noise. Seeds and `id` follow from a hash of the record's inputs and of all `shared_inputs`.
     """
 
     machine_seed: int
@@ -76,10 +70,7 @@ def digest(value: Any) -> str:
 
 
 def profile_key(name: str) -> str:
-    """Compute a hash (hex) of the content of a profile, the distribution from which machines are drawn.
-
-    The hash does not depend on the path of the profile's file.
-    """
+    """Compute a hash (hex) of the content of a profile, the distribution from which machines are drawn."""
     profile = load_profile(name)
     # the seeds of cases depend on this hash, and so on the profile's name; a renamed profile that must draw the same
     # cases as before states its former name in `seeds`
@@ -100,8 +91,7 @@ def shared_inputs(plan: SimulatedPlan) -> dict[str, Any]:
 def _level_digests(plan: SimulatedPlan) -> dict[str, dict[str, str]]:
     """Compute hashes of the machine families and controller files of a plan's factors, by factor and level (value).
 
-    The id of a case depends on the hashes of its own levels only. The stored row of a case thus stays valid when
-    another family or file is edited.
+    The id of a case depends on those of its own levels only, so its stored row stays valid when another is edited.
     """
     digests: dict[str, dict[str, str]] = {FAMILY: {}, CONTROLLER: {}}
     for level in plan.factors.get(FAMILY, ()):
@@ -115,8 +105,7 @@ def _level_digests(plan: SimulatedPlan) -> dict[str, dict[str, str]]:
 def list_cases(plan: SimulatedPlan) -> list[CampaignCase]:
     """List all cases of a plan, one for each record.
 
-    Successive records of a group get successive combinations of the factors' levels. After the last combination the
-    first one follows again, with the next number `replicate`.
+    Successive records of a group get successive combinations of the factors' levels, then the next `replicate`.
     """
     combinations = itertools.product(*plan.factors.values())
     cells = [dict(zip(plan.factors, levels, strict=True)) for levels in combinations]
@@ -149,8 +138,7 @@ def list_cases(plan: SimulatedPlan) -> list[CampaignCase]:
 def interleave_cases(cases: Sequence[CampaignCase]) -> list[CampaignCase]:
     """Reorder the cases of a campaign, with each group of the plan spread evenly over the list.
 
-    The cases of a group have the same use, leak, law of the leak, and fault. If a campaign is ended early, the
-    completed cases are from all groups, in nearly the planned proportions.
+    If a campaign is ended early, the completed cases are from all groups, in nearly the planned proportions.
     """
     groups = [(case.use, case.leak_lpm, case.law, case.fault) for case in cases]
     n_total, n_listed = Counter(groups), Counter[Any]()
@@ -171,10 +159,7 @@ def iter_sources() -> Iterator[Path]:
 
 
 def code_key() -> str:
-    """Compute a hash (16 hex digits) of the source files on which the result of a record may depend.
-
-    Only results with the same hash are combined in a campaign.
-    """
+    """Compute a hash (16 hex digits) of the source files on which the result of a record may depend."""
     return files_digest(iter_sources())[:16]
 
 

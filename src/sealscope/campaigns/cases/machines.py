@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -27,10 +26,9 @@ USUAL = Sine(3.0, 4.0)
 
 
 def case_leaks(plan: SimulatedPlan, case: CampaignCase) -> tuple[Leak, ...]:
-    """Build the leaks of a case, which open at the plan's onset.
+    """Build the leaks of a case from the plan's onset on, with their planned mean flows but not yet coefficients.
 
-    A leak states its planned mean flow, but not yet the leak coefficient that gives this flow. The law `mixture` gives
-    two leaks with half of the flow each. Returns () for a case without a leak.
+    The law `mixture` gives two leaks with half of the flow each.
     """
     if not case.leak_lpm:
         return ()
@@ -42,9 +40,9 @@ def case_leaks(plan: SimulatedPlan, case: CampaignCase) -> tuple[Leak, ...]:
 def experiment_with_flow_leak(plan: SimulatedPlan, case: CampaignCase, profile: Profile | None = None) -> Experiment:
     """Build the experiment of a case, with a leak that states its mean flow but not yet its coefficient (`case_leaks`).
 
-    The machine is drawn from the plan's profile with the seed of the case, or is the plan's rig if there is no
-    profile. The levels (values) of the plan's factors in this case replace the machine's parameters, command,
-    controller and load. `profile`: the plan's profile, if it is already loaded.
+    The machine is drawn from the plan's profile with the seed of the case, or is the plan's rig without a profile. The
+    levels (values) of the plan's factors replace its parameters, command, controller and load. `profile`: the loaded
+    profile, if any.
     """
     if plan.profile:
         family = str(case.levels.get(FAMILY, ""))
@@ -68,7 +66,9 @@ def experiment_with_flow_leak(plan: SimulatedPlan, case: CampaignCase, profile: 
             values |= {"line.orifices": str(plan.rig["line.orifices"])} | throttle_values(level)
         elif name != FAMILY:
             values[name] = level
-    machine = replace(machine, overrides=_expand_names(values))
+    # full names; if two entries are for the same parameter, the later one counts
+    overrides = {resolve_name(name, declared_names()): value for name, value in values.items()}
+    machine = replace(machine, overrides=overrides)
     fault = parse_plan_fault(case.fault, plan.onset_s) if case.fault else None
     return machine.experiment(seed=case.noise_seed, fault=fault, leak=case_leaks(plan, case))
 
@@ -79,16 +79,8 @@ def case_experiment(plan: SimulatedPlan, case: CampaignCase) -> Experiment:
     return replace(experiment, leaks=size_leaks_on_short_run(experiment))
 
 
-def _expand_names(values: Mapping[str, str | float]) -> dict[str, str | float]:
-    """Replace short parameter names by full ones; if two entries are for the same parameter, the later one counts."""
-    return {resolve_name(name, declared_names()): value for name, value in values.items()}
-
-
 def sizing_experiment(experiment: Experiment) -> Experiment:
-    """Shorten an experiment to at most `SIZING_SECONDS`, with its leaks open from the start.
-
-    This short run is used to find the leak coefficients that give the planned mean flows.
-    """
+    """Shorten an experiment to at most `SIZING_SECONDS`, with its leaks open from the start."""
     return replace(
         experiment,
         duration=min(experiment.duration, SIZING_SECONDS),
@@ -99,8 +91,7 @@ def sizing_experiment(experiment: Experiment) -> Experiment:
 def size_leaks_on_short_run(experiment: Experiment) -> tuple[Leak, ...]:
     """Find the coefficients of an experiment's leaks that give their planned mean flows; return the completed leaks.
 
-    The search simulates two or three times, so it uses a short run (`sizing_experiment`) and not the whole record. The
-    true mean flow of the record, which the record's row states, may therefore differ a little from the planned one.
+    The search uses a short run (`sizing_experiment`), so the true mean flow of the record may differ a little.
     """
     if not experiment.leaks:
         return ()

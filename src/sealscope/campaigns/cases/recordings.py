@@ -31,10 +31,7 @@ ProgressCallback = Callable[[int, int, int], None]
 
 
 def _iter_files(plan: RecordedPlan, folder: Path) -> Iterator[tuple[RecordingSet, Path]]:
-    """Yield pairs of a set of recordings and one of its files, for all sets of a plan.
-
-    `folder`: folder in which the files are searched. Raises InputError if a set has no files.
-    """
+    """Yield pairs of a set of recordings and one of its files in `folder`; raise InputError if a set has no files."""
     for recordings in plan.sets:
         files = iter_inner_files(folder, folder.glob(recordings.files))
         paths = sorted(files, key=lambda path: numeric_sort_key(path.name))
@@ -45,11 +42,10 @@ def _iter_files(plan: RecordedPlan, folder: Path) -> Iterator[tuple[RecordingSet
 
 
 def judge_recordings(plan: RecordedPlan, folder: Path, progress: ProgressCallback | None = None) -> list[CaseRow]:
-    """Judge each recording of a plan in a folder, and return the rows with the results in the order of their ids.
+    """Judge each recording of a plan in a folder; return the rows with results or errors in the order of their ids.
 
-    A recording that cannot be judged gives a row with its error. `progress`: called after each recording with the
-    numbers of recordings done, of all recordings, and of failed ones. Raises InputError if a file is in several sets,
-    or a set has no files.
+    `progress`: called after each recording with the numbers of recordings done, of all recordings, and of failed ones.
+    Raises InputError if a file is in several sets, or a set has no files.
     """
     files = list(_iter_files(plan, folder))
     for path, count in Counter(path for _, path in files).items():
@@ -65,10 +61,9 @@ def judge_recordings(plan: RecordedPlan, folder: Path, progress: ProgressCallbac
 
 
 def _stroke_direction(recording: Recording) -> str:
-    """Classify a recording as a stroke "out" or "in" by the mean of p_A - p_B, or else as "both".
+    """Classify a recording as a stroke "out" (p_A higher on average) or "in", or else as "both".
 
-    The recording is a stroke of one direction if |mean| exceeds the fraction `_MIN_ONE_SIDEDNESS` of the RMS of p_A -
-    p_B; "out" means that p_A is higher on average. Without both pressures the result is "both".
+    In a stroke |mean| of p_A - p_B exceeds the fraction `_MIN_ONE_SIDEDNESS` of its RMS.
     """
     if not all(name in recording for name in CHAMBERS):
         return "both"
@@ -78,10 +73,9 @@ def _stroke_direction(recording: Recording) -> str:
 
 
 def _judge_file(plan: RecordedPlan, recordings: RecordingSet, path: Path, name: str) -> CaseRow:
-    """Read and judge one recording, and return the row with its results, or with the error that prevented them.
+    """Read and judge one recording; return the row with its results, or with the error that prevented them.
 
-    `recordings`: set to which the recording belongs; `name`: path of the recording within the folder, from which the id
-    of the row is computed.
+    `name`: path of the recording within the folder, from which the id of the row is computed.
     """
     levels = {"set": recordings.label or recordings.files, STROKE: "unknown"}  # the stroke is filled in once known
     make_row = partial(

@@ -72,20 +72,12 @@ def expected_cause(fault: str) -> str:
 
 
 def duty_label(levels: Mapping[str, str | float]) -> str:
-    """Format the duty of a record, i.e. its command and its direction of stroke; "" if `levels` has neither.
-
-    `levels`: values of the plan's factors for the record. A score is compared only with a threshold from records of the
-    same duty.
-    """
+    """Format a record's duty, command and stroke direction, within which scores are compared; "" if it has none."""
     return ", ".join(str(levels[name]) for name in (COMMAND, STROKE) if name in levels)
 
 
 def matches_cause(named: str, true_cause: str) -> bool:
-    """Return True if the cause that a detector names is the true cause, or an ambiguous cause that includes it.
-
-    "piston or pump leak" includes these two leaks, "internal or external leak" also the external leak. A joint cause
-    includes each of its causes (`joint_causes`).
-    """
+    """Return True if the cause that a detector names is the true cause, or an ambiguous cause that includes it."""
     return named == true_cause or true_cause in _AMBIGUOUS_CAUSES.get(named, ())
 
 
@@ -97,11 +89,8 @@ def finite_or_none(value: float | None) -> float | None:
 def named_cause(evidence: Evidence | Statement) -> str:
     """Determine the cause that a detector names: a leak of `LEAKS`, another fault, "none" or "cannot tell".
 
-    `LEAKS` has the causes for which the verdict is `leak`. An external leak counts as another fault. The result is
-
-    - for the verdict `leak`: `evidence.cause` if `LEAKS` has it, else "piston leak"
-    - for the other verdicts: `evidence.cause` if it is another fault, else "none" for `no leak` and "cannot tell" for
-      `cannot tell`
+    For the verdict `leak` it is `evidence.cause` if `LEAKS` has it, else "piston leak"; for the others `evidence.cause`
+    if it is another fault, else "none" for `no leak`. An external leak counts as another fault.
     """
     if evidence.verdict == "leak":
         return evidence.cause if evidence.cause in LEAKS else PISTON_LEAK
@@ -111,11 +100,7 @@ def named_cause(evidence: Evidence | Statement) -> str:
 
 
 def ranking_score(evidence: Evidence | Statement) -> float | None:
-    """Return a detector's score of a record if a higher score means more evidence of a leak, else None.
-
-    The result is None if the verdict is `cannot tell`, or if the detector names a cause that is not in `LEAKS`, such as
-    a sensor fault or an external leak.
-    """
+    """Return a detector's score; None for `cannot tell`, and for a cause not in `LEAKS`, such as a sensor fault."""
     return evidence.score if named_cause(evidence) in (*LEAKS, NO_CAUSE) else None
 
 
@@ -133,10 +118,9 @@ class CaseRow(CaseInputs):
     """The stored result of one record: its inputs, and either scores or the error that prevented them.
 
     - `flow_lpm` [L/min]: simulated mean flow of the leak while it is open, None if it is not known
-    - `scores`: by detector, its score and the onset that it estimates
+    - `scores`, `statements`: by detector; scorers, which only compute a score, make no statement
     - `error`: text of the error, None if there was no error
     - `seconds`: processor time, which differs between runs and is not part of the result
-    - `statements`: by detector, its verdict and estimates; scorers, which only compute a score, have none
     """
 
     flow_lpm: float | None = None

@@ -26,10 +26,9 @@ def judge_record(
 ) -> tuple[Scores, dict[str, Statement]]:
     """Run each detector of a plan on a recording; return scores and statements by detector.
 
-    The scores are pairs of the detector's score and the onset [s] that it estimates. The statements have verdict and
-    estimates of each detector, without the scorers, which only compute a score. `split_s` [s]: time at which scorers
-    split the recording into two parts, None for its middle; `rig`: the rig that detectors may assume. Raises InputError
-    if the recording has a defect that rules out any verdict.
+    A score is a pair of the detector's score and the onset [s] that it estimates; scorers, which only compute a score,
+    have no statement. `split_s` [s]: time at which scorers split the recording, None for its middle; `rig`: the rig
+    that detectors may assume. Raises InputError if the recording has a defect that rules out any verdict.
     """
     record = inspect_recording(recording, INSPECTED)  # `part`: usable samples; `share`: their fraction
     if record.defect is not None:
@@ -53,11 +52,7 @@ def judge_record(
 
 
 def _run_detector(detector: PlanDetector, examination: Examination) -> Evidence:
-    """Run one detector that states a verdict, not a scorer, on a recording; return its evidence.
-
-    The detector is the continuous watch of a machine, `diagnose` or a registered detector. `examination`: the
-    prepared recording.
-    """
+    """Run one detector that states a verdict, not a scorer, on a recording; return its evidence."""
     if detector.base == WATCH:
         return run_watch(examination.recording, examination.rig, examination.false_alarm_probability)
     if detector.base == DIAGNOSE:
@@ -68,10 +63,9 @@ def _run_detector(detector: PlanDetector, examination: Examination) -> Evidence:
 def score_details(
     split_rms: SplitRms, names: Sequence[str], views: Views
 ) -> dict[str, tuple[float | None, float | None]]:
-    """Compute the score of each scorer among the detectors `names`; return (score, None) by detector.
+    """Compute the score of each scorer among the detectors `names`; return (score or None, None) by detector.
 
-    A scorer computes a score from wavelet details, but no verdict. The score is None if it cannot be computed. The
-    second value is always None, because a scorer estimates no onset. `split_rms`: RMS of the wavelet details in both
+    The second None stands for the onset, which no scorer estimates. `split_rms`: RMS of the wavelet details in both
     parts of the record; `views`: sets of channels, by the name that follows "@" in a detector's name.
     """
     scores: dict[str, tuple[float | None, float | None]] = {}
@@ -84,11 +78,10 @@ def score_details(
 
 
 def _score_over_threshold(statement: Statement) -> float | None:
-    """Compute the score of `diagnose` divided by its threshold, which can be compared between records.
+    """Compute the score of `diagnose` over its threshold, or minus a threshold <= 0, to compare records.
 
-    The detector that decides, and with it the scale of the score, may differ from record to record. If the threshold is
-    not positive, the result is the score minus the threshold. Returns None if the score or the threshold is missing, or
-    if the record has no ranking score: for the verdict `cannot tell`, and for a cause other than the leaks of `LEAKS`.
+    The detector that decides, and with it the scale of the score, may differ from record to record. Returns None if
+    there is no threshold or no ranking score (`ranking_score`).
     """
     score, threshold = ranking_score(statement), statement.threshold
     if score is None or threshold is None:
@@ -99,8 +92,7 @@ def _score_over_threshold(statement: Statement) -> float | None:
 def run_watch(recording: Recording, rig: Rig | str | os.PathLike[str], false_alarm: float) -> Evidence:
     """Run the continuous watch of a machine (`Watch`) over a recording, and return its evidence at the end.
 
-    An alarm that was raised stays until the end. `false_alarm`: bound on the probability that a healthy machine
-    raises an alarm within the recording.
+    `false_alarm`: bound on the probability that a healthy machine raises an alarm within the recording.
     """
     alarms_per_1000_hours = false_alarm * 3.6e6 / recording.duration  # 1000 hours are 3.6e6 s
     watch = Watch(load_rig(rig), alarms_per_1000_hours, learn_hours=1000.0)  # longer than any recording

@@ -15,10 +15,9 @@ from sealscope.simulation.simulate import simulate_experiment
 
 
 def run_case(plan: SimulatedPlan, case: CampaignCase, folder: Path | None = None) -> CaseRow:
-    """Simulate and judge one case of a campaign, and return the row with its results.
+    """Simulate and judge one case of a campaign, and return the row with its results or any error.
 
-    An error of any kind is stored in the row. The recording is written into `folder`, or discarded if `folder` is
-    None.
+    The recording is written into `folder`, or discarded if `folder` is None.
     """
     start_time = time.process_time()
     try:

@@ -1,8 +1,7 @@
 """Simulate many cases of a plan side by side, and score them from the RMS of the wavelet details around the onset.
 
-The same functions compute the scores from the same samples as for a recording (`scorers.SplitRms`).
-A batch stores nothing else of a record, so a plan that needs more is refused. The solver's step of a case is chosen
-on short runs of machines with the same levels of the factors.
+A batch stores nothing else of a record, so a plan that needs more is refused. The solver's step of a case is chosen on
+short runs of machines with the same levels of the factors.
 """
 
 from __future__ import annotations
@@ -45,11 +44,7 @@ N_SCOUT_MACHINES, SCOUT_SECONDS = 4, 4.0
 
 
 def scored_bounds(plan: SimulatedPlan) -> IntArray:
-    """Compute the usable samples before and after the planned onset, whose wavelet details scorers compare.
-
-    Returns an array (2, 2) with [begin, end) of the range before the onset and of the range after the onset. Samples
-    whose details depend on the other range or on padding are left out, and so is the machine's start.
-    """
+    """Compute the usable samples (2, 2), [begin, end), before and after the planned onset (`split_bounds`)."""
     rate = plan.rig.daq.sample_rate
     return split_bounds(round(plan.duration_s * rate), rate, round(plan.onset_s * rate))
 
@@ -57,18 +52,15 @@ def scored_bounds(plan: SimulatedPlan) -> IntArray:
 def check_plan(plan: SimulatedPlan, cases: Sequence[CampaignCase]) -> None:
     """Check that batches can simulate and score all cases of a plan; raise InputError otherwise.
 
-    Batches need a plan with these properties:
-
-    - all detectors are scorers, which need only the RMS of wavelet details before and after the onset
-    - no recordings are kept, and both sides of the onset have usable samples (`scored_bounds`)
-    - each leak has a single law, and no sensor has a fault
-    - no factor changes the sampling rate, and the runs can be simulated side by side (`refuse_unbatchable`); for this,
-      only the first case of each combination of levels is tested, and skipped if its experiment cannot be built: its
-      row will state the error
+    - All detectors must be scorers, which need only the RMS of wavelet details before and after the onset.
+    - No recordings are kept, and both sides of the onset have usable samples.
+    - Each leak has a single law, and no sensor has a fault.
+    - No factor changes the sampling rate, and the runs can be simulated side by side (`refuse_unbatchable`), tested on
+      the first case of each combination of levels whose experiment can be built.
     """
 
     def refusal(rule: str) -> InputError:
-        """Build the error for a plan that batches cannot run; `rule`: the rule that it breaks."""
+        """Build the error for a plan that breaks a `rule` of batches."""
         return InputError(f"a plan in batches must have {rule}; run it without --batch ({plan.place})")
 
     for name in plan.detectors:
@@ -103,10 +95,9 @@ def check_plan(plan: SimulatedPlan, cases: Sequence[CampaignCase]) -> None:
 
 
 def iter_batch_rows(plan: SimulatedPlan, cases: Sequence[CampaignCase], threads: int) -> Generator[CaseRow, None, None]:
-    """Simulate the cases of a plan batch by batch, and yield a row with the scores for each case.
+    """Simulate the cases of a plan batch by batch, and yield a row with the scores, or the error, for each case.
 
-    An error of a case is stored in its row. A row depends only on its own case, not on the other cases of the batch.
-    `threads`: number of threads of the simulation.
+    A row does not depend on the other cases of the batch. `threads`: number of threads of the simulation.
     """
     profile = load_profile(plan.profile) if plan.profile else None
     choose_step = make_step_chooser(plan, profile)
@@ -126,10 +117,9 @@ def iter_batch_rows(plan: SimulatedPlan, cases: Sequence[CampaignCase], threads:
 
 
 def _run_batch(plan: SimulatedPlan, pairs: Sequence[tuple[CampaignCase, Experiment]], threads: int) -> list[CaseRow]:
-    """Simulate and score one batch of cases, and return their rows.
+    """Simulate and score one batch of cases, each with its experiment, and return their rows.
 
-    `pairs`: the cases, each with its experiment. If the batch fails, its two halves are run separately, and so on. In
-    the end only the cases that fail by themselves have a row with an error.
+    If the batch fails, its two halves are run separately, and so on, until only the failing cases have an error.
     """
     if not pairs:
         return []
@@ -154,8 +144,8 @@ def _run_batch(plan: SimulatedPlan, pairs: Sequence[tuple[CampaignCase, Experime
 def _size_leaks(experiments: Sequence[Experiment], threads: int) -> list[Experiment]:
     """Find the leak coefficients that give the planned mean flows, in short runs; return the completed experiments.
 
-    The solver's step of an experiment is shortened if it is too long to be stable with the leak. If a short run fails,
-    the error is raised. A single experiment is first tried once more, with a step that `integrate_run` chooses.
+    The solver's step is shortened if it is unstable with the leak. If a short run fails, the error is raised, but a
+    single experiment is first tried once more with a step that `integrate_run` chooses.
     """
     sized_experiments = list(experiments)
     leaky = [k for k, experiment in enumerate(experiments) if experiment.leaks]
@@ -184,21 +174,18 @@ def make_step_chooser(
 ) -> Callable[[CampaignCase, Experiment], float]:
     """Build the function that chooses the solver's step [s] of a case from the case and its experiment.
 
-    A search for each case would take too long, so the cases of a cell, i.e. a combination of the factors' levels, share
-    the result. `N_SCOUT_MACHINES` scout machines are drawn for the cell. On a short run of each, `integrate_run`
-    chooses the longest step that passes its check of the error. A case gets the shortest of the steps chosen with the
-    case's solver, limited to the longest stable step of the case's machine, but not refined further than by
-    `MAX_STEP_REFINEMENT`. The step of a case does not depend on other cases. `profile`: distribution from which
-    machines are drawn, by default the plan's.
+    The cases of a cell, i.e. a combination of the factors' levels, share the search: on a short run of each of
+    `N_SCOUT_MACHINES` drawn scout machines, `integrate_run` chooses the longest step that passes its check of the
+    error. A case gets the shortest of the steps chosen with its solver, limited to the longest stable step of its
+    machine, but not refined further than by `MAX_STEP_REFINEMENT`. `profile`: by default the plan's.
     """
     shared = digest(shared_inputs(plan))
 
     @cache
     def cell_steps(*levels: tuple[str, str | float]) -> dict[str, float]:
-        """Compute the shortest step [s] that `integrate_run` chooses on the scout machines of a cell, by solver.
+        """Compute the shortest step [s] chosen on the scout machines of a cell, pairs (factor, level), by solver.
 
-        `levels`: pairs (factor, level), which define the cell. Machines that cannot be simulated are left out, so the
-        mapping may lack a solver or be empty.
+        Machines that cannot be simulated are left out, so the mapping may lack a solver or be empty.
         """
         steps: dict[str, float] = {}
         for number in range(N_SCOUT_MACHINES):

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Generator
-from contextlib import closing
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-from sealscope.campaigns.cases.case import CampaignCase, interleave_cases, list_cases
+from sealscope.campaigns.cases.case import interleave_cases, list_cases
 from sealscope.campaigns.cases.recordings import ProgressCallback
 from sealscope.campaigns.cases.row import CaseRow
 from sealscope.campaigns.cases.work import run_case
 from sealscope.campaigns.execution import batches, store
-from sealscope.campaigns.execution.workers import iter_results, process_count
+from sealscope.campaigns.execution.workers import iter_results, iter_rows, process_count
 from sealscope.campaigns.plans.duty import check_controllers
 from sealscope.campaigns.plans.model import SimulatedPlan
 from sealscope.errors import InputError
@@ -41,11 +40,10 @@ def run(
 
     `jobs`: number of processes, by default one per core and at most two per core, 1 for this process only; `cluster`:
     address of a Dask scheduler to use instead; `retry`: True to run failed cases again; `progress`: called with the
-    numbers of cases done, of all cases, and of failed ones; `task`: function that runs one case; `batch`: True to
-    simulate cases side by side (`batches`) with `jobs` threads; `trust`: True to run controllers that the plan names by
-    file or module, whose code may be hostile.
+    numbers of cases done, of all cases, and of failed ones; `batch`: True to simulate cases side by side (`batches`)
+    with `jobs` threads; `trust`: True to run controllers that the plan names by file or module, whose code may be
+    hostile.
 
-    The results depend neither on the process, nor on the order of the cases, nor on the other cases of a batch.
     Raises InputError for an untrusted controller, for a folder that has another campaign or is in use by another run,
     and for a plan that batches cannot run.
     """
@@ -75,16 +73,11 @@ def run(
         if batch:
             new_rows = batches.iter_batch_rows(plan, waiting, jobs)
         else:
-            new_rows = _iter_rows(iter_results(partial(task, plan, folder=recordings), waiting, jobs, cluster))
+            results = iter_results(partial(task, plan, folder=recordings), waiting, jobs, cluster)
+            error = "the process that carried it out died"
+            new_rows = iter_rows(results, lambda case: CaseRow.from_case(case, error=error))
         for row in store_rows(place, new_rows, store.WHAT):
             n_done += 1
             n_failed += row.error is not None
             report(n_done, plan.size, n_failed)
     return store.read_progress(plan, place)
-
-
-def _iter_rows(results: Generator[tuple[CampaignCase, CaseRow | None], None, None]) -> Generator[CaseRow, None, None]:
-    """Yield the row of each pair (case, row), or a row with an error if the row is None because the process died."""
-    with closing(results):
-        for case, row in results:
-            yield row or CaseRow.from_case(case, error="the process that carried it out died")

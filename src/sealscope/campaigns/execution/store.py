@@ -45,8 +45,8 @@ RUN_BY_RUN = "run by run"
 class CampaignProgress:
     """The progress of a campaign.
 
-    `records`: number of records in the plan; `done`: number of records that have been run; `failed`: number of these
-    that ended with an error; `seconds`: mean processor time of a record, None if no record has a result.
+    `done`: number of the plan's `records` that have been run; `failed`: number of these that ended with an error;
+    `seconds`: mean processor time of a record, None if no record has a result.
     """
 
     records: int
@@ -116,9 +116,8 @@ def read_rows(folder: Path) -> dict[str, CaseRow]:
 def read_plan_rows(plan: SimulatedPlan, folder: Path) -> dict[str, CaseRow]:
     """Read the rows (stored results) of a plan's cases from a campaign's folder, by id of the case, ascending.
 
-    A row that lacks the score of one of the plan's detectors is left out, unless it is the row of a failed case.
-    Raises InputError if the rows belong to another plan, and UnreadableFile if the inputs in a row differ from those
-    of its case.
+    A row that lacks the score of one of the plan's detectors is left out, unless its case failed. Raises InputError if
+    the rows belong to another plan, and UnreadableFile if the inputs in a row differ from those of its case.
     """
     rows_by_id = read_rows(folder)
     if rows_by_id:  # rows from another mode or program code can still be read
@@ -146,9 +145,9 @@ def read_progress(plan: SimulatedPlan, folder: Path) -> CampaignProgress:
 
 
 def read_head(folder: Path) -> dict[str, Any] | None:
-    """Read the head of a campaign, the file with the inputs on which all its rows depend.
+    """Read the head of a campaign, the file with the inputs on which all its rows depend; None if there is none yet.
 
-    Returns None if the folder has no campaign yet. Raises UnreadableFile if the file is damaged.
+    Raises UnreadableFile if the file is damaged.
     """
     path = folder / HEAD
     try:
@@ -182,10 +181,9 @@ def begin_campaign(folder: Path, row_inputs: Mapping[str, Any]) -> None:
 def _check_same_inputs(
     folder: Path, existing: Mapping[str, Any], row_inputs: Mapping[str, Any], ignored: Collection[str] = ()
 ) -> None:
-    """Check that the campaign stored in `folder` has the same inputs as new rows; raise InputError otherwise.
+    """Check that the head `existing` of a stored campaign has the same inputs as new rows; raise InputError otherwise.
 
-    `existing`: entries of the campaign's head, the file that lists the inputs of its stored rows; `row_inputs`: inputs
-    of the new rows; `ignored`: names of the entries that may differ.
+    `ignored`: names of the entries that may differ.
     """
     for key, name in _SHARED_ENTRIES.items():
         if key not in ignored and existing.get(key) != row_inputs[key]:

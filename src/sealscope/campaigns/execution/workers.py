@@ -8,7 +8,7 @@ import threading
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from functools import partial
 from itertools import islice
 from multiprocessing import get_context
@@ -33,14 +33,13 @@ def iter_results(
 ) -> Generator[tuple[Item, Result | None], None, None]:
     """Run `task` on each item in several processes, and yield pairs of item and result in the order of completion.
 
-    `jobs`: number of processes to start, 1 for this process only; `cluster`: address of a Dask scheduler whose
-    workers are used instead. An item is taken from `items` when a worker can take it. Items and `task` are pickled.
-    Processes on this machine ignore the keyboard interrupt; they end with the generator or with the parent process.
+    `jobs`: number of processes to start, 1 for this process only; `cluster`: address of a Dask scheduler whose workers
+    are used instead. An item is taken from `items` when a worker can take it. Items and `task` are pickled. Processes
+    on this machine ignore the keyboard interrupt; they end with the generator or with the parent process.
 
-    If a process dies, for example because it needs too much memory, its item is run once more, alone, after all
-    others. If it dies again, the result is None. Exceptions of `task` are raised here. Raises MissingExtra if a
-    cluster is wanted and Dask is not installed, and InputError if no scheduler answers or a worker has another
-    version of Sealscope.
+    If a process dies, for example for want of memory, its item is run once more, alone, after all others. If it dies
+    again, the result is None. Exceptions of `task` are raised here. Raises MissingExtra if a cluster is wanted and Dask
+    is not installed, and InputError if no scheduler answers or a worker has another version of Sealscope.
     """
     if jobs == 1 and cluster is None:
         yield from ((item, task(item)) for item in items)
@@ -80,12 +79,21 @@ def iter_results(
                 yield item, result
 
 
+def iter_rows(
+    results: Generator[tuple[Item, Result | None], None, None], make_lost: Callable[[Item], Result]
+) -> Generator[Result, None, None]:
+    """Yield the results of `iter_results`, and `make_lost(item)` for an item whose process died."""
+    with closing(results):
+        for item, row in results:
+            yield row or make_lost(item)
+
+
 def iter_results_in_order(
     jobs: int, task: Callable[[Item], Result], items: Sequence[Item]
 ) -> Iterator[tuple[Item, Result | None]]:
     """Run `task` on each item in `jobs` processes, and yield pairs of item and result in the order of the items.
 
-    The result is None if the process of the item died twice (`iter_results`).
+    The result is None if the process of the item died twice.
     """
     results: dict[int, Result | None] = {}  # results not yet yielded, by number of the item
     next_number = 0
@@ -99,9 +107,8 @@ def iter_results_in_order(
 class _Pools(NamedTuple):
     """Access to worker processes, on this machine or on a cluster.
 
-    `start_pool`: function that starts a pool of processes; `max_items`: largest number of items that run or wait in
-    all pools at a time; `submit`: function that gives an item to a pool and returns its future; `death`: exception
-    that the future raises if its process died.
+    `start_pool`: starts a pool of processes; `max_items`: largest number of items that run or wait in all pools;
+    `submit`: gives an item to a pool and returns its future; `death`: exception of a future whose process died.
     """
 
     start_pool: Callable[[], Executor]
@@ -112,10 +119,9 @@ class _Pools(NamedTuple):
 
 @contextmanager
 def _local_processes(task: Callable[[Any], Any], max_items: int) -> Iterator[_Pools]:
-    """Provide worker processes of this machine, and end them when the context ends.
+    """Provide up to `max_items` worker processes of this machine for `task`, and end them when the context ends.
 
-    Each process is a pool of its own, because a process that dies breaks its whole pool. `task`: function that the
-    processes run on items; `max_items`: largest number of processes, each of which has one item at a time.
+    Each process is a pool of its own, because a process that dies breaks its whole pool.
     """
     context = get_context("spawn")
     lifeline, parent_end = context.Pipe(duplex=False)  # a worker ends when `parent_end` is closed
@@ -140,11 +146,10 @@ def _local_processes(task: Callable[[Any], Any], max_items: int) -> Iterator[_Po
 
 @contextmanager
 def _cluster_workers(task: Callable[[Any], Any], address: str) -> Iterator[_Pools]:
-    """Provide the workers of a Dask scheduler as one pool.
+    """Provide the workers of the Dask scheduler at `address` as one pool for `task`.
 
-    `task`: function that the workers run on items; `address`: address of the scheduler. Raises MissingExtra if Dask is
-    not installed, and InputError if the scheduler does not answer, has no workers, or a worker has another version of
-    Sealscope.
+    Raises MissingExtra if Dask is not installed, and InputError if the scheduler does not answer, has no workers, or a
+    worker has another version of Sealscope.
     """
     try:
         import distributed
@@ -181,10 +186,7 @@ _task: list[Callable[[Any], Any]] = []
 
 
 def _initialise_worker(task: Callable[[Any], Any], lifeline: Connection[Any, Any]) -> None:
-    """Initialise a worker process: store its task, ignore the keyboard interrupt, and end it when its parent ends.
-
-    `lifeline`: end of a pipe whose other end the parent process has.
-    """
+    """Store the task of this worker process, ignore the keyboard interrupt, and end when the pipe `lifeline` ends."""
     _task[:] = [task]
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends its workers
     threading.Thread(target=_exit_with_parent, args=(lifeline,), daemon=True).start()
@@ -204,10 +206,7 @@ def _exit_with_parent(lifeline: Connection[Any, Any]) -> None:
 
 @contextmanager
 def _worker_environment() -> Iterator[None]:
-    """Set the environment variables `_ENVIRONMENT` for the processes that are started within the context.
-
-    Variables that are already set keep their values.
-    """
+    """Set those variables of `_ENVIRONMENT` that are not set, for the processes started within the context."""
     added = {name: value for name, value in _ENVIRONMENT.items() if not os.environ.get(name)}
     os.environ.update(added)
     try:

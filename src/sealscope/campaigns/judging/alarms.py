@@ -29,11 +29,10 @@ class AlarmFractions:
     - `cannot_tell`: fraction with the verdict `cannot tell`, which includes the records without a result
     - `failed`: number of records without a result
     - `coverage`: of the intervals stated for the leak flow, fraction that contains the true flow
-    - `named`: fraction with an alarm that names the cause of the group's `fault` (`matches_cause`), without meaning for
-      a group without a fault; None if the detector states no verdicts of its own
-    - `false_alarm`: fraction of leak-free records with an alarm; `per_hour`: false alarms per operating hour. Both are
-      stated only in results by size of the leak, and are None if there are no leak-free records. `per_hour` is also
-      None if the operating time is not known.
+    - `named`: fraction with an alarm that names the cause of the group's `fault`; None if the detector states no
+      verdicts
+    - `false_alarm`, `per_hour`: fraction of leak-free records with an alarm, and false alarms per operating hour; only
+      in results by size of the leak, None without leak-free records or (`per_hour`) operating time
     """
 
     detector: str
@@ -57,10 +56,7 @@ class AlarmFractions:
 
     @property
     def informedness(self) -> float:
-        """Youden's J of a group with a leak: fraction of alarms minus `false_alarm`, 1 if perfect, 0 for mere guesses.
-
-        The result is nan if `false_alarm` is None.
-        """
+        """Youden's J of a group with a leak: fraction of alarms minus `false_alarm`, nan if that is None."""
         return self.alarms.value - self.false_alarm.value if self.false_alarm else math.nan
 
 
@@ -68,8 +64,7 @@ class AlarmFractions:
 class Alarms:
     """The verdicts of all detectors, with methods that summarise the alarms among them.
 
-    `verdicts`: by detector, its verdict on each record; `confidence`: confidence level of the intervals of all
-    fractions.
+    `confidence`: confidence level of the intervals of all fractions.
     """
 
     verdicts: Verdicts
@@ -85,10 +80,9 @@ class Alarms:
     def by_size(self, hours: float | None, pooled: bool = False) -> Iterator[AlarmFractions]:
         """Yield the fractions of alarms of each detector for each size of leak; if `pooled`, for all sizes together.
 
-        The size is the planned mean flow, in the unit of the plan. Records with other faults are left out. Two
-        reference detectors, which always or never raise an alarm, come last. If all records are leak-free, each
-        detector has one result, with alarms in 0 of 0 records. `hours`: operating time of one record [h], None to omit
-        the rate of false alarms.
+        The size is the planned mean flow. Records with other faults are left out. Two reference detectors, which always
+        or never raise an alarm, come last. If all records are leak-free, each detector has one result, with alarms in 0
+        of 0 records. `hours`: operating time of one record [h], None to omit the rate of false alarms.
         """
         for name, records in drop_other_faults(self._with_references()).items():
             leak_free = [record for record in records if not record.size]
@@ -104,26 +98,18 @@ class Alarms:
                 yield replace(fractions, alarms=detected, false_alarm=false_alarm, per_hour=per_hour)
 
     def by_cell(self) -> Iterator[AlarmFractions]:
-        """Yield each detector's fractions of alarms for each size of leak and combination of the factors' values.
+        """Yield each detector's fractions of alarms for each size of leak and combination of the factors' levels.
 
-        The size of a leak is its planned mean flow. A factor is a condition that a plan varies, such as the load; the
-        values that occur are called its levels. Records with faults other than a leak are left out.
+        Records with faults other than a leak are left out.
         """
-
-        def cell_key(record: JudgedRow) -> tuple[float, str]:
-            """Return the size of a record's leak, and its levels as text, since mixed types cannot be sorted."""
-            return record.size, repr(tuple(record.row.levels.items()))
-
         for name, records in drop_other_faults(self.verdicts).items():
-            for (size, _), group in group_by(records, cell_key).items():
+            # levels as text, since mixed types cannot be sorted
+            cells = group_by(records, lambda record: (record.size, repr(tuple(record.row.levels.items()))))
+            for (size, _), group in cells.items():
                 yield self._summarise(name, group, leak_lpm=size, levels=dict(group[0].row.levels))
 
     def by_fault(self) -> Iterator[AlarmFractions]:
-        """Yield the fractions of alarms for each pair of a detector and a fault other than a piston leak.
-
-        Records that also have a piston leak are left out. Two reference detectors, which always or never raise an
-        alarm, come last.
-        """
+        """Yield the fractions of alarms for each pair of a detector or reference and a fault without a piston leak."""
         for name, records in self._with_references().items():
             faulty = (record for record in records if record.row.fault and record.size == 0)
             for fault, group in group_by(faulty, lambda record: record.row.fault).items():
@@ -132,10 +118,9 @@ class Alarms:
     def by_family(self) -> Iterator[AlarmFractions]:
         """Yield each detector's fractions of alarms for each family of machines, size of leak and law of the leak.
 
-        A family is a group of machines that a plan's profile defines. The size of a leak is its planned mean flow; the
-        law is the relation of its flow and pressure. The results of all families together come first. A size that
-        occurs with several laws also has a result for all laws together, and leak-free records have only this result.
-        Records with faults other than a leak are left out. If the records have no families, nothing is yielded.
+        A family is a group of machines that a plan's profile defines. The results of all families together come first.
+        A size that occurs with several laws also has a result for all laws together, and leak-free records have only
+        this result. Records with faults other than a leak are left out.
         """
         for name, records in drop_other_faults(self.verdicts).items():
             members = (record for record in records if FAMILY in record.row.levels)
@@ -155,10 +140,7 @@ class Alarms:
         return proportion(sum(values), len(values), self.confidence)
 
     def _summarise(self, detector: str, group: Sequence[JudgedRow], **group_fields: Any) -> AlarmFractions:
-        """Compute the fractions of alarms of a detector on a group of records.
-
-        `group_fields`: the fields of `AlarmFractions` that define the group, such as `leak_lpm` or `fault`.
-        """
+        """Compute the fractions of alarms of a detector on a group of records, which `group_fields` define."""
         statements = [(record, record.statement) for record in group if record.statement is not None]
         intervals = [(record.flow_lpm, statement.leak_interval_lpm) for record, statement in statements]
         names_cause = [

@@ -16,9 +16,9 @@ from sealscope.evaluation.roc import Area, Roc, auc, roc_curve
 class DetectorPod:
     """One detector's probability of detection (POD) over the size of the leak, i.e. over its planned mean flow.
 
-    `sizes`: detections at each size; `curve`: logistic curve fitted to hits and misses, None if it cannot be fitted;
-    `why`: reason why there is no curve, "" if there is one. `proven`: smallest tested size such that, for it and for
-    all larger tested sizes, the lower confidence bound of the detected fraction is at least 90 %; inf if there is none.
+    `curve`: logistic curve fitted to hits and misses, None if it cannot be fitted, for the reason `why`; `proven`:
+    smallest tested size such that, for it and for all larger ones, the lower confidence bound of the detected fraction
+    is at least 90 %; inf if there is none.
     """
 
     detector: str
@@ -37,8 +37,7 @@ class DetectorPod:
 class SizeRoc:
     """One detector's ROC (receiver operating characteristic): detections over false alarms, for all thresholds.
 
-    It is computed from the scores of leak-free records and of the records with a leak of the size `leak_lpm`, nan for
-    all sizes together. `area`: area under the curve.
+    `leak_lpm`: size of the leak, nan for all sizes together; `area`: area under the curve.
     """
 
     detector: str
@@ -48,11 +47,7 @@ class SizeRoc:
 
 
 def iter_pods(verdicts: Verdicts, confidence: float) -> Iterator[DetectorPod]:
-    """Yield each detector's probability of detection over the size of the leak.
-
-    The size is the planned mean flow, in the unit of the plan. `verdicts`: by detector, its verdict on each record;
-    `confidence`: confidence level of the intervals. If no record has a leak, nothing is yielded.
-    """
+    """Yield each detector's probability of detection over the planned mean flow, if any record has a leak."""
     for name, records in verdicts.items():
         leaky = [record for record in records if record.size > 0]
         if not leaky:
@@ -72,9 +67,7 @@ def iter_pods(verdicts: Verdicts, confidence: float) -> Iterator[DetectorPod]:
 def iter_rocs(verdicts: Verdicts, confidence: float) -> Iterator[SizeRoc]:
     """Yield ROC curves of each detector that has scores: for all leaks together, and for each planned mean flow.
 
-    `verdicts`: by detector, its verdict on each record; `confidence`: confidence level of the curves' intervals. A
-    record without a score counts as if its score were lower than all others. A curve is left out unless there are at
-    least two records with a leak and two without.
+    A record without a score counts as lowest. A curve needs at least two records with a leak and two without.
     """
     for name, records in verdicts.items():
         scores = [record.row.score(name) if record.row.error is None else None for record in records]

@@ -34,15 +34,13 @@ from sealscope.evaluation.thresholds import Promise
 class Judgement:
     """The statistics of a campaign's verdicts.
 
-    - `thresholds`: thresholds of the scorers (detectors that only compute a score)
-    - `leak_free`: number of leak-free records from which the thresholds are set, 0 if none is set
+    - `leak_free`: number of leak-free records from which the `thresholds` of scorers are set, 0 if none is set
     - `judged`: number of judged records that have a result
     - `failed`: rows with an error, on which the verdict of every detector is `cannot tell`
     - `table`, `overall`: fractions of alarms for each size of the leak, and for all sizes together
     - `onsets`, `flows`: errors of the onsets and leak flows that detectors state
     - `causes`: confusion matrices of the causes that detectors name
     - `pods`: probability of detection over the size of the leak
-    - `rocs`: ROC curves
     - `cells`, `faults`, `families`: fractions of alarms for each combination of the factors' levels, for each fault
       other than a leak, and for each family of machines
     - `achieved_flows`: by planned size of the leak, mean and standard deviation of the simulated leak flow [L/min]
@@ -78,11 +76,9 @@ def judge(
 ) -> Judgement:
     """Collect the verdicts of all detectors on the rows with `use` "judge", and compute their statistics.
 
-    A detector states its verdict itself, or it is a scorer, whose score is compared with a threshold. Without a fixed
-    threshold, one is set from the leak-free rows with the same command and stroke direction (`compute_thresholds`).
-    Raises InputError if there is no row to judge, or too few leak-free rows to set a threshold.
+    Scorers without a fixed threshold get one from the leak-free rows of the same duty (`compute_thresholds`). Raises
+    InputError if there is no row to judge, or too few leak-free rows to set a threshold.
 
-    - `detectors`: names of the detectors
     - `false_alarm`: wanted false-alarm probability
     - `promise`: "average" if the thresholds keep this probability on average over sets of leak-free records, "bound" if
       they keep it with the probability `confidence` (`quantile_threshold`)
@@ -121,10 +117,7 @@ def judge(
 
 
 def _achieved_flows(rows: Sequence[CaseRow]) -> dict[float, tuple[float, float]]:
-    """Compute mean and standard deviation of the simulated leak flows [L/min], by the flow that was planned [L/min].
-
-    The standard deviation is nan for a single record. Planned flows without a simulated one are left out.
-    """
+    """Compute mean and standard deviation, nan for a single record, of the simulated flows [L/min] by planned flow."""
     achieved = {}
     for size, group in group_by((row for row in rows if row.leak_lpm > 0), lambda row: row.leak_lpm).items():
         flows = [row.flow_lpm for row in group if row.flow_lpm is not None]

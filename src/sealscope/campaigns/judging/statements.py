@@ -20,8 +20,8 @@ from sealscope.evaluation.table import CANNOT_TELL, Confusion, confusion_matrix
 class StatedErrors:
     """Errors (estimate minus true value) of one detector's estimates on the records with one size of leak.
 
-    `leak_lpm`: size of the leak, i.e. its planned mean flow [L/min], 0 for leak-free records; `errors`: errors of the
-    estimated onsets [s] on records with an alarm, or of the estimated leak flows [L/min] on all records.
+    `leak_lpm`: planned mean flow [L/min], 0 for leak-free records; `errors`: of the estimated onsets [s] on records
+    with an alarm, or of the estimated leak flows [L/min] on all records.
     """
 
     detector: str
@@ -33,8 +33,7 @@ class StatedErrors:
 class NamedCauses:
     """The confusion matrix of one detector: how often it names each cause, for each true cause of a record.
 
-    The true cause of a record without leak and fault is "none". `covered`: fraction of records for which the detector
-    names the true cause, or an ambiguous cause that includes the true one.
+    `covered`: fraction of records for which it names the true cause, or an ambiguous cause that includes the true one.
     """
 
     detector: str
@@ -45,8 +44,7 @@ class NamedCauses:
 def onset_errors(verdicts: Verdicts, onset_s: float, confidence: float) -> Iterator[StatedErrors]:
     """Yield the errors [s] of the estimated onsets for each detector and each planned mean flow of the leak.
 
-    Only records with a leak, an alarm and an estimated onset count. `verdicts`: by detector, its verdict on each
-    record; `onset_s` [s]: true onset of all leaks; `confidence`: confidence level of the errors' intervals.
+    Only records with a leak, an alarm and an estimated onset count. `onset_s` [s]: true onset of all leaks.
     """
     for name, records in verdicts.items():
         detected = (record for record in records if record.size > 0 and record.alarm)
@@ -61,11 +59,7 @@ def onset_errors(verdicts: Verdicts, onset_s: float, confidence: float) -> Itera
 
 
 def flow_errors(verdicts: Verdicts, confidence: float) -> Iterator[StatedErrors]:
-    """Yield the errors of the estimated leak flows [L/min] for each detector and each planned mean flow.
-
-    `verdicts`: by detector, its verdict on each record; `confidence`: confidence level of the errors' intervals.
-    Detectors that estimate no flow are skipped.
-    """
+    """Yield the errors of the leak flows [L/min] that detectors estimate, for each detector and planned mean flow."""
     for name, records in verdicts.items():
         for size, group in group_by(records, attrgetter("size")).items():
             estimates = [
@@ -82,10 +76,9 @@ def _iter_errors(
     estimates: Sequence[tuple[float | None, float, tuple[float, float] | None]],
     confidence: float,
 ) -> Iterator[StatedErrors]:
-    """Yield the errors of one detector's estimates on the records of one planned mean flow `leak_lpm` [L/min].
+    """Yield the errors of one detector's estimates on the records of one planned flow [L/min], if it states any.
 
-    `estimates`: for each record (estimate, true value, interval), with None for a missing estimate or interval. Nothing
-    is yielded if all estimates are missing. `confidence`: confidence level of the errors' intervals.
+    `estimates`: for each record (estimate, true value, interval), with None for a missing estimate or interval.
     """
     values = [math.nan if value is None else value for value, _, _ in estimates]
     if np.isfinite(values).any():
@@ -98,8 +91,7 @@ def _iter_errors(
 def iter_cause_confusions(verdicts: Verdicts, confidence: float) -> Iterator[NamedCauses]:
     """Yield the confusion matrix of true and named causes for each detector that names causes.
 
-    `verdicts`: by detector, its verdict on each record; `confidence`: confidence level of the fractions' intervals. A
-    record with a leak and another fault has two true causes and is left out. A record without a result counts as
+    A record with a leak and another fault has two true causes and is left out. A record without a result counts as
     `cannot tell`. Nothing is yielded if no record has a fault other than a leak.
     """
     for name, records in verdicts.items():

@@ -25,8 +25,7 @@ _PROPORTION = ("count", "of", "fraction", "low", "high")
 class PriorKnowledge:
     """The information that a detector is given before it judges a record.
 
-    `onset`: True if the detector knows the true onset of the leak; `channels`: channels that the detector may read;
-    `rig`: name of the rig that the detector assumes, "" if it assumes no rig.
+    `onset`: True if it knows the true onset of the leak; `channels` it may read; `rig` it assumes, or "".
     """
 
     onset: bool
@@ -40,19 +39,12 @@ class PriorKnowledge:
 
 @cache
 def _table_layouts() -> dict[str, dict[str, str]]:
-    """Load the layouts of all tables from `tables.toml`, by name of the table.
-
-    A layout maps the heading of each column to a text that says how the column is filled: flags, such as "share" for
-    a proportion, and the dotted path of an attribute of the object that a row shows, as in "share alarms".
-    """
+    """Load the layouts of all tables: by heading, flags and an attribute's dotted path, such as "share alarms"."""
     return tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 
 
 def resolve_attribute(source: Any, path: str) -> Any:
-    """Return the value at a dotted path of attributes, mapping keys and tuple indices, starting from `source`.
-
-    Returns None if a value on the way is None.
-    """
+    """Return the value at a dotted path of attributes, mapping keys and indices; None if one on the way is None."""
     for name in path.split("."):
         if source is None:
             return None
@@ -66,8 +58,8 @@ def resolve_attribute(source: Any, path: str) -> Any:
 def _build_cells(column: str, content: str, row: Any, factors: Sequence[str]) -> TableRow:
     """Build those cells of a table's row that one entry of `tables.toml` describes, by name of the column.
 
-    `column`: name of the entry; `content`: text of the entry, such as "share alarms": flags, and the dotted path of an
-    attribute of `row`. The path "levels" fills one column for each of the plan's `factors`. Flags:
+    `column`: name of the entry; `content`: its text, flags and the dotted path of an attribute of `row`. The path
+    "levels" fills one column for each of the plan's `factors`. Flags:
 
     - "share": the attribute is a proportion, which fills the five columns `_PROPORTION`; they are empty for None
     - "stated", together with "share": the columns are also empty for a proportion of no records
@@ -89,9 +81,8 @@ def build_tables(
 ) -> dict[str, list[TableRow]]:
     """Build the tables of a judgement, with the columns that `tables.toml` lists, by name of the table.
 
-    The name of a table is also the name of its file. `unit`: unit of the leaks' sizes; `known`: by detector, the
-    information that it was given, None to leave out the columns with this information; `part`: purpose of the plan,
-    such as development or judging.
+    `unit`: unit of the leaks' sizes; `known`: by detector, the information that it was given, None to leave out these
+    columns; `part`: purpose of the plan, such as development or judging.
     """
     knowledge = {name: row.as_row() for name, row in (known or {}).items()}
     factors = list(dict.fromkeys(name for cell in judgement.cells for name in cell.levels))
@@ -118,10 +109,9 @@ def build_tables(
     }
 
     def build_row(columns: Mapping[str, str], row: Any) -> TableRow:
-        """Build one row of a table, by name of the column, from the object `row` that fills it.
+        """Build the row of a table with the contents `columns` from the object `row` that fills it.
 
-        `columns`: contents of the columns by name, as in `tables.toml`. Columns for the information given to a
-        detector (content "known ...") are left out if `knowledge` is empty.
+        Columns for the information given to a detector (content "known ...") are left out if `knowledge` is empty.
         """
         cells: TableRow = {}
         for column, content in columns.items():
@@ -139,8 +129,7 @@ def build_tables(
 def records_table(rows: Iterable[CaseRow], detectors: Sequence[str], unit: str = "L/min") -> list[TableRow]:
     """Build the table of all records, with their inputs, scores and statements, in the order of their ids.
 
-    Run times are left out, because they would differ between two runs of the same campaign. `detectors`: names of the
-    detectors whose scores are included; `unit`: unit of the leak sizes, for the heads of columns.
+    Run times are left out, because they would differ between two runs of the same campaign.
     """
     ordered = sorted(rows, key=lambda row: row.id)
     factors = list(dict.fromkeys(name for row in ordered for name in sorted(row.levels)))
@@ -167,7 +156,7 @@ def records_table(rows: Iterable[CaseRow], detectors: Sequence[str], unit: str =
 def write_tables(folder: Path, tables: Mapping[str, Sequence[TableRow]]) -> list[Path]:
     """Write each table as `NAME.csv` into a folder, with all digits; return the paths of the files.
 
-    An empty table is not written, and its file of an earlier run is removed.
+    For an empty table, the file of an earlier run is removed.
     """
     paths = []
     for name, rows in tables.items():

@@ -19,8 +19,7 @@ Thresholds = Mapping[tuple[str, str], Threshold]
 class JudgedRow(NamedTuple):
     """The result of a record (`row`) with the verdict of one detector on it.
 
-    `statement`: verdict and estimates as the detector states them, None for a scorer, which only computes a score, and
-    for a record without a result.
+    `statement`: verdict and estimates as the detector states them, None for a scorer and for a record without a result.
     """
 
     row: CaseRow
@@ -56,13 +55,10 @@ def compute_thresholds(
 ) -> Thresholds:
     """Compute the threshold of each scorer that needs one, for each duty with enough leak-free records.
 
-    `rows`: results of the records; those for calibration without an error count. The duty of a record is its command
-    and stroke direction (`duty_label`). A record without a score cannot raise an alarm, so it counts as the lowest
-    score of its duty.
-
-    `false_alarm`: wanted false-alarm probability; `promise`: "average" if it is kept on average over sets of leak-free
-    records, "bound" if it is kept with the probability `confidence`. Returns thresholds by (detector, duty). Raises
-    InputError if a scorer needs a threshold and no duty has enough records for `false_alarm`.
+    The duty of a record is its command and stroke direction (`duty_label`). A record without a score counts as the
+    lowest score of its duty. `false_alarm`: wanted false-alarm probability; `promise`: "average" if it is kept on
+    average over sets of leak-free records, "bound" if it is kept with the probability `confidence`. Returns thresholds
+    by (detector, duty). Raises InputError if a scorer needs a threshold and no duty has enough records.
     """
     scorers = [name for name in detectors if parse_detector_name(name).needs_threshold]
     leak_free: dict[str, list[CaseRow]] = {}
@@ -88,10 +84,9 @@ def collect_verdicts(
 ) -> dict[str, list[JudgedRow]]:
     """Collect the verdict of each detector on each row; return them by detector, in the order of `rows`.
 
-    If the detector states a verdict, this verdict is used. Otherwise its score is compared with its limit in `limits`
-    or, if `limits` lacks the detector, with the threshold in `thresholds` for the row's duty: the verdict is `leak` if
-    the score is higher, else `no leak`. The verdict is `cannot tell` if the record has no result, if there is no score,
-    or if there is neither limit nor threshold.
+    It is the verdict that the detector states, or `leak` if its score is above its limit in `limits` or, failing that,
+    the threshold for the row's duty in `thresholds`, else `no leak`. It is `cannot tell` if the record has no result,
+    or the detector no score or no limit.
     """
 
     def judge_row(row: CaseRow, detector: str) -> JudgedRow:
@@ -111,11 +106,7 @@ def collect_verdicts(
 
 
 def drop_other_faults(verdicts: Verdicts) -> Verdicts:
-    """Remove the records that have a fault other than a piston leak.
-
-    `verdicts`: by detector, its verdict on each record. Records with such a fault are removed even if they also have a
-    leak.
-    """
+    """Remove the records that have a fault other than a piston leak, even if they also have a leak."""
     return {name: [record for record in records if not record.row.fault] for name, records in verdicts.items()}
 
 

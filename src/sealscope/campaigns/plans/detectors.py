@@ -32,9 +32,7 @@ ALL_CHANNELS = tuple(name for name in CHANNEL_UNITS if name != "q_leak")
 class PlanDetector:
     """A detector that a plan names, such as "diagnose @ pressures", split into its parts.
 
-    - `name`: the full name
-    - `base`: the part before "@": the name of a scorer or of a registered detector, `diagnose`, or `watch` for the
-      continuous watch of a machine
+    - `base`: the part before "@": a scorer, a registered detector, `diagnose`, or `watch`, a machine's continuous watch
     - `view`: the part after "@", which names the set of channels that the detector may use, "" if there is no "@"
     - `scorer`: the scorer, a rule that only computes a score; None for a detector that states verdicts itself
     """
@@ -52,18 +50,14 @@ class PlanDetector:
 
 @cache
 def parse_detector_name(name: str) -> PlanDetector:
-    """Split a detector name of a plan, such as "diagnose @ pressures", into detector and view (set of channels).
-
-    Names of detectors or views that do not exist are accepted; `check_detector` refuses them.
-    """
+    """Split a detector name, such as "diagnose @ pressures", into detector and view, of which neither need exist."""
     base, _, view = name.partition(_VIEW)
     return PlanDetector(name, base, view, scorer=SCORERS.get(base))
 
 
 def check_detector(name: str, views: Views) -> None:
-    """Check that a plan's detector exists and that the plan defines its view; raise InputError otherwise.
+    """Check that a plan's detector, such as "diagnose @ pressures", and its view exist; raise InputError otherwise.
 
-    `name`: name of the detector, such as "diagnose @ pressures", whose view is the set of channels named after "@";
     `views`: channels of each view of the plan, by its name. A name without "@" needs no view.
     """
     parsed = parse_detector_name(name)

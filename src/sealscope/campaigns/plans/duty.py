@@ -1,7 +1,6 @@
 """Check and parse the texts in a plan: commands, controllers, loads, closed throttles and faults.
 
-A text has the same form as the option of `sealscope simulate` with the same name, such as `--command` (a voltage, or
-a target of the piston's position), `--controller` or `--load`.
+A text has the same form as the option of `sealscope simulate` with the same name, such as `--command` or `--load`.
 """
 
 from __future__ import annotations
@@ -18,7 +17,6 @@ from sealscope.simulation.faults import Fault, parse_fault
 from sealscope.simulation.targets_and_loads import Position, command_or_target, parse_force, parse_position
 from sealscope.units import parse_quantity
 
-#: Factors of a plan that set the duty of a machine.
 COMMAND, CONTROLLER, LOAD = "command", "controller", "load"
 #: Rate [Hz] at which a target is sampled to check that the piston can reach it.
 _TARGET_CHECK_RATE = 50.0
@@ -27,9 +25,8 @@ _TARGET_CHECK_RATE = 50.0
 def check_duty(name: str, level: str | float, rig: Rig, duration: float) -> None:
     """Check a level (value) of a plan's factor `command`, `controller` or `load`; raise InputError if it is invalid.
 
-    `name`: the factor; `rig`: rig of the plan; `duration` [s]: length of a record. A command that is a target of the
-    piston's position must stay within the rig's stroke for this time. A built-in controller must fit the rig. Of any
-    other controller, only the form of its name is checked.
+    `name`: the factor; `duration` [s]: length of a record, for which a target of the piston's position must stay within
+    the rig's stroke. A built-in controller must fit the rig. Of any other, only the form of its name is checked.
     """
     examples = {COMMAND: "'3 sin(4t)' or 'position 50 mm sin(2t)'", CONTROLLER: "'pi'", LOAD: "'2 kN'"}
     if not isinstance(level, str):
@@ -48,9 +45,8 @@ def check_duty(name: str, level: str | float, rig: Rig, duration: float) -> None
 def check_controllers(plan: SimulatedPlan, trust: bool) -> None:
     """Check that every controller of a plan is trusted, and build those that are not built in.
 
-    A plan may be hostile, so code that it names (`FILE.py:NAME`, `MODULE:NAME`) is run only if `trust` is True.
-    Built-in and installed controllers are always trusted. Raises InputError if a controller is untrusted or cannot be
-    built.
+    A plan may be hostile, so code that it names (`FILE.py:NAME`, `MODULE:NAME`) is run only if `trust` is True. Raises
+    InputError if a controller is neither installed nor trusted, or cannot be built.
     """
     names = [str(level) for level in plan.factors.get(CONTROLLER, ())]
     if plan.profile:
@@ -73,11 +69,9 @@ def find_voltage_command(commands: tuple[str | float, ...]) -> str | None:
 
 
 def throttle_values(level: str | float) -> dict[str, str | float]:
-    """Compute the parameters of a rig whose throttles, one in each line, are closed by a fraction of their area.
+    """Compute the parameters of a rig whose throttles are closed by a fraction of their area, such as 0.25 or '25 %'.
 
-    `level`: the fraction as a number or a text, such as 0.25 or '25 %'. Returns values by name of the parameter. If the
-    fraction is above 0, they include `line.orifices`, because the rig must have throttles. Raises InputError for a
-    negative fraction, or one of 100 % or more.
+    Above 0 they include `line.orifices`, as the rig must have throttles. Raises InputError for < 0 %, or >= 100 %.
     """
     fraction = parse_quantity(level, "1") if isinstance(level, str) else float(level)
     if not 0.0 <= fraction < 1.0:
@@ -87,10 +81,9 @@ def throttle_values(level: str | float) -> dict[str, str | float]:
 
 
 def parse_plan_fault(text: str, onset_s: float) -> Fault:
-    """Parse the text of a fault other than a piston leak, such as "pump leak x3".
+    """Parse the text of a fault other than a piston leak, such as "pump leak x3", which starts at `onset_s` [s].
 
-    The fault starts at `onset_s` [s] unless the text states a time, as in "pump leak x3 from 20 s". Raises InputError
-    if the text names no fault.
+    The text may state another time, as in "pump leak x3 from 20 s". Raises InputError if it names no fault.
     """
     # a time is stated as "from 20 s" or "growing from 20 s to 60 s"
     has_time = any(f" {word} " in f" {text} " for word in ("from", "growing"))

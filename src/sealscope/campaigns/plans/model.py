@@ -1,7 +1,6 @@
 """The two kinds of campaign plan: one of simulated records, and one of recordings of real machines.
 
-Each field is read from the entry of the plan's TOML file that has the field's name, or its `alias` if it has one;
-`place` is the path of the file.
+A field is read from the entry of the plan's TOML file that has its name, or its `alias` if it has one.
 """
 
 from __future__ import annotations
@@ -32,10 +31,7 @@ def _quantity_validator(unit: str) -> BeforeValidator:
 
 
 def _validate_file_name(name: str) -> str:
-    """Return `name` if it is a valid file name of at most 80 letters, digits, '-', '_' and '.'; else raise ValueError.
-
-    A name that begins with '.' is invalid, too.
-    """
+    """Return a file name of at most 80 letters, digits, '-', '_' and '.', not at its start; else raise ValueError."""
     if not all(c.isalnum() or c in "-_." for c in name) or name.startswith(".") or len(name) > _MAX_NAME_LENGTH:
         raise ValueError(f"must be of at most {_MAX_NAME_LENGTH} letters, digits, '-', '_' and '.'")
     return name
@@ -63,10 +59,7 @@ def _validate_level(value: Any) -> Any:
 
 
 def _validate_channels(names: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the names of channels if they are valid; raise ValueError for an unknown or repeated channel.
-
-    The channel `q_leak` is refused, too: it measures the leak that detectors are to find.
-    """
+    """Return the names of channels; raise ValueError for an unknown or repeated one, or the leak's meter `q_leak`."""
     if not set(names) <= set(CHANNEL_UNITS) or len(set(names)) < len(names):
         raise ValueError(f"must be a list of channels, each once, got {list(names)}")
     if "q_leak" in names:
@@ -75,10 +68,7 @@ def _validate_channels(names: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def _validate_view_name(name: str) -> str:
-    """Return the name of a view (a set of channels) if it is not empty and has no "@" and no outer blanks.
-
-    Otherwise raises ValueError.
-    """
+    """Return the name of a view (a set of channels); raise ValueError if empty, with "@" or with outer blanks."""
     if not name.strip() or name != name.strip() or "@" in name:
         raise ValueError("must be a plain name without '@'")
     return name
@@ -91,7 +81,6 @@ Flag = Annotated[bool, Field(strict=True)]
 Text = Annotated[str, Field(pattern=r"^[^\n]*$")]
 FileName = Annotated[str, Field(min_length=1), AfterValidator(_validate_file_name)]
 Seconds = Annotated[Number, _quantity_validator("s")]
-#: One name or more.
 Names = Annotated[tuple[str, ...], Field(min_length=1)]
 Channels = Annotated[Names, AfterValidator(_validate_channels)]
 Level = Annotated[str | int | float, BeforeValidator(_validate_level)]
@@ -150,7 +139,6 @@ class _JudgedPlan(_Plan):
     - `false_alarm`: wanted false-alarm probability of each detector
     - `promise`: "average" if thresholds keep this probability on average over sets of leak-free records, "bound" if
       they keep it with the probability `confidence` (`quantile_threshold`)
-    - `detectors`: names of the detectors to evaluate, such as "diagnose @ pressures"
     - `unit`: unit of the leaks' sizes
     - `views`: sets of channels, by the name that follows the "@" in a detector's name
     - `channels`: channels of the detectors without "@", None for all but the flow meter of the leak
@@ -168,10 +156,9 @@ class _JudgedPlan(_Plan):
     assume_set: Values = field(default_factory=dict)
 
     def _load_assumed(self, default: Rig | None) -> Rig | None:
-        """Load the rig that detectors may assume, and replace its parameters by the values in the plan's `assume_set`.
+        """Load the rig `assume`, else `default`, else the rig `thesis`, with the values of `assume_set`.
 
-        The rig is the plan's `assume`, else `default`, else the packaged rig `thesis`. Returns None if `assume` and
-        `default` are None and there are no values to replace.
+        Returns None if `assume` and `default` are None and there are no values to replace.
         """
         rig = default if self.assume is None else load_rig(self.assume)
         if not self.assume_set:
@@ -184,20 +171,17 @@ class SimulatedPlan(_JudgedPlan):
     """The plan of a simulated campaign.
 
     - `rig_name`, `rig_set`: name or file of the rig, and values that replace some of its parameters
-    - `rate`: sampling rate of the data acquisition, a number in Hz or a text with a unit, None for the rig's own
-    - `profile`: name of the profile (a distribution of machines) from which the machine of each record is drawn, ""
-      to simulate the rig itself
-    - `duration_s` [s]: length of a record
+    - `rate`: sampling rate, a number in Hz or a text with a unit, None for the rig's own
+    - `profile`: distribution from which the machine of each record is drawn, "" to simulate the rig itself
     - `onset_s` [s]: start of the leaks, nan for half of the duration
     - `seed`: number from which the seeds of all records derive
     - `keep_recordings`: True to store the recordings
-    - `records`: groups of records
     - `factors`: by name, the levels (values) of each factor; records are made for every combination of levels
     - `part`: purpose of the plan, such as development or judging
 
     The factors `command`, `controller` and `load` set how the machine is moved and loaded, `closed` how far the
-    throttles of its lines are closed, and `family` which groups of the profile's machines are drawn. Any other factor
-    is a parameter of the rig.
+    throttles of its lines are closed, and `family` which groups of the profile's machines are drawn. Others are
+    parameters of the rig.
     """
 
     rig_name: Annotated[Text, Field(alias="rig")] = "thesis"
@@ -237,8 +221,7 @@ class RecordingSet(_TomlTable):
     - `files`: pattern of the file names
     - `use`: `calibrate` for healthy recordings from which thresholds are set, `judge` for recordings to be judged
     - `size`: size of the leak in the plan's `unit`, 0 for healthy recordings
-    - `first`, `end`: the matching files are ordered by the numbers in their names; those from position `first` to
-      `end` - 1, counted from 1, belong to the set
+    - `first`, `end`: positions from 1 of the first file and after the last, ordered by the numbers in their names
     - `label`: name of the set in tables, by default the pattern
     """
 
@@ -258,8 +241,7 @@ class RecordingSet(_TomlTable):
 class RecordedPlan(_JudgedPlan):
     """The plan of a campaign over recordings of real machines, which are files in a folder.
 
-    `channel_map`: by channel, the name of its column in the files; `rate_hz` [Hz]: sampling rate for files without
-    times; `sets`: sets of recordings, each with one size of leak.
+    `channel_map`: by channel, the name of its column; `rate_hz` [Hz]: sampling rate of files without times.
     """
 
     channel_map: Annotated[Mapping[str, str], Field(alias="map")] = field(default_factory=dict)

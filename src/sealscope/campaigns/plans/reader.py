@@ -63,7 +63,7 @@ def read_plan(tree: Mapping[str, Any], place: str = "plan") -> AnyPlan:
     """Build a plan from the parsed tables of a TOML file, and check it; raise InputError if it is invalid.
 
     A file with the table [recordings] gives a plan of recordings, any other a plan of simulated records. `place`: path
-    of the file, for messages; files that the plan names are relative to its folder.
+    of the file; files that the plan names are relative to its folder.
     """
     plan = _parse_tables(tree, place)
     default_view = {} if plan.channels is None else {"": plan.channels}  # for detectors without "@"
@@ -91,8 +91,7 @@ def _parse_tables(tree: Mapping[str, Any], place: str) -> AnyPlan:
     """Build a plan from the parsed tables `tree` of its file, without a check of its factors and of the files it names.
 
     The entries of [campaign] and of [recordings] become fields of the plan, and so does each other table as a whole.
-    `place`: path of the file, for messages. Raises InputError, with the name of the entry and its table, if an entry is
-    unknown or has a wrong value.
+    Raises InputError, with the name of the entry, if an entry is unknown or has a wrong value.
     """
     source = next((name for name in _KINDS if name in tree), "records")  # name of the table that lists the records
     plan_class, tables, source_entries = _KINDS[source]
@@ -117,10 +116,7 @@ def _parse_tables(tree: Mapping[str, Any], place: str) -> AnyPlan:
 
 
 def _call_for_entry(entry: str, place: str, function: Callable[[], _T]) -> _T:
-    """Call `function` for an entry of a plan, and return the result; add `entry` and `place` to an InputError.
-
-    `entry`: full name of the entry, such as "campaign.rig"; `place`: path of the plan's file.
-    """
+    """Call `function` for an entry of a plan; add `entry`, such as "campaign.rig", and `place` to an InputError."""
     try:
         return function()
     except InputError as error:
@@ -128,19 +124,12 @@ def _call_for_entry(entry: str, place: str, function: Callable[[], _T]) -> _T:
 
 
 def _path_in_plan_folder(name: str, place: str) -> str:
-    """Complete the path of a TOML file that a plan names, relative to the plan's folder.
-
-    A name without the ending .toml is the name of a packaged file, and is returned unchanged.
-    """
+    """Complete the path of a TOML file relative to the plan's folder; other names, of packaged files, stay."""
     return os.fspath(Path(place).parent / name) if name.endswith(".toml") else name
 
 
 def _complete_simulated_plan(plan: SimulatedPlan) -> SimulatedPlan:
-    """Fill in the paths and default onset of a simulated plan, and check it; raise InputError if it is invalid.
-
-    Files of the plan's rig and profile are looked for in the plan's folder. The profile "none" becomes "", and the
-    default onset is half of the duration.
-    """
+    """Fill in the paths and default onset of a simulated plan, and check it; raise InputError if it is invalid."""
     place = plan.place
     profile = "" if plan.profile == "none" else _path_in_plan_folder(plan.profile, place)
     onset = plan.duration_s / 2 if math.isnan(plan.onset_s) else plan.onset_s
@@ -162,8 +151,7 @@ def _complete_simulated_plan(plan: SimulatedPlan) -> SimulatedPlan:
 def _check_factors(plan: SimulatedPlan) -> None:
     """Check the factors of a plan and their levels (values); raise InputError if one of them is invalid.
 
-    Each level must be valid and occur once in its factor. There may be at most `MAX_CELLS` combinations of levels. If
-    the plan varies the controller, all its commands must be targets of the piston's position, not voltages.
+    With a factor `controller`, all commands must be targets of the piston's position, not voltages.
     """
     for name, levels in plan.factors.items():
         if len({repr(level) for level in levels}) < len(levels):
@@ -179,11 +167,9 @@ def _check_factors(plan: SimulatedPlan) -> None:
 
 
 def _commands(plan: SimulatedPlan) -> tuple[str | float, ...]:
-    """List the commands of a plan's records.
+    """List the commands of a plan's records: levels of the factor `command`, or commands of the profile's families.
 
-    These are the levels of the factor `command`. Without this factor, they are the commands in the plan's profile of
-    machines, but only of the families that the factor `family` lists, if there is one. Without factor and profile the
-    only command is '3 sin(4t)'.
+    Without factor and profile the only command is '3 sin(4t)'.
     """
     if COMMAND in plan.factors or not plan.profile:
         return plan.factors.get(COMMAND, ("3 sin(4t)",))
@@ -207,10 +193,8 @@ def _check_level(plan: SimulatedPlan, name: str, level: str | float) -> None:
 def _check_records(plan: SimulatedPlan) -> None:
     """Check the groups of records of a plan; raise InputError if a group is invalid.
 
-    No two groups may agree in use, leak, law and fault; each fault must be known; and at least one group must be
-    judged. If a detector needs a threshold, there must be enough leak-free records for the plan's false-alarm
-    probability (`records_needed`). The required number is multiplied by the number of commands, as each command has
-    its own thresholds.
+    The groups must differ in use, leak, law or fault, and at least one must be judged. If a detector needs a threshold,
+    there must be enough leak-free records (`records_needed`) for each command.
     """
     contents = [(group.use, group.leak_lpm, group.law, group.fault) for group in plan.records]
     for number, (content, group) in enumerate(zip(contents, plan.records, strict=True), 1):

@@ -1,7 +1,7 @@
 """The decision rules of the thesis as scorers: they compute a score of a record, which is high if there is a leak.
 
-The score is computed from the RMS of the pressures' wavelet details d1 to d4 and d3d4, the product of d3 and d4. The
-threshold of a scorer is set from a plan's leak-free records, except that sign rules have the threshold 0.
+The score is computed from the RMS of the pressures' wavelet details d1 to d4 and d3d4, the product of d3 and d4. Its
+threshold is set from a plan's leak-free records, or 0 for sign rules.
 """
 
 from __future__ import annotations
@@ -21,8 +21,7 @@ from sealscope.signals.filters import IntArray
 
 #: The machine's start is left out of the first part: this many seconds, but at most this fraction of the part.
 START_SECONDS, START_FRACTION = 2.0, 0.05
-#: By the direction that a rule tests, the last word of its name: the statistic of the log RMS, and its sign in the
-#: score (0 for its absolute value).
+#: By the direction that ends a rule's name: statistic of the log RMS, and its sign in the score (0: absolute value).
 _DIRECTIONS = {
     "fell": ("change", -1.0),
     "rose": ("change", 1.0),
@@ -36,9 +35,9 @@ _BOTH = "d3d4 of both chambers as the thesis says"
 def split_bounds(n: int, rate: float, split: int) -> IntArray:
     """Compute the usable samples of the two parts into which a record of `n` samples is split at sample `split`.
 
-    Returns an array (2, 2) with [begin, end) of each part. Samples are left out if their wavelet details depend on
-    the other part or on padding. At the start of the record, `START_SECONDS` at the sampling rate `rate` [Hz] are
-    left out, too, but at most `START_FRACTION` of the first part. A part without usable samples has end <= begin.
+    Returns (2, 2): [begin, end) of each part, without samples whose wavelet details depend on the other part or on
+    padding, and without the machine's start: `START_SECONDS` at the sampling rate `rate` [Hz], but at most
+    `START_FRACTION` of the first part. A part without usable samples has end <= begin.
     """
     # numbers of earlier and of later samples on which a detail of the last level depends, whose filter is longest
     before, after = (int(samples) for samples in edge_samples()[-1])
@@ -50,8 +49,8 @@ def split_bounds(n: int, rate: float, split: int) -> IntArray:
 class SplitRms:
     """The natural logarithms of the RMS of the pressures' wavelet details, before and after the split of a record.
 
-    `log_rms`: by chamber, "p_A" or "p_B", three arrays (5,): before the split, after it, and over both parts. Each
-    has the log RMS of d1 to d4, with the RMS in Pa, and of d3d4, the product of d3 and d4, with the RMS in Pa^2.
+    `log_rms`: by chamber, "p_A" or "p_B", three arrays (5,): before the split, after it, and over both parts, for d1 to
+    d4 (RMS in Pa) and d3d4, the product of d3 and d4 (RMS in Pa^2).
     """
 
     log_rms: Mapping[str, tuple[Array, Array, Array]]
@@ -61,7 +60,7 @@ class SplitRms:
         """Compute the log RMS of the pressures' wavelet details before and after the time `split_s` [s].
 
         The recording must be uniformly sampled without missing samples. A chamber whose pressure was not recorded is
-        left out; if one of the parts is too short, the result has no chamber.
+        left out, and so are both if one of the parts is too short.
         """
         rate = recording.rate
         bounds = split_bounds(len(recording), rate, round((split_s - float(recording.t[0])) * rate))
@@ -78,8 +77,7 @@ class SplitRms:
         """Compute the log RMS of the pressures' wavelet details from their mean squares in both parts of a record.
 
         `squares`: by chamber, mean squares (2, 5) of d1 to d4 and d3d4, before and after the split; `bounds` (2, 2):
-        first sample and end of each part (`split_bounds`). The mean over both parts is weighted by their numbers of
-        samples.
+        first sample and end of each part, by which the mean over both is weighted.
         """
         log_rms = {}
         n_samples = np.diff(bounds)[:, 0]
@@ -95,11 +93,9 @@ class SplitRms:
         return SplitRms({chamber: values for chamber, values in self.log_rms.items() if chamber in visible})
 
     def value(self, chamber: str, quantity: str, statistic: str) -> float | None:
-        """Return one statistic of a wavelet detail's natural log RMS: its change at the split, or its overall value.
+        """Return a wavelet detail's log RMS over both parts ("level"), or its "change" from the first to the second.
 
-        `chamber`: "p_A" or "p_B"; `quantity`: "d1" to "d4" or "d3d4"; `statistic`: "change" for the log RMS after the
-        split minus the one before, "level" for the log RMS over both parts. Returns None if the chamber is missing or
-        the number is not finite.
+        `quantity`: "d1" to "d4" or "d3d4". Returns None if the chamber is missing or the number is not finite.
         """
         if chamber not in self.log_rms:
             return None
@@ -112,17 +108,10 @@ class SplitRms:
 class Scorer:
     """A decision rule of the thesis that computes a score of a record, to be compared with a threshold.
 
-    `conditions`: one or several, each a wavelet detail, a chamber and a direction, such as ("d3", "p_A", "fell");
-    `threshold`: fixed threshold, None if it is to be set from leak-free records. The record is split into two parts.
-    The score of a condition depends on its direction:
-
-    - "rose": change of the detail's log RMS from the first to the second part
-    - "fell": the negative of this change
-    - "changed": the magnitude of this change
-    - "high": log RMS over both parts
-    - "low": the negative of this log RMS
-
-    The rule's score is the smallest score of its conditions.
+    `conditions`: each a wavelet detail, a chamber and a direction, such as ("d3", "p_A", "fell"); `threshold`: fixed
+    threshold, None if it is set from leak-free records. The rule's score is the smallest of its conditions' scores. By
+    direction, these are the change of the detail's log RMS from the first to the second part of the record ("rose"),
+    its negative ("fell"), its magnitude ("changed"), the log RMS over both parts ("high"), or its negative ("low").
     """
 
     name: str
@@ -149,8 +138,7 @@ class Scorer:
     def score(self, split_rms: SplitRms) -> float | None:
         """Compute the score of a record, which is high if there is a leak.
 
-        `split_rms`: log RMS of the wavelet details in the two parts of the record. Returns None if the record is too
-        short, if it lacks a chamber's pressure, or if a constant pressure makes a logarithm infinite.
+        Returns None if the record is too short, lacks a chamber's pressure, or has a constant pressure.
         """
         scores = []
         for quantity, chamber, direction in self.conditions:
@@ -165,8 +153,7 @@ class Scorer:
 def _iter_scorers() -> Iterator[Scorer]:
     """Yield all scorers: rules on one wavelet detail of one chamber, and the thesis's rule on both chambers.
 
-    Each rule on a fall or a rise, and the thesis's rule, also occurs as a sign rule, whose threshold is 0. A sign rule
-    raises an alarm at any change in the tested direction.
+    Rules on a fall or a rise, and the thesis's rule, also occur as sign rules, whose threshold is 0.
     """
     for chamber, quantity, direction in product(CHAMBERS, QUANTITIES, _DIRECTIONS):
         rule = Scorer(f"{quantity} of {chamber} {direction}", ((quantity, chamber, direction),))
@@ -178,5 +165,4 @@ def _iter_scorers() -> Iterator[Scorer]:
     yield Scorer(f"sign rule: {_BOTH}", conditions, threshold=0.0)
 
 
-#: Every scorer by name.
 SCORERS: Mapping[str, Scorer] = MappingProxyType({scorer.name: scorer for scorer in _iter_scorers()})

@@ -24,8 +24,7 @@ def _chamber_table(sheet: DataSheet, measured: DataSheet | None, chamber: str, i
     """Tabulate the RMS of one chamber's wavelet details in all tests of Appendix C, in the form of the thesis.
 
     A detail has six columns: RMS without the leak, RMS with the leak, and the change [%], simulated and then measured.
-    `sheet`: the simulated data sheet; `measured`: the measured one, None if not given, in which case its cells are
-    empty; `chamber`: "p_A" or "p_B"; `item`: entry of `items.toml` for which the table is made.
+    Without a `measured` sheet its cells are empty.
     """
     heads = ["test", "mean leak [L/min]", "input", "closed [%]", "level"]
     columns: list[list[float] | list[None]] = []
@@ -50,16 +49,9 @@ def _chamber_table(sheet: DataSheet, measured: DataSheet | None, chamber: str, i
 def compare_sheets(sheet: DataSheet, measured: DataSheet | None) -> list[tuple[Cell, ...]]:
     """Compare the simulated data sheet with the measured one, in one row for each chamber and wavelet detail.
 
-    All means are over the tests. The columns are:
-
-    - chamber and detail;
-    - geometric mean change of the RMS with the leak [%], i.e. 100 (exp(mean log change) - 1), simulated;
-    - the same, measured;
-    - geometric mean and geometric standard deviation of the simulated over the measured RMS, both without the leak;
-    - number of tests in which the simulated and the measured RMS change in the same direction;
-    - correlation of the simulated and the measured logarithmic changes.
-
-    `measured`: the measured sheet; if it is None, all columns after the simulated change are None.
+    The cells are chamber, detail, geometric mean change of the RMS with the leak [%], simulated and measured, geometric
+    mean and standard deviation of the simulated over the measured RMS without the leak, number of tests in which both
+    RMS change in the same direction, and correlation of the log changes. Without `measured`, its cells are None.
     """
     rows: list[tuple[Cell, ...]] = []
     for chamber, name in COLUMNS:
@@ -80,11 +72,7 @@ def compare_sheets(sheet: DataSheet, measured: DataSheet | None) -> list[tuple[C
 
 
 def agreement_tables(context: Context, item: Item) -> tuple[ThesisTable, ...]:
-    """Tabulate how well the simulated data sheet agrees with the measured one.
-
-    The first table compares the sheets (`compare_sheets`). The other two list both sheets, a table for each chamber,
-    in the form of the thesis.
-    """
+    """Tabulate how well the simulated data sheet agrees with the measured one (`compare_sheets`), and both sheets."""
     table, sheet = simulated_sheet(context, "leak")
     notes = f"{table.notes} Means are geometric." + ("" if context.sheet else " No measured sheet was given.")
     summary = item.table(compare_sheets(sheet, context.sheet), notes, resolved=table.resolved)
@@ -92,11 +80,10 @@ def agreement_tables(context: Context, item: Item) -> tuple[ThesisTable, ...]:
 
 
 def difference_figure(context: Context, item: Item) -> tuple[Figure, ...]:
-    """Draw the change of a wavelet detail's RMS with the leak, over the mean leak of each test.
+    """Draw the change of a wavelet detail's RMS with the leak, in its unit and in %, over the mean leak of each test.
 
-    The points are the measured change, the change simulated with the leak, and the change between the two halves of a
-    test that is simulated without any leak. The two panels show the changes in the unit of the RMS and in %.
-    `item.inputs` has the chamber, the detail, and the direction in which a leak should change the RMS ("down" or "up").
+    The points are measured, simulated with the leak, and simulated without any leak. `item.inputs` has the chamber, the
+    detail, and the direction in which a leak should change the RMS ("down" or "up").
     """
     chamber, name, direction = (item.inputs[key] for key in ("chamber", "detail", "way"))
     (table, sheet), leak = simulated_sheet(context, "leak"), mean_leaks()

@@ -40,10 +40,9 @@ RmsPairs = Mapping[str, Mapping[str, tuple[float, ...]]]
 def draw_drifts(number: int, half: float, draw: int = 0) -> tuple[ParameterDrift, ...]:
     """Draw random steps of the rig's parameters in the middle of a test, which simulate drift.
 
-    Each entry under `drifts` in `cases.toml` lists parameters and a range of relative sizes. For each entry, one size
-    is drawn uniformly from this range and given a random sign; all parameters of the entry step by this size. `number`:
-    number of the test; `half`: time of the step, half the duration [s]; `draw`: 0, 1, .. for different draws of one
-    test. The random numbers depend on `number` and `draw` only.
+    Each entry under `drifts` in `cases.toml` lists parameters, which all step by one relative size: it is drawn
+    uniformly from the entry's range and given a random sign. `half`: time of the step [s]; `draw`: 0, 1, .. for
+    different draws of the test `number`. The random numbers depend on `number` and `draw` only.
     """
     rng = np.random.default_rng([_SEEDS["drift"], draw, number])
     drifts = load_texts("cases.toml")["drifts"].values()
@@ -60,10 +59,9 @@ def draw_drifts(number: int, half: float, draw: int = 0) -> tuple[ParameterDrift
 def leak_test(
     condition: Condition, half: float, seed: int, *, leak: bool = True, drifts: tuple[ParameterDrift, ...] = ()
 ) -> Experiment:
-    """Build the experiment of one test of Appendix C, on the rig that was fitted to these tests.
+    """Build the experiment of one test of Appendix C, with its leak open in the second half, on the rig fitted to it.
 
-    The leak of the test is open in the second half. `condition`: inputs of the test; `half`: half the duration [s];
-    `seed`: seed of the noise; `leak`: False for no leak; `drifts`: steps of parameters (`draw_drifts`).
+    `half`: half the duration [s]; `seed`: seed of the noise; `leak`: False for no leak; `drifts`: steps of parameters.
     """
     return Experiment.of(
         rig=BENCH_RIG,
@@ -79,9 +77,8 @@ def leak_test(
 def build_experiments(kind: Runs, half: float, quick: bool) -> list[tuple[Condition, Experiment]]:
     """Build the experiments of all tests of Appendix C, as pairs (inputs of the test, experiment).
 
-    `kind`: what changes in the middle of each test, "leak" (the leak opens), "no-leak" (nothing) or "drift" (parameters
-    of the rig step, without a leak); `half`: half the duration [s]. With drift each test occurs twice, with two random
-    draws of the steps, or once if `quick`.
+    `kind`: what changes in the middle of each test; `half`: half the duration [s]. With drift each test occurs twice,
+    with two random draws of the steps, or once if `quick`.
     """
     runs = []
     for draw, condition in product(range(2 if kind == "drift" and not quick else 1), APPENDIX_C):
@@ -92,10 +89,7 @@ def build_experiments(kind: Runs, half: float, quick: bool) -> list[tuple[Condit
 
 
 def _describe_change(experiment: Experiment) -> str:
-    """Describe what changes in the middle of a test: "leak opened", drifting parameters with factors, or "nothing".
-
-    A parameter that drifts is described as "NAME x FACTOR", with the factor on its value.
-    """
+    """Describe what changes in the middle of a test: "leak opened", drifts "NAME x FACTOR", or "nothing"."""
     if experiment.leaks:
         return "leak opened"
     end = np.array(experiment.duration)
@@ -106,9 +100,8 @@ def _describe_change(experiment: Experiment) -> str:
 def part_detail_rms(recording: Recording, parts: Sequence[tuple[float, float]]) -> RmsPairs:
     """Compute the RMS of the wavelet details of both chamber pressures in each part (from, to) [s] of a recording.
 
-    Returns, by chamber and detail, a tuple with one RMS for each part: of d1..d4 [psi], and of the product d3d4
-    [psi^2]. Each part is shortened at both ends by the reach of the wavelet's filters, so that no detail depends on
-    samples outside of it.
+    Returns, by chamber and detail, the RMS of each part: of d1..d4 [psi], and of the product d3d4 [psi^2]. Each part is
+    shortened by the reach of the wavelet's filters, so that no detail depends on samples outside of it.
     """
     before, after = reach("db8", 4)[-1]  # numbers of earlier and later samples on which d4 depends
     bounds = np.round(np.array(parts) * recording.rate).astype(int) + np.array([before, -after])
@@ -143,9 +136,8 @@ def make_row(
 ) -> tuple[Cell, ...]:
     """Build the row of a test in a table with the columns `COLUMNS`.
 
-    `condition`: inputs of the test; `change`: description of what changes in the middle of the test; `mean_leak_lpm`:
-    mean leak [L/min]; `ranges_MPa`: range of p_A and of p_B in the first half, before the leak opens [MPa]; `rms`: RMS
-    of each wavelet detail in the first and in the second half, by chamber and detail.
+    `change`: text of what changes in the middle of the test; `ranges_MPa`: range of p_A and of p_B before [MPa]; `rms`:
+    RMS of each wavelet detail in the first and in the second half, by chamber and detail.
     """
     values = (rms[chamber][name][k] for chamber, name, k, _ in _RMS_COLUMNS)
     return (condition.number, condition.command, condition.closed_pct, change, mean_leak_lpm, *ranges_MPa, *values)
@@ -158,10 +150,7 @@ def column(table: ThesisTable, head: str) -> Array:
 
 
 def parse_sheet(table: ThesisTable) -> DataSheet:
-    """Build the data sheet from a table with the columns `COLUMNS`: the RMS of the wavelet details of simulated tests.
-
-    The table has one row for each test, and both halves of a test in separate columns.
-    """
+    """Build the data sheet from a table of simulated tests, one a row, with the columns `COLUMNS`."""
     # (chambers, details, halves, tests)
     values = np.array([column(table, head) for *_, head in _RMS_COLUMNS]).reshape(len(CHAMBERS), len(QUANTITIES), 2, -1)
     return DataSheet({c: {q: values[k, j].T for j, q in enumerate(QUANTITIES)} for k, c in enumerate(CHAMBERS)})
@@ -170,9 +159,8 @@ def parse_sheet(table: ThesisTable) -> DataSheet:
 def runs_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Simulate the 41 tests of Appendix C, and tabulate the RMS of their wavelet details in both halves.
 
-    `item.inputs` states what changes in the middle of a test: the leak opens, nothing, or parameters of the rig step
-    (drift). With the leak, the first test of each operating condition is repeated with half the solver's step, except
-    in a quick reproduction.
+    `item.inputs` states the kind of the runs. With the leak, the first test of each operating condition is repeated
+    with half the solver's step, except in a quick reproduction.
     """
     half, kind = QUICK_HALF if context.quick else HALF, item.inputs["runs"]
     rows = []
@@ -199,11 +187,6 @@ def runs_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
 
 
 def simulated_sheet(context: Context, runs: Runs) -> tuple[ThesisTable, DataSheet]:
-    """Return the simulated tests of Appendix C as a table and as a data sheet.
-
-    The tests are read from the item `appendix-c-RUNS`, which must be among the `needs` of the context. `runs`: kind of
-    the tests by what changes in the middle of each: "leak" (a leak begins), "drift" (parameters of the rig step), or
-    "no-leak" (nothing changes).
-    """
+    """Return the simulated tests of Appendix C of a kind (`Runs`), needed by the item, as table and data sheet."""
     table = first_table(context, f"appendix-c-{runs}")
     return table, parse_sheet(table)

@@ -41,8 +41,7 @@ class WaveletFunctions(NamedTuple):
 class WaveletCentre(NamedTuple):
     """Centre of a wavelet in time and in frequency.
 
-    `time`: centre of its energy, in samples at scale 1; `frequency`: frequency at which its spectrum is largest
-    [cycles per sample].
+    `time`: centre of its energy [samples at scale 1]; `frequency` of its largest response [cycles per sample].
     """
 
     time: float
@@ -77,9 +76,8 @@ def wavelet_spectrum(omega: Array) -> np.ndarray:
     """Compute the Fourier transform Psi of the mother wavelet db8 at `omega` [rad per sample at scale 1].
 
     Psi(w) = G(w/2)/sqrt(2) prod_(j>=2) H(w/2^j)/sqrt(2). H and G are the frequency responses sum_k taps_k exp(-i w k)
-    of the low-pass and of the high-pass synthesis filter. The wavelet has unit l2 norm.
-
-    Source: Daubechies, Ten Lectures on Wavelets (1992), eqs. (5.1.17), (6.2.2).
+    of the low-pass and of the high-pass synthesis filter. The wavelet has unit l2 norm. Source: Daubechies, Ten
+    Lectures on Wavelets (1992), eqs. (5.1.17), (6.2.2).
     """
 
     def response(taps: list[float], omega: Array) -> np.ndarray:
@@ -94,10 +92,7 @@ def wavelet_spectrum(omega: Array) -> np.ndarray:
 
 
 def wavelet_centre() -> WaveletCentre:
-    """Compute the centre of the mother wavelet db8 in time and in frequency.
-
-    The centre in time is weighted by |psi|^2; the centre in frequency is the peak of |Psi|.
-    """
+    """Compute the centre of db8 in time, weighted by |psi|^2, and in frequency, the peak of its spectrum |Psi|."""
     _, psi, t = mother_wavelet()
     omega = np.linspace(0.1, 12.0, 12000)  # [rad per sample], around the peak
     peak = omega[np.abs(wavelet_spectrum(omega)).argmax()]
@@ -105,20 +100,16 @@ def wavelet_centre() -> WaveletCentre:
 
 
 def scales_for(frequencies: Array) -> Array:
-    """Compute the scales a = f_c/f [s] at which the wavelet db8 responds most to the `frequencies` f [Hz].
-
-    f_c is the frequency at which the wavelet's spectrum is largest at scale 1.
-    """
+    """Compute the scales f_c/f [s] for `frequencies` f [Hz], with f_c the centre frequency of db8 at scale 1."""
     return np.asarray(wavelet_centre().frequency / np.asarray(frequencies, dtype=np.float64))
 
 
 def continuous_transform(x: Array, rate: float, scales: Array) -> Array:
     """Compute the continuous wavelet transform of samples `x` (n,) at `rate` [Hz] for `scales` a [s].
 
-    CWT(a, b) = integral of x(t) |a|^(-1/2) psi((t - b)/a) dt, eqs. (3.4), (3.6). The mean of x is subtracted, the
-    record is mirrored at its ends, and the integral is computed by Fourier transforms. The time b is the
-    wavelet's middle (the centre of its energy). Returns (scales, n), a column for b at each sample [unit of x times
-    s^0.5].
+    CWT(a, b) = integral of x(t) |a|^(-1/2) psi((t - b)/a) dt, eqs. (3.4), (3.6). The mean of x is subtracted, and the
+    record is mirrored at its ends. The time b is the centre of the wavelet's energy. Returns (scales, n), a column for
+    b at each sample [unit of x times s^0.5].
     """
     # db8 is 15 samples long at scale 1; 16 leaves a margin
     wavelet_reach = int(np.ceil(16.0 * float(np.max(scales)) * rate))
@@ -143,9 +134,8 @@ def inverse_gain(frequencies: Array, weight: float = 2.0) -> Array:
 
     gain(w) = integral over a > 0 of a^(1 - weight) |Psi(a w)|^2 da,
 
-    where Psi is the spectrum of the wavelet db8 and w = 2 pi f; the integral is over six decades of scales around the
-    frequencies. With weight 2 the gain is the same at all frequencies (the wavelet's admissibility constant), and
-    the signal is recovered by a division by this constant. Eq. (3.5) is printed with weight 0, for which the gain falls
+    with Psi the spectrum of db8 and w = 2 pi f, over six decades of scales around the frequencies. With weight 2 the
+    gain is the same at all frequencies (the wavelet's admissibility constant). With weight 0, as in eq. (3.5), it falls
     as 1/w^2.
     """
     omega = 2.0 * np.pi * np.asarray(frequencies, dtype=np.float64)
@@ -162,10 +152,7 @@ def two_tone_signal(t: Array) -> Array:
 
 
 def amplitude_spectrum(x: Array, rate: float) -> AmplitudeSpectrum:
-    """Compute the amplitudes and phases of the cosines whose sum is the signal `x` (n,), sampled at `rate` [Hz].
-
-    Amplitudes and phases follow from the discrete Fourier transform of eq. (3.2).
-    """
+    """Compute the cosines whose sum is the signal `x` (n,), sampled at `rate` [Hz], by eq. (3.2)."""
     spectrum = np.asarray(np.fft.rfft(x), dtype=np.complex128) * (2.0 / x.size)
     # 2: half of a cosine's amplitude is at its negative frequency; mean and Nyquist frequency have no such half
     spectrum[0] /= 2.0
@@ -238,10 +225,9 @@ def wavelet_figure(context: Context, item: Item) -> tuple[Figure, ...]:
 
 
 def vanishing_moments(psi: Array, t: Array) -> int:
-    """Count the vanishing moments of a wavelet `psi` (n,) over the time `t` (n,).
+    """Count the vanishing moments of a wavelet `psi` (n,) over the time `t` (n,), at most 20.
 
-    The moments are the integrals of t^k psi(t), k = 0, 1, ... They are counted up to the first moment that differs from
-    0 by more than rounding, at most 20.
+    These are the integrals of t^k psi(t), k = 0, 1, ..., before the first that differs from 0 by more than rounding.
     """
     k = 0
     centred = t - t.mean()  # smaller powers, the same number of vanishing moments
@@ -289,7 +275,7 @@ def transform_figure(context: Context, item: Item) -> tuple[Figure, ...]:
 def _width(t: Array, values: Array) -> float:
     """Compute the width [s] of the largest peak of a series `values` over `t` [s].
 
-    The width is the standard deviation of the times within 0.1 s of the maximum, weighted by `values` squared.
+    This is the standard deviation of the times within 0.1 s of the maximum, weighted by `values` squared.
     """
     near_peak = np.abs(t - t[values.argmax()]) < 0.1
     weight = values[near_peak] ** 2 / np.sum(values[near_peak] ** 2)
@@ -298,10 +284,7 @@ def _width(t: Array, values: Array) -> float:
 
 
 def scalogram_figure(context: Context, item: Item) -> tuple[Figure, ...]:
-    """Draw the wavelet transform of a simulated, ringing chamber pressure p_A without and with a leak.
-
-    The transform follows eqs. (3.4)-(3.6), and is drawn for p_A as recorded and for p_A without the instruments' noise.
-    """
+    """Draw the wavelet transform of a simulated, ringing p_A without and with a leak, with and without noise."""
     run = context.run(Experiment.of(command=_COMMAND, duration=20.0, leak=f"{_LEAK} from {_ONSET:g} s"))
     t = run.recorded.t
     rate = 1.0 / float(t[1] - t[0])
@@ -334,8 +317,7 @@ def scalogram_figure(context: Context, item: Item) -> tuple[Figure, ...]:
 def _running_rms(t: Array, rows: Array, size: int) -> tuple[Array, Array]:
     """Compute the rms of each row of `rows` (rows, n) in successive blocks of `size` samples.
 
-    `t` (n,): times of the samples [s]. Returns the mean time of each block [s], and the rms (rows, blocks). Samples
-    after the last whole block are left out.
+    `t` (n,): times of the samples [s]. Returns the mean time of each whole block [s], and the rms (rows, blocks).
     """
     n_used = t.size // size * size
     block_rms = np.sqrt(np.mean(rows[:, :n_used].reshape(rows.shape[0], -1, size) ** 2, axis=2))
@@ -343,18 +325,12 @@ def _running_rms(t: Array, rows: Array, size: int) -> tuple[Array, Array]:
 
 
 def judge_claims(context: Context, item: Item) -> tuple[Claim, ...]:
-    """Judge claims 3.1 to 3.6 on transforms, on the wavelet db8, and on the effect of a leak on the pressures.
-
-    `item` is not used.
-    """
+    """Judge claims 3.1 to 3.6 on transforms, the wavelet db8, and leaks in the pressures; `item` is not used."""
     return (*_fourier_claims(), *_wavelet_claims(), _leak_claim(context))
 
 
 def _fourier_claims() -> Iterator[Claim]:
-    """Judge claims 3.1 and 3.2 on the spectrum of the signal of eq. (3.3).
-
-    3.1: the spectrum has the amplitudes of the two tones and is 0 elsewhere. 3.2: both tones are cosines, of phase 0.
-    """
+    """Judge claims 3.1 and 3.2: the signal of eq. (3.3) has the spectrum of two cosines of phase 0, else zero."""
     t = np.arange(round(RATE)) / RATE
     frequency, amplitude, phase = amplitude_spectrum(two_tone_signal(t), RATE)
     tones = [nearest_index(frequency, tone) for tone, _ in TONES]
@@ -369,8 +345,8 @@ def _fourier_claims() -> Iterator[Claim]:
 def _wavelet_claims() -> Iterator[Claim]:
     """Judge claims 3.3 to 3.5 on the wavelet db8.
 
-    3.3: the wavelet has the mean 0. 3.4: it has the energy 1, also when scaled by eq. (3.6). 3.5: the transform and its
-    inverse as printed in eq. (3.5) have the same gain at 30 and at 100 Hz, within 1 %.
+    3.3: its mean is 0. 3.4: its energy is 1, also when scaled by eq. (3.6). 3.5: the transform and its inverse as
+    printed in eq. (3.5) have the same gain at 30 and at 100 Hz, within 1 %.
     """
     _, psi, t = mother_wavelet()
     step = float(t[1] - t[0])
@@ -391,10 +367,7 @@ def _wavelet_claims() -> Iterator[Claim]:
 
 
 def _leak_claim(context: Context) -> Claim:
-    """Judge claim 3.6: a leak lowers mean, peak and range of both chamber pressures by more than the noise.
-
-    The limit is the standard deviation of a pressure transducer's noise (`visible_pressure`).
-    """
+    """Judge claim 3.6: a leak lowers mean, peak and range of both pressures by more than a transducer's noise."""
     experiments = (Experiment.of(command=_COMMAND, duration=40.0, leak=leak) for leak in (None, _LEAK))
     healthy, leaking = (context.run(experiment, prove=False) for experiment in experiments)
     is_settled = healthy.t > 10.0  # [s]

@@ -36,10 +36,9 @@ NOMINAL_LPM: dict[str, float] = {"large": 0.0150, "medium": 0.0100, "small": 0.0
 class PrintedTest:
     """One of the ten leakage tests whose figures chapter 5 prints.
 
-    `section` of the thesis, such as "5.2a"; `command`: text of the command; `level` of the leak, such as "large";
-    `first_figure`: n in the number 5.n of its first figure; `n_input_figures`: number of its figures that show command,
-    speed and displacement, 0 to 2 (2: whole test and close-up); `half`: time [s] at which the leak opened, half the
-    duration.
+    `section` of the thesis, such as "5.2a"; `level` of the leak, such as "large"; `first_figure`: n in the number 5.n
+    of its first figure; `n_input_figures`: number of its figures that show command, speed and displacement, 0 to 2 (2:
+    whole test and close-up); `half`: time [s] at which the leak opened, half the duration.
     """
 
     section: str
@@ -56,15 +55,12 @@ class PrintedTest:
 
     @property
     def candidates(self) -> tuple[Condition, ...]:
-        """The tests of Appendix C that can be this test, because they have its command and leak level."""
+        """The tests of Appendix C that have the command and leak level of this test."""
         return tuple(row for row in APPENDIX_C if (row.command, row.level) == (self.command, self.level))
 
     @property
     def condition(self) -> Condition:
-        """The test of Appendix C that this test of chapter 5 probably is; the thesis does not say.
-
-        It is the one of the `candidates` whose mean leak is nearest to the nominal leak of the level (section 5.1).
-        """
+        """The test of Appendix C that this test probably is: the candidate with the leak nearest to nominal."""
         return min(self.candidates, key=lambda row: abs(row.mean_leak_lpm - NOMINAL_LPM[self.level]))
 
     @property
@@ -73,15 +69,11 @@ class PrintedTest:
         return float(self.command.split("(")[1].rstrip(")").removesuffix("t").strip() or 1.0)  # 1.0 for "sin(t)"
 
 
-#: The ten tests by section.
 TESTS: dict[str, PrintedTest] = {row[0]: PrintedTest(*row) for row in load_texts("cases.toml")["shown"]}
 
 
 def make_test_experiment(test: PrintedTest) -> Experiment:
-    """Build the experiment of one of the ten tests of chapter 5, with the leak open in the second half.
-
-    The rig is the one that was fitted to Appendix C.
-    """
+    """Build the experiment of one of the ten tests of chapter 5, with the leak open in the second half."""
     return leak_test(test.condition, test.half, seed=test.condition.number)
 
 
@@ -116,20 +108,16 @@ class FigureView:
         return Panel("t [s]", label, curves, marks=((self.test.half, "leak opens"),), x_range=self.span)
 
     def _curve(self, y: Array, label: str, role: Role, t: Array | None = None, start: float = 0.0) -> FigureCurve:
-        """Build the curve of `y` over `t` [s] within the figure's interval, from `start` [s] on.
+        """Build the curve of `y` over `t` [s], by default the recording's times, within the figure's interval.
 
-        If `t` is None, `y` is over the times of the recording. `label`: text of the curve in the legend; `role`: its
-        meaning, which determines the line style.
+        `role`: meaning of the curve, which determines the line style; `start` [s]: the curve begins there or later.
         """
         t = self.recording.t if t is None else t
         is_drawn = (t >= max(start, self.span[0])) & (t <= self.span[1])
         return FigureCurve(t[is_drawn], y[is_drawn], label, role)
 
     def _curve_pair(self, y: Array, t: Array | None = None) -> list[FigureCurve]:
-        """Build two curves of `y` over `t` [s] within the figure's interval, one before and one after the leak opens.
-
-        If `t` is None, `y` is over the times of the recording.
-        """
+        """Build the curves of `y` over `t` [s], by default the recording's times, before and after the leak opens."""
         half = self.test.half
         start, stop = self.span
         # the curve before the leak is drawn as in a figure that ends where the leak opens
@@ -137,18 +125,14 @@ class FigureView:
         return [before, self._curve(y, "leak", "leak", t, start=half)]
 
     def _part_masks(self) -> tuple[tuple[Mask, str], ...]:
-        """Return (mask, label) of the part without the leak, after the start-up, and of the part with the leak.
-
-        The masks (n,) are over the samples of the recording.
-        """
+        """Return (mask, label) of the samples without the leak, after the start-up, and of those with the leak."""
         t, half = self.recording.t, self.test.half
         return ((t >= SETTLING) & (t < half), _PART_LABELS[0]), (t >= half, _PART_LABELS[1])
 
     def draw_inputs(self) -> PanelsAndNumbers:
         """Draw command, motor speed and displacement of the test as three panels.
 
-        Returns the panels and the numbers: the RMS of the speed [rpm] and the drift (linear trend) [mm/s] of the
-        displacement, each without and with the leak.
+        The numbers are the RMS of the speed and the linear trend of the displacement, without and with the leak.
         """
         recording = self.recording
         rpm, x = recording["omega"] / _RPM, recording["x"] * 1e3
@@ -167,8 +151,8 @@ class FigureView:
     def draw_leak(self) -> PanelsAndNumbers:
         """Draw the leak flow and both chamber pressures of the test as three panels.
 
-        Returns the panels and the numbers: the mean leak, simulated and measured by the thesis, and the 5 to 95 % range
-        of each pressure without and with the leak.
+        Numbers: mean leak, simulated and in the thesis, and the 5 to 95 % range of each pressure before and after it
+        opens.
         """
         recording = self.recording
         flow = self._curve(recording["q_leak"] / LITRE_PER_MINUTE, "flow meter, A to B positive", "leak")
@@ -186,10 +170,7 @@ class FigureView:
         return panels, numbers
 
     def draw_details(self) -> PanelsAndNumbers:
-        """Draw the wavelet details d1 to d4 and d3d4 of one chamber's pressure as five panels.
-
-        Returns the panels and the numbers: the RMS of each detail without and with the leak, and the change of the RMS.
-        """
+        """Draw the wavelet details d1 to d4 and d3d4 of the pressure as five panels; the numbers are their RMS."""
         series = zip(QUANTITIES, details(self.recording[self.chamber] / PSI).quantities(), strict=True)
         panels = [self._panel(f"{name} [{UNITS[name]}]", *self._curve_pair(values)) for name, values in series]
         return panels, self._rms_changes(QUANTITIES)
@@ -197,8 +178,7 @@ class FigureView:
     def draw_windowed_rms(self) -> PanelsAndNumbers:
         """Draw the windowed RMS of the wavelet details d3, d4 and d3d4 of one chamber's pressure as three panels.
 
-        Horizontal lines mark the RMS over the part of the test without the leak, after the start-up, and over the part
-        with the leak. Returns the panels and the numbers: these two RMS of each detail, and the change of the RMS.
+        Horizontal lines, and the numbers, state the RMS over the parts without and with the leak.
         """
         t, curves = windowed_detail_rms(self.recording, self.chamber)
         rms = part_detail_rms(self.recording, self.test.parts)[self.chamber]
@@ -209,10 +189,7 @@ class FigureView:
         return panels, self._rms_changes(_WINDOWED)
 
     def _rms_changes(self, names: tuple[str, ...]) -> list[Number]:
-        """Compute the RMS of the wavelet details `names` without and with the leak, and the change [%] of each.
-
-        The details are those of the pressure in the figure's chamber. Each RMS is over one part of the test.
-        """
+        """Compute the RMS of the wavelet details `names` without and with the leak, and the change [%] of each."""
         numbers = []
         for name, (before, after) in part_detail_rms(self.recording, self.test.parts)[self.chamber].items():
             if name in names:
@@ -232,11 +209,7 @@ _VIEWS: dict[str, tuple[str, Callable[[FigureView], PanelsAndNumbers]]] = {
 
 
 def iter_views() -> Iterator[tuple[str, str, dict[str, object]]]:
-    """Yield (id, title, inputs) of Figs. 5.1 to 5.89, which show each test in several views.
-
-    The views (`_VIEWS`) are drawn over the whole test or as a close-up of 20 s around the opening of the leak. `inputs`
-    are those of `leak_test_figure`.
-    """
+    """Yield (id, title, inputs) of Figs. 5.1 to 5.89: views of each test as a whole, or close to the opening."""
     for test in TESTS.values():
         input_views = [("input", "", False), ("input", "", True)]  # (view, chamber, is_closeup)
         test_views = [*input_views[: test.n_input_figures], ("leak", "", False), ("leak", "", True)]
@@ -253,10 +226,7 @@ def iter_views() -> Iterator[tuple[str, str, dict[str, object]]]:
 
 
 def leak_test_figure(context: Context, item: Item) -> tuple[Figure, ...]:
-    """Draw one of Figs. 5.1 to 5.89: one view of one test over an interval of time.
-
-    `item.inputs` has the test, the view, such as "details", the chamber and the interval [s].
-    """
+    """Draw one of Figs. 5.1 to 5.89: the view, test, chamber and interval that `item.inputs` names."""
     test = TESTS[item.inputs["test"]]
     span = (item.inputs["from_s"], item.inputs["to_s"])
     view = FigureView(context.run(make_test_experiment(test)), test, span, item.inputs["chamber"])
@@ -268,8 +238,8 @@ def leak_test_figure(context: Context, item: Item) -> tuple[Figure, ...]:
 def windowed_detail_rms(recording: Recording, chamber: str) -> tuple[Array, dict[str, Array]]:
     """Compute the RMS of a chamber pressure's wavelet details in windows of 1000 samples that begin every 500 samples.
 
-    Windows near the record's ends are left out if they have samples whose details depend on padding. Returns the
-    centres of the windows [s], and the RMS of d1..d4 [psi] and d3d4 [psi^2] by the detail's name.
+    Windows near the record's ends, whose details depend on padding, are left out. Returns the centres of the windows
+    [s], and the RMS of d1..d4 [psi] and d3d4 [psi^2] by the detail's name.
     """
     transformed = details(recording[chamber] / PSI)
     inside = transformed.inside()
@@ -300,8 +270,7 @@ class LeakTestMeasures:
 def fit_step_time(t: Array, y: Array, min_points: int = 5) -> float:
     """Estimate the time [s] at which a series `y` (n,) over `t` (n,) [s] changes its mean, by least squares.
 
-    The mean is taken as constant before and after this time. The estimate is halfway between two points, with at least
-    `min_points` points on each side.
+    It is halfway between two points, with at least `min_points` points on each side.
     """
     n = y.size
     n_before = np.arange(min_points, n - min_points + 1)
@@ -314,10 +283,7 @@ def fit_step_time(t: Array, y: Array, min_points: int = 5) -> float:
 
 
 def measure_test(context: Context, test: PrintedTest, *, leak: bool = True) -> LeakTestMeasures:
-    """Simulate one of the ten tests of chapter 5, and compute measures of its parts without and with the leak.
-
-    `leak`: False to simulate the same test without its leak.
-    """
+    """Simulate one of the ten tests of chapter 5, with or without its `leak`, and compute measures of both parts."""
     experiment = make_test_experiment(test)
     run = context.run(experiment) if leak else context.run(replace(experiment, leaks=()), prove=False)
     recording = run.recorded

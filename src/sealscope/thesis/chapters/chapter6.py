@@ -73,10 +73,7 @@ DUTY = f"position {1e3 * AMPLITUDE} mm sin({OMEGA!r}t)"
 
 
 def conductance(lpm: float, rig: Rig) -> float:
-    """Compute the leakage conductance [m^3/(s Pa)] of a leak that passes `lpm` [L/min] under a load of 2 kN (`LOAD`).
-
-    The formula is flow / (LOAD / A_A): the load on the piston area A_A gives the pressure difference.
-    """
+    """Compute the conductance [m^3/(s Pa)] of a leak of `lpm` [L/min] under 2 kN: flow / (LOAD / piston area A_A)."""
     return lpm * LITRE_PER_MINUTE / (LOAD / rig.cylinder.A_A)
 
 
@@ -92,11 +89,7 @@ def _amplitude_at(run: Trajectory, mask: NDArray[np.bool_], f: float) -> float:
 
 
 def supply_flow(run: Trajectory) -> Array:
-    """Compute the flow [m^3/s] from the supply into a servo valve without overlap, over time.
-
-    If the spool connects the supply with chamber A (spool position x_s > 0), this is the flow Q_A into A, else the flow
-    -Q_B into chamber B.
-    """
+    """Compute the flow [m^3/s] from a valve's supply: Q_A into chamber A for a spool position x_s > 0, else -Q_B."""
     return np.asarray(np.where(run["x_s"] > 0.0, run["Q_A"], -run["Q_B"]))
 
 
@@ -105,8 +98,8 @@ class ControlledRig:
     """A rig whose piston a controller positions, with a leak that passes `lpm` [L/min] under a load of 2 kN (`LOAD`).
 
     The rig's friction and bulk modulus differ from those that the controller assumes (`PLANT_MISMATCH`). `controller`:
-    name of the controller, "" for none (open loop), "ideal" for a fault-tolerant one that knows the leak; `rig`: name
-    of the rig; `values`: parameters that override the rig's, as pairs (name, value in SI units).
+    its name, "" for none (open loop), "ideal" for a fault-tolerant one that knows the leak; `values`: parameters that
+    override the rig's, as pairs (name, value in SI units).
     """
 
     controller: str
@@ -117,8 +110,7 @@ class ControlledRig:
     def run(self, command: str, duration: float, load: str = "0 N") -> Trajectory:
         """Simulate the controlled rig for `duration` [s] under the load `LOAD` (2 kN) plus `load`.
 
-        `command`: text of a position target or, in an open loop, of a voltage command; `load`: text of a force against
-        positive x.
+        `command`: text of a position target or, in an open loop, a voltage; `load`: text of a force against +x.
         """
         rig = _rig(self.rig)
         leak_conductance = conductance(self.lpm, rig)
@@ -138,18 +130,14 @@ class ControlledRig:
         return integrate_run(experiment, experiment.leaks)
 
     def run_duty(self, load: str = "0 N") -> tuple[Trajectory, Array]:
-        """Simulate five cycles of the position sine `DUTY`; return the run, and a mask of its last two cycles.
-
-        `load`: text of a load in addition to `LOAD`. The mask is over the outputs of the run.
-        """
+        """Simulate five cycles of `DUTY` under `LOAD` plus `load`; return the run and a mask of its last two cycles."""
         run = self.run(DUTY, 5.0 * CYCLE, load)
         return run, np.asarray((run.t >= 3.0 * CYCLE) & (run.t < 5.0 * CYCLE))
 
     def stiffness(self) -> float:
         """Compute the dynamic stiffness |F/x| [N/mm] of the controlled piston at `STIFFNESS_FREQUENCY`.
 
-        The target is constant while the load varies as a sine of 0.5 Hz and amplitude `STIFFNESS_FORCE`. The result is
-        this amplitude over that of the piston's motion at the same frequency.
+        The target is constant while the load varies as a sine of 0.5 Hz and amplitude `STIFFNESS_FORCE`.
         """
         force = f"{STIFFNESS_FORCE} N sin({2 * math.pi * STIFFNESS_FREQUENCY!r}t)"
         run = self.run("position 0 mm sin(t)", duration=16.0, load=force)  # amplitude 0: a constant target
@@ -159,9 +147,8 @@ class ControlledRig:
     def bandwidth(self) -> float:
         """Compute the frequency [Hz] at which the tracking error of small sines first exceeds -3 dB of the target.
 
-        The error is |x/target - 1| of complex amplitudes, and its limit 0.71. The target is a sum of sines of the
-        frequencies `BANDWIDTH_FREQUENCIES`, between which the result is interpolated. Returns the lowest frequency if
-        the error exceeds the limit there already, and inf if the error exceeds the limit at none of them.
+        The error is |x/target - 1| of complex amplitudes at `BANDWIDTH_FREQUENCIES`, between which the result is
+        interpolated. Returns the lowest frequency if the error is larger there already, and inf if it never is.
         """
         frequencies = BANDWIDTH_FREQUENCIES
         terms = [f"{1e3 * BANDWIDTH_SPEED / (2 * math.pi * f):.6f} mm sin({2 * math.pi * f!r}t)" for f in frequencies]
@@ -184,9 +171,8 @@ class ControlledRig:
     def efficiencies(self) -> tuple[float, float]:
         """Compute the electrical and the hydraulic efficiency of a sine motion against a damper as the only load.
 
-        The efficiencies are the work in the damper over the electrical energy of the motor, and over the hydraulic
-        energy. The hydraulic energy is delivered by the pump at its ports or, in a valve-controlled rig, by a lossless
-        supply at the supply's pressure.
+        These are the work in the damper over the electrical energy of the motor, and over the hydraulic energy,
+        delivered by the pump at its ports or, in a valve-controlled rig, by a lossless supply at the supply's pressure.
         """
         run, mask = replace(self, values=(("F_l", 0.0), ("d_load", DAMPER))).run_duty()
         flow = supply_flow(run) if _rig(self.rig).circuit.valve_controlled else run["Q_1"]
@@ -209,11 +195,7 @@ class Tracking(NamedTuple):
 
 
 def tracking(run: Trajectory, mask: Array) -> Tracking:
-    """Compute the tracking error, energy and compensated leakage of a run that follows the position sine `DUTY`.
-
-    `mask`: samples of whole cycles of the sine, which are evaluated. The compensated flow is 0 if the controller
-    reports none.
-    """
+    """Compute the `Tracking` of a run that follows the position sine `DUTY`; `mask`: samples of whole cycles."""
     error = AMPLITUDE * np.sin(OMEGA * run.t[mask]) - run["x"][mask]
     flow = 0.0 if run.compensated is None else float(np.mean(run.compensated[mask])) / LITRE_PER_MINUTE
     energy = float(np.mean(run["V"][mask] * run["i"][mask])) * CYCLE
@@ -221,11 +203,7 @@ def tracking(run: Trajectory, mask: Array) -> Tracking:
 
 
 def controllers_table(context: Context, item: Item) -> tuple[ThesisTable | Figure, ...]:
-    """Tabulate tracking error, bandwidth, energy, stiffness and compensated flow, by controller and leak.
-
-    The compensated flow is the leakage that a controller estimates and makes up for. Error and stiffness are also drawn
-    as a figure.
-    """
+    """Tabulate, and partly draw, tracking, bandwidth, energy, stiffness and leakage, by controller and leak."""
     rows: list[tuple[Cell, ...]] = []
     for name, lpm in itertools.product(CONTROLLERS, _leak_flows(context)):
         loop = ControlledRig(name, lpm)
@@ -246,17 +224,13 @@ def _figure_over_leak(
 ) -> Figure:
     """Draw some columns of a table over the leak, one panel each.
 
-    `roles`: line style of each curve, by the first cells of the curve's rows; the next cell of these rows is the leak
-    [L/min]. `columns`: heads of the columns to draw. A leak of 0 is drawn at 0.001 L/min.
+    `roles`: line style of each curve, by the first cells of its rows; `columns`: heads of the columns to draw.
     """
     panels = []
     for head in columns:
         curves = []
         for names, role in roles.items():
-            leak_column = len(names)
-            rows = [row for row in table.rows if row[:leak_column] == names]
-            y_column = table.columns.index(head)
-            leak, y = (np.array([float(row[k] or 0.0) for row in rows]) for k in (leak_column, y_column))
+            leak, y = map(np.array, zip(*_column_by_leak(table, names, head).items(), strict=True))
             leak = np.maximum(leak, 0.001)  # a logarithmic axis has no 0
             curves.append(FigureCurve(leak, y, ", ".join(names), role))
         panels.append(Panel("leak [L/min], none drawn at 0.001", head, tuple(curves), log_x=True, log_y=log_y))
@@ -266,9 +240,8 @@ def _figure_over_leak(
 def open_loop_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Tabulate the drift of the piston's mean position over the leak, in an open loop and with two controllers.
 
-    In the open loop a sine of the voltage moves the piston; the controllers are "pi" and "fault-tolerant". The columns
-    are leak, amplitude of the motion in the open loop, its drift, this drift minus the drift without a leak, and the
-    drift with each controller.
+    In the open loop, in which a sine of the voltage moves the piston, the columns are the amplitude of the motion, its
+    drift, and this drift minus that without a leak.
     """
     rows: list[tuple[Cell, ...]] = []
     healthy_drift = 0.0
@@ -302,10 +275,7 @@ def load_head(controller: str, lpm: float, quantity: str) -> str:
 
 
 def load_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
-    """Tabulate tracking error and energy over the load, for three controllers without and with a leak.
-
-    The piston follows a sine of the position (`DUTY`).
-    """
+    """Tabulate tracking error and energy over the load, for three controllers without and with a leak."""
     loops = [ControlledRig(name, lpm) for name in LOAD_CONTROLLERS for lpm in (0.0, 0.05)]
     heads = ["load [N]"]
     for loop in loops:
@@ -321,9 +291,8 @@ def load_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
 def external_leak_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Tabulate tracking and stiffness of each controller with a leak past the rod seal of either side.
 
-    The last column shows the loss of oil from the circuit: the change [kPa] of the mean of min(p_A, p_B) over a cycle,
-    from the third to the fifth cycle. The flow of a leak is stated for the mean pressure of the leaking side in a run
-    without leaks.
+    The last column is the change [kPa] of the mean of min(p_A, p_B) over a cycle, from the third to the fifth cycle,
+    due to the loss of oil. The flow of a leak is stated for the mean pressure of the leaking side without leaks.
     """
     healthy, mask = ControlledRig("pi", 0.0).run_duty()
     pressure = {side: float(np.mean(healthy[f"p_{side}"][mask])) for side in ("A", "B")}
@@ -342,11 +311,7 @@ def external_leak_table(context: Context, item: Item) -> tuple[ThesisTable, ...]
 
 
 def valve_table(context: Context, item: Item) -> tuple[ThesisTable | Figure, ...]:
-    """Compare the pump-controlled with the valve-controlled rig in a table over controllers and leaks.
-
-    The columns are tracking error, bandwidth, stiffness, electrical and hydraulic energy in a cycle, and efficiencies.
-    Energy and stiffness are also drawn as a figure.
-    """
+    """Compare the pump-controlled with the valve-controlled rig in a table over controllers and leaks, and a figure."""
     rigs = {"pump": RIG, "valve": VALVE_RIG}
     rows: list[tuple[Cell, ...]] = []
     for (source, rig), name, lpm in itertools.product(rigs.items(), VALVE_CONTROLLERS, _leak_flows(context)):
@@ -363,10 +328,9 @@ def valve_table(context: Context, item: Item) -> tuple[ThesisTable | Figure, ...
 
 
 def _column_by_leak(table: ThesisTable, names: tuple[str, ...], head: str) -> dict[float, float]:
-    """Return the values in the column `head` of a table by the leak [L/min].
+    """Return the values in the column `head` of a table by the leak [L/min]; empty cells are read as 0.
 
     Only rows whose first cells are `names`, such as a controller's name, are read; the leak is in the next column.
-    Empty cells are read as 0.
     """
     leak_column, value_column = len(names), table.columns.index(head)
     rows = [row for row in table.rows if row[:leak_column] == names]
@@ -379,10 +343,7 @@ def judge_claims(context: Context, item: Item) -> tuple[Claim, ...]:
 
 
 def _disturbance_claim(context: Context) -> Claim:
-    """Judge claim 6.2.1: if the position is fed back, a leak causes no drift.
-
-    The drift with the PI controller must be below 0.1 mm/min (`NEGLIGIBLE_DRIFT`) for each leak.
-    """
+    """Judge claim 6.2.1: with position feedback (PI), the drift due to a leak is below 0.1 mm/min for each leak."""
     table = first_table(context, "sec-6.2-open-loop")
     heads = "leak [L/min]", "open: drift by the leak [mm/min]", "pi: drift [mm/min]"
     rows = [row for row in zip(*(column(table, head) for head in heads), strict=True) if row[0] > 0]  # with a leak
@@ -395,8 +356,7 @@ def _tolerance_claim(context: Context) -> Claim:
     """Judge claim 6.2.2: a fault-tolerant controller restores tracking and stiffness with a leak.
 
     With each leak, the tracking error may be at most 10 % larger, and the stiffness at most 10 % smaller, than with the
-    PI controller and no leak. Without a leak the controller must have the tracking error of the PI controller, and
-    compensate no leakage.
+    PI controller and no leak. Without a leak it must track like the PI controller, and compensate no leakage.
     """
     table = first_table(context, "sec-6.2-controllers")
     error, tolerant_error = (_column_by_leak(table, (name,), _ERROR) for name in ("pi", "fault-tolerant"))
@@ -432,10 +392,7 @@ def _load_claim(context: Context) -> Claim:
 
 
 def _valve_claim(context: Context) -> Claim:
-    """Judge claim 6.2.4: pump and valve control differ in efficiency and in tracking error.
-
-    With the PI controller and no leak, both must differ by more than a factor of 1.5 (`DISTINCT_RATIO`).
-    """
+    """Judge claim 6.2.4: pump and valve differ in efficiency and tracking error by more than a factor of 1.5."""
     table = first_table(context, "sec-6.2-valve")
     tests = []
     for head in ("efficiency against a damper [%]", _ERROR):

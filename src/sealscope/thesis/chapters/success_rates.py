@@ -29,10 +29,9 @@ _Row = tuple[Cell, ...]
 class Rule:
     """A rule of Table 5.1, by which the RMS of some wavelet details indicates a leak.
 
-    The rule fires in a test, i.e. indicates a leak, if the RMS of all its details of p_A fall and the RMS of all its
-    details of p_B rise (`DIRECTION`) from the first half of the test to the second, in which the leak is open.
-    `details`: (chamber, detail) pairs; `printed`: success rates [%] that the thesis prints, "" for a rule that the
-    thesis does not claim.
+    The rule fires in a test, i.e. indicates a leak, if the RMS of all its details of p_A fall and of all its details of
+    p_B rise (`DIRECTION`) when the leak opens. `details`: (chamber, detail) pairs; `printed`: success rates [%] that
+    the thesis prints, "" for a rule that the thesis does not claim.
     """
 
     name: str
@@ -46,7 +45,7 @@ class Rule:
 
 
 def _load_rules(name: str) -> tuple[Rule, ...]:
-    """Load the rules by which details indicate a leak from the entry `name` of `cases.toml`."""
+    """Load the rules in the entry `name` of `cases.toml`."""
     return tuple(Rule(*row) for row in load_texts("cases.toml")[name])
 
 
@@ -57,10 +56,7 @@ CLAIMED_CELLS = CLAIMED[:6]
 
 
 def _format_count(fires: Fires | None) -> tuple[Cell, Cell, Cell, Cell]:
-    """Format how often a rule fires as four cells of a table: "k/n", rate [%], and its 95 % interval [%].
-
-    `fires`: mask (tests,), or None if there are no tests, for which the cells are empty.
-    """
+    """Format a rule's firings, a mask (tests,), as the cells k/n, rate [%], 95 % interval [%]; None is empty."""
     if fires is None:
         return None, None, None, None
     k, n = int(fires.sum()), fires.size
@@ -69,16 +65,11 @@ def _format_count(fires: Fires | None) -> tuple[Cell, Cell, Cell, Cell]:
 
 
 def _count_heads(source: str, count: str) -> tuple[str, ...]:
-    """Build the column heads of the four cells in which a table states a count.
-
-    The cells are the count, the rate [%], and both limits of its 95 % interval [%]. `source`: name of the data sheet,
-    with which each head begins; `count`: name of the first column.
-    """
+    """Build the heads of a count, a rate [%] and its 95 % interval on the data sheet `source`."""
     return tuple(f"{source}: {part}" for part in (count, "rate [%]", "95 % low [%]", "95 % high [%]"))
 
 
 _SOURCES = ("sheet", "simulated leak", "simulated, no leak", "simulated, drift only")
-#: Heads of the three tables.
 RATES = (
     *("rule", "printed [%]", *(head for source in _SOURCES for head in _count_heads(source, "fires"))),
     "simulated leak less drift [points]",
@@ -97,9 +88,7 @@ def count_rules(measured: DataSheet | None, leak: DataSheet, no_leak: DataSheet,
     """Count in how many tests each rule of Table 5.1 fires (indicates a leak), as rows with the columns `RATES`.
 
     `measured`: measured sheet, None if not given; `leak`, `no_leak`, `drift`: sheets simulated with leak, without leak,
-    and without leak but with drifting parameters. A row has the count, the rate and its 95 % interval on each sheet,
-    and the rate on `leak` minus the rate on `drift`. Two more rows are for a rule that always fires and a rule that
-    never fires.
+    and without leak but with drifting parameters. Two more rows are for rules that always and that never fire.
     """
     rules: dict[str, tuple[str, Callable[[DataSheet], Fires]]] = {
         **{rule.name: (rule.printed, rule.fires) for rule in (*CLAIMED, *UNCLAIMED)},
@@ -118,9 +107,8 @@ def count_rules(measured: DataSheet | None, leak: DataSheet, no_leak: DataSheet,
 def column_tests(sheet: DataSheet) -> list[_Row]:
     """Test each column of a data sheet, a chamber's wavelet detail, for a change with the leak by a sign test.
 
-    Hypothesis of the two-sided sign test: in each test of the sheet the RMS falls or rises with probability 1/2. Holm's
-    correction covers all ten columns, since Table 5.1 chose among them. Returns rows with the columns `TESTS`, without
-    the source.
+    Hypothesis of the two-sided sign test: the RMS falls or rises with probability 1/2. Holm's correction covers all ten
+    columns, since Table 5.1 chose among them. Returns rows with the columns `TESTS`, without the source.
     """
     rows = []
     for chamber, name in COLUMNS:
@@ -135,10 +123,9 @@ def column_tests(sheet: DataSheet) -> list[_Row]:
 def d1_threshold(sheet: DataSheet, chamber: str, either_side: bool = False) -> float:
     """Compute the change of log RMS that noise alone exceeds in 5 % of the tests (`FALSE_ALARMS`).
 
-    The result is ``1.645 rms(log change of d1)`` over the tests of the sheet if changes of one sign count, and 1.960
-    times this rms if changes of either sign count (`either_side`). d1 is the finest wavelet detail of the pressure
-    `chamber`, "p_A" or "p_B". d1 is noise and does not depend on the leak, so d1 changes between the halves of a test
-    as in a rig without a leak. The other details scatter at least as much.
+    It is 1.645 times the rms log change of d1 over the tests of the sheet if changes of one sign count, and 1.960 times
+    if `either_side`. The finest wavelet detail d1 of the pressure `chamber` is noise and does not depend on the leak.
+    The other details scatter at least as much.
     """
     change = sheet.log_change(chamber, "d1")
     return float((WITHIN_95 if either_side else UPPER_95) * np.sqrt(np.mean(change**2)))
@@ -147,9 +134,8 @@ def d1_threshold(sheet: DataSheet, chamber: str, either_side: bool = False) -> f
 def drift_threshold(drift: DataSheet, chamber: str, detail: str) -> float:
     """Compute the change of log RMS that drifting parameters alone exceed in 5 % of the tests (`FALSE_ALARMS`).
 
-    The result is the 95 % quantile over the tests of `drift`, the sheet simulated with drifting parameters and no leak.
-    Changes count as positive in the direction in which a leak should move the RMS: down for p_A, up for p_B
-    (`DIRECTION`). `detail`: the wavelet detail of the pressure `chamber`, such as "d3".
+    It is the 95 % quantile over `drift`, the sheet simulated with drifting parameters and no leak, for changes of the
+    detail in the direction in which a leak should move it: down for p_A, up for p_B (`DIRECTION`).
     """
     return float(np.quantile(drift.log_change(chamber, detail) * DIRECTION[chamber], 1.0 - FALSE_ALARMS))
 
@@ -157,15 +143,10 @@ def drift_threshold(drift: DataSheet, chamber: str, detail: str) -> float:
 def count_with_thresholds(measured: DataSheet | None, leak: DataSheet, drift: DataSheet) -> list[_Row]:
     """Count the leaks that each rule on a single wavelet detail finds if a change must exceed a threshold.
 
-    A leak counts as found if the log RMS of the detail changes with the leak by more than the threshold, in the
-    direction in which a leak should move it (`DIRECTION`). 5 % of the tests without a leak exceed the threshold.
-
-    - `measured`: measured tests, or None; the scatter of d1 gives their threshold (`d1_threshold`).
-    - `leak`: tests that are simulated with a leak.
-    - `drift`: tests that are simulated without a leak but with drifting parameters; they give the threshold for `leak`
-      (`drift_threshold`).
-
-    Returns rows with the columns `THRESHOLDS`.
+    The log RMS of the detail must change with the leak by more than the threshold, which 5 % of the tests without a
+    leak exceed, in the direction in which a leak should move it. The threshold is that of `d1_threshold` for the
+    `measured` tests, None if not given, and that of `drift_threshold` for the tests simulated with a `leak`. Returns
+    rows with the columns `THRESHOLDS`.
     """
     rows: list[_Row] = []
     for rule in (*CLAIMED_CELLS, *UNCLAIMED):
@@ -184,12 +165,7 @@ def count_with_thresholds(measured: DataSheet | None, leak: DataSheet, drift: Da
 
 
 def success_rate_tables(context: Context, item: Item) -> tuple[ThesisTable, ...]:
-    """Build three tables on the success rates of Table 5.1, the fractions of tests in which a rule indicates the leak.
-
-    - The rates counted again (`count_rules`)
-    - Sign tests of all columns of Appendix C (`column_tests`)
-    - The rates of the rules on a single detail if a change must exceed a threshold (`count_with_thresholds`)
-    """
+    """Tabulate the success rates of Table 5.1, sign tests of all columns, and the rates with thresholds."""
     leak_runs, leak = simulated_sheet(context, "leak")
     _, no_leak = simulated_sheet(context, "no-leak")
     _, drift = simulated_sheet(context, "drift")

@@ -15,11 +15,7 @@ from sealscope.thesis.engine.products import Claim, ThesisTable, Verdict
 
 
 def detection_claims(context: Context, item: Item) -> tuple[Claim, ...]:
-    """Judge the claims on leak detection in the thesis's abstract and chapters 1, 5 and 6, in the order of the thesis.
-
-    The evidence is the measured and the simulated data sheets, and the simulated tests of chapter 5
-    (`gather_evidence`). `item` is not used.
-    """
+    """Judge the claims on leak detection in the abstract and chapters 1, 5 and 6; `item` is unused."""
     evidence = gather_evidence(context)
     claims = (*sheet.leak_level_claims(), *sheet.claims(evidence), *sheet.curve_claims(evidence), *rig.claims(evidence))
     return tuple(sorted(claims, key=_claim_order))

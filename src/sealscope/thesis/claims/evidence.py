@@ -1,7 +1,4 @@
-"""Collect the evidence for the claims on detection: data sheets, measured tests, counts, correlations, regressions.
-
-The regressions are cross-validated: no test takes part in the fit that predicts it.
-"""
+"""Collect the evidence for the claims on detection: data sheets, measured tests, counts, correlations, regressions."""
 
 from __future__ import annotations
 
@@ -20,7 +17,7 @@ from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array
 from sealscope.thesis.chapters.appendix_c_runs import simulated_sheet
 from sealscope.thesis.chapters.chapter5 import TESTS, LeakTestMeasures, measure_test
-from sealscope.thesis.chapters.success_rates import DIRECTION, Rule, column_tests
+from sealscope.thesis.chapters.success_rates import DIRECTION, column_tests
 from sealscope.thesis.engine.context import Context
 from sealscope.thesis.engine.products import Claim, ThesisTable
 from sealscope.thesis.engine.texts import judge_claim
@@ -33,13 +30,12 @@ SENSITIVE = ("d3", "d4", "d3d4")
 
 @dataclass(frozen=True, eq=False)
 class ClaimEvidence:
-    """The data by which the claims on detection are judged.
+    """Hold the data by which the claims on detection are judged.
 
     `measured_sheet`: measured data sheet of Appendix C, None if not given; `leak_sheet`, `no_leak_sheet`,
     `drift_sheet`: the same tests simulated with their leak, without a leak, and without a leak but with drifting
-    parameters; `leak_table`: table of the runs of `leak_sheet`, one row a test; `test_measures`: measures of the ten
-    tests whose figures chapter 5 prints, by section, such as "5.2a"; `no_leak_measures`: measures of test 5.2a
-    simulated without its leak.
+    parameters; `leak_table`: the runs of `leak_sheet`, one row a test; `test_measures`: measures of the ten simulated
+    tests of chapter 5 by section, such as "5.2a"; `no_leak_measures`: those of test 5.2a without its leak.
     """
 
     measured_sheet: DataSheet | None
@@ -52,11 +48,7 @@ class ClaimEvidence:
 
 
 def gather_evidence(context: Context) -> ClaimEvidence:
-    """Gather the data by which the claims on detection are judged.
-
-    The simulated sheets of Appendix C are products of other entries of `items.toml`; the ten tests of chapter 5 are
-    simulated and measured here.
-    """
+    """Gather the evidence for the claims on detection; the ten tests of chapter 5 are simulated here."""
     leak_table, leak_sheet = simulated_sheet(context, "leak")
     return ClaimEvidence(
         measured_sheet=context.sheet,
@@ -71,8 +63,6 @@ def gather_evidence(context: Context) -> ClaimEvidence:
 
 #: A finding on a sheet: its text, and True or False for each part of the claim on which it decides.
 Finding = tuple[str, Sequence[bool]]
-#: Tests a claim on a measured or simulated sheet.
-SheetTest = Callable[[DataSheet], Iterable[Finding]]
 
 
 @dataclass(frozen=True)
@@ -83,7 +73,7 @@ class SheetClaim:
     `values`: computes the values of placeholders in the claim's other texts.
     """
 
-    test: SheetTest
+    test: Callable[[DataSheet], Iterable[Finding]]
     head: str = ""
     separator: str = "; "
     values: Callable[[ClaimEvidence, DataSheet], Mapping[str, Any]] = lambda evidence, sheet: {}
@@ -91,8 +81,7 @@ class SheetClaim:
     def judge(self, evidence: ClaimEvidence, id: str, kind: str = "") -> Claim:
         """Judge the claim by the measured data sheet, and state the findings on the measured and the simulated sheet.
 
-        The simulated sheet has no influence on the verdict. `id`: the claim's id; `kind`: key of the texts in
-        `claims.toml` if the claim shares them with others, by default `id`. Without a measured sheet the verdict is
+        `kind`: key of the texts in `claims.toml` if claims share them, by default `id`. Without a measured sheet it
         `cannot be tested`.
         """
 
@@ -108,38 +97,22 @@ class SheetClaim:
         return judge_claim(id, parts, kind, sheet=sheet_text, simulation=simulation_text, **values)
 
 
-def format_rule_rate(sheet: DataSheet, rule: Rule) -> str:
-    """Format the fraction of the tests of a data sheet in which a rule fires, such as "35/41 = 85.4 % (71 to 94 %)".
-
-    A rule of Table 5.1 fires in a test if the RMS values indicate a leak (`Rule`). The limits in brackets are the 95 %
-    interval.
-    """
-    return format_rate(rule.fires(sheet))
-
-
 def format_rate(tests: Sequence[bool] | np.ndarray) -> str:
-    """Format the number of tests that passed, as `k/n = rate % (low to high %)` with the exact 95 % interval.
-
-    The interval is Clopper and Pearson's. `tests` (n,): True for each test that passed.
-    """
+    """Format the number of tests (n,) that passed as `k/n = rate % (low to high %)`, with the exact 95 % interval."""
     k, n = int(np.sum(tests)), len(tests)
     low, high = clopper_pearson(k, n)
     return f"{k}/{n} = {100 * k / n:.1f} % ({100 * low:.0f} to {100 * high:.0f} %)"
 
 
 def log_change_to_percent(change: Array | float) -> float:
-    """Convert a change c of a natural logarithm to the relative change 100 (exp(c) - 1) [%].
-
-    For several changes c the result is the geometric mean change: their mean is converted.
-    """
+    """Convert a change c of a logarithm, or the mean of several, to the relative change 100 (exp(c) - 1) [%]."""
     return float(100.0 * np.expm1(np.mean(change)))
 
 
 def holm_p_values(sheet: DataSheet) -> dict[tuple[str, str], float]:
-    """Compute the p-value of a two-sided sign test on each column of a data sheet, corrected by Holm's method.
+    """Compute the p-values of sign tests on the columns of a data sheet, corrected by Holm; keys are (chamber, detail).
 
-    A column has the RMS of one wavelet detail of one chamber pressure. Hypothesis: the RMS rises or falls with the leak
-    with probability 1/2 in each test. The correction is for all ten columns. Returns the p-values by (chamber, detail).
+    Hypothesis of a test: with the leak the RMS rises or falls with probability 1/2 (two-sided).
     """
     # a row begins with chamber and detail, and ends with the corrected p-value and whether it is below 5 %
     return {(str(chamber), str(name)): float(p) for chamber, name, *_, p, _ in column_tests(sheet)}  # type: ignore[arg-type]
@@ -148,9 +121,7 @@ def holm_p_values(sheet: DataSheet) -> dict[tuple[str, str], float]:
 def moves_beyond_chance(sheet: DataSheet, chamber: str, name: str) -> bool:
     """Return True if the RMS of a wavelet detail changes with the leak significantly and as the thesis states.
 
-    The RMS must fall in more tests of the sheet than it rises for p_A, and rise in more tests than it falls for p_B
-    (`DIRECTION`). The p-value of the two-sided sign test, corrected by Holm for all columns of the sheet, must be below
-    5 % (`holm_p_values`). `chamber`: "p_A" or "p_B"; `name`: the detail, such as "d3".
+    It must fall in most tests for p_A, or rise in most for p_B, with a corrected p-value below 5 % (`holm_p_values`).
     """
     change = sheet.log_change(chamber, name) * DIRECTION[chamber]  # > 0: in the thesis's direction
     return bool(np.sum(change > 0) > np.sum(change < 0) and holm_p_values(sheet)[chamber, name] < 0.05)
@@ -159,29 +130,22 @@ def moves_beyond_chance(sheet: DataSheet, chamber: str, name: str) -> bool:
 def is_correlated(r: float, n: int, controls: int = 0) -> bool:
     """Return True if a correlation coefficient `r` of n points differs from 0 at the 5 % level (two-sided).
 
-    `controls`: number of columns on which both variables were regressed before, 0 for a plain correlation. Criterion
-    (Fisher's z): ``|artanh r| sqrt(n - 3 - controls) > 1.96``. Source: Fisher, Metron 3 (1924) 329-332.
+    Criterion (Fisher's z): ``|artanh r| sqrt(n - 3 - controls) > 1.96``, with `controls` the number of columns on which
+    both variables were regressed before. Source: Fisher, Metron 3 (1924) 329-332.
     """
     z = np.arctanh(np.clip(r, -0.999999, 0.999999))  # clipped, as artanh(1) is infinite
     return bool(abs(z) * np.sqrt(n - 3 - controls) > WITHIN_95)
 
 
 def condition_design() -> Array:
-    """Build the design matrix (tests, commands + 1) of the operating conditions of Appendix C for a regression.
-
-    The columns are an indicator of each command (1 in tests with this command, else 0), and the closed fraction of the
-    throttles.
-    """
+    """Build the design matrix (tests, commands + 1): indicators of the commands, and the closed fraction."""
     commands = sorted({row.command for row in APPENDIX_C})
     indicators = [[float(row.command == command) for command in commands] for row in APPENDIX_C]
     return np.column_stack([np.array(indicators), [row.closed_pct / 100.0 for row in APPENDIX_C]])
 
 
 def partial_correlation(x: Array, y: Array, controls: Array) -> float:
-    """Compute the partial correlation of `x` and `y` (n,), given the k variables `controls` (n, k).
-
-    The result is the correlation of the residuals of `x` and of `y` after least squares on `controls`.
-    """
+    """Compute the correlation of the residuals of `x` and `y` (n,) after least squares on `controls` (n, k)."""
     residuals = [v - controls @ np.linalg.lstsq(controls, v, rcond=None)[0] for v in (x, y)]
     return float(np.corrcoef(residuals[0], residuals[1])[0, 1])
 
@@ -198,11 +162,7 @@ def leave_one_out_r2(columns: Array, y: Array) -> float:
 
 
 def change_design(sheet: DataSheet) -> Array:
-    """Build the design matrix (tests, 7) for a regression on the changes of the RMS with the leak.
-
-    The columns are a constant, and log(RMS with leak / RMS without) of d3, d4 and d3d4 of p_A and of p_B, the wavelet
-    details of Table 5.1.
-    """
+    """Build the design matrix (tests, 7): a constant, and the log changes with the leak of d3, d4, d3d4 of p_A, p_B."""
     changes = [sheet.log_change(chamber, name) for chamber in CHAMBERS for name in SENSITIVE]
     return np.column_stack([np.ones_like(changes[0]), *changes])
 
@@ -210,12 +170,10 @@ def change_design(sheet: DataSheet) -> Array:
 def classify_without_baseline(sheet: DataSheet, leave_out: Literal["test", "condition"]) -> tuple[float, float]:
     """Classify the halves of the tests as leaking or not by the RMS of wavelet details, without a healthy baseline.
 
-    A test has a half without and a half with the leak. The eight inputs of a half are the logarithms of the RMS of the
-    wavelet details d1 to d4 of p_A and of p_B. A logistic regression with an L2 penalty (C = 1 of scikit-learn) on
-    standardised columns is cross-validated: each time both halves of one test, or of all tests of one operating
-    condition (command and closing of the throttles), are left out of the fit and then classified (`leave_out`). Returns
-    the fraction of halves classified correctly, and the area under the ROC curve. Raises MissingExtra if scikit-learn
-    is not installed.
+    The inputs for a half of a test, without or with the leak, are the logarithms of the RMS of d1 to d4 of p_A and p_B.
+    A logistic regression with an L2 penalty (C = 1) on standardised columns is cross-validated, leaving out one test,
+    or all tests of one command and closing of the throttles, at a time (`leave_out`). Returns the fraction of halves
+    classified correctly, and the area under the ROC curve. Raises MissingExtra if scikit-learn is not installed.
     """
     try:
         from sklearn.linear_model import LogisticRegression

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -13,9 +13,9 @@ from sealscope.signals.filters import decomposition_filters, reach
 from sealscope.signals.windows import WINDOW_SIZE
 from sealscope.thesis.chapters.appendix_c_runs import column
 from sealscope.thesis.chapters.success_rates import CLAIMED, FALSE_ALARMS
-from sealscope.thesis.claims.evidence import NO_SHEET, ClaimEvidence, format_rate, format_rule_rate
+from sealscope.thesis.claims.evidence import NO_SHEET, ClaimEvidence, format_rate
 from sealscope.thesis.engine.products import Claim
-from sealscope.thesis.engine.texts import judge_claim
+from sealscope.thesis.engine.texts import format_range, judge_claim
 from sealscope.thesis.sheet import APPENDIX_C, BENCH_RIG
 
 #: Changes [%] below which a quantity counts as unchanged, and above which a change counts as severe.
@@ -35,10 +35,7 @@ _COMPARED_CLOSING = 75.0
 
 
 def claims(evidence: ClaimEvidence) -> tuple[Claim, ...]:
-    """Judge the claims of the abstract and of chapters 1, 5 and 6 that the data sheet alone cannot decide.
-
-    These claims are 1.3.1, which cannot be tested, a.3, 5.7.1 to 5.7.6, and 6.1.2 to 6.1.4.
-    """
+    """Judge the claims of the abstract and of chapters 1, 5 and 6 that the data sheet alone cannot decide."""
     return (
         judge_claim("1.3.1", [None]),
         *_wavelet_claims(),
@@ -52,8 +49,8 @@ def claims(evidence: ClaimEvidence) -> tuple[Claim, ...]:
 def _wavelet_claims() -> Iterator[Claim]:
     """Judge claims 5.7.5 and a.3 on db8: it separates bands better than lower orders, and its computation is cheap.
 
-    5.7.5: in the order db1, db2, db4, db8, each high-pass filter must have a smaller fraction of its energy below its
-    band than the filter before. a.3: the transform must need fewer than 1e7 operations per second.
+    5.7.5: in the order db1, db2, db4, db8, the fraction of each high-pass filter's energy below its band must fall.
+    a.3: the transform must need fewer than 1e7 operations per second.
     """
     overlaps = {}  # order -> fraction of the high-pass filter's energy below its band
     for order in (1, 2, 4, 8):
@@ -80,15 +77,9 @@ def _wavelet_claims() -> Iterator[Claim]:
 
 
 def _percent_change(pair: tuple[float, float]) -> float:
-    """Compute the relative change [%] of a quantity from the first value of `pair`, without a leak, to the second."""
+    """Compute the relative change [%] from the first value of `pair` to the second."""
     before, after = pair
     return 100.0 * (after / before - 1.0)
-
-
-def _format_range(values: Iterable[float]) -> str:
-    """Format the smallest and the largest of some percentages, such as "-1.25 to +3.00 %"."""
-    values = list(values)
-    return f"{min(values):+.2f} to {max(values):+.2f} %"
 
 
 def _printed_test_claims(evidence: ClaimEvidence) -> Iterator[Claim]:
@@ -112,7 +103,7 @@ def _printed_test_claims(evidence: ClaimEvidence) -> Iterator[Claim]:
     velocity = [_percent_change(test.velocity) for test in tests.values()]
     pressure = [_percent_change(test.range_MPa[c]) for test in tests.values() for c in CHAMBERS]
     is_severe = [max(np.abs(changes)) > _SEVERE_CHANGE for changes in (velocity, pressure)]
-    yield judge_claim("6.1.2", is_severe, velocity=_format_range(velocity), pressure=_format_range(pressure))
+    yield judge_claim("6.1.2", is_severe, velocity=format_range(velocity, "%"), pressure=format_range(pressure, "%"))
     ranges = tests["5.3a"].range_MPa
     texts = [f"{c} {1e3 * ranges[c][0]:.1f} to {1e3 * ranges[c][1]:.1f} kPa" for c in CHAMBERS]
     is_changed = [abs(_percent_change(ranges[c])) > _SEVERE_CHANGE for c in CHAMBERS]
@@ -130,21 +121,20 @@ def _printed_test_claims(evidence: ClaimEvidence) -> Iterator[Claim]:
 def _d3_sign_claim(evidence: ClaimEvidence) -> Claim:
     """Judge claim 5.7.6: a fall of the RMS of the wavelet detail d3 of p_A indicates a leak.
 
-    In simulations without a leak the RMS must fall in fewer than 5 % of the tests, both with constant and with drifting
-    parameters.
+    It must fall in fewer than 5 % of the tests simulated without a leak, with constant and with drifting parameters.
     """
     d3_rule = CLAIMED[0]  # d3 of p_A falls
     sheets = {"leak": evidence.leak_sheet, "no_leak": evidence.no_leak_sheet, "drift": evidence.drift_sheet}
-    is_rare = [float(d3_rule.fires(sheets[name]).mean()) < FALSE_ALARMS for name in ("no_leak", "drift")]
-    counts = {name: format_rule_rate(sheet, d3_rule) for name, sheet in sheets.items()}
-    return judge_claim("5.7.6", is_rare, **counts)
+    fires = {name: d3_rule.fires(sheet) for name, sheet in sheets.items()}
+    is_rare = [float(fires[name].mean()) < FALSE_ALARMS for name in ("no_leak", "drift")]
+    return judge_claim("5.7.6", is_rare, **{name: format_rate(tests) for name, tests in fires.items()})
 
 
 def _throttle_claim(evidence: ClaimEvidence) -> Claim:
     """Judge claim 6.1.3: partly closed throttles raise the leak-free pressure ranges, more so at larger commands.
 
-    For each command, the range of each chamber pressure at the largest closing must exceed the range with open
-    throttles by more than 1 %. Among the commands whose largest closing is 75 %, the rise must grow with the amplitude.
+    For each command, the largest closing must raise the range of each chamber pressure by more than 1 %. Among the
+    commands whose largest closing is 75 %, the rise must grow with the amplitude.
     """
     ranges = np.stack([column(evidence.leak_table, f"{chamber} range [MPa]") for chamber in CHAMBERS])
     closed_pct = np.array([row.closed_pct for row in APPENDIX_C])
@@ -168,8 +158,8 @@ def _throttle_claim(evidence: ClaimEvidence) -> Claim:
 def _agreement_claim(evidence: ClaimEvidence) -> Claim:
     """Judge claim 6.1.4: simulation and measurement agree.
 
-    The geometric mean of simulated over measured leak-free RMS must be from 1/1.25 to 1.25, for d1 to d4 of each
-    chamber. The RMS of d3 of p_A must change with the leak in the same direction in at least 39 of the 41 tests.
+    For d1 to d4 of each chamber, the geometric mean of simulated over measured leak-free RMS must be from 1/1.25 to
+    1.25. The RMS of d3 of p_A must change with the leak in the same direction in at least 39 of the 41 tests.
     """
     measured, leak = evidence.measured_sheet, evidence.leak_sheet
     if measured is None:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import traceback
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from contextlib import closing
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache, partial
 from graphlib import TopologicalSorter
@@ -17,7 +16,7 @@ from typing import Any, Literal
 
 from sealscope.campaigns.cases.case import digest, files_digest
 from sealscope.campaigns.cases.row import error_text
-from sealscope.campaigns.execution.workers import iter_results, process_count
+from sealscope.campaigns.execution.workers import iter_results, iter_rows, process_count
 from sealscope.errors import InputError
 from sealscope.storage.folders import make_inner_folder
 from sealscope.storage.opening import is_file_path
@@ -35,7 +34,6 @@ Progress = Callable[[int, int, Sequence[str]], None]
 State = Literal["made", "kept", "left out", "failed", "not made"]
 #: Libraries whose versions results and drawings depend on.
 _LIBRARIES = ("numpy", "scipy", "numba", "PyWavelets", "matplotlib")
-#: Name of the results folder in messages.
 _WHAT = "a reproduction"
 
 
@@ -92,12 +90,11 @@ def reproduce(
 ) -> dict[str, ItemStatus]:
     """Make the selected items of the thesis and the items they need; return the status of all items by id.
 
-    `patterns`: selection (`items.select_items`); `folder`: folder of the results; `quick`: True to simulate less;
-    `jobs`: number of processes, by default one per core, 1 for this process only; `sheet`: folder of the measured
-    data sheet (`sheet.find_sheet`); `items`: the list to select from, by default that of `items.toml`; `publish`:
-    writes the products as files; `progress`: is told which items are finished and in work. Results that an earlier call
-    stored from the same inputs are reused. A failed item does not stop the others, and KeyboardInterrupt leaves all
-    finished items stored.
+    `patterns`: selection (`items.select_items`); `quick`: True to simulate less; `jobs`: number of processes, by
+    default one per core, 1 for this process only; `sheet`: folder of the measured data sheet; `items`: the list to
+    select from, by default that of `items.toml`; `publish`: writes the products as files; `progress`: is told which
+    items are finished and in work. Results that an earlier call stored in `folder` from the same inputs are reused. A
+    failed item does not stop the others, and KeyboardInterrupt leaves all finished items stored.
 
     Raises InputError for an unknown item, a bad sheet, or a folder that is damaged, in use or cannot be written.
     """
@@ -120,11 +117,7 @@ def reproduce(
         n_done = 0
 
         def start_jobs(ready: Sequence[str]) -> Iterator[_Job]:
-            """Yield the job of each item in `ready`, the ids of items whose needed items are all finished.
-
-            A job consists of the item, the key of its inputs, and the products of the items it needs. When a job is
-            requested, its item is reported as in work.
-            """
+            """Yield the job of each item in `ready`, whose needed items are all finished, and report it as in work."""
             for name in ready:
                 in_work.append(name)
                 progress(n_done, len(waiting), in_work)
@@ -136,7 +129,8 @@ def reproduce(
         order.prepare()
         while order.is_active():
             ready = sorted(order.get_ready(), key=list(waiting).index)
-            new_rows = _iter_rows(iter_results(task, start_jobs(ready), min(process_count(jobs), len(ready))))
+            results = iter_results(task, start_jobs(ready), min(process_count(jobs), len(ready)))
+            new_rows = iter_rows(results, lambda job: ItemRow(job[0].id, job[1], error="the process that made it died"))
             for row in store_rows(store, new_rows, _WHAT, allow_nan=True):
                 state: State = "failed" if row.error else "made"
                 statuses[row.id] = ItemStatus(waiting[row.id], state, row.error, row.products, row.files)
@@ -166,7 +160,7 @@ def _item_keys(items: Sequence[Item], sheet_key: str, quick: bool, is_published:
     """Compute for each item a digest of all inputs of its products and files, by id.
 
     `sheet_key`: digest of the data sheet, "" if not given; `quick`: True if less is simulated; `is_published`: True if
-    files are written. The digest of an item includes the digests of the items it needs.
+    files are written.
     """
     by_id = {item.id: item for item in items}
     sources = sources_key()
@@ -183,11 +177,7 @@ def _item_keys(items: Sequence[Item], sheet_key: str, quick: bool, is_published:
 
 
 def _parse_row(keys: Mapping[str, str], tree: Any) -> ItemRow | None:
-    """Build the stored result of an item from JSON values; return None if it was made from other inputs.
-
-    `keys`: present digest of each item's inputs, by id, with which the stored digest is compared; `tree`: the values.
-    Raises ValueError if they are not a stored result.
-    """
+    """Build the stored result of an item; None if `keys` has another digest of its inputs, ValueError if malformed."""
     if not isinstance(tree, dict):
         raise ValueError("no row")
     return convert_type(ItemRow, tree) if keys.get(str(tree.get("id"))) == tree.get("key") else None
@@ -196,9 +186,7 @@ def _parse_row(keys: Mapping[str, str], tree: Any) -> ItemRow | None:
 def _item_status(item: Item, sheet: DataSheet | None, row: ItemRow | None, folder: Path) -> ItemStatus:
     """Determine the status of an item before anything is made: "kept", "left out" or "not made".
 
-    An item is left out if it needs the data sheet and `sheet` is None. An item is kept if its stored result `row` is
-    not an error and all its files still exist in `folder`; `row` is None if no result from the present inputs is
-    stored.
+    It is kept if its stored `row`, None if there is none, is no error and all its files exist in `folder`.
     """
     if item.needs_sheet and sheet is None:
         return ItemStatus(item, "left out", MISSING)
@@ -207,26 +195,13 @@ def _item_status(item: Item, sheet: DataSheet | None, row: ItemRow | None, folde
     return ItemStatus(item, "kept", "", row.products, row.files)
 
 
-def _iter_rows(results: Generator[tuple[_Job, ItemRow | None], None, None]) -> Generator[ItemRow, None, None]:
-    """Yield the row to store for each item, from pairs (job, row).
-
-    The row is None if the process of the job died; a row that states this error is then yielded instead.
-    """
-    with closing(results):
-        for (item, key, _), row in results:
-            yield row or ItemRow(item.id, key, error="the process that made it died")
-
-
 def _make_item(
     quick: bool, sheet: DataSheet | None, publish: Publish | None, folder: Path, runs: Path, job: _Job
 ) -> ItemRow:
-    """Make one item (a figure, table or claims) and write its files; return the result to be stored.
+    """Make one item (a figure, table or claims) and write its files; return the result, or the error, to be stored.
 
-    An exception is not raised, but its text is stored as the error of the result.
-
-    `quick`: True to simulate less; `sheet`: measured data sheet, None if not given; `publish`: writes the products as
-    files, None to write none; `folder`: folder of the results; `runs`: folder of simulated runs; `job`: the item, the
-    key of its inputs, and the products of the items it needs.
+    `quick`: True to simulate less; `sheet`: measured data sheet, None if not given; `publish`: writes the files, None
+    to write none; `folder`: folder of the results; `runs`: folder of simulated runs.
     """
     item, key, needed = job
     context = Context(item.id, item.needs, quick, sheet if item.reads_sheet else None, needed, runs)

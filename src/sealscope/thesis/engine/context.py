@@ -50,8 +50,7 @@ class SimulatedRun:
 def simulate_run(experiment: Experiment, prove: bool) -> SimulatedRun:
     """Simulate an experiment, and return a failed run as a result instead of raising an error.
 
-    A run that changes too much when the solver's step is halved does not count as failed (`resolved` is False).
-    `prove`: True to make this test, for which the run is repeated with half the step.
+    `prove`: True to repeat the run with half the solver's step; a large change does not count as a failure.
     """
     try:
         simulated = simulate_experiment(replace(experiment, allow_unresolved=True), prove=prove)
@@ -83,8 +82,7 @@ class Context:
     def run(self, experiment: Experiment, *, prove: bool = True) -> SimulatedRun:
         """Simulate an experiment, or load its run if another item of this reproduction has simulated it.
 
-        `prove`: True to repeat the run with half the solver's step and compare both. Other processes that ask for the
-        same run wait for it.
+        `prove`: True to repeat the run with half the solver's step. Other processes that ask for the same run wait.
         """
         path = self.runs / f"{experiment.key()}{'-proved' if prove else ''}.run"
         with lock_file(path.with_suffix(".lock"), busy=None):  # None: waits without a limit
@@ -95,7 +93,7 @@ class Context:
         return run
 
     def product(self, name: str) -> Products:
-        """Return the products of the needed item `name`; () if the needed item was left out.
+        """Return the products of the needed item `name`; () if it was left out.
 
         Raises InputError if the needed item failed, or if the item to be made does not name it in its `needs`.
         """
@@ -107,10 +105,7 @@ class Context:
 
 
 def first_table(context: Context, item: str) -> ThesisTable:
-    """Return the first table among the products of the item `item`, which the item to be made needs.
-
-    Raises InputError if the needed item failed or made no table.
-    """
+    """Return the first table of the needed item `item`; raise InputError if the item failed or made no table."""
     table = next((product for product in context.product(item) if isinstance(product, ThesisTable)), None)
     if table is None:
         raise InputError(f"{item} must make a table, which another item needs, got none")

@@ -21,10 +21,10 @@ from sealscope.thesis.engine.texts import load_texts
 class Item:
     """One case, figure, table or group of claims of the thesis that can be reproduced.
 
-    `id`: kind and the thesis's number, such as "fig-4.22"; `make`: function that makes its products (figures, tables,
-    claims); `inputs`: inputs of that function by name; `uses_sheet`: True if it shows the measured data sheet when that
-    is given; `needs_sheet`: True if it cannot be made without the sheet; `needs`: ids of items whose products `make`
-    uses; `claims`: ids of claims that it supports or refutes; `columns`: heads of its table.
+    `id`: kind and the thesis's number, such as "fig-4.22"; `make`: function that makes its products; `inputs`: inputs
+    of that function by name; `uses_sheet`: True if it shows the measured data sheet when that is given; `needs_sheet`:
+    True if it cannot be made without the sheet; `needs`: ids of items whose products `make` uses; `claims`: ids of
+    claims that it supports or refutes; `columns`: heads of its table.
     """
 
     id: str
@@ -47,11 +47,7 @@ class Item:
     def figure(
         self, panels: Iterable[Panel], numbers: Iterable[Number] = (), resolved: bool | None = None, notes: str = ""
     ) -> Figure:
-        """Build the figure of this item, with its id, title and claims.
-
-        `numbers`: numbers reported with the figure; `resolved`: True if all simulated runs passed the test with half
-        the solver's step, False if one did not, None if nothing was tested; `notes`: text below the figure.
-        """
+        """Build the figure of this item, with its id, title and claims; the arguments are those of `Figure`."""
         return Figure(self.id, self.title, tuple(panels), tuple(numbers), self.claims, resolved, notes)
 
     def table(
@@ -66,9 +62,8 @@ class Item:
     ) -> ThesisTable:
         """Build a table of this item, with its claims.
 
-        `rows`: cells of the table; `notes`: text below the table; `columns` (heads) and `title` replace those of the
-        item if stated; `tail` is appended to the item's id, for a second table of one item; `resolved`: True if all
-        simulated runs passed the test with half the solver's step, False if one did not, None if nothing was tested.
+        `columns` (heads) and `title` replace those of the item if stated; `tail` is appended to the item's id, for a
+        second table of one item; the other arguments are those of `ThesisTable`.
         """
         heads = tuple(columns) or self.columns
         id, title = self.id + tail, title or self.title
@@ -80,10 +75,7 @@ _FIELDS = {declared.name for declared in fields(Item)}
 
 @cache
 def load_items() -> tuple[Item, ...]:
-    """Read the list of all items from `items.toml`, in the order of the file.
-
-    An item is a figure, a table or the claims of a chapter that can be reproduced.
-    """
+    """Read the list of all items from `items.toml`, in the order of the file."""
     return tuple(
         item for chapter, rows in load_texts("items.toml").items() for name, row in rows.items()
         for item in _iter_row_items(name, int(chapter), row)
@@ -91,11 +83,10 @@ def load_items() -> tuple[Item, ...]:
 
 
 def _iter_row_items(name: str, chapter: int, row: Mapping[str, Any]) -> Iterator[Item]:
-    """Yield the items (figures, tables, claims) that a row of `items.toml` describes.
+    """Yield the items (figures, tables, claims) that a row of `items.toml` with the key `name` describes.
 
-    A row describes one item, whose id is `name`, the key of the row. Entries of the row that are no fields of `Item`
-    become its `inputs`. A row with an entry `each` describes several items instead: this entry names a function that
-    yields (id, title, inputs) of each item.
+    Entries of the row that are no fields of `Item` become its `inputs`. An entry `each` names a function that yields
+    (id, title, inputs) of several items.
     """
     row_inputs: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in row.items()}
     row_fields: dict[str, Any] = {key: row_inputs.pop(key) for key in row if key in _FIELDS}
@@ -118,8 +109,7 @@ def _import_function(name: str) -> Any:
 def select_items(items: Sequence[Item], patterns: Sequence[str]) -> tuple[Item, ...]:
     """Select items (figures, tables, claims) by id (`fig-5.58`), `all`, chapter (`chapter-4`) or wildcards (`fig-5.*`).
 
-    The selected items keep the order of the list `items`. Raises InputError, with the closest ids, if a pattern
-    matches nothing.
+    They keep the order of `items`. Raises InputError, with the closest ids, if a pattern matches nothing.
     """
     ids = [item.id for item in items]
     selected: set[str] = set()
@@ -143,10 +133,7 @@ def select_items(items: Sequence[Item], patterns: Sequence[str]) -> tuple[Item, 
 
 
 def add_needed_items(items: Sequence[Item], selected: Iterable[Item]) -> tuple[Item, ...]:
-    """Return the selected items and all items whose products they need, directly or indirectly.
-
-    An item is a figure, a table or the claims of a chapter. The result has the order of the list `items`.
-    """
+    """Add to the selected items all whose products they need, directly or indirectly, in the order of `items`."""
     by_id, ids = {item.id: item for item in items}, {item.id for item in selected}
     while missing := {needed for name in ids for needed in by_id[name].needs} - ids:
         ids |= missing

@@ -23,10 +23,7 @@ Values = Annotated[Array, PlainValidator(np.asarray)]
 
 @dataclass(frozen=True, eq=False)
 class FigureCurve:
-    """One series of points (x, y) in a panel of a figure, in the panel's units.
-
-    `role`: meaning of the curve, which determines its line style; `kind`: drawn as a line, as points or as stems.
-    """
+    """One series of points (x, y) in a panel of a figure; `role`: its meaning, which determines the line style."""
 
     x: Values
     y: Values
@@ -133,11 +130,9 @@ class Claim:
 
 
 def claim_verdict(tests: Iterable[bool | None]) -> Verdict:
-    """Judge a claim by the results of tests of its parts.
+    """Judge a claim by the results of tests of its parts; None, for a test that cannot be made, is ignored.
 
-    The claim `holds` if all tests pass, `does not hold` if no test passes, and `holds in part` otherwise. A result of
-    None stands for a test that cannot be made, and is ignored. If there are no other results, the claim `cannot be
-    tested`.
+    It `holds` if all pass, `does not hold` if none does, else `holds in part`, or `cannot be tested` without results.
     """
     results = {bool(test) for test in tests if test is not None}
     if len(results) == 1:
@@ -146,10 +141,9 @@ def claim_verdict(tests: Iterable[bool | None]) -> Verdict:
 
 
 def thin_curve(x: Array, y: Array, max_points: int = 4000) -> tuple[Array, Array]:
-    """Thin a curve (x, y) to about `max_points` points that preserve its peaks.
+    """Thin a curve (x, y) to about `max_points` points that preserve its peaks, the extremes of successive blocks.
 
-    The points kept are the minimum and the maximum of each block of successive points; points after the last whole
-    block are left out. A curve with at most `max_points` points is returned unchanged.
+    Points after the last whole block are left out. A shorter curve is returned unchanged.
     """
     if x.size <= max_points:
         return x, y

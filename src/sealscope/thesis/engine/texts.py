@@ -25,13 +25,18 @@ def format_note(name: str, **values: Any) -> str:
     return str(load_texts("notes.toml")[name]).format(**values)
 
 
+def format_range(values: Iterable[float], unit: str, factor: float = 1.0) -> str:
+    """Format the smallest and the largest of some values, such as "-1.25 to +3.00 kPa"; `factor` converts to `unit`."""
+    scaled = [value * factor for value in values]
+    return f"{min(scaled):+.2f} to {max(scaled):+.2f} {unit}"
+
+
 def judge_claim(id: str, tests: Iterable[bool | None], kind: str = "", /, **values: Any) -> Claim:
     """Judge the claim `id` by the tests of its parts (`claim_verdict`), and fill `values` into its texts.
 
-    `tests`: results, None for a test that cannot be made. The texts are in `claims.toml` under `id`, or under `kind`
-    for claims that share texts. Three of the `values`, if given, replace a whole text: `sheet` (what the thesis's data
-    show), `simulation` (what a simulation shows) and `why` (reason for the verdict). The others fill the
-    placeholders of the same name.
+    The texts are in `claims.toml` under `id`, or under `kind` for claims that share texts. The values `sheet` (what the
+    thesis's data show), `simulation` (what a simulation shows) and `why` (reason for the verdict) replace a whole text,
+    the others the placeholders of the same name.
     """
     claims = load_texts("claims.toml")
     templates = dict(claims[kind or id])

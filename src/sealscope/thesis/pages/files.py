@@ -21,9 +21,9 @@ _NAME = re.compile(r"[a-z0-9]+([-.][a-z0-9]+)*")
 def publish(item: Item, products: Sequence[Product | Claim], folder: Path) -> tuple[str, ...]:
     """Write an item's products into `folder` as files; return their paths, relative to the folder.
 
-    The files are `figures/ID.svg`, `figures/ID.png` and `tables/ID.csv` for each figure or table. Claims go to
+    These are `figures/ID.svg`, `figures/ID.png` and `tables/ID.csv` for each figure or table. Claims go to
     `tables/ID.csv` of their item, or to `tables/ID-claims.csv` if the item has a table. Raises ValueError for an id
-    that cannot be a file name.
+    that is no file name.
     """
     for name in ("figures", "tables"):
         make_inner_folder(folder, name)
@@ -62,8 +62,7 @@ def publish(item: Item, products: Sequence[Product | Claim], folder: Path) -> tu
 def figure_rows(figure: Figure) -> Iterable[Sequence[object]]:
     """Yield a table of all points that a figure shows: the heads of its columns, then its rows.
 
-    The columns are x and y of each curve, and x, y and value of each image. Shorter columns are filled with empty
-    texts.
+    The columns are x and y of each curve, and x, y and value of each image; shorter columns are filled with "".
     """
     heads: list[str] = []
     columns: list[list[str]] = []

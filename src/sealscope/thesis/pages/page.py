@@ -104,10 +104,7 @@ def write_thesis_page(
 def _page_product(
     status: ItemStatus, product: Figure | ThesisTable, folder: Path, claims: dict[str, Claim]
 ) -> PageProduct:
-    """Build the page's entry of a figure or table from its files in `folder`.
-
-    `claims`: all claims by id; the entry gets those that the product supports or refutes.
-    """
+    """Build the page's entry of a figure or table from its files in `folder`; `claims`: all claims by id."""
     picture = _encode_picture(folder, product.id) if isinstance(product, Figure) else ""
     product_claims = [claims[name] for name in product.claims if name in claims]
     # (format, path) of the product's files, which are named by its id
@@ -130,10 +127,7 @@ def _encode_picture(folder: Path, name: str) -> str:
 
 
 def format_cell(value: Any) -> str:
-    """Format a table's value for the page: a float with five significant digits, None and nan as a dash.
-
-    Floats from 1e5 on have four digits; integers and texts are unchanged.
-    """
+    """Format a value for the page: a float with five significant digits, four from 1e5 on, None and nan as a dash."""
     if value is None or (isinstance(value, float) and math.isnan(value)):
         return "–"
     if isinstance(value, float):

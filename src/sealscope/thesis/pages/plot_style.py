@@ -28,15 +28,14 @@ _ROWS = {role: {**row, "dashes": tuple(row.get("dashes", ()))} for role, row in 
 STYLES: dict[Role, Style] = {role: Style(**row) for role, row in _ROWS.items()}
 #: Dashes of further curves with the same role in a panel.
 SAME_ROLE = tuple(map(tuple, _TABLES["again"]["dashes"]))
-#: matplotlib's settings.
 SETTINGS = Path(__file__).with_name("thesis.mplstyle")
 
 
 def caption(figure_id: str, title: str) -> str:
     """Format a caption from the id and the title of a product, such as "Fig. 4.22. Pressures in the chambers".
 
-    A letter or word after the number in the id, as in "fig-4.2-a", follows the number as "a)" or in brackets. An id
-    without the number of a figure, table or equation of the thesis gives the title alone.
+    A letter or word after the number, as in "fig-4.2-a", follows as "a)" or in brackets. An id without the number of a
+    figure, table or equation gives the title alone.
     """
     kind, _, number_and_part = figure_id.partition("-")
     prefix = {"fig": "Fig.", "table": "Table", "eq": "Eq."}.get(kind)
@@ -51,7 +50,6 @@ def caption(figure_id: str, title: str) -> str:
 def typeset(label: str) -> str:
     """Convert the symbols in a label, such as p_A, d3, omega and m^3/s, to matplotlib's mathematical notation."""
     text = label.replace("$", r"\$")
-    # wavelet details
     text = re.sub(r"\bd3d4\b", r"$d_3 d_4$", text)
     text = re.sub(r"\bd([1-9])\b", r"$d_\1$", text)
     # symbols with a subscript, then Greek letters without
@@ -68,5 +66,4 @@ def typeset(label: str) -> str:
 
 
 _GREEK = {"omega": r"\omega", "theta": r"\theta"}
-#: Superscript of each digit.
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")

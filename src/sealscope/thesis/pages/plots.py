@@ -30,10 +30,8 @@ _TOP_MARGIN, _WARNING_HEIGHT, _LEGEND_HEIGHT = 0.03, 0.34, 0.24
 _LINE_HEIGHT, _CAPTION_MARGIN = 0.16, 0.14
 #: Number of rows of panels -> height of a row [inch].
 _ROW_HEIGHTS = {1: 3.4, 2: 2.35, 3: 1.85, 4: 1.6}
-#: Characters of a caption's line.
 _CAPTION_CHARACTERS = 122
-#: Width of a label's line and margin in a legend, and width of all labels that fit above a figure or a panel
-#: [characters].
+#: Width [characters] of a label's line and margin in a legend, and of all labels above a figure or a panel.
 _LABEL_MARGIN, _MAX_SHARED_CHARACTERS, _MAX_LEGEND_CHARACTERS = 6, 100, 92
 #: Points to which a line is thinned.
 _MAX_POINTS = 2400
@@ -57,8 +55,7 @@ def require_drawing() -> None:
 def draw(figure: Figure) -> tuple[bytes, bytes]:
     """Draw a figure; return it as an SVG file with searchable text, and as a PNG file of `DPI` dots per inch.
 
-    Long curves are rasterised in an SVG that would be too large otherwise. Raises MissingExtra if matplotlib is not
-    installed.
+    Long curves are rasterised in an SVG that would be too large. Raises MissingExtra if matplotlib is not installed.
     """
     require_drawing()
     import matplotlib
@@ -110,20 +107,13 @@ def _render_png(mpl_figure: MplFigure, *, has_image: bool) -> bytes:
 
 
 def choose_grid(n_panels: int) -> tuple[int, int]:
-    """Choose the numbers of rows and columns in which a figure's panels are arranged.
-
-    There is one column for up to five panels, there are two columns for up to twelve panels, and else three.
-    """
+    """Choose the rows and columns of a figure's panels: one column for up to five, two for up to twelve, else three."""
     columns = 1 if n_panels <= 5 else 2 if n_panels <= 12 else 3
     return -(-n_panels // columns), columns  # rows rounded up
 
 
 def _draw_figure(figure: Figure) -> MplFigure:
-    """Lay out and draw a figure with matplotlib.
-
-    From top to bottom the figure has: a warning if a run is not resolved by the solver's step, the legend if all panels
-    share it, the panels, and the caption.
-    """
+    """Lay out and draw a figure: from top to bottom a warning, the shared legend, the panels, and the caption."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure as MplFigure
 
@@ -208,10 +198,7 @@ def _draw_panel(mpl_figure: MplFigure, ax: Axes, panel: Panel, *, label_marks: b
 
 
 def _use_plain_numbers(axis: Axis) -> None:
-    """Label a logarithmic axis with plain numbers such as 0.2, 1 and 50.
-
-    An axis over four decades or more keeps powers of ten.
-    """
+    """Label a logarithmic axis of less than four decades with plain numbers such as 0.2, 1 and 50."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     axis.set_minor_formatter(NullFormatter())
@@ -224,8 +211,8 @@ def _use_plain_numbers(axis: Axis) -> None:
 def drawn_points(curve: FigureCurve, x_range: _Range | None) -> tuple[np.ndarray, np.ndarray]:
     """Select the points (x, y) of a curve that are drawn.
 
-    A curve of more than `_MAX_POINTS` points is cut to `x_range` plus one point on each side, unless `x_range` is None
-    or x is not rising. A curve of kind "line" is then thinned to about `_MAX_POINTS` points that preserve its peaks.
+    A curve of more than `_MAX_POINTS` points is cut to `x_range` plus one point on each side, unless x is not rising. A
+    line is then thinned to about `_MAX_POINTS` points that preserve its peaks.
     """
     x, y = np.asarray(curve.x, dtype=np.float64), np.asarray(curve.y, dtype=np.float64)
     if x_range is not None and x.size > _MAX_POINTS and np.all(np.diff(x) >= 0):
@@ -238,9 +225,8 @@ def drawn_points(curve: FigureCurve, x_range: _Range | None) -> tuple[np.ndarray
 def _draw_curve(ax: Axes, curve: FigureCurve, n_before: int, x_range: _Range | None, *, is_only: bool) -> None:
     """Draw a curve into `ax` in the line style of its role.
 
-    `n_before`: number of earlier curves with this role in the panel, by which other dashes are chosen; `x_range`:
-    limits of the x axis, None for those of the curves; `is_only`: True for the only curve of a panel, which is drawn in
-    the style "other" if its role is "reference".
+    `n_before`: number of earlier curves with this role in the panel, by which other dashes are chosen; `is_only`: True
+    for the only curve of a panel, whose role "reference" is drawn as "other".
     """
     style = STYLES["other" if is_only and curve.role == "reference" else curve.role]
     x, y = drawn_points(curve, x_range)
@@ -264,10 +250,7 @@ def _draw_curve(ax: Axes, curve: FigureCurve, n_before: int, x_range: _Range | N
 
 
 def _has_shared_legend(panels: Sequence[Panel]) -> bool:
-    """Return True if one legend serves all panels of a figure.
-
-    This is so if there are several panels, all with the same two or more curves, and if the labels fit on one line.
-    """
+    """Return True if several panels have the same two or more curves, whose labels fit on one line."""
     keys = {tuple((curve.label, curve.role, curve.kind) for curve in panel.curves) for panel in panels}
     labels = [curve.label for curve in panels[0].curves] if panels else []
     is_short = sum(map(len, labels)) + _LABEL_MARGIN * len(labels) <= _MAX_SHARED_CHARACTERS
@@ -297,10 +280,9 @@ def _thicken_lines(legend: Legend) -> None:
 
 
 def _hide_repeated_x_labels(axes: Any, panels: Sequence[Panel]) -> None:
-    """Remove the x labels of all panels but the lowest of each column, if all panels have the same x axis.
+    """Remove the x labels of all panels but the lowest of each column, if all have the same x axis and none an image.
 
-    `axes` (rows, columns): matplotlib's axes, of which the last ones may be switched off. Nothing changes if a panel
-    has an image.
+    `axes` (rows, columns): matplotlib's axes, of which the last ones may be switched off.
     """
     visible_axes = [ax for ax in axes.flat if ax.axison]
     x_axes = {(ax.get_xlabel(), tuple(round(end, 9) for end in ax.get_xlim())) for ax in visible_axes}

@@ -1,7 +1,7 @@
 """The twelve cases of Tables 4.2 and 4.3, the readings of the equations, and the numbers by which claims are judged.
 
-A case is simulated with the thesis's method and step ("as_published"), and with a step that converges; the equations
-are the same. A reading is one way to understand equations that the thesis states inconsistently.
+A case is simulated with the thesis's method and step ("as_published"), and with a step that converges. A reading is one
+way to understand equations that the thesis states inconsistently.
 """
 
 from __future__ import annotations
@@ -63,8 +63,8 @@ class Reading:
 
     `metering`: "meter-out" (the text: the return flow is throttled on both sides) or "literal" (eqs. 4.11, 4.12 as
     printed); `closed_means`: a throttle is closed by a fraction of its "area" (eq. 4.8) or of its "diameter" (the
-    text's 3.75 mm of 5 mm); `d_line_mm`: diameter of the lines, 7 (Table 4.1) or 5 (the text); `V_line_cm3`: volume
-    V_1 = V_2 of each line, which the thesis does not give.
+    text's 3.75 mm of 5 mm); `d_line_mm`: diameter of the lines, 7 (Table 4.1) or 5 (the text); `V_line_cm3`: volume V_1
+    = V_2 of each line, which the thesis does not give.
     """
 
     metering: Literal["meter-out", "literal"] = "meter-out"
@@ -80,10 +80,9 @@ class Reading:
         return text if self.V_line_cm3 == Reading.V_line_cm3 else f"{text}, V_1 = {self.V_line_cm3:g} cm3"
 
     def values(self, closed_pct: float | None) -> tuple[tuple[str, str | float], ...]:
-        """Return the rig's parameters under this interpretation, for throttles closed by `closed_pct` [%].
+        """Return the rig's parameters, as (dotted name, value), for throttles closed by `closed_pct` [%].
 
-        A closing of 0 means open throttles, None a rig without throttles. Each parameter is a pair (dotted name,
-        value).
+        A closing of 0 means open throttles, None a rig without throttles.
         """
         sampling: tuple[tuple[str, str | float], ...] = (("daq.sample_rate", SAMPLE_RATE),)
         if closed_pct is None:
@@ -120,9 +119,8 @@ def make_experiment(
 ) -> Experiment:
     """Build the experiment of a command with throttles closed by `closed_pct` [%], None for no throttles.
 
-    `reading`: interpretation of the throttles' equations; `solver`: "as_published" for the thesis's method and step
-    (RK4, 1e-4 s), "converged" for a step chosen by its error; `duration` [s]; `overrides`: parameters that replace
-    those of the interpretation.
+    `solver`: "as_published" for the thesis's method and step (RK4, 1e-4 s), "converged" for a step chosen by its error;
+    `overrides`: parameters that replace those of the `reading`.
     """
     values = {**dict(reading.values(closed_pct)), **overrides}
     experiment = Experiment.of(command=command, duration=duration, set=values)
@@ -132,12 +130,7 @@ def make_experiment(
 def make_drift_experiment(
     reading: Reading, closed_pct: float | None, solver: Solver, **overrides: str | float
 ) -> Experiment:
-    """Build the long experiment in which the drift of the piston is measured, with the command of section 4.3.
-
-    `closed_pct`: closing of the throttles [%], None for no throttles; `reading`: interpretation of the thesis's
-    equations of the throttles; `solver`: "as_published" for the thesis's method and step (RK4, 1e-4 s), "converged"
-    for a step chosen by its error; `overrides`: parameters that replace those of the interpretation.
-    """
+    """Build the long experiment in which the drift is measured, with `overrides` of the reading's parameters."""
     overrides = {"daq.sample_rate": _DRIFT_RATE, **overrides}
     return make_experiment(COMMAND, closed_pct, reading, solver, duration=_DRIFT_DURATION, overrides=overrides)
 
@@ -145,11 +138,7 @@ def make_drift_experiment(
 def run_both_solvers(
     context: Context, command: str, closed_pct: float | None, reading: Reading = DEFAULT_READING
 ) -> Runs:
-    """Simulate a command with the thesis's solver (RK4, 1e-4 s) and with a converged one; return both runs by solver.
-
-    `closed_pct`: closing of the throttles [%], None for no throttles; `reading`: interpretation of the thesis's
-    equations of the throttles.
-    """
+    """Simulate a command by both solvers, with throttles closed by `closed_pct` [%], None for no throttles."""
     return {solver: context.run(make_experiment(command, closed_pct, reading, solver)) for solver in LABELS}
 
 
@@ -169,10 +158,7 @@ def steady_mask(run: SimulatedRun) -> np.ndarray:
 
 
 def steady_output(run: SimulatedRun, name: str) -> Array:
-    """Return the values of an output in the steady part of a run, from pi to 2 pi seconds (`STEADY`).
-
-    Returns a single nan if the run diverged.
-    """
+    """Return an output in the steady part of a run, from pi to 2 pi seconds; a single nan if the run diverged."""
     return np.array([math.nan]) if run.diverged else np.asarray(run.outputs[name][steady_mask(run)])
 
 
@@ -182,10 +168,7 @@ def steady_range(run: SimulatedRun, name: str) -> float:
 
 
 def mean_difference(run: SimulatedRun, first: str, second: str) -> float:
-    """Compute the mean of the output `first` minus the output `second` from pi to 2 pi seconds of a run.
-
-    The result is nan if the run diverged.
-    """
+    """Compute the mean of output `first` minus `second` from pi to 2 pi seconds of a run; nan if it diverged."""
     return float(np.mean(steady_output(run, first) - steady_output(run, second)))
 
 
@@ -209,10 +192,7 @@ def summarise_run(run: SimulatedRun) -> dict[str, float]:
 
 
 def piston_drift(run: SimulatedRun) -> float:
-    """Compute the drift [m] of the piston: its mean position in the last whole period of the command minus the first.
-
-    Returns nan if the run diverged.
-    """
+    """Compute the drift [m] of the piston's mean from the first to the last whole period; nan if the run diverged."""
     if run.diverged:
         return math.nan
     t, x = run.t, run.outputs["x"]

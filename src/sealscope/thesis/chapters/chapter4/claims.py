@@ -1,8 +1,7 @@
 """Judge the testable sentences of chapter 4.
 
-Claims on the orifices are judged on converged runs under both interpretations ("readings") of the throttles' equations,
-meter-out and as printed (`cases.Reading`); the results of RK4 at 1e-4 s, the thesis's solver, are stated for
-comparison.
+Claims on the orifices are judged on converged runs under both interpretations ("readings") of the throttles' equations
+(`cases.Reading`); the results of RK4 at 1e-4 s, the thesis's solver, are stated for comparison.
 """
 
 from __future__ import annotations
@@ -11,6 +10,7 @@ import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import TypeVar
 
 import numpy as np
@@ -36,7 +36,7 @@ from sealscope.thesis.chapters.chapter4.friction import falling_friction_limit, 
 from sealscope.thesis.engine.context import Context, SimulatedRun
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Cell, Claim, ThesisTable
-from sealscope.thesis.engine.texts import NOT_TESTED, format_note, judge_claim
+from sealscope.thesis.engine.texts import NOT_TESTED, format_note, format_range, judge_claim
 from sealscope.thesis.sines import sine_fit
 
 #: A change of drift counts if it exceeds this fraction of the drift without orifices.
@@ -48,13 +48,15 @@ _MAX_RESIDUAL, _MAX_FLOW_DIFFERENCE = 0.05, 0.05
 _T = TypeVar("_T")
 #: Summaries of runs (`cases.summarise_run`) with several commands or closings.
 Rows = list[dict[str, float]]
+#: The summaries by solver and by interpretation of the throttles' equations.
+RowsByReading = dict[Solver, dict[Reading, Rows]]
 
 
 def ringing(run: SimulatedRun, window: float = 0.05, after: float = 0.3) -> float:
     """Compute the median peak-to-peak ringing [Pa] of the noise-free p_A after the pump's reversals.
 
-    The ringing is p_A minus the moving mean of p_A over `window` [s]. The peak-to-peak value is taken from `window` to
-    `after` [s] after each reversal of the pump's direction. Reversals in the first second are left out.
+    The ringing is p_A minus its moving mean over `window` [s], from `window` to `after` [s] after each reversal of the
+    pump's direction. Reversals in the first second are left out.
     """
     rate = 1.0 / float(run.t[1] - run.t[0])
     p_A, omega = run.outputs["p_A"], run.outputs["omega"]
@@ -98,10 +100,7 @@ def _judge_cases_without_orifices(context: Context) -> Iterator[Claim]:
     yield judge_claim("4.5", [ring < noise for ring in rings.values()], rings=text, noise=noise * 1e-3)
 
     def drift_mm(**overrides: float) -> float:
-        """Compute the drift [mm] of the piston in a run of 60 s, with some of the rig's parameters replaced.
-
-        The drift is the mean position in the last whole period of the command minus the mean in the first period.
-        """
+        """Compute the drift [mm] of the piston in a run of 60 s, with some of the rig's parameters replaced."""
         experiment = cases.make_drift_experiment(DEFAULT_READING, closed_pct=None, solver="converged", **overrides)
         run = context.run(experiment)
         return 1e3 * cases.piston_drift(run)
@@ -115,10 +114,9 @@ def _judge_cases_without_orifices(context: Context) -> Iterator[Claim]:
 
 
 def _judge_step_and_gains(context: Context) -> Iterator[Claim]:
-    """Judge claims 4.1 and 4.3 on the solver's step and on the gains of the speed loop.
+    """Judge claims 4.1 and 4.3: halving the thesis's step of 1e-4 s changes a run by no more than the tolerance.
 
-    A test passes if halving the thesis's step of 1e-4 s changes a run by no more than the tolerance. The runs are all
-    cases of Tables 4.2 and 4.3 for claim 4.1, and two runs with the gains of the thesis's drive for claim 4.3.
+    The runs are all cases of Tables 4.2 and 4.3 for claim 4.1, and two with the gains of the thesis's drive for 4.3.
     """
     runs = {case: context.run(make_experiment(*case, solver="as_published")) for case in cases.CASES.values()}
 
@@ -184,8 +182,8 @@ def _judge_equations_and_tables(context: Context) -> Iterator[Claim]:
 def count_passed(tests: Mapping[Reading, tuple[bool, ...]]) -> str:
     """Format how many tests passed, such as "7 of 16 tests pass".
 
-    `tests`: results by interpretation of the throttles' equations (`Reading`). If only some tests passed, the text also
-    names the interpretations under which all of them do.
+    `tests`: results by interpretation of the throttles' equations. If only some tests passed, the text also names the
+    interpretations under which all of them do.
     """
     results = [test for row in tests.values() for test in row]
     passing_readings = [reading.title for reading, row in tests.items() if all(row)]
@@ -203,9 +201,9 @@ def _judge_runs(
 ) -> Claim:
     """Judge claim 4.`number` of the thesis by converged runs under both interpretations of the throttles' equations.
 
-    The claim's text states the results of both solvers, the converged one and the thesis's. `numbers`: results of the
-    runs by solver and interpretation (`Reading`); `test`: yields True or False for each test on the results under one
-    interpretation; `format_numbers`: formats the results under all interpretations.
+    `numbers`: results of the runs by solver and interpretation; `test`: yields True or False for each test on the
+    results under one interpretation; `format_numbers`: formats the results under all interpretations. The claim's text
+    states the results of both solvers.
     """
     tests = {
         solver: {reading: tuple(test(values)) for reading, values in numbers[solver].items()} for solver in SOLVERS
@@ -218,44 +216,38 @@ def _judge_runs(
     return judge_claim(f"4.{number}", results, simulation=simulation, noise=cases.visible_pressure() * 1e-3)
 
 
-def _format_range(values: Iterable[float], unit: str = "kPa", factor: float = 1e-3) -> str:
-    """Format the smallest and the largest of some values, such as "-1.25 to +3.00 kPa"; `factor` converts to `unit`."""
-    scaled = [value * factor for value in values]
-    return f"{min(scaled):+.2f} to {max(scaled):+.2f} {unit}"
-
-
 def _range_text(head: str, values: Callable[[Rows], Iterable[float]]) -> Callable[[list[Rows]], str]:
     """Build a function that formats the smallest and the largest of some numbers [kPa] over several runs.
 
-    The built function takes a list of lists: for each interpretation of the throttles' equations, the summaries of some
-    runs (`summarise_run`). `head`: text before the numbers; `values`: computes the numbers [Pa] from one inner list.
+    `values`: computes the numbers [Pa] from the summaries of the runs (`summarise_run`) under one interpretation of the
+    throttles' equations; the built function takes a list of these. `head`: text before the numbers.
     """
-    return lambda rows_of_readings: f"{head} {_format_range(v for rows in rows_of_readings for v in values(rows))}"
+    return lambda readings: f"{head} {format_range((v for rows in readings for v in values(rows)), 'kPa', 1e-3)}"
 
 
 def _changes(rows: Rows, statistic: str, names: Iterable[str] = PRESSURES) -> list[float]:
-    """Compute by how much a statistic of each pressure changes [Pa] from the first run to each later one.
+    """Compute by how much a statistic of each pressure changes [Pa] from the first run to each later one, run by run.
 
-    `rows`: summaries of the runs (`summarise_run`); `statistic`: "peak" (maximum) or "range" (maximum minus minimum);
-    `names`: the pressures. The changes are in one list, run by run.
+    `rows`: summaries of the runs (`summarise_run`); `statistic`: "peak" (maximum) or "range" (maximum minus minimum).
     """
     keys = [f"{statistic} of {name}" for name in names]
     return [row[key] - rows[0][key] for row in rows[1:] for key in keys]
 
 
-def _run_cases(context: Context, *commands_and_closings: tuple[str, float]) -> dict[Solver, dict[Reading, Rows]]:
+def _run_cases(context: Context, *commands_and_closings: tuple[str, float]) -> RowsByReading:
     """Simulate cases under both interpretations of the throttles' equations (`READINGS`), with both solvers.
 
-    A case is (command, closing): both throttles are closed by `closing` [%] of their area or diameter (`Reading`), 0
-    for open ones. Returns, by solver and interpretation, a list with the summary of each case's run (`summarise_run`).
+    A case is (command, closing [%] of both throttles). Returns, by solver and interpretation, a list with the summary
+    of each case's run (`summarise_run`).
     """
-
-    def summarise(command: str, closed: float, reading: Reading, solver: Solver) -> dict[str, float]:
-        """Simulate one case under one interpretation of the equations, and summarise its run."""
-        return cases.summarise_run(context.run(make_experiment(command, closed, reading, solver)))
-
     return {
-        solver: {reading: [summarise(*case, reading, solver) for case in commands_and_closings] for reading in READINGS}
+        solver: {
+            reading: [
+                cases.summarise_run(context.run(make_experiment(command, closed, reading, solver)))
+                for command, closed in commands_and_closings
+            ]
+            for reading in READINGS
+        }
         for solver in SOLVERS
     }
 
@@ -278,11 +270,7 @@ def _judge_opening(context: Context) -> Iterator[Claim]:
         return _changes(rows, "peak") + _changes(rows, "range")
 
     def format_flow_difference(rows_of_readings: list[Rows]) -> str:
-        """Format the largest rms(Q_A - Q_B) / rms(Q_A) of the runs with orifices that are 25 % closed.
-
-        The largest is over the interpretations of the throttles' equations (`READINGS`). `rows_of_readings`: for each
-        interpretation the summaries of two runs, of which the second has the orifices 25 % closed (`summarise_run`).
-        """
+        """Format the largest rms(Q_A - Q_B) / rms(Q_A) of the runs with orifices that are 25 % closed."""
         largest = max(rows[1][flows] for rows in rows_of_readings)
         return f"rms of Q_A - Q_B over rms of Q_A at most {100 * largest:.2f} %"
 
@@ -300,55 +288,39 @@ def _judge_opening(context: Context) -> Iterator[Claim]:
 def _judge_larger_closings(context: Context) -> Iterator[Claim]:
     """Judge claims 4.14 to 4.16 and 4.21 on larger commands and closings of the orifices.
 
-    - 4.14: the pressures' ranges (maximum minus minimum) grow with the amplitude of the command.
-    - 4.15: tighter orifices raise the chamber pressures' peaks (maxima).
-    - 4.16: tighter orifices raise the ranges of all four pressures.
-    - 4.21: the largest drop at the orifices is visible.
-
-    Each change or drop must exceed a transducer's noise (`visible_pressure`).
+    The pressures' ranges (maximum minus minimum) grow with the amplitude of the command (4.14); tighter orifices raise
+    the chamber pressures' peaks (4.15) and the ranges of all four pressures (4.16); the largest drop at the orifices is
+    visible (4.21). Each change must exceed a transducer's noise (`visible_pressure`).
     """
     min_visible = cases.visible_pressure()
     by_command = _run_cases(context, *((command, 50.0) for command in COMMANDS))
     fast_by_closing = _run_cases(context, *((COMMANDS[2], closed) for closed in CLOSINGS))
     slow_by_closing = _run_cases(context, *((COMMAND, closed) for closed in CLOSINGS))
 
-    def range_changes_to_last(rows: Rows) -> list[float]:
-        """Compute the changes of all pressures' ranges (maximum minus minimum) [Pa] from the first run to the last.
-
-        `rows`: summaries of the runs.
-        """
+    def range_changes(rows: Rows) -> list[float]:
+        """Compute the changes of all pressures' ranges [Pa] from the first run to the last."""
         return _changes([rows[0], rows[-1]], "range")
 
-    def ranges_grow(rows: Rows) -> Iterator[bool]:
-        """Yield for each pressure True if its range grows with the closing of the orifices.
+    def judge_increase(number: int, runs: RowsByReading, head: str, values: Callable[[Rows], Iterable[float]]) -> Claim:
+        """Judge claim 4.`number`: the numbers [Pa] that `values` computes from the runs' summaries are visible."""
+        return _judge_runs(
+            number, runs, lambda rows: (value > min_visible for value in values(rows)), _range_text(head, values)
+        )
 
-        The range is the pressure's maximum minus minimum. The range must grow from 25 to 50 and to 75 % closed
-        orifices, and from 25 to 75 % by more than a transducer's noise. `rows`: summaries of these three runs, in this
-        order.
-        """
+    def ranges_grow(rows: Rows) -> Iterator[bool]:
+        """Yield for each pressure True if its range grows from 25 to 50 to 75 % closed orifices, visibly in all."""
         for name in PRESSURES:
             at_25, at_50, at_75 = (row[f"range of {name}"] for row in rows)
             yield at_25 < at_50 < at_75 and at_75 - at_25 > min_visible
 
-    def chamber_peak_changes(rows: Rows) -> list[float]:
-        """Compute the changes of the chamber pressures' peaks (maxima) [Pa] from the first run to each later one.
-
-        `rows`: summaries of the runs.
-        """
-        return _changes(rows, "peak", CHAMBERS)
-
-    def largest_drops(rows: Rows) -> list[float]:
-        """List the largest pressure drop [Pa] at the orifices in each run; `rows`: summaries of the runs."""
-        return [row["largest drop"] for row in rows]
-
-    changes = _range_text(f"{COMMANDS[2]} against {COMMANDS[0]}, 50 % closed, ranges", range_changes_to_last)
-    yield _judge_runs(14, by_command, lambda rows: np.array(range_changes_to_last(rows)) > min_visible, changes)
-    changes = _range_text(f"50 and 75 against 25 % closed, {COMMANDS[2]}, peaks", chamber_peak_changes)
-    yield _judge_runs(15, fast_by_closing, lambda rows: np.array(chamber_peak_changes(rows)) > min_visible, changes)
-    changes = _range_text("75 against 25 % closed, ranges", range_changes_to_last)
+    head = f"{COMMANDS[2]} against {COMMANDS[0]}, 50 % closed, ranges"
+    yield judge_increase(14, by_command, head, range_changes)
+    head = f"50 and 75 against 25 % closed, {COMMANDS[2]}, peaks"
+    yield judge_increase(15, fast_by_closing, head, lambda rows: _changes(rows, "peak", CHAMBERS))
+    changes = _range_text("75 against 25 % closed, ranges", range_changes)
     yield _judge_runs(16, slow_by_closing, ranges_grow, changes)
-    drops = _range_text(f"largest drop at 25, 50, 75 % under {COMMAND}", largest_drops)
-    yield _judge_runs(21, slow_by_closing, lambda rows: np.array(largest_drops(rows)) > min_visible, drops)
+    head = f"largest drop at 25, 50, 75 % under {COMMAND}"
+    yield judge_increase(21, slow_by_closing, head, lambda rows: [row["largest drop"] for row in rows])
 
 
 def _judge_drift(context: Context) -> Iterator[Claim]:
@@ -368,42 +340,27 @@ def _judge_drift(context: Context) -> Iterator[Claim]:
         for solver in SOLVERS
     }
 
-    def drift_formatter(head: str) -> Callable[[list[list[float]]], str]:
-        """Build a function that formats, for each closing, the drift of the piston due to the orifices.
+    def format_drifts(head: str, rows: list[list[float]]) -> str:
+        """Format the drift [mm] due to the orifices at each closing, as its smallest and largest value over `rows`.
 
-        This is the drift with orifices minus the drift without. The text states its smallest and its largest value over
-        the interpretations of the throttles' equations. `head`: text before these values.
+        A row has the drifts [m] under one interpretation of the equations, one for each closing.
         """
-
-        def format_drift(rows: list[list[float]]) -> str:
-            """Format the drift [mm] due to the orifices at each closing, as its smallest and largest value over `rows`.
-
-            Each row has the drifts [m] under one interpretation of the equations, one for each closing.
-            """
-            parts = (_format_range([row[k] - drift_without for row in rows], "mm", 1e3) for k in range(len(CLOSINGS)))
-            texts = (f"{closed:g} % closed {part}" for closed, part in zip(CLOSINGS, parts, strict=True))
-            return f"{head} {', '.join(texts)}"
-
-        return format_drift
+        parts = (format_range([row[k] - drift_without for row in rows], "mm", 1e3) for k in range(len(CLOSINGS)))
+        texts = (f"{closed:g} % closed {part}" for closed, part in zip(CLOSINGS, parts, strict=True))
+        return f"{head} {', '.join(texts)}"
 
     def differs(row: list[float]) -> Iterator[bool]:
-        """Yield for each closing whether the drift differs from that without orifices by over `min_change`.
-
-        `row`: the drift [m] at each closing.
-        """
+        """Yield for each closing whether the drift [m] differs from that without orifices by over `min_change`."""
         return (abs(with_orifices - drift_without) > min_change for with_orifices in row)
 
     def grows(row: list[float]) -> Iterator[bool]:
-        """Yield for each closing except the first whether the piston drifts more than at the closing before.
-
-        The magnitude must grow by more than `min_change`. `row`: the drift [m] at each closing.
-        """
+        """Yield for each closing but the first whether the drift [m] is larger than before by over `min_change`."""
         return (abs(later) - abs(earlier) > min_change for earlier, later in itertools.pairwise(row))
 
     head = f"drift over 60 s without orifices {drift_without * 1e3:.3f} mm, in addition at"
-    yield _judge_runs(18, drifts, differs, drift_formatter(head))
+    yield _judge_runs(18, drifts, differs, partial(format_drifts, head))
     head = "drift over 60 s beyond that without orifices, at"
-    yield _judge_runs(19, drifts, grows, drift_formatter(head))
+    yield _judge_runs(19, drifts, grows, partial(format_drifts, head))
 
 
 #: Keys of a run's summary that the table of readings shows, and the factor from SI units to the table's units.
@@ -417,10 +374,7 @@ _HALVING_TEST = {True: "passed", False: "not passed", None: "not made"}
 
 
 def claims(context: Context, item: Item) -> tuple[ThesisTable | Claim, ...]:
-    """Judge the claims of chapter 4, and tabulate summaries of the runs with one command.
-
-    The table has a row for each interpretation of the throttles' equations, solver and closing of the orifices.
-    """
+    """Judge the claims of chapter 4, and tabulate runs by interpretation of the equations, solver and closing."""
     without_orifices = (_judge_cases_without_orifices, _judge_step_and_gains, _judge_equations_and_tables)
     with_orifices = (_judge_opening, _judge_larger_closings, _judge_drift)
     judgements = [claim for judge in (*without_orifices, *with_orifices) for claim in judge(context)]

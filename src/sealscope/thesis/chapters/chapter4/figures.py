@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -42,7 +43,6 @@ class FigureUnit(NamedTuple):
     scale: float
 
 
-#: The units of the quantities, by name.
 FIGURE_UNITS: dict[str, FigureUnit] = {
     "u": FigureUnit("V", 1.0),
     "omega": FigureUnit("rad/s", 1.0),
@@ -52,8 +52,7 @@ FIGURE_UNITS: dict[str, FigureUnit] = {
 }
 #: Gauge pressure [MPa] of a vacuum.
 _VACUUM = -1e-6 * P_ATM
-#: Two curves coincide if their rms difference is below this fraction of their range; one of them is then drawn as this
-#: number of marks.
+#: Curves with an rms difference below this fraction of their range coincide; one is then drawn as so many marks.
 _COINCIDENCE_FRACTION, _N_MARKS = 0.005, 80
 _CLOSING_ROLES: dict[float, Role] = {25.0: "25 %", 50.0: "50 %", 75.0: "75 %"}
 #: Line volumes V_1 = V_2 [cm^3] that are compared, and those of a quick reproduction.
@@ -66,21 +65,16 @@ def item_reading(item: Item) -> Reading:
 
 
 def _run_case(context: Context, item: Item) -> tuple[Runs, str]:
-    """Simulate a case of Table 4.2 or 4.3 with the thesis's solver (RK4, 1e-4 s) and with a converged one.
-
-    `item.inputs` has the key of the case (`CASES`), and may have an interpretation of the throttles' equations. Returns
-    the runs by solver, and the notes for the figure or table.
-    """
+    """Simulate the case of Table 4.2 or 4.3 that `item.inputs` names by both solvers; return runs and notes."""
     (command, closed_pct), reading = CASES[item.inputs["case"]], item_reading(item)
     runs = run_both_solvers(context, command, closed_pct, reading)
     return runs, _run_notes(runs, reading if closed_pct is not None else None)
 
 
 def _run_notes(runs: Runs, reading: Reading | None) -> str:
-    """Format the notes on a figure of a case: variant of the equations, and runs that failed or need a smaller step.
+    """Format the notes on a case: reading of the equations, failed or unresolved runs, and pressures below vacuum.
 
-    The notes also name runs in which a pressure falls below vacuum. `reading`: one way to understand the thesis's
-    inconsistent equations (`Reading`); None for a case without orifices.
+    `reading`: one way to understand the thesis's inconsistent equations; None for a case without orifices.
     """
     notes = [format_note("measured-curve")]
     if reading is not None:
@@ -101,52 +95,38 @@ def _axis_label(name: str) -> str:
 
 
 def _line_curve(run: SimulatedRun, name: str, label: str, role: Role) -> FigureCurve:
-    """Build the curve of the output `name` of a run over time, in the figures' unit.
-
-    `label`: text of the curve in the legend; `role`: its meaning, which determines the line style.
-    """
+    """Build the curve of an output of a run over time, in the figures' unit; `role` determines its line style."""
     return FigureCurve(run.t, run.outputs[name] * FIGURE_UNITS[name].scale, label, role)
 
 
-def _marked_curve(run: SimulatedRun, name: str, label: str, role: Role) -> FigureCurve:
-    """Build the curve of the output `name` as about 80 marks, so that another curve with the same values stays visible.
-
-    `label`: text of the curve in the legend; `role`: its meaning, which determines the style of the marks.
-    """
-    thinned = slice(None, None, max(1, run.t.size // _N_MARKS))
-    values = run.outputs[name][thinned] * FIGURE_UNITS[name].scale
-    return FigureCurve(run.t[thinned], values, f"{label} (the same)", role, "points")
+def _mark_points(curve: FigureCurve) -> FigureCurve:
+    """Convert a line to about 80 marks, between which another curve with the same values stays visible."""
+    step = max(1, curve.x.size // _N_MARKS)
+    return replace(curve, x=curve.x[::step], y=curve.y[::step], label=f"{curve.label} (the same)", kind="points")
 
 
 def _solver_curves(runs: Runs, name: str) -> tuple[FigureCurve, ...]:
     """Build the curves of an output over time, one for each solver whose run did not diverge.
 
-    If both curves coincide, that is if their rms difference is below 0.5 % of the output's range, the curve of the
-    thesis's solver is drawn as a few marks.
+    If both coincide, i.e. differ by less than 0.5 % of the output's range (rms), the thesis's curve is a few marks.
     """
-    converged = runs["converged"]
-    max_difference = _COINCIDENCE_FRACTION * steady_range(converged, name) * FIGURE_UNITS[name].scale
-    if len(completed_runs(runs)) == 2 and _rms_difference(runs, name) < max_difference:
-        marks = _marked_curve(runs["as_published"], name, LABELS["as_published"], "as_published")
-        return _line_curve(converged, name, LABELS["converged"], "converged"), marks
-    return tuple(_line_curve(run, name, label, solver) for solver, label, run in completed_runs(runs))
+    max_difference = _COINCIDENCE_FRACTION * steady_range(runs["converged"], name) * FIGURE_UNITS[name].scale
+    curves = {solver: _line_curve(run, name, label, solver) for solver, label, run in completed_runs(runs)}
+    if len(curves) == 2 and _rms_difference(runs, name) < max_difference:
+        return curves["converged"], _mark_points(curves["as_published"])
+    return tuple(curves.values())
 
 
 def _rms_difference(runs: Runs, name: str) -> float:
-    """Compute the rms difference of an output between the runs with the thesis's solver and with a converged one.
-
-    The difference is in the figures' unit (`FIGURE_UNITS`), and taken from pi to 2 pi seconds of the runs. The result
-    is nan if a run diverged.
-    """
+    """Compute the rms difference of an output between both solvers' steady runs, in the figures' unit, or nan."""
     difference = steady_output(runs["as_published"], name) - steady_output(runs["converged"], name)
     return float(np.sqrt(np.mean(difference**2)) * FIGURE_UNITS[name].scale)
 
 
 def case_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
-    """Tabulate minimum, maximum and standard deviation of each quantity in a case of Table 4.2 or 4.3.
+    """Tabulate minimum, maximum and standard deviation of each quantity in a case of Table 4.2 or 4.3, by solver.
 
-    The case is simulated with the thesis's solver (RK4, 1e-4 s) and with a converged one. The last column is the rms
-    difference between both runs. All numbers are from pi to 2 pi seconds of the runs.
+    The last column is the rms difference between both runs. All numbers are from pi to 2 pi seconds of the runs.
     """
     runs, notes = _run_case(context, item)
     rows: list[tuple[Cell, ...]] = []
@@ -163,10 +143,7 @@ def case_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
 
 
 def time_figure(context: Context, item: Item) -> tuple[Figure, ...]:
-    """Draw some quantities of a case over time, each with the thesis's solver and with a converged one.
-
-    `item.inputs` has the case of Table 4.2 or 4.3 and the names of the quantities, such as "p_A".
-    """
+    """Draw the quantities that `item.inputs` names, such as "p_A", over time in a case, by solver."""
     runs, notes = _run_case(context, item)
     command, _ = CASES[item.inputs["case"]]
     t = runs["converged"].t
@@ -185,10 +162,9 @@ def time_figure(context: Context, item: Item) -> tuple[Figure, ...]:
 
 
 def orifice_figure(context: Context, item: Item) -> tuple[Figure, ...]:
-    """Draw the pressures on both sides of an orifice and their difference over time (Figs. 4.13, 4.14).
+    """Draw the pressures on both sides of an orifice and their difference over time (Figs. 4.13, 4.14), by solver.
 
-    The case is simulated with the thesis's solver (RK4, 1e-4 s) and with a converged one. `item.inputs` has the case
-    and the names of the pressures on the pump's and on the cylinder's side.
+    `item.inputs` has the case and the names of the pressures on the pump's and on the cylinder's side.
     """
     runs, notes = _run_case(context, item)
     pump, chamber = item.inputs["quantities"]
@@ -213,20 +189,20 @@ def _orifice_curves(run: SimulatedRun, pump: str, chamber: str) -> tuple[FigureC
     curves coincide, the pump's is drawn as a few marks.
     """
     chamber_curve = _line_curve(run, chamber, chamber, "A" if chamber == "p_A" else "B")
+    pump_curve = _line_curve(run, pump, pump, "reference")
     rms_difference = float(np.sqrt(np.mean((steady_output(run, pump) - steady_output(run, chamber)) ** 2)))
     if rms_difference >= _COINCIDENCE_FRACTION * steady_range(run, chamber):
-        return _line_curve(run, pump, pump, "reference"), chamber_curve
-    return chamber_curve, _marked_curve(run, pump, pump, "reference")
+        return pump_curve, chamber_curve
+    return chamber_curve, _mark_points(pump_curve)
 
 
 def _sweep_curves(
     template: str, sweep: Mapping[float, Runs], measure: Callable[[SimulatedRun], float], solvers: Sequence[Solver]
 ) -> tuple[tuple[FigureCurve, ...], list[Number]]:
-    """Build a curve of a measure over a varied parameter for each solver, and list the curves' points as numbers.
+    """Build a curve of a measure over a varied parameter for each solver, and list the curves' points as numbers [MPa].
 
-    Curves and numbers are in MPa. `sweep`: runs by value of the varied parameter and by solver; `measure`: computes the
-    measure [Pa] of a run, such as the range of a pressure; `template`: name of a number, with a placeholder for the
-    parameter's value; `solvers`: solvers to draw.
+    `template`: name of a number, with a placeholder for the parameter's value; `sweep`: runs by this value and by
+    solver; `measure`: computes the measure [Pa] of a run, such as the range of a pressure.
     """
     curves, numbers = [], []
     for solver in solvers:
@@ -238,11 +214,7 @@ def _sweep_curves(
 
 
 def closing_figure(context: Context, item: Item) -> tuple[Figure, ...]:
-    """Draw one pressure over time with orifices that are 25, 50 and 75 % closed, and its range over the closing.
-
-    The runs are made with the thesis's solver (RK4, 1e-4 s) and with a converged one. `item.inputs` has the pressure's
-    name.
-    """
+    """Draw a pressure with orifices that are 25, 50 and 75 % closed, and its range over the closing, by solver."""
     name, reading = item.inputs["quantity"], item_reading(item)
     sweep = {closed: run_both_solvers(context, COMMAND, closed, reading) for closed in CLOSINGS}
     panels = []
@@ -260,11 +232,7 @@ def closing_figure(context: Context, item: Item) -> tuple[Figure, ...]:
 
 
 def volume_figure(context: Context, item: Item) -> tuple[Figure, ...]:
-    """Draw how the pressures depend on the line volumes V_1 = V_2, which the thesis does not give.
-
-    The panels show the range of p_1, the range of p_A, and the mean of p_1 - p_A, for one command and throttles that
-    are closed by 25 %.
-    """
+    """Draw how the pressures depend on the line volumes V_1 = V_2, which the thesis does not give."""
     command, closed = "3 sin(4t)", 25.0  # closed [%]
     volumes = _QUICK_VOLUMES if context.quick else _VOLUMES
     sweep = {volume: run_both_solvers(context, command, closed, Reading(V_line_cm3=volume)) for volume in volumes}
@@ -283,9 +251,6 @@ def volume_figure(context: Context, item: Item) -> tuple[Figure, ...]:
 
 
 def measured_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
-    """Tabulate the figures of chapter 4 that show only measured curves.
-
-    Each row names such a figure, its content, and the simulated figure that replaces it. `context` is not used.
-    """
+    """Tabulate the figures of chapter 4 that show only measured curves, and the simulated figure that replaces each."""
     rows = ((*row, "cannot be reproduced: no numbers are given") for row in load_texts("cases.toml")["measured"])
     return (item.table(rows, format_note("measured-only")),)

@@ -29,9 +29,8 @@ def thesis_rig() -> Rig:
 def stribeck_force(v: Array, F_C: float, *, literal_bracket: bool = False) -> Array:
     """Compute the friction [N] of the thesis's rig at the velocities `v` (n,) [m/s], eqs. (4.21), (4.22) of the thesis.
 
-    The friction is the sum of Coulomb, Stribeck and viscous friction (`stribeck_friction`). `F_C` [N]: Coulomb force;
-    `literal_bracket`: True to close the unbalanced bracket of eq. (4.22) at its end. The friction then jumps at the
-    threshold velocity v_th.
+    `F_C` [N]: Coulomb force; `literal_bracket`: True to close the unbalanced bracket of eq. (4.22) at its end. The
+    friction then jumps at the threshold velocity v_th.
     """
     f = thesis_rig().friction
     friction = getattr(stribeck_friction, "py_func", stribeck_friction)  # uncompiled: a few hundred points
@@ -41,8 +40,7 @@ def stribeck_force(v: Array, F_C: float, *, literal_bracket: bool = False) -> Ar
 def friction_at_threshold(F_C: float) -> dict[str, tuple[float, float]]:
     """Compute the friction [N] at the threshold velocity v_th and just above it, for both forms of eq. (4.22).
 
-    Returns the two forces by the name of the form: "continuous", or "literal" with the bracket as printed. `F_C`:
-    Coulomb force [N].
+    The keys are "continuous", and "literal" with the bracket as printed. `F_C`: Coulomb force [N].
     """
     v_th = thesis_rig().friction.v_th
     velocities = np.array([v_th, math.nextafter(v_th, 1.0)])
@@ -54,10 +52,9 @@ def friction_at_threshold(F_C: float) -> dict[str, tuple[float, float]]:
 
 
 def falling_friction_limit(F_C: float) -> float:
-    """Compute the velocity [m/s] up to which the friction falls with speed, for the Coulomb force `F_C` > 0 [N].
+    """Compute the velocity [m/s] up to which friction falls with speed, 0 if never; `F_C` > 0: Coulomb force [N].
 
-    At this velocity v, viscous friction rises as fast as Stribeck friction falls: F_v = F_C (K_brk - 1) C_c exp(-C_c
-    v). The result is 0 if the friction never falls. The parameters are those of the thesis's rig: F_v [N s/m] viscous
+    It solves F_v = F_C (K_brk - 1) C_c exp(-C_c v), with the parameters of the thesis's rig: F_v [N s/m] viscous
     coefficient, K_brk breakaway force over Coulomb force, C_c [s/m] decay of the Stribeck effect.
     """
     f = thesis_rig().friction
@@ -67,10 +64,7 @@ def falling_friction_limit(F_C: float) -> float:
 
 
 def friction_models_figure(context: Context, item: Item) -> tuple[Figure, ...]:
-    """Draw Fig. 4.2: Coulomb, static and stick-slip friction and the Stribeck curve, with numbers of Table 4.1.
-
-    `context` is not used.
-    """
+    """Draw Fig. 4.2: Coulomb, static and stick-slip friction and the Stribeck curve; `context` is not used."""
     f = thesis_rig().friction
     F, F_brk, v_th = f.F_pr, f.F_pr * f.K_brk, f.v_th
     v = np.linspace(-0.1, 0.1, 801)
@@ -93,11 +87,7 @@ def friction_models_figure(context: Context, item: Item) -> tuple[Figure, ...]:
 
 
 def stribeck_figure(context: Context, item: Item) -> tuple[Figure, ...]:
-    """Draw Fig. 4.3: friction over velocity, its slope, and both interpretations of eq. (4.22) near standstill.
-
-    The interpretations close the unbalanced bracket of the equation in different places (`stribeck_force`). `context`
-    is not used.
-    """
+    """Draw Fig. 4.3: friction over velocity, its slope, and both ways to close the bracket of eq. (4.22)."""
     rig = thesis_rig()
     f = rig.friction
     # Coulomb force with both chambers at charge pressure; F_cfr multiplies the sum of the pressures, eq. (4.20)
