@@ -23,7 +23,7 @@ from sealscope.diagnosis.inference.blocks import (
 )
 from sealscope.diagnosis.inference.changes.charge_pressure import ChargeTrend
 from sealscope.diagnosis.inference.differences import size_penalty
-from sealscope.diagnosis.inference.leak_law import apparent_conductances
+from sealscope.diagnosis.inference.leak_law import EXPONENTS, apparent_conductances, law_priors
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.inference.onset import Information, StepTest, step_tests
 from sealscope.diagnosis.inference.terms import (
@@ -67,7 +67,7 @@ def volume_observables(
 
     A leak is tested as a laminar flow, and as a flow proportional to a power of p_A - p_B below 1. The coefficients of
     the motion are tested together, for a change of their common scale. The result has one observable for each test. Its
-    `advantage` comes from the prior on its size, the sensor offset, and the oil that the accumulator lost.
+    `advantage` comes from the priors on its size and its law, the sensor offset, and the oil that the accumulator lost.
 
     - `blocks`: Gram matrices of the columns in blocks of the recording, without the sensor offset of p_A - p_B, for the
       tests of laminar leaks; `plain`: the same with the pressures as recorded, for all other tests.
@@ -80,9 +80,10 @@ def volume_observables(
     centred, recorded = (series.merge(max_blocks=INFERENCE.blocks.coarse) for series in (blocks, plain))
     # a laminar leak is tested without the sensor offset, so an improbable offset counts against the leak
     leak_disadvantage = offset_cost(estimate_offset(blocks, columns))
+    law_prior = dict(zip(EXPONENTS, law_priors().tolist(), strict=True))
     observables = []
     for hypothesis in _step_hypotheses(centred, recorded, balances[0].terms, columns, has_accumulator=bool(oil_loss)):
-        name, signs, coefficient, shape = hypothesis
+        name, signs, coefficient, shape, law = hypothesis
         steps = step_tests(coefficient, signs, shape)
         if not steps:
             continue
@@ -91,6 +92,7 @@ def volume_observables(
             advantage = -leak_disadvantage
         else:
             advantage = -_size_penalty(name, step.fitted.size, recorded, columns[0].names, volume_ratio, flow_scale)
+        advantage += 2.0 * float(np.log(law_prior[law] / law_prior[1.0]))
         # a leak whose oil a check valve makes up has a name of its own, which ends with MADE_UP
         if (accumulator_test := oil_loss.get(name.removesuffix(MADE_UP))) is not None:
             advantage += _accumulator_support(step, accumulator_test)
@@ -134,13 +136,14 @@ class _Hypothesis(NamedTuple):
 
     `name`: name of the observable; `signs`: 1 to test for a step up, -1 for a step down; `coefficient`: likelihood of
     the coefficient in K blocks; `shape` (K,): change of the coefficient in each block by a unit step, None for 1 in all
-    blocks.
+    blocks; `law`: exponent e of a flow proportional to a pressure's power e, 1 for all but some leaks.
     """
 
     name: str
     signs: Sequence[float]
     coefficient: Information
     shape: Array | None = None
+    law: float = 1.0
 
 
 def _step_hypotheses(
@@ -158,12 +161,13 @@ def _step_hypotheses(
         if _is_tested(term, first, has_accumulator):
             blocks = centred if term.name in (LEAK, PUMP) else recorded
             signs = (1.0,) if term.cause in _ONE_WAY and term.name != BIAS else (1.0, -1.0)
-            yield _Hypothesis(_observable_name(term), signs, information(blocks, columns, index))
+            law = 0.5 if term.name == ORIFICE else 1.0
+            yield _Hypothesis(_observable_name(term), signs, information(blocks, columns, index), law=law)
     # pressures as recorded: the removed offset was estimated for a laminar leak, and may be the effect of another law
     leak = information(recorded, columns, first.leak)
     for exponent, shape in apparent_conductances(recorded, columns).items():
         if exponent < 1.0:  # 1 is the laminar leak, tested above
-            yield _Hypothesis(f"{LEAK} of exponent {exponent:g}", (1.0,), leak, shape)
+            yield _Hypothesis(f"{LEAK} of exponent {exponent:g}", (1.0,), leak, shape, law=exponent)
     scale = first.names.index(ORIFICE)  # the column of the orifice, no longer needed, takes the motion's volume
     yield _Hypothesis(SCALE, (1.0, -1.0), information(_with_fitted_motion(recorded, columns, scale), columns, scale))
 
