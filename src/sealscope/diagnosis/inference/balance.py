@@ -121,10 +121,7 @@ class BlockStream:
         self.restart(start)
 
     def restart(self, begin: float) -> None:
-        """Continue after a gap in the samples; the next sample is at the time `begin` [s].
-
-        Samples of a block that is not complete are dropped.
-        """
+        """Drop the samples of an incomplete block; the next sample is at the time `begin` [s], after a gap."""
         self._begin = begin
         self._pieces: list[Mapping[str, Array]] = []  # joined only when they complete a block
         self._first = 0  # index of the first stored sample, counted from `begin`
@@ -134,10 +131,8 @@ class BlockStream:
     def push(self, samples: Mapping[str, Array], last: bool = False) -> Blocks | None:
         """Add samples of the stream and return the blocks that they complete; None if they complete none.
 
-        A block is a few seconds of samples, reduced to Gram matrices of the volume balances' regressions (`Blocks`).
-        The first `n_first` blocks are returned together. `samples`: equally long arrays by channel name, NaN where a
-        sample is missing; `last`: true if no samples follow. Complete blocks then do not wait for the samples after
-        them, or for `n_first` blocks.
+        `samples`: arrays by channel name, NaN where missing; `last`: true if no samples follow. Complete blocks then do
+        not wait for the samples after them, or for the first `n_first` blocks, which are returned together.
         """
         if samples:
             self._pieces.append(samples)
@@ -174,8 +169,7 @@ class BlockStream:
     def state(self) -> dict[str, Any]:
         """Return the state of the stream as plain values for JSON, from which `load_state` continues.
 
-        It consists of the samples that later blocks need, the offsets and signs that were estimated from the first
-        samples, and the sums over earlier blocks that determine the weights of the rows (`blocks.Weighting`).
+        It has the samples that later blocks need, constants of the first samples, and sums over all blocks.
         """
         return {
             "samples": {name: plain_array(values) for name, values in self._join_pieces().items()},
@@ -188,10 +182,7 @@ class BlockStream:
         }
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Restore the state of a stream from the plain values that the method `state` returned.
-
-        Raise InputError if the values do not fit the balances of this stream.
-        """
+        """Restore what `state` returned; raise InputError if the values do not fit the balances of this stream."""
         samples = require_part(state, "samples", Mapping)
         self.restart(float(require_part(state, "begin", (float, int))))
         self._pieces = [{name: restore_array(values, name) for name, values in samples.items()}] if samples else []
@@ -208,18 +199,13 @@ class BlockStream:
     def _flow_sign_log_odds(self, rows: Sequence[Array]) -> tuple[float, ...]:
         """Compute for each volume balance the log odds that the recorded flow has the right sign.
 
-        `rows`: for each balance the rows (r, m) of its regression, one for each test function of the weak form.
-
-        The log odds of a correct sign are the sum over three symptoms of correct wiring:
+        `rows`: for each balance the rows (r, m) of its regression, one for each test function of the weak form. The log
+        odds are the sum over three symptoms of correct wiring, each with a z score (`_sign_log_odds`):
 
         - Oil leaks from high to low pressure.
         - p_A - p_B correlates with the flow into A, since friction dissipates energy. A constant load also does work in
-          strokes that do not return; therefore the mean of p_A - p_B, weighted by the magnitude of the flow, is
-          subtracted first.
+          strokes that do not return; its mean p_A - p_B, weighted by abs(flow), is subtracted.
         - The position x grows with the flow into A. A negative correlation does not count, since x may be reversed.
-
-        Each symptom has a z score, with the probability Phi(z) of a correct sign, except for a fraction of machines in
-        which something else causes the score (`_sign_log_odds`).
         """
         odds_by_balance = []
         for balance, columns, values in zip(self._balances, self.columns, rows, strict=True):
@@ -240,24 +226,29 @@ class BlockStream:
     def _build_blocks(self, samples: Mapping[str, Array], first: int, end: int) -> Blocks:
         """Compute the blocks with the indices `first` to `end` - 1 from `samples`, arrays by channel name.
 
-        A row is the volume balance integrated with one test function of the weak form. The rows of these blocks are
-        weighted together: one robust fit to all of them determines the weights. The first call also estimates the
-        signs of the left sides, for all blocks of the stream. `on_samples` is called with the samples of each block.
+        One robust fit to all rows of these blocks determines their weights. The first call also estimates, for all
+        blocks of the stream, the signs of the left sides, absolute minus gauge pressure, and the speeds of rests.
+        `on_samples` is called with the samples of each block.
         """
         length = self._strides_per_block * self._stride  # samples in a block
         n_first_samples = (self._n_first or end) * length  # samples in the first blocks; in all without `_n_first`
-        self._estimate_stream_constants(samples, n_first_samples)
+        if self._absolute_offsets is None:
+            self._absolute_offsets = {
+                name: _absolute_offset(samples[name][:n_first_samples]) for name in ("p_A", "p_B") if name in samples
+            }
+        if self._finds_rests and self._rest_limits is None:
+            self._rest_limits = _find_rest_limits(samples, self._rate, self._balances[0])
         if self._on_samples is not None:
             for k in range(first * length, end * length, length):
                 block = slice(k - self._first, k - self._first + length)
                 self._on_samples(self._begin + k / self._rate, {name: samples[name][block] for name in samples})
         size = max(1, BATCH_SAMPLES // length)  # blocks in a batch, whose rows are computed together
         batches = [self._compute_rows(samples, k, min(k + size, end)) for k in range(first, end, size)]
-        weights = np.concatenate([batch.weights for batch in batches])
+        row_parts, *block_parts = zip(*batches, strict=True)
+        weights, flow, pressures = (np.concatenate(parts) for parts in block_parts)
         is_counted = weights > 0.0  # rows without missing samples
         root_weights = np.sqrt(weights[is_counted])[:, None]  # a product of two entries of a row has its weight
-        rows_by_balance = zip(*(batch.rows for batch in batches), strict=True)
-        rows = [np.concatenate(parts)[is_counted] * root_weights for parts in rows_by_balance]
+        rows = [np.concatenate(parts)[is_counted] * root_weights for parts in zip(*row_parts, strict=True)]
         if not self.left_signs:
             self.sign_log_odds = self._flow_sign_log_odds(rows)
             self.left_signs = tuple(-1.0 if log_odds < 0.0 else 1.0 for log_odds in self.sign_log_odds)
@@ -273,32 +264,22 @@ class BlockStream:
             end=start + (self._strides_per_block - 1) * stride,
             gram=self._weighting.compute_gram_matrices(rows, block_ends),
             rows=weights.reshape(-1, self._strides_per_block).sum(axis=1),
-            flow=np.concatenate([batch.flow for batch in batches]),
-            pressures=np.concatenate([batch.pressures for batch in batches]),
+            flow=flow,
+            pressures=pressures,
             zero=np.full(end - first, self._offset),
         )
 
-    def _estimate_stream_constants(self, samples: Mapping[str, Array], n_samples: int) -> None:
-        """Estimate and store two constants of the stream: absolute minus gauge pressure, and the speed of rests.
+    def _compute_rows(
+        self, samples: Mapping[str, Array], first: int, end: int
+    ) -> tuple[list[Array], Array, Array, Array]:
+        """Compute the rows of each volume balance in the K blocks `first` to `end` - 1 from `samples`, by channel name.
 
-        They are estimated at the first call only. The difference of absolute and gauge pressure is estimated for each
-        sensor from the first `n_samples` of `samples`. The speeds below which pump or piston count as resting are
-        estimated from all `samples`, and only if the volume balance needs them.
-        """
-        if self._absolute_offsets is None:
-            self._absolute_offsets = {
-                name: _absolute_offset(samples[name][:n_samples]) for name in ("p_A", "p_B") if name in samples
-            }
-        if self._finds_rests and self._rest_limits is None:
-            self._rest_limits = _find_rest_limits(samples, self._rate, self._balances[0])
+        Returns four items:
 
-    def _compute_rows(self, samples: Mapping[str, Array], first: int, end: int) -> _BlockRows:
-        """Compute the rows of each volume balance in the blocks `first` to `end` - 1, and their weights.
-
-        A row contains the integrals of a balance's terms and left side, each with one test function of the weak form; a
-        regression of the left side on the terms later gives the coefficients. `samples`: arrays by channel name. For
-        each block the result also contains the mean magnitude of the first balance's left side as a flow [m^3/s], and
-        the means of equal parts of the sorted samples of p_A - p_B [Pa].
+        - for each balance an array (r, m) of its terms and left side, with one row for each test function;
+        - weights (r,) of the rows: 1, a fraction next to a hole (a long gap), and 0 with a missing sample;
+        - mean magnitudes (K,) of the first balance's left side [m^3/s];
+        - means (K, p) of p equal parts of the sorted samples of p_A - p_B [Pa].
         """
         length = self._strides_per_block * self._stride  # samples in a block
         # range of the samples of the blocks; the test functions of the last rows extend beyond the last block
@@ -308,11 +289,7 @@ class BlockStream:
             name: values[begin - self._first : stop + self._margin - self._first] for name, values in samples.items()
         }
         signals = Signals(
-            piece,
-            self._rate,
-            to_absolute=self._absolute_offsets,
-            offset=self._offset,
-            rest_limits=self._rest_limits,
+            piece, self._rate, to_absolute=self._absolute_offsets, offset=self._offset, rest_limits=self._rest_limits
         )
         without_margins = slice(start - begin, stop - 1 - begin)  # selects increments, one fewer than samples
         is_whole = np.ones((end - first) * self._strides_per_block, dtype=bool)
@@ -332,33 +309,14 @@ class BlockStream:
         hole_weights = (
             weights_near_holes(piece[HOLE][start - begin : stop - begin], self._rate) if HOLE in piece else 1.0
         )
-        return _BlockRows(tuple(rows), np.where(is_whole, hole_weights, 0.0), mean_flow, pressures)
-
-
-class _BlockRows(NamedTuple):
-    """Rows of the regression of each volume balance in K blocks, and their weights.
-
-    `rows`: for each balance an array (r, m) of m columns (its terms and left side), with one row for each test function
-    of the weak form. `weights` (r,): 1 without holes (long gaps of missing samples), a fraction next to a hole, and 0
-    with a missing sample. `flow` (K,): mean magnitude of the first balance's left side [m^3/s]; `pressures` (K, p):
-    means of p equal parts of the sorted samples of p_A - p_B [Pa].
-    """
-
-    rows: tuple[Array, ...]
-    weights: Array
-    flow: Array
-    pressures: Array
+        return rows, np.where(is_whole, hole_weights, 0.0), mean_flow, pressures
 
 
 def _z_score(products: Array) -> float:
-    """Compute the z score of the sum of `products` (r,) under the hypothesis that their mean is zero.
+    """Compute the z score of the sum of `products` (r,): sum(products) / sqrt(OVERLAP sum(products^2)).
 
-    A row of the regression has one product of two factors: the flow on the left side of the balance, and a quantity
-    that on average has the same sign if the sensors are wired correctly, such as the motion of the piston. The score is
-
-        z = sum(products) / sqrt(OVERLAP sum(products^2)).
-
-    Neighbouring rows overlap, which increases the variance of the sum by the factor `OVERLAP`.
+    A product is that of the flow and a quantity of equal sign if the sensors are wired correctly, in one row of the
+    regression. Overlapping neighbouring rows increase the variance of the sum by the factor `OVERLAP`.
     """
     standard_deviation = float(np.linalg.norm(products) * np.sqrt(OVERLAP))
     return float(products.sum()) / max(standard_deviation, float(np.finfo(float).tiny))
@@ -371,8 +329,6 @@ def _sign_log_odds(z: float, other_cause: float) -> float:
     equally probable. With the standard normal distribution Phi,
 
         log odds = log((Phi(z) + c/2) / (Phi(-z) + c/2)).
-
-    `BlockStream._flow_sign_log_odds` lists the three symptoms.
     """
     from scipy.special import ndtr
 
@@ -380,11 +336,9 @@ def _sign_log_odds(z: float, other_cause: float) -> float:
 
 
 def _leak_z_score(gram: Array, roles: ColumnRoles, n_rows: int) -> float:
-    """Compute the z score of the leak's coefficient by least squares, under the hypothesis that it is zero.
+    """Compute the z score of the leak's coefficient by least squares: positive for oil from high to low pressure.
 
-    A positive score means that oil flows from high to low pressure. The score is 0 if the rows do not determine the
-    coefficient. `gram` (m, m): Gram matrix of `n_rows` rows of the regression; `roles`: indices of its columns by role
-    (leak, motion, left side).
+    It is 0 if the `n_rows` rows of the regression, with the Gram matrix `gram` (m, m), do not determine it.
     """
     nuisance = [k for k in roles.nuisance if k != roles.leak]
     leak_and_left = [roles.leak, roles.left]
@@ -403,10 +357,9 @@ def _leak_z_score(gram: Array, roles: ColumnRoles, n_rows: int) -> float:
 def max_rest_rate(increments: Array, rate: float, fraction: float = INFERENCE.rest.share) -> float:
     """Compute the speed [m/s] or flow [m^3/s] below which a piston or a pump counts as resting.
 
-    The limit is the larger of two speeds: a `fraction` of the mean speed in motion, sum(v^2) / sum(abs(v)), and three
-    standard deviations of the noise of a speed that is averaged over `AVERAGING_TIME`. For a pump the "speed" v is its
-    flow. `increments` (n,): increments of the position [m] or of the pump's volume [m^3] between samples; `rate`:
-    sampling rate [Hz].
+    It is the larger of a `fraction` of the mean speed in motion, sum(v^2) / sum(abs(v)), and three standard deviations
+    of the noise of a speed v that is averaged over `AVERAGING_TIME`. For a pump v is its flow. `increments` (n,):
+    increments of the position [m] or of the pump's volume [m^3] between samples; `rate`: sampling rate [Hz].
     """
     velocity = increments[np.isfinite(increments)] * rate
     speed = np.abs(velocity)
@@ -421,9 +374,9 @@ def max_rest_rate(increments: Array, rate: float, fraction: float = INFERENCE.re
 
 
 def _absolute_offset(pressure: Array) -> float:
-    """Compute the difference absolute - gauge pressure [Pa] from the samples (n,) [Pa] of a sensor.
+    """Compute absolute - gauge pressure [Pa] of a sensor's samples (n,) [Pa]: at least the atmospheric pressure.
 
-    It is the atmospheric pressure, or more if a sample would otherwise be below `MIN_ABSOLUTE_PRESSURE`.
+    It is larger if a sample would otherwise be below `MIN_ABSOLUTE_PRESSURE`.
     """
     finite = pressure[np.isfinite(pressure)]
     min_reading = float(np.min(finite)) if finite.size else 0.0
@@ -431,22 +384,17 @@ def _absolute_offset(pressure: Array) -> float:
 
 
 def samples_without_holes(recording: Recording, names: Collection[str]) -> dict[str, Array]:
-    """Return the samples of the channels `names`, with NaN in long gaps and where a pressure is clipped.
-
-    The result maps the name of a channel to its samples (n,). Long gaps are those that `flag_holes` finds; in the
-    recording they are filled in.
-    """
+    """Return the samples (n,) of the channels `names`, NaN in long gaps (`flag_holes`) and in clipped pressures."""
     samples = bridged_samples(recording, names)
     is_hole = samples.pop(HOLE, np.zeros(0)) > 0.0
     return {name: np.where(is_hole, np.nan, values) for name, values in samples.items()} if is_hole.any() else samples
 
 
 def bridged_samples(recording: Recording, names: Collection[str]) -> dict[str, Array]:
-    """Return the samples of the channels `names`, with NaN where a pressure is clipped.
+    """Return the samples (n,) of the channels `names`, with NaN where a pressure is clipped.
 
-    The result maps the name of a channel to its samples (n,). In holes, i.e. long gaps of missing samples, it keeps
-    the values with which the recording fills them in. If there are holes, the additional entry `HOLE` is 1 there and
-    0 elsewhere.
+    Holes, i.e. long gaps of missing samples, keep the values with which the recording fills them in. If there are
+    holes, the additional entry `HOLE` is 1 there and 0 elsewhere.
     """
     samples = {}
     is_hole = flag_holes(recording)
@@ -465,11 +413,10 @@ def derive_drive_signals(
 ) -> dict[str, Array]:
     """Add signals from a model of the drive to the samples of a recording, each an array (n,) by channel name.
 
-    `rig` states the drive; `rate`: sampling rate [Hz]. The entry `START` is exp(-t/lag) at the time t since the first
-    sample: the effect of the drive's unknown initial state decays with the time constant lag. If the command u is the
-    only channel that shows the pump's flow, the pump's speed "omega" [rad/s] is added: the drive's response to u, NaN
-    where u is missing. With `loaded` the drive responds to the load p_A - p_B as well. Otherwise the droop of the real
-    speed under load counts as leakage.
+    `rate`: sampling rate [Hz]. The entry `START` is exp(-t/lag) at the time t since the first sample: the effect of the
+    drive's unknown initial state decays with the time constant lag. If only the command u shows the pump's flow, its
+    speed "omega" [rad/s] is added: the drive's response to u, NaN where u is missing. With `loaded` the drive responds
+    to the load p_A - p_B as well. Otherwise the droop of the real speed under load counts as leakage.
     """
     drive = Drive.from_rig(rig)
     derived = {START: np.exp(-np.arange(len(samples["p_A"])) / (rate * drive.lag))}
@@ -486,16 +433,15 @@ def derive_drive_signals(
 
 
 def _hold_missing(values: Array) -> Array:
-    """Replace each missing value (NaN) of an array (n,) by the last value before it; by 0 before the first value."""
+    """Replace each missing value (NaN) of an array (n,) by the last known one; by 0 before the first."""
     last = np.maximum.accumulate(np.where(np.isnan(values), -1, np.arange(len(values))))
     return np.where(last < 0, 0.0, values[last])
 
 
 def min_samples_for_step(rate: float) -> int:
-    """Compute the minimum number of samples to test a recording for a leak that begins within it.
+    """Compute the minimum number of samples, at a `rate` [Hz], to test for a leak that begins within a recording.
 
-    These are the samples of `MIN_BLOCKS` blocks of minimum length, and the samples after the last block over which the
-    test functions of its last rows extend. `rate`: sampling rate [Hz].
+    These are `MIN_BLOCKS` blocks of minimum length, and the samples over which the last test functions extend.
     """
     stride = stride_samples(rate)
     block = max(SPAN, round(MIN_BLOCK_TIME / STRIDE)) * stride  # [samples]
@@ -503,11 +449,10 @@ def min_samples_for_step(rate: float) -> int:
 
 
 class RegimeBlocks(NamedTuple):
-    """Blocks, balances and columns of a recording, under one assumption on the valves while the pump rests.
+    """Blocks of a recording under one assumption on the valves while the pump rests.
 
     - `blocks`, `plain`: the blocks after removal of the sensor offset of p_A - p_B, and with p_A - p_B as recorded;
-    - `equations`: the volume balances;
-    - `columns`: for each balance the indices of its columns by role (leak, motion, left side);
+    - `equations`: the volume balances; `columns`: the roles of their columns;
     - `shut`: true if valves cut the pump off from the cylinder while it rests, false if it stays connected.
     """
 
@@ -541,10 +486,7 @@ class RecordedBlocks(NamedTuple):
     sign_log_odds: tuple[float, ...]
 
     def with_sign_prior(self, log_odds: Array) -> RecordedBlocks:
-        """Reverse each recorded flow whose sign is wrong by this recording and prior evidence together.
-
-        `log_odds` (E,): log odds of each balance, from other recordings, that the recorded flow has the right sign.
-        """
+        """Reverse the flows whose sign is wrong after adding `log_odds` (E,) of the right one by other recordings."""
         is_right = np.array(self.sign_log_odds) >= 0.0
         is_reversed = ((np.array(self.sign_log_odds) + log_odds >= 0.0) != is_right).tolist()
         if not any(is_reversed):
@@ -553,21 +495,12 @@ class RecordedBlocks(NamedTuple):
         return self._replace(open=self.open.reverse_flow(is_reversed), shut=shut)
 
     def regime(self, odds: float) -> RegimeBlocks:
-        """Return the blocks for the more probable state of the valves at rest: shut if `odds` > 0, else open.
-
-        `odds`: log odds of shut valves, from all recordings of the machine. If `shut` is None, the blocks for open
-        valves are returned in any case.
-        """
+        """Return the blocks for the more probable valves at rest: shut ones, if possible, for positive log `odds`."""
         return self.shut if self.shut is not None and odds > 0.0 else self.open
 
 
 def recorded_blocks(recording: Recording, rig: Rig) -> RecordedBlocks | None:
-    """Compute the blocks of a recording for a volume balance; None if its channels allow none, or it is too short.
-
-    A block is a few seconds of samples, reduced to Gram matrices of the volume balances' regressions. If a
-    pump-controlled cylinder rests at times, the result has two versions of the blocks: while the pump rests, it may
-    stay connected to the cylinder, or valves may cut it off.
-    """
+    """Compute the blocks of a recording for a volume balance; None if its channels allow none, or it is too short."""
     names = frozenset(name for name in recording.channels if name in READ)
     balances = equations(rig, names)
     if not balances:
@@ -604,10 +537,7 @@ def recorded_blocks(recording: Recording, rig: Rig) -> RecordedBlocks | None:
     has_holds = may_shut and _longest_hold(samples, recording.rate, balances[0]) >= INFERENCE.held_oil.shortest
 
     def compute_regime_blocks(offset: float, shut: bool) -> Blocks:
-        """Compute the blocks after subtracting `offset` [Pa] from p_A - p_B, for one assumption on the valves.
-
-        `shut`: true if valves cut the pump off from the cylinder while it rests, false if they do not.
-        """
+        """Compute the blocks after subtracting `offset` [Pa] from p_A - p_B, for open or `shut` valves at rest."""
         blocks = compute_blocks(offset)
         if not may_shut:
             return blocks
@@ -634,10 +564,9 @@ def _longest_hold(samples: Mapping[str, Array], rate: float, balance: Equation) 
 def _find_rest_limits(samples: Mapping[str, Array], rate: float, balance: Equation) -> RestLimits:
     """Compute the flow of the pump and the speed of the piston below which they count as resting.
 
-    A flow meter measures the oil that enters the cylinder. If little enters, the valves are closed, and a moving piston
-    only creeps because of a leak, which must not count as motion. With a flow meter, therefore, only the flow is
-    judged: the limit of the piston's speed is minus infinity. `samples`: arrays by channel name at the `rate` [Hz];
-    `balance`: volume balance, whose left side is the flow of the pump or of the meter.
+    With a flow meter only the flow is judged, and the limit of the piston's speed is minus infinity: if little oil
+    enters the cylinder, the valves are closed, and a moving piston only creeps because of a leak. `samples`: arrays by
+    channel name at the `rate` [Hz]; `balance`: volume balance, whose left side is the flow of the pump or of the meter.
     """
     signals = Signals(samples, rate)
     if flow_source(samples) == "q_pump":
@@ -649,10 +578,9 @@ def _find_rest_limits(samples: Mapping[str, Array], rate: float, balance: Equati
 def _build_regime(balances: tuple[Equation, ...], compute_blocks: Callable[[float], Blocks]) -> RegimeBlocks:
     """Compute the blocks of the volume balances, both as recorded and without the sensor offset of p_A - p_B.
 
-    `compute_blocks(offset)` computes the blocks after subtracting an offset [Pa] from p_A - p_B. The offset is
-    estimated from the recorded blocks and removed from their Gram matrices. If it exceeds `NEGLIGIBLE_OFFSET` standard
-    deviations of its prior, the blocks are instead computed again after subtracting it, and the remaining offset is
-    removed.
+    `compute_blocks(offset)` subtracts an offset [Pa] from p_A - p_B. The offset is estimated from the recorded blocks
+    and removed from their Gram matrices. If it exceeds `NEGLIGIBLE_OFFSET` standard deviations of its prior, the blocks
+    are instead computed again after subtracting it, and the remaining offset is removed.
     """
     columns = tuple(ColumnRoles(balance) for balance in balances)
     plain = compute_blocks(0.0)  # as recorded

@@ -13,12 +13,6 @@ first motion on (`RecordedBalance.running_blocks`).
 
 To estimate one coefficient g in each block, all other coefficients are eliminated (`information`). Each of them has a
 level and a slow drift, c_j(t) = sum_p c_jp P_p(t) with polynomials P_p, and a normal prior on its size (`priors.toml`).
-Let d be the column of g (the tested column), o the other columns with their drifts, y the left side and s^2 the
-residual variance of a row. N_k, n_k and B_k are the sums of d^2, d y and d o' over the rows of block k; M is the sum of
-o o' over all rows, plus the precision of the priors, and m the sum of o y. The likelihood is exp(eta'g - g'Lambda g/2)
-with
-
-    Lambda = (diag N - B M^-1 B') / s^2,    eta = (n - B M^-1 m) / s^2.
 """
 
 from __future__ import annotations
@@ -95,18 +89,11 @@ class Blocks:
         return Blocks(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
 
     def pack(self) -> Blocks:
-        """Return the blocks for storage, with the upper triangles of their symmetric Gram matrices only.
-
-        For K blocks, E equations and m columns, `gram` then has the shape (K, E, m (m + 1) / 2).
-        """
+        """Return the blocks for storage, with only the upper triangles of `gram`, shape (K, E, m (m + 1) / 2)."""
         return replace(self, gram=self.gram[..., *np.triu_indices(self.gram.shape[-1])])
 
     def unpack(self, size: int) -> Blocks:
-        """Return the blocks with full Gram matrices, from blocks in which `pack` has stored the upper triangles only.
-
-        `size`: number of columns m of the full matrices (K, E, m, m). Raise InputError if the stored shapes do not fit
-        this number, or if the arrays have different numbers of blocks.
-        """
+        """Restore the m = `size` columns that `pack` left out; raise InputError if the stored shapes do not fit."""
         upper, lower = np.triu_indices(size)
         lengths = {len(getattr(self, name)) for name in self.__dataclass_fields__}
         if self.gram.shape[2:] != upper.shape or lengths != {len(self.start)}:
@@ -122,28 +109,21 @@ class Blocks:
 
     @property
     def moving_flow(self) -> float:
-        """Mean flow while the machine moves [m^3/s].
-
-        It is sum(flow^2) / sum(flow) over the blocks, i.e. the mean of `flow` weighted by itself, so that standstills
-        do not contribute.
-        """
+        """Mean of `flow`, weighted by itself so that standstills do not count [m^3/s]."""
         return float(self.flow @ self.flow) / max(float(self.flow.sum()), np.finfo(float).tiny)
 
     @property
     def is_moving(self) -> NDArray[np.bool_]:
-        """Flags (K,) of the blocks in which the machine moves.
+        """Flags (K,) of the blocks with at least `rest.moves` (`priors.toml`) times `moving_flow`.
 
-        In these blocks the mean flow is at least the fraction `rest.moves` (`priors.toml`) of `moving_flow`. The flow
-        of a pump that only holds a load is smaller.
+        The flow of a pump that only holds a load is smaller.
         """
         return np.asarray(self.flow >= INFERENCE.rest.moves * self.moving_flow)
 
     def merge(self, max_blocks: int = MAX_BLOCKS) -> Blocks:
-        """Return at most `max_blocks` blocks, each the sum or weighted mean of several neighbouring ones.
+        """Merge groups of equally many neighbouring blocks, the last perhaps smaller, to at most `max_blocks` blocks.
 
-        Groups of equally many neighbours are merged; the last group may be smaller. Gram matrices and numbers of rows
-        are added. Flow and pressures are averaged with the numbers of rows as weights. The first block of a group
-        gives `zero`.
+        Gram matrices and numbers of rows are added, flow and pressures averaged by rows; the first block gives `zero`.
         """
         group_size = -(-len(self) // max_blocks)  # rounded up
         if group_size <= 1:
@@ -165,24 +145,20 @@ class Blocks:
     def mean_pressure(self, offset: float | None = None) -> Array:
         """Compute the mean of abs(p_A - p_B - offset) [Pa] in each block, shape (K,).
 
-        `offset` [Pa]: sensor offset of p_A - p_B, by default `zero`, which is already subtracted in `gram`. The mean
-        flow of a laminar leak is its coefficient times this pressure.
+        `offset` [Pa]: sensor offset of p_A - p_B, by default `zero`. A laminar leak's flow is proportional.
         """
         subtracted = self.zero[:, None] if offset is None else offset
         return np.asarray(np.abs(self.pressures - subtracted).mean(axis=1))
 
     def mean_root(self) -> Array:
-        """Compute the mean of sqrt(abs(p_A - p_B - zero)) [Pa^0.5] in each block, shape (K,).
-
-        The mean flow of a leak through an orifice is its coefficient times this mean.
-        """
+        """Compute the mean of sqrt(abs(p_A - p_B - zero)) [Pa^0.5] in each block, (K,): that drives an orifice."""
         return np.asarray(np.sqrt(np.abs(self.pressures - self.zero[:, None])).mean(axis=1))
 
     def driving_pressure(self, names: Sequence[str], term: str) -> float:
         """Estimate the root mean square of the pressure that drives a term [Pa], such as p_B for a leak out of side B.
 
-        `names`: names of the columns, in the order of `gram`. s_term^2 and s_leak^2 are the sums of squares of the
-        columns of the term and of the leak, over the equations that contain the term, and rms is a root mean square:
+        `names`: names of the columns of `gram`. With the sums of squares s_term^2 and s_leak^2 of the columns of term
+        and leak, over the equations that contain the term, and the root mean square rms,
 
             pressure = rms(p_A - p_B) s_term / s_leak.
         """
@@ -208,16 +184,14 @@ class ColumnRoles:
     - `nuisance`: terms whose coefficients are unknown in any machine;
     - `compared`: the nuisance terms, and those that are fitted only to compare recordings;
     - `motion`: motion of the piston, or flow of the valve's edges; `compliance`: the chambers' oil and its air;
-    - `hold_leak`: leakage of a pump that holds the load (`terms.HOLDING`), which a comparison of recordings leaves out,
-      or None;
+    - `hold_leak`: leakage of a pump that holds the load, left out in a comparison of recordings, or None;
     - `fast`, `slow`: terms whose coefficients are free in each block, or common to all, while rows are weighted.
 
     Prior standard deviations of the coefficients (m - 1,):
 
     - `drift_rate`: drift, relative to the coefficient [1/min];
-    - `between_deviation`: relative difference between recordings, infinite without a prior, 0 for a flow offset that
-      repeats in all recordings;
-    - `level_deviation`: constant part of the coefficient, in the coefficient's unit, infinite without a prior.
+    - `between_deviation`: relative difference between recordings, infinite without a prior, 0 if it repeats;
+    - `level_deviation`: constant part, in the coefficient's unit, infinite without a prior.
 
     `names` and `drivers` (m - 1,): names and drivers of the terms (`Term`); `healthy_conductance` [m^3/(s Pa)]:
     standard deviation of a healthy machine's leak.
@@ -256,14 +230,12 @@ class ColumnRoles:
         self.healthy_conductance = equation.healthy
 
     def difference_precisions(self, indices: Sequence[int], coefficients: Array, leak_coefficient: float) -> Array:
-        """Compute the precisions of the priors on the differences of c coefficients between recordings.
+        """Compute the prior precisions (c,) of the differences of c coefficients from those of other recordings.
 
-        The differences are those of one recording from the other recordings. `indices` (c,): indices of the columns of
-        the coefficients; `coefficients` (c,): coefficients in the other recordings; `leak_coefficient`: the leak's
-        coefficient in the other recordings [m^3/(s Pa)]. The prior deviations are relative to the coefficients:
-        `between_deviation`, for the leak `between.pump` of `priors.toml`. An exception is a flow offset that repeats:
-        it differs only by the leak's flow at the pressure `zero.pressure`, the standard deviation of a sensor offset of
-        p_A - p_B. A deviation of 0 gives an infinite precision.
+        `indices` (c,): their columns; `coefficients` (c,): their values in the other recordings; `leak_coefficient`:
+        the leak's value there [m^3/(s Pa)]. The prior deviations are relative to the coefficients: `between_deviation`,
+        for the leak `between.pump` of `priors.toml`. Only a flow offset that repeats differs by the leak's flow at the
+        pressure `zero.pressure`, the standard deviation of a sensor offset of p_A - p_B. Precisions may be infinite.
         """
         is_leak = np.array(indices) == self.names.index(LEAK)
         deviations = np.abs(coefficients) * np.where(is_leak, INFERENCE.between.pump, self.between_deviation[indices])
@@ -273,7 +245,7 @@ class ColumnRoles:
             return np.asarray(1.0 / deviations**2)
 
     def with_free_zero(self) -> ColumnRoles:
-        """Return a copy of these roles whose flow offset (zero of the flow) may differ freely between recordings."""
+        """Return a copy whose flow offset (zero of the flow) may differ freely between recordings."""
         roles = copy(self)
         if self.bias is not None:
             roles.between_deviation = self.between_deviation.copy()
@@ -281,36 +253,32 @@ class ColumnRoles:
         return roles
 
     def replace_leak(self, name: str) -> ColumnRoles:
-        """Return a copy of these column roles in which the term `name` is tested instead of the leak.
-
-        The leak becomes an ordinary term, whose coefficient differs between recordings within the prior `between.pump`
-        of `priors.toml`.
-        """
+        """Return a copy in which the term `name` is tested instead of the leak, which becomes an ordinary term."""
         roles = copy(self)
         roles.leak, roles.between_deviation = self.names.index(name), self.between_deviation.copy()
         roles.between_deviation[self.leak] = INFERENCE.between.pump
         return roles
 
     def leak_deviation(self, column: int, blocks: Blocks) -> float:
-        """Compute the prior standard deviation of a leak's coefficient in a healthy machine, in the coefficient's unit.
+        """Compute a healthy machine's prior standard deviation of the leak's coefficient in `column`, in its unit.
 
-        `column`: index of the leak's column. For a flow through an orifice, the prior gives the same mean flow over
-        `blocks` as the prior of a laminar leak. The result is infinite for a column that no pressure drives, such as
-        the left side, or without a prior.
+        For an orifice it gives the same mean flow as for a laminar leak past a piston, since what a pump leaks is
+        laminar. It is infinite if no pressure drives the column.
         """
         driver = self.drivers[column] if column < self.left else ""
         pressure, root = float(np.mean(blocks.mean_pressure())), float(np.mean(blocks.mean_root()))
         per_conductance = {"": float("inf"), "pressure": 1.0, "root": pressure / root if root > 0.0 else 1.0}
-        return self.healthy_conductance * per_conductance[driver]
+        conductance = (
+            min(self.healthy_conductance, INFERENCE.healthy.piston) if driver == "root" else self.healthy_conductance
+        )
+        return conductance * per_conductance[driver]
 
     def offset_deviation(self, column: int, blocks: Blocks) -> float:
-        """Compute the prior standard deviation of the error that a pressure sensor's offset causes in a column.
+        """Compute the prior standard deviation of the error that a pressure sensor's offset causes in a `column`.
 
-        `column`: index of the regression's column. The result is in Pa for the column of a laminar leak, in Pa^0.5 for
-        the column of an orifice. It is 0 if no pressure drives the flow of the column's term. It is also 0 in an
-        equation without flow offset, since the error is removed by means of the flow offset's column (`_shift_offset`).
-        The standard deviation of the offset itself is limited to the mean of abs(p_A - p_B) over `blocks`, since
-        recordings may be in counts instead of Pa.
+        It is in Pa for a laminar leak, in Pa^0.5 for an orifice, and 0 if no pressure drives the term. It is also 0 in
+        an equation without flow offset, by whose column the error is removed (`_shift_offset`). The offset's own
+        deviation is limited to the mean of abs(p_A - p_B) over `blocks`, since recordings may be in counts.
         """
         # what drives the flow of the column's term: "pressure", "root" (square root of a pressure), or "" for neither
         driver = self.drivers[column] if column < self.left and self.bias is not None else ""
@@ -321,10 +289,9 @@ class ColumnRoles:
 
 
 class Weighting:
-    """Weighting of the rows of successive blocks by Huber's weights, which limit the effect of outliers.
+    """Huber's weights of the rows of successive blocks, which limit the effect of outliers.
 
-    The weights follow from a fit that also uses weighted sums over earlier blocks. These sums are the state of the
-    object. `columns`: for each equation the indices of its columns by role (leak, motion, left side).
+    They follow from a fit that also uses weighted sums over earlier blocks, the state of the object.
     """
 
     def __init__(self, columns: Sequence[ColumnRoles]) -> None:
@@ -356,9 +323,8 @@ class Weighting:
         """Compute the Gram matrices (K, E, m, m) of K blocks, in which outlying rows have smaller weights.
 
         `values`: for each equation the rows (r, m) of all blocks; `ends` (K,): index past the last row of each block.
-        Huber's weights follow from a fit to these and earlier blocks. In this fit the coefficients of fast columns are
-        free in each block, and the coefficients of slow columns are common to all blocks (`ColumnRoles`). The number of
-        blocks and the sums over earlier blocks, which this object stores, are updated.
+        The fit to these and earlier blocks has coefficients of fast columns that are free in each block, and common
+        ones of slow columns (`ColumnRoles`). The sums over earlier blocks are updated.
         """
         self._count += len(ends)
         update_fraction = min(1.0, SUPPORT / self._count)  # the last fifth of all blocks counts most
@@ -372,8 +338,7 @@ class Weighting:
 def solve(matrix: Array, right: Array) -> Array:
     """Solve matrix x = right for a positive semidefinite `matrix` (n, n) and `right` (n,) or (n, k).
 
-    The matrix is scaled to a unit diagonal, to which a small ridge is added. Components of x in the null space of the
-    matrix are about zero.
+    The matrix is scaled to a unit diagonal with a small ridge. Components of x in its null space are about zero.
     """
     scale = np.sqrt(np.maximum(matrix.diagonal(), 0.0))
     scale[~(scale > 0.0)] = 1.0  # a column of zeros stays as it is
@@ -392,10 +357,7 @@ def solve(matrix: Array, right: Array) -> Array:
 
 @cache
 def _positive_definite_solver() -> Callable[[Array, Array], tuple[Array, Array, int]]:
-    """Return LAPACK's solver for positive definite matrices, imported when first used.
-
-    For a few columns it takes a third of the time of NumPy's solver.
-    """
+    """Return LAPACK's solver for positive definite matrices, which is faster for a few columns than NumPy's."""
     from scipy.linalg.lapack import dposv
 
     return dposv  # type: ignore[no-any-return]
@@ -404,43 +366,46 @@ def _positive_definite_solver() -> Callable[[Array, Array], tuple[Array, Array, 
 def information(blocks: Blocks, columns: Sequence[ColumnRoles], test: int, left_out: int | None = None) -> Information:
     """Compute the joint likelihood of one coefficient's values in all blocks, with the other coefficients eliminated.
 
-    The coefficient is that of one term of a volume balance. Its likelihood is normal: the result contains the precision
-    matrix, and the product of this matrix with the mean. For a leak it also contains the prior standard deviation of
-    the coefficient in a healthy machine (`level`). `columns`: for each equation the indices of its columns by role
-    (leak, motion, left side); the likelihoods of the equations are multiplied. `test`: index of the coefficient's
-    column, or of the left side to test a change of the left side's scale. `left_out`: index of another column to leave
-    out of the regression, or None.
+    For a leak the result also contains the prior standard deviation of the coefficient in a healthy machine (`level`).
+    The likelihoods of the equations are multiplied. `test`: index of the coefficient's column, or of the left side to
+    test a change of its scale; `left_out`: another column to leave out.
+
+    With the residual variance s^2 of a row, precision and vector of an equation are the Schur complements
+
+        precision = (N - C (G + P)^-1 C') / s^2,    vector = (n - C (G + P)^-1 (b + P mu)) / s^2.
+
+    N is the diagonal matrix of the tested column's sums of squares in each block, n its products with the left side,
+    and C those with the nuisance columns, the other terms. G is the Gram matrix of the nuisance columns and b their
+    products with the left side. P / s^2 is the prior precision of their coefficients, and mu the prior mean.
     """
     count = len(blocks)
     precision, vector = np.zeros((count, count)), np.zeros(count)
     for e, roles in enumerate(columns):
-        nuisance = [k for k in roles.nuisance if k not in (test, left_out)]
-        equation_precision, equation_vector = _eliminate_nuisance(blocks.gram[:, e], blocks, roles, test, nuisance)
-        precision += equation_precision
-        vector += equation_vector
+        fit = _fit_equation(blocks, e, roles, test, left_out)
+        normal = fit.normal
+        right_sides = np.column_stack([normal.coupling.T, normal.moment + fit.prior_moment])
+        solution = solve(normal.gram + np.diag(fit.prior_precision), right_sides)
+        schur = (np.diag(normal.energy) - normal.coupling @ solution[:, :-1]) / fit.variance
+        precision += 0.5 * (schur + schur.T)
+        vector += (normal.tested_moment - normal.coupling @ solution[:, -1]) / fit.variance
     return Information(blocks.time, precision, vector, level=columns[0].leak_deviation(test, blocks))
 
 
 def _drift_polynomials(blocks: Blocks) -> tuple[Array, float]:
-    """Compute Legendre polynomials in time over K blocks, (K, DRIFT_DEGREE + 1), and the recording's length [min].
-
-    Slow drifts of coefficients are weighted sums of these polynomials. A single block has only the constant polynomial.
-    """
+    """Compute the polynomials (K, DRIFT_DEGREE + 1) of slow drifts over K blocks, and the recording's length [min]."""
     minutes = max(float(blocks.end[-1] - blocks.start[0]), 1e-9) / 60.0
     position = (blocks.time - blocks.start[0]) / (60.0 * minutes) * 2.0 - 1.0  # -1 to 1, the polynomials' range
     return np.polynomial.legendre.legvander(position, DRIFT_DEGREE if len(blocks) > 1 else 0), minutes
 
 
 class _NormalEquations(NamedTuple):
-    """Gram matrices and moments of a regression on nuisance columns, whose coefficients drift, and on a tested column.
+    """Gram matrices and moments of a regression on drifting nuisance columns and the column of the tested coefficient.
 
-    The tested column belongs to the coefficient to estimate. Each nuisance column is multiplied by each drift
-    polynomial, which gives c columns in all. Sums over the rows of all blocks, or of each of K blocks:
+    Each nuisance column is multiplied by each drift polynomial, which gives c columns. Sums over rows:
 
-    - `gram` (c, c), `moment` (c,): products of these c columns with each other and with the left side;
-    - `coupling` (K, c): products of the tested column with the c columns, in each block;
-    - `energy` (K,): sum of squares of the tested column, in each block;
-    - `tested_moment` (K,): product of the tested column with the left side, in each block;
+    - `gram` (c, c), `moment` (c,): products of these columns with each other and with the left side;
+    - `coupling` (K, c): products of the tested column with these, in each block;
+    - `energy`, `tested_moment` (K,): products of the tested column with itself and with the left side, in each block;
     - `left_square`: sum of squares of the left side.
     """
 
@@ -452,11 +417,7 @@ class _NormalEquations(NamedTuple):
     left_square: float
 
     def eliminate_tested(self) -> tuple[Array, Array, float]:
-        """Eliminate the tested coefficient, which is free in each block, from the normal equations.
-
-        Returns the reduced sums: the Gram matrix (c, c) of the other columns, their products (c,) with the left side,
-        and the sum of squares of the left side.
-        """
+        """Return `gram`, `moment` and `left_square` after elimination of the tested coefficient, free in each block."""
         energy = np.maximum(self.energy, np.finfo(float).tiny)
         gram = self.gram - (self.coupling / energy[:, None]).T @ self.coupling
         moment = self.moment - self.coupling.T @ (self.tested_moment / energy)
@@ -468,9 +429,8 @@ def _build_normal_equations(
 ) -> _NormalEquations:
     """Build the normal equations of a regression on drifting nuisance columns and one tested column.
 
-    `gram` (K, m, m): Gram matrices of K blocks; `polynomials` (K, n_polynomials): drift polynomials; `nuisance`:
-    indices of the columns that are multiplied by each polynomial; `test`, `left`: indices of the tested column and of
-    the left side.
+    `gram` (K, m, m): Gram matrices of K blocks; `polynomials` (K, n_polynomials): drift polynomials; `nuisance`,
+    `test`, `left`: indices of the nuisance columns, of the tested one and of the left side.
     """
     n, n_polynomials = len(nuisance), polynomials.shape[1]
     size = n * n_polynomials
@@ -489,11 +449,10 @@ def _build_normal_equations(
 
 
 class _Prior(NamedTuple):
-    """Prior standard deviations of c nuisance coefficients: of their `level` and their `drift`, (c,) each.
+    """Prior standard deviations (c,) of c nuisance coefficients: of the `level`, their constant part, and the `drift`.
 
-    The level is the constant part of a coefficient. The last of the c coefficients is the remaining error [Pa] of the
-    sensor offset of p_A - p_B. `offset` [Pa]: prior standard deviation of the whole offset, of which `current_offset`
-    is already subtracted; the error therefore has the prior mean -`current_offset`.
+    The last coefficient is the remaining error [Pa] of the sensor offset of p_A - p_B, with the mean -`current_offset`,
+    the part that is already subtracted. `offset` [Pa]: prior standard deviation of the whole offset.
     """
 
     level: Array
@@ -502,30 +461,15 @@ class _Prior(NamedTuple):
     current_offset: float = 0.0
 
 
-class _NuisanceFit(NamedTuple):
-    """Fit of the nuisance coefficients: `coefficients` (c,), and `variance` of a row's residual.
-
-    Each nuisance column has `n_polynomials` successive coefficients, first that of the constant polynomial. The last
-    column is that of the sensor offset's error. The variance is inflated for overlapping rows. `prior_precision` (c,):
-    prior precision of the coefficients, times `variance`; `prior_moment` (c,): product of `prior_precision` and the
-    prior mean of the coefficients.
-    """
-
-    coefficients: Array
-    prior_precision: Array
-    prior_moment: Array
-    variance: float
-    n_polynomials: int
-
-
-def _fit_nuisance(normal: _NormalEquations, prior: _Prior, n_polynomials: int, n_rows: float) -> _NuisanceFit:
+def _fit_nuisance(
+    normal: _NormalEquations, prior: _Prior, n_polynomials: int, n_rows: float
+) -> tuple[Array, Array, Array, float]:
     """Fit all coefficients of a regression except the tested one, and the residual variance of a row.
 
-    `normal`: normal equations of the regression, from which the tested coefficient, free in each block, is eliminated.
-    Each other (nuisance) column has `n_polynomials` coefficients, one for each polynomial of its drift, the constant
-    polynomial first. `prior`: prior standard deviations of the coefficients; `n_rows`: number of rows in all blocks.
-    The residual variance determines the weight of the prior, and so the fit. Both are found by iteration, until the
-    variance changes by at most the fraction `TOLERANCE`.
+    `normal`: normal equations, from which the tested coefficient, free in each block, is eliminated; `prior`: priors on
+    the c other coefficients, with `n_polynomials` each; `n_rows`: number of rows in all blocks. The variance weights
+    the prior, and so determines the fit: both are found by iteration, until the variance changes by at most the
+    fraction `TOLERANCE`. Returns `coefficients`, `prior_precision`, `prior_moment` and `variance` of `_EquationFit`.
     """
     gram, moment, left_square = normal.eliminate_tested()
     min_variance = 1e-14 * normal.left_square / n_rows  # rounding errors of the sums
@@ -548,31 +492,42 @@ def _fit_nuisance(normal: _NormalEquations, prior: _Prior, n_polynomials: int, n
         if abs(variance - previous) <= TOLERANCE * previous:
             break
     row_variance = max(OVERLAP * variance, np.finfo(float).tiny)
-    return _NuisanceFit(coefficients, prior_precision, prior_moment, row_variance, n_polynomials)
+    return coefficients, prior_precision, prior_moment, row_variance
 
 
 class _EquationFit(NamedTuple):
-    """Fit of one equation: sensor offset of p_A - p_B and nuisance coefficients.
+    """Fit of one equation to K blocks: sensor offset of p_A - p_B and nuisance coefficients.
 
-    `offset`: the fitted offset [Pa], relative to the one already removed; `normal`: normal equations after subtracting
-    this offset; `nuisance`: coefficients, the last of which is the remaining error of the offset.
+    - `nuisance`: indices of the nuisance columns; `polynomials` (K, n): those of their drifts;
+    - `normal`: normal equations after subtracting `offset` [Pa], which is relative to the one already removed;
+    - `coefficients` (c,): n for each nuisance column, the constant first, and last for the offset's error;
+    - `prior_precision` (c,): prior precision times `variance`; `prior_moment` (c,): its product with the prior mean;
+    - `variance`: variance of a row's residual, inflated for overlapping rows.
     """
 
+    nuisance: list[int]
+    polynomials: Array
     normal: _NormalEquations
-    nuisance: _NuisanceFit
     offset: float
+    coefficients: Array
+    prior_precision: Array
+    prior_moment: Array
+    variance: float
 
 
-def _fit_equation(gram: Array, blocks: Blocks, roles: ColumnRoles, test: int, nuisance: list[int]) -> _EquationFit:
-    """Fit the nuisance coefficients of one equation and the sensor offset z of p_A - p_B, by Gauss-Newton steps.
+def _fit_equation(
+    blocks: Blocks, equation: int, roles: ColumnRoles, test: int | None = None, left_out: int | None = None
+) -> _EquationFit:
+    """Fit the nuisance coefficients of an equation and the sensor offset z of p_A - p_B, by Gauss-Newton steps.
 
     The tested coefficient g is free in each block. The leakage is g (p_A - p_B - z) = g (p_A - p_B) - g z. A change of
     g between blocks also changes the constant flow -g z, and so reveals z. z is small, since a first estimate of the
     offset is already removed from the Gram matrices (`pressure_offset.remove_pressure_offset`).
 
-    `gram` (K, m, m): Gram matrices of the equation in K blocks; `roles`: indices of its columns by role (leak, motion,
-    left side); `test`: index of the column of g; `nuisance`: indices of the nuisance columns.
+    `equation`: its index; `test`: column of g, by default the leak's; `left_out`: another column to leave out.
     """
+    gram, test = blocks.gram[:, equation], roles.leak if test is None else test
+    nuisance = [k for k in roles.nuisance if k not in (test, left_out)]
     polynomials, minutes = _drift_polynomials(blocks)
     n_rows, n_polynomials = max(float(blocks.rows.sum()), 1.0), polynomials.shape[1]
     total = gram.sum(axis=0)
@@ -584,11 +539,12 @@ def _fit_equation(gram: Array, blocks: Blocks, roles: ColumnRoles, test: int, nu
     # inf: the level of the offset has the prior deviation `offset_deviation` instead
     prior = _Prior(np.append(roles.level_deviation[nuisance], np.inf), drift, offset_deviation)
     nuisance_and_offset = [*nuisance, gram.shape[1]]  # `_shift_offset` appends the offset's column
-    offset, coefficients = 0.0, np.zeros(len(blocks))  # z, and g in each block
+    offset, tested_coefficients = 0.0, np.zeros(len(blocks))  # z, and g in each block
     for iteration in range(_MAX_OFFSET_STEPS + 1):
-        shifted = _shift_offset(gram, roles, test, coefficients, offset)
+        shifted = _shift_offset(gram, roles, test, tested_coefficients, offset)
         normal = _build_normal_equations(shifted, polynomials, nuisance_and_offset, test, roles.left)
-        fit = _fit_nuisance(normal, prior._replace(current_offset=offset), n_polynomials, n_rows)
+        parts = _fit_nuisance(normal, prior._replace(current_offset=offset), n_polynomials, n_rows)
+        fit = _EquationFit(nuisance, polynomials, normal, offset, *parts)
         step = float(fit.coefficients[-n_polynomials])  # constant part of the last coefficient, the offset's error
         is_last = iteration == _MAX_OFFSET_STEPS or not offset_deviation > 0.0
         # in the first iteration g is 0, so that the offset has no effect
@@ -596,18 +552,16 @@ def _fit_equation(gram: Array, blocks: Blocks, roles: ColumnRoles, test: int, nu
             break
         offset += step
         tested_residual = normal.tested_moment - normal.coupling @ fit.coefficients
-        coefficients = tested_residual / np.maximum(normal.energy, np.finfo(float).tiny)
-    return _EquationFit(normal, fit, offset)
+        tested_coefficients = tested_residual / np.maximum(normal.energy, np.finfo(float).tiny)
+    return fit
 
 
 def _shift_offset(gram: Array, roles: ColumnRoles, test: int, coefficients: Array, offset: float) -> Array:
     """Correct one column of Gram matrices for a sensor offset, and append a column for the error of that offset.
 
-    `gram` (K, m, m): Gram matrices of K blocks; `roles`: indices of the columns by role (leak, motion, left side);
-    `test`: index of the tested column, a pressure times the sampling interval dt, whose coefficient g is to be
-    estimated; `coefficients` (K,): g in each block; `offset` [Pa]: subtracted from the pressure. The appended column -g
-    dt is the derivative of the volume balance with respect to the offset. It becomes the last of the m + 1 columns of
-    the result. In an equation without flow offset, nothing is corrected and the appended column is zero.
+    `gram` (K, m, m): Gram matrices of K blocks; `test`: column of a pressure times the sampling interval dt, from which
+    `offset` [Pa] dt is subtracted; `coefficients` (K,): its coefficient g in each block. The appended, last column -g
+    dt is the derivative of the volume balance by the offset. Without flow offset the column is zero.
     """
     size = gram.shape[1]
     transform = np.zeros((len(gram), size, size + 1))
@@ -618,124 +572,68 @@ def _shift_offset(gram: Array, roles: ColumnRoles, test: int, coefficients: Arra
     return np.asarray(transform.transpose(0, 2, 1) @ gram @ transform)
 
 
-def _eliminate_nuisance(
-    gram: Array, blocks: Blocks, roles: ColumnRoles, test: int, nuisance: list[int]
-) -> tuple[Array, Array]:
-    """Compute the likelihood of the tested coefficient in K blocks by one equation: precision (K, K) and vector (K,).
-
-    `gram` (K, m, m): Gram matrices of the blocks; `roles`: indices of the columns by role (leak, motion, left side);
-    `test`: index of the tested column; `nuisance`: indices of the columns to eliminate. With the residual variance s^2
-    of a row, the results are the Schur complements
-
-        precision = (N - C (G + P)^-1 C') / s^2,    vector = (n - C (G + P)^-1 (b + P mu)) / s^2.
-
-    N is the diagonal matrix of the tested column's sums of squares, n its products with the left side, and C its
-    products with the nuisance columns. G is the Gram matrix of the nuisance columns and b their products with the left
-    side. P / s^2 is the prior precision of the nuisance coefficients, and mu their prior mean.
-    """
-    normal, fit, _ = _fit_equation(gram, blocks, roles, test, nuisance)
-    right_sides = np.column_stack([normal.coupling.T, normal.moment + fit.prior_moment])
-    solution = solve(normal.gram + np.diag(fit.prior_precision), right_sides)
-    precision = (np.diag(normal.energy) - normal.coupling @ solution[:, :-1]) / fit.variance
-    vector = (normal.tested_moment - normal.coupling @ solution[:, -1]) / fit.variance
-    return 0.5 * (precision + precision.T), vector
-
-
-def _nuisance_columns(roles: ColumnRoles) -> list[int]:
-    """Return the indices of the nuisance columns, whose coefficients are unknown in any machine, without the leak's."""
-    return [k for k in roles.nuisance if k != roles.leak]
-
-
-def offset_cost(offset: float) -> float:
+def offset_cost(offset: Any) -> Any:
     """Compute -2 log of the prior density of a sensor offset of p_A - p_B [Pa], relative to the density of no offset.
 
     The prior is a normal density of standard deviation s for good sensors or, with small odds o, a wide one of standard
-    deviation w for sensors that are far off (`zero` in `priors.toml`). The more favourable of the two counts:
+    deviation w for sensors that are far off (`zero` in `priors.toml`). The more favourable counts:
 
         cost = min((offset / s)^2, (offset / w)^2 + 2 log(w / (s o))).
     """
-    return float(offset_costs(np.asarray(offset)))
-
-
-def offset_costs(offsets: Array) -> Array:
-    """Compute `offset_cost`, the lower of the costs by a narrow and by a wide prior, for an array of offsets [Pa]."""
     usual, far, odds = INFERENCE.zero.pressure, INFERENCE.zero.far, INFERENCE.zero.odds
-    return np.asarray(np.minimum((offsets / usual) ** 2, (offsets / far) ** 2 + 2.0 * np.log(far / usual / odds)))
+    return np.minimum((offset / usual) ** 2, (offset / far) ** 2 + 2.0 * np.log(far / usual / odds))
 
 
 def estimate_offset(blocks: Blocks, columns: Sequence[ColumnRoles]) -> float:
     """Estimate the total sensor offset of p_A - p_B [Pa] in a recording, as the mean of one estimate per equation.
 
-    `columns`: for each equation the indices of its columns by role (leak, motion, left side). The result includes the
-    offset that is already removed from `blocks`. Only changes of the leak between blocks show the offset; without them
-    the estimate stays near the removed offset.
+    Only changes of the leak between blocks show it; without them the estimate stays near the offset already removed.
     """
-    fits = [
-        _fit_equation(blocks.gram[:, e], blocks, roles, roles.leak, _nuisance_columns(roles))
-        for e, roles in enumerate(columns)
-    ]
-    return float(np.mean(blocks.zero)) + float(np.mean([fit.offset for fit in fits]))
+    offsets = [_fit_equation(blocks, e, roles).offset for e, roles in enumerate(columns)]
+    return float(np.mean(blocks.zero)) + float(np.mean(offsets))
 
 
-class LeakAndBias(NamedTuple):
-    """Joint likelihood of the leak coefficient and the flow offset in K blocks, the K leaks first.
+def estimate_leak_and_bias(blocks: Blocks, roles: ColumnRoles) -> tuple[Array, Array, Array]:
+    """Compute the joint likelihood of leak and flow offset (bias, `roles.bias`) in K blocks, for the first equation.
 
-    `precision` (2 K, 2 K) and `vector` (2 K,) are as in `onset.Information`. The flow offset is the flow at the mean
-    pressure difference `pressure` (K,) [Pa] of each block; there leak and offset are uncorrelated within the block.
-    """
-
-    precision: Array
-    vector: Array
-    pressure: Array
-
-
-def estimate_leak_and_bias(blocks: Blocks, roles: ColumnRoles) -> LeakAndBias:
-    """Compute the joint likelihood of leak coefficient and flow offset (bias) in K blocks, for the first equation.
-
-    All other coefficients are eliminated. Returns the precision (2 K, 2 K) and the information vector (2 K,), leaks
-    first, and the mean pressure difference (K,) in each block (`LeakAndBias`). `roles`: indices of the equation's
-    columns by role (leak, motion, left side); they must include the flow offset (`roles.bias`).
+    Returns precision (2 K, 2 K) and vector (2 K,) as in `onset.Information`, the K leaks first, and the mean pressure
+    difference (K,) [Pa] in each block. The flow offset is that at this pressure, uncorrelated with the leak.
     """
     leak, bias = roles.leak, roles.bias
     assert bias is not None
-    gram = blocks.gram[:, 0].copy()
+    blocks = replace(blocks, gram=blocks.gram.copy())
+    gram = blocks.gram[:, 0]
     bias_energy = gram[:, bias, bias]
     has_bias = bias_energy > RIDGE * bias_energy.max()  # false if the flow offset's column is zero, as at rest
     # mean of p_A - p_B in each block: the leak's column is (p_A - p_B) dt, that of the flow offset is dt
     mean_pressure = np.where(has_bias, gram[:, leak, bias], 0.0) / np.where(has_bias, bias_energy, 1.0)
-    fit = _fit_equation(gram, blocks, roles, leak, _nuisance_columns(roles))
+    fit = _fit_equation(blocks, 0, roles)
     # subtract this mean from the leak's column, so that leak and flow offset are uncorrelated in the block
     gram[:, leak] -= mean_pressure[:, None] * gram[:, bias]
     gram[:, :, leak] -= mean_pressure[:, None] * gram[:, :, bias]
     nuisance = [k for k in roles.nuisance if k not in (leak, bias)]
-    position = _nuisance_columns(roles).index(bias)
-    polynomials, _ = _drift_polynomials(blocks)
     # prior precisions of the fit, a row for each nuisance column; the last row is the sensor offset's, not used here
-    prior = fit.nuisance.prior_precision.reshape(-1, polynomials.shape[1])[:-1]
-    prior = np.delete(prior, position, axis=0).ravel()  # without the flow offset, which is estimated here
-    leaks, biases = (_build_normal_equations(gram, polynomials, nuisance, k, roles.left) for k in (leak, bias))
+    prior = fit.prior_precision.reshape(-1, fit.polynomials.shape[1])[:-1]
+    prior = np.delete(prior, fit.nuisance.index(bias), axis=0).ravel()  # without the flow offset
+    leaks, biases = (_build_normal_equations(gram, fit.polynomials, nuisance, k, roles.left) for k in (leak, bias))
     coupling = np.vstack([leaks.coupling, biases.coupling])
     solution = solve(leaks.gram + np.diag(prior), np.column_stack([coupling.T, leaks.moment]))
     precision = np.diag(np.concatenate([leaks.energy, biases.energy])) - coupling @ solution[:, :-1]
     vector = np.concatenate([leaks.tested_moment, biases.tested_moment]) - coupling @ solution[:, -1]
-    variance = fit.nuisance.variance
-    return LeakAndBias(0.5 * (precision + precision.T) / variance, vector / variance, mean_pressure)
+    return 0.5 * (precision + precision.T) / fit.variance, vector / fit.variance, mean_pressure
 
 
 def estimate_weighted_mean(blocks: Blocks, roles: ColumnRoles, weights: Mapping[int, float]) -> tuple[float, float]:
     """Estimate a weighted mean of several coefficients of the first volume balance, and its standard error.
 
-    `roles`: indices of the columns of this balance by role (leak, motion, left side). `weights` maps the index of a
-    nuisance column to the weight of its coefficient; the weights sum to 1. Only the constant part of each coefficient
-    is averaged, not its drift.
+    `weights`: weight of each coefficient by the index of its nuisance column, with the sum 1. Drifts do not count.
     """
-    nuisance = _nuisance_columns(roles)
-    normal, fit, _ = _fit_equation(blocks.gram[:, 0], blocks, roles, roles.leak, nuisance)
+    fit = _fit_equation(blocks, 0, roles)
     contrast = np.zeros(len(fit.coefficients))  # weights of all coefficients of the fit
     for column, weight in weights.items():
-        constant = nuisance.index(column) * fit.n_polynomials  # index of the first of the column's coefficients
+        constant = fit.nuisance.index(column) * fit.polynomials.shape[1]  # index of the column's first coefficient
         contrast[constant] = weight
-    gram, _, _ = normal.eliminate_tested()
+    gram, _, _ = fit.normal.eliminate_tested()
     precision = gram + np.diag(fit.prior_precision)
     variance = float(contrast @ solve(precision, contrast)) * fit.variance
     return float(contrast @ fit.coefficients), float(np.sqrt(max(variance, 0.0)))
@@ -744,11 +642,7 @@ def estimate_weighted_mean(blocks: Blocks, roles: ColumnRoles, weights: Mapping[
 def sum_blocks(blocks: Blocks, columns: Sequence[ColumnRoles]) -> Array:
     """Compute the Gram matrix of a whole recording for each of E equations, divided by the residual variance of a row.
 
-    The result has the shape (E, m, m), where the m columns are the terms of the volume balance and, last, its left
-    side. `columns`: for each equation the indices of its columns by role (leak, motion, left side).
+    The result has the shape (E, m, m); the m columns are the terms of the balance and, last, its left side.
     """
-    grams = []
-    for e, roles in enumerate(columns):
-        fit = _fit_equation(blocks.gram[:, e], blocks, roles, roles.leak, _nuisance_columns(roles))
-        grams.append(blocks.gram[:, e].sum(axis=0) / fit.nuisance.variance)
-    return np.array(grams)
+    variances = [_fit_equation(blocks, e, roles).variance for e, roles in enumerate(columns)]
+    return np.array([blocks.gram[:, e].sum(axis=0) / variance for e, variance in enumerate(variances)])

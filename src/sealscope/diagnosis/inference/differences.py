@@ -56,8 +56,7 @@ class PriorScatter(NamedTuple):
     """Prior on the scatter of a quantity between recordings of one machine.
 
     `deviation`: expected standard deviation of the quantity; `recordings`: number of recordings that would tell as much
-    about the scatter as this prior; `inflation`: largest factor by which the standard errors may be too small, the
-    same for all recordings.
+    about the scatter as this prior; `inflation`: largest common factor by which the errors may be too small.
     """
 
     deviation: float
@@ -77,28 +76,15 @@ def compare_with_healthy(
 ) -> Observable | None:
     """Test a value by Student's t for a difference from the values of healthy recordings.
 
-    Parameters
-    ----------
-    name, data : str
-        Name of the observable, and of the kind of data from which it is computed (`Observable`).
-    value : float
-        Value of the judged recording.
-    healthy : sequence of float
-        Values of the healthy recordings, in the same unit.
-    error : float
-        Standard error of a single value.
-    above : bool
-        Count only a value above the healthy ones.
-    prior_change : float
-        Standard deviation of a true change, infinite if unknown. If it is known, the p-value is at least the inverse of
-        the Bayes factor of such a change, and 1 if a true change explains the value no better than scatter does.
+    - `name`, `data`: name and kind of data of the observable;
+    - `error`: standard error of a single value;
+    - `above`: count only a value above the healthy ones;
+    - `prior_change`: standard deviation of a true change, infinite if unknown. If it is known, the p-value is at least
+      the inverse of the Bayes factor of such a change, and 1 if it explains the value no better than scatter does.
 
-    Returns
-    -------
-    Observable or None
-        Its size is the difference from the healthy mean, and its score the square of t; with `above`, the score of a
-        value below the mean is 0. Its chance is the p-value, the probability of so large a t without a change. None for
-        fewer than `MIN_HEALTHY` healthy recordings, or if a number is not finite.
+    The observable's size is the difference from the healthy mean, its score the square of t (with `above`, 0 for a
+    value below the mean), and its chance the p-value. Return None for fewer than `MIN_HEALTHY` healthy recordings, or
+    if a number is not finite.
     """
     from scipy.special import stdtr
 
@@ -137,28 +123,14 @@ def compare_estimates(
 ) -> Observable | None:
     """Test an estimate for a difference from the estimates of healthy recordings, each with a known standard error.
 
-    Parameters
-    ----------
-    name, data : str
-        Name of the observable, and of the kind of data from which it is computed (`Observable`).
-    judged : Estimate
-        Estimate from the judged recording.
-    healthy : sequence of Estimate
-        Estimates from the healthy recordings.
-    prior : PriorScatter
-        Prior on the scatter between recordings.
-    above : bool
-        Count only an estimate above the healthy ones.
-    further_deviation : float
-        Standard deviation of the judged estimate from further causes, such as an unusual load.
+    - `name`, `data`: name and kind of data of the observable;
+    - `prior`: prior on the scatter between recordings;
+    - `above`: count only an estimate above the healthy ones;
+    - `further_deviation`: standard deviation of the judged estimate from further causes, such as an unusual load.
 
-    Returns
-    -------
-    Observable or None
-        Its size is the difference from the weighted mean of the healthy estimates, and its score the square of this
-        difference over its variance; with `above`, the score of a negative difference is 0. Its chance is the p-value,
-        the probability of so large a difference without a change. None for fewer than `MIN_HEALTHY` healthy recordings,
-        or if a number is not finite.
+    The observable's size is the difference from the weighted mean of the healthy estimates, its score the square of
+    this difference over its variance (with `above`, 0 for a negative one), and its chance the p-value. Return None for
+    fewer than `MIN_HEALTHY` healthy recordings, or if a number is not finite.
     """
     from scipy.special import ndtr
 
@@ -192,9 +164,8 @@ def compare_estimates(
 def excess_error(error: float, healthy_errors: Sequence[float]) -> float:
     """Compute the part of a value's standard error `error` that must be added to the scatter of healthy values.
 
-    The scatter already contains an error as large as the median of `healthy_errors`, the standard errors of the
-    healthy values. The result is sqrt(`error`^2 - median^2), or 0 if `error` is below the median. Without healthy
-    values the result is `error`.
+    The scatter already contains an error as large as the median of `healthy_errors`. The result is sqrt(`error`^2 -
+    median^2), or 0 if `error` is below the median. Without healthy values it is `error`.
     """
     if not healthy_errors:
         return error

@@ -17,7 +17,6 @@ after the onset, the step is g / s.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -44,9 +43,7 @@ def apparent_conductances(blocks: Blocks, columns: Sequence[ColumnRoles]) -> dic
 
     It is the regression coefficient of this flow on p_A - p_B within the block. For an orifice, e = 1/2, the Gram
     matrices give this coefficient r. For the other exponents it is approximated by r^(2 (1 - e)), which is 1 for
-    laminar flow, e = 1. The result maps each exponent e of `EXPONENTS` to an array (K,) [Pa^(e - 1)]. `blocks`: the K
-    blocks, with the Gram matrices of the volume balance; `columns`: for each equation the indices of the columns of
-    these matrices by role (leak, motion, left side).
+    laminar flow, e = 1. The result maps each exponent e of `EXPONENTS` to an array (K,) [Pa^(e - 1)].
     """
     leak, orifice = columns[0].leak, columns[0].names.index(ORIFICE)
     gram = blocks.gram.sum(axis=1)  # sum over the equations
@@ -56,21 +53,20 @@ def apparent_conductances(blocks: Blocks, columns: Sequence[ColumnRoles]) -> dic
 
 
 def law_flows(blocks: Blocks) -> dict[float, Array]:
-    """Compute the mean flow in each of K blocks of a leak with the flow |p_A - p_B|^e times a coefficient.
+    """Compute the mean flow in each of K blocks of a leak with the flow |p_A - p_B|^e times a coefficient of 1.
 
-    With dp = p_A - p_B, and <> for the mean over a block, the flow divided by the coefficient is approximated by
-    <|dp|>^(2 e - 1) <|dp|^(1/2)>^(2 - 2 e), which is exact for e = 1 (laminar) and e = 1/2 (orifice). The result maps
-    each exponent e of `EXPONENTS` to an array (K,) of these values [Pa^e].
+    With dp = p_A - p_B, and <> for the mean over a block, the flow is approximated by
+
+        <|dp|>^(2 e - 1) <|dp|^(1/2)>^(2 - 2 e),
+
+    exact for e = 1 (laminar) and e = 1/2 (orifice). The result maps each exponent e of `EXPONENTS` to (K,) [Pa^e].
     """
     pressure, root = blocks.mean_pressure(), blocks.mean_root()
     return {exponent: pressure ** (2.0 * exponent - 1.0) * root ** (2.0 - 2.0 * exponent) for exponent in EXPONENTS}
 
 
 def law_priors() -> Array:
-    """Return the prior probability of each law of a leak's flow, |p_A - p_B|^e, in the order of `EXPONENTS`.
-
-    Laminar flow, e = 1, has the probability `size.laminar` of `priors.toml`; the other exponents are equally probable.
-    """
+    """Return the prior probability of each exponent of `EXPONENTS`: `size.laminar` (`priors.toml`) and equal others."""
     laminar: float = INFERENCE.size.laminar
     n_others = len(EXPONENTS) - 1
     return np.array([laminar, *[(1.0 - laminar) / n_others] * n_others])
@@ -79,11 +75,9 @@ def law_priors() -> Array:
 def find_leak_step(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Information) -> StepTest | None:
     """Test for a leak that begins within a recording, with a flow proportional to a power of |p_A - p_B| (its law).
 
-    There is one test for each exponent of `EXPONENTS`. Its p-value (`chance`) is divided by the prior probability of
-    the law, and the test with the smallest p-value is returned. The step's size is the change of the conductance,
-    averaged over the blocks by their information. `blocks`: the K blocks, with the Gram matrices of the volume balance;
-    `columns`: for each equation the indices of the columns of these matrices by role (leak, motion, left side); `leak`:
-    likelihood of the leak's coefficient in the K blocks. Return None if too few blocks have information.
+    The p-value (`chance`) of the test for each exponent of `EXPONENTS` is divided by the prior probability of the law,
+    and the test with the smallest one is returned. The step's size is the change of the conductance, averaged over the
+    blocks by their information. `leak`: likelihood of the leak's coefficient in the blocks. None if too few tell.
     """
     weights = np.maximum(leak.precision.sum(axis=0), 0.0)  # information of each block
     shapes = apparent_conductances(blocks, columns)
@@ -97,10 +91,7 @@ def find_leak_step(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Informa
 
 
 def growth_priors() -> list[tuple[float, float]]:
-    """List possible relative growths of a leak from its onset to the recording's end, as pairs (growth, probability).
-
-    The growth 0 (a constant leak) has the probability `growth.steady` (`priors.toml`), the others are equally probable.
-    """
+    """List possible relative growths of a leak from its onset to the recording's end, as (growth, probability)."""
     prior = INFERENCE.growth
     growths = prior.most * (np.arange(N_GROWTHS) + 1.0) / N_GROWTHS  # evenly spaced up to the largest
     probability = (1.0 - prior.steady) / N_GROWTHS
@@ -108,25 +99,17 @@ def growth_priors() -> list[tuple[float, float]]:
 
 
 def _onset_positions(leak: Information, test: StepTest) -> Array:
-    """Return the onsets (o,) that a step test has tried, counted in blocks from the start of the first block.
-
-    `leak`: likelihood of the tested coefficient. If it has a prior on the coefficient's level, `test` counts this prior
-    as one block before the first, which is subtracted here.
-    """
+    """Return the onsets (o,) of `test`, counted in blocks of the recording, without one for a prior on the level."""
     return test.positions - float(np.isfinite(leak.level))
 
 
 def estimate_step_flow(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Information, test: StepTest) -> Flow:
-    """Estimate the mean flow [m^3/s] of a leak that begins within a recording, over the time from its onset to the end.
+    """Estimate the mean flow [m^3/s] of a leak that begins within a recording, from its onset to the end.
 
-    This mean over time is computed for each combination of a law (exponent of |p_A - p_B|, `EXPONENTS`), a growth
-    (fraction by which the leak increases from the onset to the end) and an onset. The result is the mean over these
-    combinations, weighted by their likelihood and the prior probability of the growth (laws and onsets have equal
-    ones), and the standard deviation of their mixture.
-
-    `blocks`: the K blocks, with the pressures and the Gram matrices of the volume balance; `columns`: for each equation
-    the indices of the columns of these matrices by role (leak, motion, left side); `leak`: likelihood of the leak's
-    coefficient in the K blocks; `test`: step test of this coefficient, whose more probable onsets are used.
+    It is the mean over combinations of a law (exponent of |p_A - p_B|, `EXPONENTS`), a growth (fraction by which the
+    leak increases from the onset to the end) and an onset, weighted by their likelihood and the prior probability of
+    the growth; its standard error is the standard deviation of their mixture. `leak`: likelihood of the leak's
+    coefficient in the blocks; `test`: step test of this coefficient, whose more probable onsets are used.
     """
     onsets = np.flatnonzero(test.weights > NEGLIGIBLE * test.weights.max())
     positions = _onset_positions(leak, test)[onsets]
@@ -137,53 +120,35 @@ def estimate_step_flow(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Inf
     for growth, probability in growth_priors():
         steps = step_shapes(len(blocks), positions, growth)  # (K, o)
         for exponent in EXPONENTS:
-            sizes = step_sizes(leak, onsets, shapes[exponent], growth)
+            likelihood, size, deviation = step_sizes(leak, onsets, shapes[exponent], growth)
             unit = (rows * unit_flows[exponent]) @ steps / n_rows_after  # mean flow of a step of 1 after its onset
-            log_weights.append(np.log(probability) + sizes.likelihood)
-            flows.append(sizes.size * unit)
-            standard_errors.append(sizes.deviation * unit)
+            log_weights.append(np.log(probability) + likelihood)
+            flows.append(size * unit)
+            standard_errors.append(deviation * unit)
     weights = np.exp(np.ravel(log_weights) - np.max(log_weights))
     return mixture_flow(weights, np.ravel(flows), np.ravel(standard_errors))
 
 
-class LawWeight(NamedTuple):
-    """Probability of one law of a leak, i.e. of one exponent e in flow = C |p_A - p_B|^e, and the flow by this law.
-
-    `flow`: mean flow [m^3/s] if the leak's conductance, fitted as if it were laminar, rises by 1 m^3/(s Pa);
-    `log_weight`: logarithm of the law's probability, up to a constant.
-    """
-
-    flow: float
-    log_weight: float
-
-
 def estimate_rise_flow(
-    leak: Information, test: StepTest | None, value: float, deviation: float, laws: Sequence[LawWeight], max_flow: float
+    leak: Information,
+    test: StepTest | None,
+    value: float,
+    deviation: float,
+    laws: Sequence[tuple[float, float]],
+    max_flow: float,
 ) -> Flow:
     """Estimate the mean flow [m^3/s] of a leak after its onset, from the leakage above that of healthy recordings.
 
+    - `leak`: likelihood of the leak's coefficient in the blocks of the recording; `test`: test for a step of it, None
+      for a leak from the start;
+    - `value`, `deviation`: mean rise of the coefficient over the recording, and its standard deviation [m^3/(s Pa)];
+    - `laws`: for each law of `EXPONENTS` the mean flow for a rise of 1, and its log probability up to a constant;
+    - `max_flow`: mean flow of the pump [m^3/s]; onsets and laws with a larger leak are excluded.
+
     For an onset and a law the flow is the mean rise times the law's flow per rise, divided by the fraction of the
     recording's information after the onset. The result is the mean of these flows over the onsets, under the most
-    probable law; its standard error includes the differences to the other laws.
-
-    Parameters
-    ----------
-    leak : Information
-        Likelihood of the leak's coefficient in the blocks of the recording.
-    test : StepTest, optional
-        Test for a step of that coefficient; without it the leak counts from the start.
-    value, deviation : float
-        Mean rise of the coefficient over the whole recording, and its standard deviation [m^3/(s Pa)].
-    laws : sequence of LawWeight
-        For each law of `EXPONENTS` its log probability, and the mean flow for a rise of 1.
-    max_flow : float
-        Mean flow of the pump [m^3/s]; onsets and laws with a larger leak are excluded.
-
-    Returns
-    -------
-    Flow
-        The mean flow and its standard error. If all combinations of onset and law are excluded, the flow is that of
-        the first law for a leak from the start of the recording.
+    probable law; its standard error includes the differences to the other laws. If all are excluded, it is the flow
+    under the first law for a leak from the start.
     """
     log_weights, fractions = _weigh_rise_onsets(leak, test, value)
     unit_flows, law_log_weights = np.array(laws).T
@@ -202,10 +167,9 @@ def _weigh_rise_onsets(leak: Information, test: StepTest | None, value: float) -
     """Weigh the possible onsets of a leak whose coefficient has risen by `value` on average over the recording.
 
     Returns the log weight of each onset, and the fraction of the recording's information after the onset, (o,) each.
-    The first onset is the recording's start, with log weight 0 and fraction 1. The others are the onsets of `test` with
-    a fraction above `MIN_FRACTION`. A leak that begins later must cause a larger step, `value` / fraction. The weight
-    of an onset is the likelihood of this step relative to no step, divided by the number of onsets. Without a `test`,
-    or if `value` is not positive, only the first onset remains. `leak`: likelihood of the coefficient in the blocks.
+    The first onset is the recording's start, with log weight 0 and fraction 1. The others are those of `test` with a
+    fraction above `MIN_FRACTION`, weighted by the likelihood of the step that they need, `value` / fraction, relative
+    to no step, over their number. Without a `test`, or if `value` is not positive, only the first onset remains.
     """
     if test is None or not value > 0.0:
         return np.zeros(1), np.ones(1)
@@ -221,11 +185,7 @@ def _weigh_rise_onsets(leak: Information, test: StepTest | None, value: float) -
 
 
 def mixture_flow(weights: Array, flows: Array, deviations: Array) -> Flow:
-    """Average k alternative estimates of a leak's flow [m^3/s], or of another quantity, by their weights.
-
-    `weights`, `flows` and their standard `deviations`: (k,) each; the sum of the weights need not be 1. The result is
-    the mean and the standard deviation of the mixture.
-    """
+    """Compute mean and standard deviation of a mixture of k estimates (k,) of a flow [m^3/s] or another quantity."""
     probabilities = weights / weights.sum()
     value = float(probabilities @ flows)
     return Flow(value, float(np.sqrt(probabilities @ (deviations**2 + (flows - value) ** 2))))

@@ -56,10 +56,7 @@ class Observable:
 
     @property
     def surprisal(self) -> float:
-        """Minus the natural logarithm of `chance`, the probability that a healthy recording scores as high.
-
-        In a healthy machine it is exponentially distributed if the chance is stated correctly.
-        """
+        """Minus the natural logarithm of `chance`: exponentially distributed in a healthy machine if that is right."""
         return float(-np.log(max(self.chance, np.finfo(float).tiny)))
 
     @classmethod
@@ -68,9 +65,8 @@ class Observable:
     ) -> Observable:
         """Make the observable of a step, a sudden lasting change, within the recording.
 
-        `test`: the best of `n_tests` tests, whose chance is therefore multiplied by their number (Bonferroni);
-        `sign`: 1 for a step up, -1 for a step down, whose size the test states as positive. `name`, `data` and
-        `advantage` become the fields of the observable.
+        `test`: the best of `n_tests` tests, whose chance is therefore multiplied by their number (Bonferroni); `sign`:
+        1 for a step up, -1 for a step down, whose size the test states as positive.
         """
         return cls(
             name=name,
@@ -103,9 +99,8 @@ class Remark(NamedTuple):
 class LeakRise(NamedTuple):
     """Leakage of a recording above that of healthy recordings (`rise`), and its agreement with a step.
 
-    `step_log_ratio`: log likelihood ratio of two explanations of the estimated rise. One is a step of the leakage that
-    was found within the recording, the other is that the leakage has not risen. The log ratio is positive if the rise
-    agrees with the step.
+    `step_log_ratio`: log likelihood ratio of two explanations of the estimated rise, a step of the leakage that was
+    found within the recording to no rise. It is positive if the rise agrees with the step.
     """
 
     rise: Rise
@@ -117,7 +112,7 @@ class RiseTest(Protocol):
 
     @property
     def score(self) -> float:
-        """Statistic of the test for increased leakage, such as a z score; it grows with the leakage."""
+        """Statistic of the test, such as a z score; it grows with the leakage."""
 
     @property
     def chance(self) -> float:
@@ -134,10 +129,9 @@ class DatedTest(RiseTest, Protocol):
         """Return the most likely onset of the leak [s] with its 95 % interval."""
 
     def detectable_step(self, chance: float) -> float:
-        """Return the smallest step of the leak's conductance [m^3/(s Pa)] that is detected with a high probability.
+        """Return the smallest increase of the leak's conductance [m^3/(s Pa)] that is detected with a high probability.
 
-        A step is a sudden, lasting increase. `chance`: probability, without a step, that the test finds one; it sets
-        the threshold of the test.
+        `chance`: probability, without an increase, that the test finds one; it sets the threshold.
         """
 
 
@@ -162,11 +156,7 @@ class LeakMeasure(Protocol):
 
     @property
     def flow_factors(self) -> tuple[float, float]:
-        """Smallest and largest possible ratio of the leak's true flow to the stated flow.
-
-        The ratios differ from 1 if the channels do not show on which path the oil leaks, or how the flow depends on
-        the pressure.
-        """
+        """Smallest and largest ratio of the leak's true flow to the stated one, if its path or law is unknown."""
 
     @property
     def flow_per_conductance(self) -> float:
@@ -178,10 +168,7 @@ class LeakMeasure(Protocol):
 
     @property
     def rise_flow(self) -> Flow | None:
-        """Mean flow [m^3/s] of the leakage above that of healthy recordings; None if the flow is unknown.
-
-        Without healthy recordings it is the flow of the total leakage.
-        """
+        """Mean flow [m^3/s] above healthy recordings, or of the total leakage without these; None if it is unknown."""
 
     @property
     def rise_onset(self) -> Interval | None:
@@ -189,10 +176,7 @@ class LeakMeasure(Protocol):
 
     @property
     def excess(self) -> float | None:
-        """Total leakage minus the limit in the rig's file (`pump.G_healthy`), in standard deviations of the leakage.
-
-        None if no limit applies.
-        """
+        """Total leakage minus the limit in the rig's file (`pump.G_healthy`) in standard deviations, or None."""
 
     @property
     def bound_flow(self) -> float:
@@ -204,17 +188,13 @@ class LeakMeasure(Protocol):
 
     @property
     def step_rise(self) -> LeakRise | None:
-        """Leakage above that of healthy recordings, with the evidence that a step within the recording caused it.
-
-        None without healthy recordings.
-        """
+        """Leakage above that of healthy recordings, with the evidence for a step as its cause; None without these."""
 
     @property
     def lpm_per_flow(self) -> float | None:
         """Factor from this detector's flows [m^3/s], computed with an assumed machine, to the true flows [L/min].
 
-        A detector assumes dimensions that the rig's file does not state, such as the piston's area or the pump's
-        displacement. None if the true flows cannot be known without these dimensions.
+        None if they depend on dimensions that the rig's file does not state, such as the piston's area.
         """
 
     @property
@@ -223,34 +203,23 @@ class LeakMeasure(Protocol):
 
     @property
     def ratio(self) -> Interval | None:
-        """Measured ratio of the pump's displacement to the piston's area, relative to the assumed ratio.
-
-        None if it is not measured.
-        """
+        """Measured over assumed ratio of the pump's displacement to the piston's area; None if it is not measured."""
 
     @property
     def remarks(self) -> Sequence[Remark]:
         """Remarks for the reader of the verdict: contradicting dimensions, offsets of sensors, delays of channels."""
 
     def relative(self, flow: Flow) -> RelativeLeak | None:
-        """Convert a leak's flow [m^3/s] to a fraction of the pump's flow and a creep speed [m/s] of the piston.
-
-        None if both are unknown.
-        """
+        """Convert a leak's flow to a fraction of the pump's flow and a creep speed [m/s]; None if both are unknown."""
 
     def total(self, detectable_flow: float | None) -> TotalLeakage | None:
-        """Return the total leakage in the recording and the smallest detectable leak; None if both are unknown.
+        """Return the total leakage and the smallest detectable leak; None if both are unknown.
 
-        `detectable_flow`: flow [m^3/s] of the smallest leak that would be detected if it began within the recording;
-        None if that was not tested.
+        `detectable_flow`: flow [m^3/s] of the smallest leak that would be detected within the recording, or None.
         """
 
     def history(self, onset_s: float | None) -> LeakCourse | None:
-        """Return the leakage over the time of the recording; None if it is unknown.
-
-        With an onset `onset_s` [s] of a leak it is the growth of the leakage since the onset, with None the total
-        leakage.
-        """
+        """Return the leakage over time, or with an onset [s] its growth since then; None if it is unknown."""
 
 
 class Ringing(NamedTuple):

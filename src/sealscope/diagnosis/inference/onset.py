@@ -91,6 +91,12 @@ class Information(NamedTuple):
     slope: float = float("inf")
     walk: float = float("inf")
 
+    def fraction_after(self, onset: float) -> float:
+        """Compute the fraction, 0 to 1, of the information on the mean of g in the blocks after `onset` [s]."""
+        weights = self.precision.sum(axis=0)
+        after = weights[self.time >= onset].sum()
+        return float(np.clip(after / max(weights.sum(), np.finfo(float).tiny), 0.0, 1.0))
+
 
 class Interval(NamedTuple):
     """An estimate `value` with its 95 % interval from `low` to `high`."""
@@ -101,10 +107,7 @@ class Interval(NamedTuple):
 
 
 class FittedStep(NamedTuple):
-    """Fitted `size` of a step (a sudden lasting change) of a coefficient, and its standard error `deviation`.
-
-    Both are in the unit of the coefficient.
-    """
+    """Fitted `size` of a step (a sudden lasting change) of a coefficient, and its standard error `deviation`."""
 
     size: float
     deviation: float
@@ -152,44 +155,36 @@ class StepTest:
 
     @cached_property
     def weights(self) -> Array:
-        """Probability of each tried onset, given that there is a step, shape (o,); all are equally probable before."""
+        """Probability of each tried onset, shape (o,), given that there is a step; before, all are equally probable."""
         weights = np.exp(self.likelihood - self.likelihood.max())
         return np.asarray(weights / weights.sum())
 
-    def onset(self, probability: float = BOUND_PROBABILITY) -> Interval:
-        """Return the most likely onset of the step [s] and the interval that contains it with `probability`.
+    def onset(self) -> Interval:
+        """Return the most likely onset of the step [s] with its 95 % interval.
 
-        The interval is widened by half a block at both ends, since the rows within the block of the onset are
-        weighted as if the whole block leaked or none of it. A block has `PARTS` evenly spaced onsets.
+        It is widened by half a block, which has `PARTS` evenly spaced onsets, at both ends: the rows within the block
+        of the onset are weighted as if the whole block leaked or none of it.
         """
-        tail = 0.5 - 0.5 * probability  # on either side of the interval
+        tail = 0.5 - 0.5 * BOUND_PROBABILITY  # on either side of the interval
         low, high = np.interp([tail, 1.0 - tail], np.cumsum(self.weights), self.onsets)
         best = float(self.onsets[self.best])
         spacing = float(self.onsets[1] - self.onsets[0]) if len(self.onsets) > 1 else 0.0
         half_block = 0.5 * PARTS * spacing
         return Interval(best, min(float(low), best) - half_block, max(float(high), best) + half_block)
 
-    def bound(self, probability: float = BOUND_PROBABILITY) -> float:
-        """Compute the upper bound of the step, in the unit of the coefficient.
-
-        It is the quantile of the step's size at `probability`, given that the size is > 0, over all tried onsets.
-        """
-        return bound_steps(self.weights, self.size, self.deviation, probability)
+    def bound(self) -> float:
+        """Compute the 95 % upper bound of the step, in the unit of the coefficient (`bound_steps`)."""
+        return bound_steps(self.weights, self.size, self.deviation, BOUND_PROBABILITY)
 
     def share_alarms(self, share: float) -> StepTest:
-        """Return this test with its p-value divided by `share`, for use among several tests of which the best counts.
-
-        `share`: fraction of the total false-alarm probability that this test may use. The distribution of the score
-        (`law`) gets the same share.
-        """
+        """Return this test with its p-value divided by `share`, its fraction of the false alarms of several tests."""
         return replace(self, chance=min(1.0, self.chance / share), law=self.law._replace(share=share))
 
     def detectable_step(self, chance: float, power: float = 0.9) -> float:
-        """Compute the smallest step that is detected with the probability `power`.
+        """Compute the smallest step that is detected with the probability `power`, in the unit of the coefficient.
 
         `chance`: probability, without a step, that the test finds one, which sets the threshold of the score. The step
-        is (sqrt(threshold of the score) + normal quantile of `power`) times the median standard error over all
-        onsets, in the unit of the coefficient.
+        is (sqrt(threshold) + normal quantile of `power`) times the median standard error over all onsets.
         """
         from scipy.special import ndtri
 
@@ -197,10 +192,7 @@ class StepTest:
         return float((threshold_z + ndtri(power)) * np.median(self.deviation))
 
     def threshold(self, chance: float) -> float:
-        """Compute the score that a coefficient without a step exceeds with the probability `chance`.
-
-        The score is twice the logarithm of a likelihood ratio. The result is limited to the range from 0 to 10 000.
-        """
+        """Compute the score that a coefficient without a step exceeds with the probability `chance`, at most 10 000."""
         max_score = 1e4  # upper end of the search; such a score has practically no probability
         if self.law.chance(0.0) <= chance:
             return 0.0
@@ -224,7 +216,7 @@ def bound_steps(weights: Array, size: Array, deviation: Array, probability: floa
         return max(max_step, 0.0)
 
     def excess_chance(fraction: float) -> float:
-        """Compute P(step > `fraction` * `max_step`) - (1 - `probability`) P(step > 0); the upper bound is its root."""
+        """Compute P(step > `fraction` * `max_step`) - (1 - `probability`) P(step > 0), whose root is the bound."""
         return float(weights @ ndtr((size - fraction * max_step) / deviation)) - (1.0 - probability) * probability_up
 
     return max_step * find_root(excess_chance, 0.0, 1.0) if excess_chance(1.0) < 0.0 else max_step
@@ -237,10 +229,7 @@ class History(NamedTuple):
     covariance: Array
 
     def average(self, weights: Array) -> Interval:
-        """Compute the mean of the coefficient over the blocks, with its 95 % interval.
-
-        `weights` (K,): weight of each block; their sum is 1.
-        """
+        """Compute the mean of the coefficient by `weights` (K,) of the blocks, with sum 1, and its 95 % interval."""
         value = float(weights @ self.mean)
         half_width = WITHIN_95 * float(np.sqrt(np.maximum(weights @ self.covariance @ weights, 0.0)))
         return Interval(value, value - half_width, value + half_width)
@@ -255,10 +244,9 @@ class History(NamedTuple):
 def fit_history(information: Information, test: StepTest | None, *, with_step: bool) -> History:
     """Estimate a coefficient in each block of a recording, as the sum of a level, a slope and a random walk.
 
-    `information`: likelihood of the coefficient; `test`: step test of the coefficient, whose fitted variances of walk
-    and noise are used. Without a test there is no walk, and the noise has the variance 1. With fewer than `MIN_BLOCKS`
-    blocks there is no slope. `with_step`: add a step at the best onset of `test`, and use the variances that were
-    fitted together with a step.
+    `test`: step test of the coefficient, whose fitted variances of walk and noise are used. Without a test there is no
+    walk, and the noise has the variance 1. With fewer than `MIN_BLOCKS` blocks there is no slope. `with_step`: add a
+    step at the best onset of `test`, and use the variances that were fitted together with a step.
     """
     time = information.time
     count = len(time)
@@ -295,8 +283,7 @@ class NullLaw(NamedTuple):
     """Distribution of the score of a step test in a healthy machine, i.e. without a step.
 
     `dimensions`: degrees of freedom m; `length`: length L of the curve that the whitened steps over all onsets form on
-    the unit sphere (see the module); `share`: fraction of the false-alarm probability that this test gets, if the best
-    of several tests counts.
+    the unit sphere (see the module); `share`: fraction of the false alarms that this test gets among several.
     """
 
     dimensions: float
@@ -304,11 +291,9 @@ class NullLaw(NamedTuple):
     share: float = 1.0
 
     def chance(self, score: float) -> float:
-        """Compute the probability P that a coefficient without a step has a higher score.
+        """Compute the probability P that a coefficient without a step has a higher score (formula: see the module).
 
-        P is the fraction of the unit sphere in m dimensions that lies within a tube about a curve, with a radius that
-        follows from the score. The curve consists of the whitened steps at all onsets (see the module for the
-        formula). If several tests share a false-alarm probability, P is divided by the share of this test (Bonferroni).
+        If several tests share a false-alarm probability, P is divided by the share of this test (Bonferroni).
         """
         from scipy.special import betainc
 
@@ -321,67 +306,55 @@ class NullLaw(NamedTuple):
 def step_test(information: Information, signs: Sequence[float] = (1.0,), shape: Array | None = None) -> StepTest | None:
     """Test a coefficient for a step, a sudden lasting change, at an unknown onset.
 
-    `information`: likelihood of the coefficient in K blocks; `signs`: 1 to test for a step up, -1 for a step down;
-    `shape` (K,): change of the coefficient in each block by a unit step, by default 1. With two signs the test with
-    the higher score is returned, and the probability of a false alarm is twice its `chance`. Return None if too few
-    blocks have information.
+    `signs`: 1 to test for a step up, -1 for a step down; `shape` (K,): change of the coefficient in each block by a
+    unit step, by default 1. Of two signs the test with the higher score is returned, and the probability of a false
+    alarm is twice its `chance`. Return None if too few blocks have information.
     """
     return max(step_tests(information, signs, shape), key=lambda test: test.score, default=None)
 
 
 def step_tests(information: Information, signs: Sequence[float], shape: Array | None = None) -> list[StepTest]:
-    """Test a coefficient for a step up, a step down, or both, each at an unknown onset.
-
-    `information`: likelihood of the coefficient in K blocks; `signs`: 1 for steps up, -1 for steps down; `shape` (K,):
-    change of the coefficient in each block by a unit step, by default 1. The result has one test for each sign; it is
-    empty if too few blocks have information.
-    """
+    """Test a coefficient for a step with each of the `signs`, as in `step_test`; empty without enough information."""
     whitened = _whiten_blocks(information)
     if whitened is None:
         return []
-    steps = whitened.transform @ whitened.step_shapes(whitened.positions, shape)
-    fits = _fit_steps(whitened.z, steps, whitened.eigen)
-    return [_test_step_up(whitened, steps, fits if sign > 0.0 else fits.upside_down()) for sign in signs]
+    whitening, z, onsets = whitened
+    steps = whitening.transform_steps(whitening.positions, shape)
+    fits = _fit_steps(z, steps, whitening.eigen)
+    return [_test_step_up(whitening, onsets, steps, fits if sign > 0.0 else fits.upside_down()) for sign in signs]
 
 
-class StepSizes(NamedTuple):
-    """Steps fitted at each of o onsets: log `likelihood`, `size` and its standard error `deviation`, (o,) each."""
-
-    likelihood: Array
-    size: Array
-    deviation: Array
-
-
-def step_sizes(information: Information, onsets: NDArray[np.intp], shape: Array, growth: float) -> StepSizes:
+def step_sizes(
+    information: Information, onsets: NDArray[np.intp], shape: Array, growth: float
+) -> tuple[Array, Array, Array]:
     """Estimate the size of a step up of a coefficient, for each of o possible onsets.
 
     The coefficient also has a level, a slope and a random walk, whose likeliest variance is used at each onset.
-    `information`: likelihood of the coefficient in K blocks; `onsets` (o,): indices of the onsets in
-    `StepTest.onsets`; `shape` (K,): factor on the step in each block, 1 for a step of the coefficient itself;
-    `growth`: relative growth of the step from its onset to the end of the recording, 0 for a constant step.
+    `onsets` (o,): indices of the onsets in `StepTest.onsets`; `shape` (K,): change of the coefficient in each block by
+    a unit step; `growth`: relative growth of the step from its onset to the end of the recording. Returns log
+    likelihood, size and its standard error, (o,) each.
     """
     whitened = _whiten_blocks(information)
     assert whitened is not None
-    n = len(whitened.z)
-    steps = whitened.transform @ whitened.step_shapes(whitened.positions[onsets], shape, growth)
-    fit = _fit_steps(whitened.z, steps, whitened.eigen)
+    whitening, z, _ = whitened
+    n = len(z)
+    fit = _fit_steps(z, whitening.transform_steps(whitening.positions[onsets], shape, growth), whitening.eigen)
     # log likelihood (walk, onset) with the best size of the step and the best variance of the noise
     likelihoods = (
         0.5 * np.log(fit.weight).sum(axis=1)[:, None]
-        + whitened.walk_log_priors[:, None]
+        + whitening.walk_log_priors[:, None]
         - 0.5 * n * np.log(fit.residual_squares / n)
     )
     likeliest_walk = likelihoods.argmax(axis=0), np.arange(len(onsets))  # index (walk, onset)
     sizes, variances = fit.moments / fit.energies, fit.residual_squares / n / fit.energies
-    return StepSizes(likelihoods[likeliest_walk], sizes[likeliest_walk], np.sqrt(variances)[likeliest_walk])
+    return likelihoods[likeliest_walk], sizes[likeliest_walk], np.sqrt(variances)[likeliest_walk]
 
 
 class _StepFits(NamedTuple):
-    """Least-squares fits of a step up to whitened values z (n,), for each of o onsets and w random walks.
+    """Least-squares fits of a step up to whitened values z (n,), for each of o onsets and w random walks (`WALKS`).
 
-    The walks have the variances `WALKS`. `weight` (w, n): variance of the noise over that of each z; `total` (w,):
-    weighted sum of squares of z; `moments` and `energies` (w, o): weighted products of the steps with z and with
-    themselves; `residual_squares` (w, o): weighted sum of squares after the fit.
+    `weight` (w, n): variance of the noise over that of each z; `total` (w,): weighted sum of squares of z; `moments`,
+    `energies` (w, o): products of the steps with z and themselves; `residual_squares` (w, o): after the fit.
     """
 
     weight: Array
@@ -400,8 +373,8 @@ class _StepFits(NamedTuple):
 def _fit_steps(z: Array, steps: Array, eigen: Array) -> _StepFits:
     """Fit a step up by least squares at each of o onsets, for each variance of the random walk in `WALKS`.
 
-    `z` (n,): whitened values of the coefficient; `steps` (n, o): unit steps, whitened in the same way; `eigen` (n,):
-    eigenvalues of the walk's covariance (`_Whitened`). Only steps up count: a step down does not reduce the residual.
+    `z` (n,): whitened values of the coefficient; `steps` (n, o): whitened unit steps; `eigen` (n,): eigenvalues of the
+    walk's covariance (`_Whitening`). Only steps up count: a step down does not reduce the residual.
     """
     weight = 1.0 / (1.0 + WALKS[:, None] * eigen)
     total = np.maximum((weight * z**2).sum(axis=1), np.finfo(float).tiny)
@@ -410,56 +383,15 @@ def _fit_steps(z: Array, steps: Array, eigen: Array) -> _StepFits:
 
 
 def _residual_squares(total: Array, moments: Array, energies: Array) -> Array:
-    """Compute the residual sum of squares after the fit of a step up, shape (w, o).
-
-    There is one result for each of w assumed variances of the coefficient's random walk and each of o onsets. A step
-    down does not reduce the sum. `total` (w,): sum of squares before the fit; `moments` and `energies` (w, o): products
-    of the steps with the whitened values and with themselves. The result is kept above rounding errors.
-    """
+    """Compute `residual_squares` of `_StepFits` from its other fields, kept above rounding errors."""
     return np.asarray(np.maximum(total[:, None] - np.maximum(moments, 0.0) ** 2 / energies, 1e-12 * total[:, None]))
-
-
-class _Whitened(NamedTuple):
-    """Whitened values z (n,) of a coefficient, i.e. with independent noise of variance 1.
-
-    Level and slope of the coefficient over the blocks do not change z, as these directions are projected out. The
-    components of z are along the eigenvectors of the random walk's covariance.
-
-    - `transform` (n, K): matrix from the coefficient in K blocks to z;
-    - `eigen` (n,): eigenvalues of the random walk's covariance, times the scale `unit`;
-    - `unit`: scale at which walk and noise change z equally on average;
-    - `positions`, `onsets` (o,): possible onsets, counted in blocks, and as times [s];
-    - `walk_log_priors` (w,): log prior of each variance in `WALKS`.
-    """
-
-    z: Array
-    transform: Array
-    eigen: Array
-    unit: float
-    positions: Array
-    onsets: Array
-    walk_log_priors: Array
-
-    def step_shapes(self, positions: Array, shape: Array | None = None, growth: float = 0.0) -> Array:
-        """Compute the change of the coefficient in each of K blocks by a unit step at each of o onsets, shape (K, o).
-
-        `positions` (o,): onsets, counted in blocks from the start; `shape`: factor on the step in each block of the
-        recording, by default 1; `growth`: relative growth of the step from its onset to the end. If the coefficient
-        has a prior on its level, this prior is the first of the K blocks, without an entry in `shape`.
-        """
-        count = self.transform.shape[1]
-        steps = step_shapes(count, positions, growth)
-        if shape is not None:
-            steps[count - len(shape) :] *= shape[:, None]
-        return steps
 
 
 def step_shapes(count: int, positions: Array, growth: float = 0.0) -> Array:
     """Compute the mean of a unit step in each of `count` = K blocks, for each of o onsets, shape (K, o).
 
-    `positions` (o,): onsets, counted in blocks from the start. The block of the onset shows only the fraction of the
-    step after the onset. From the onset on the step grows linearly from 1 to 1 + `growth` at the end of the last
-    block.
+    `positions` (o,): onsets, counted in blocks from the start. From its onset within a block on, the step grows
+    linearly from 1 to 1 + `growth` at the end of the last block.
     """
     end_since_onset = np.arange(count)[:, None] + 1.0 - positions  # end of each block minus onset, (K, o)
     steps, middle_since_onset = np.clip(end_since_onset, 0.0, 1.0), end_since_onset - 0.5
@@ -468,11 +400,18 @@ def step_shapes(count: int, positions: Array, growth: float = 0.0) -> Array:
 
 
 class _Whitening(NamedTuple):
-    """Matrices that whiten the estimates of a coefficient in K blocks (`whiten`), from their precision and priors only.
+    """Matrices that whiten the estimates of a coefficient in K blocks, from their precision and priors only.
 
-    `root` (r,) and `vectors` (K, r): square roots of the non-zero eigenvalues of the precision, and their eigenvectors;
-    `complement` (n, r + s): directions orthogonal to level and slope, where s = 1 if a prior on the slope adds one more
-    value, else 0; `basis` (n, n): eigenvectors of the random walk's covariance. `_Whitened` gets the other fields.
+    The whitened values z (n,) have independent noise of variance 1. Level and slope of the coefficient are projected
+    out.
+
+    - `root` (r,), `vectors` (K, r): square roots of the non-zero eigenvalues of the precision, and their eigenvectors;
+    - `complement` (n, r + s): directions orthogonal to level and slope; s = 1 with a prior on the slope;
+    - `basis`, `eigen` (n, n), (n,): eigenvectors of the random walk's covariance, and its eigenvalues times `unit`;
+    - `transform` (n, K): matrix from the coefficient in K blocks to z;
+    - `unit`: scale at which walk and noise change z equally on average;
+    - `positions` (o,): possible onsets, counted in blocks;
+    - `walk_log_priors` (w,): log prior of each variance in `WALKS`.
     """
 
     root: Array
@@ -485,30 +424,30 @@ class _Whitening(NamedTuple):
     positions: Array
     walk_log_priors: Array
 
-    def whiten(self, time: Array, vector: Array) -> _Whitened:
-        """Transform the estimates of a coefficient in K blocks to independent values of variance 1.
-
-        Their level and slope over the blocks are projected out. `time` (K,): middles of the blocks [s]; `vector` (K,):
-        precision matrix times the estimates, as in `Information`.
-        """
+    def whiten(self, vector: Array) -> Array:
+        """Transform the `vector` (K,) of `Information` to z (n,)."""
         z = (self.vectors.T @ vector) / self.root
         z = np.append(z, np.zeros(self.complement.shape[1] - len(z)))  # a prior on the slope is one more estimate, 0
-        return _Whitened(
-            z=self.basis.T @ (self.complement @ z),
-            transform=self.transform,
-            eigen=self.eigen,
-            unit=self.unit,
-            positions=self.positions,
-            onsets=_onset_times(time, self.positions),
-            walk_log_priors=self.walk_log_priors,
-        )
+        return np.asarray(self.basis.T @ (self.complement @ z))
+
+    def transform_steps(self, positions: Array, shape: Array | None = None, growth: float = 0.0) -> Array:
+        """Compute the change of z by a unit step at each of o onsets, shape (n, o).
+
+        `positions`, `growth`: as in `step_shapes`; `shape`: factor on the step in each block of the recording, by
+        default 1. A prior on the level is the first of the K blocks, without an entry in `shape`.
+        """
+        count = self.transform.shape[1]
+        steps = step_shapes(count, positions, growth)
+        if shape is not None:
+            steps[count - len(shape) :] *= shape[:, None]
+        return np.asarray(self.transform @ steps)
 
 
-def _whiten_blocks(information: Information) -> _Whitened | None:
+def _whiten_blocks(information: Information) -> tuple[_Whitening, Array, Array] | None:
     """Transform the estimates of a coefficient in blocks to independent values of variance 1.
 
-    Their level and slope over the blocks are projected out. Return None if too few blocks have information, or if the
-    precision is not finite.
+    Returns the matrices, the values z (n,), and the times of the possible onsets (o,) [s]; None without enough
+    information.
     """
     time, precision, vector = _prepend_level_prior(information)
     if not np.isfinite(precision).all():
@@ -517,24 +456,21 @@ def _whiten_blocks(information: Information) -> _Whitened | None:
         whitening = _unit_whitening(len(time), information.slope, information.walk)
     else:
         whitening = _build_whitening(precision, information.slope, information.walk)
-    return None if whitening is None else whitening.whiten(time, vector)
+    if whitening is None:
+        return None
+    return whitening, whitening.whiten(vector), _onset_times(time, whitening.positions)
 
 
 @lru_cache(maxsize=16)
 def _unit_whitening(count: int, slope: float, walk: float) -> _Whitening | None:
-    """Build the matrices of `_build_whitening` for `count` independent estimates of variance 1; None if too few.
-
-    This frequent case is cached. The matrices eliminate level and slope. `slope`, `walk`: scales of the priors on the
-    linear change and on the random walk over all blocks, relative to the standard deviation of an estimate.
-    """
+    """Build the matrices of `_build_whitening` for `count` independent estimates of variance 1, a frequent case."""
     return _build_whitening(np.eye(count), slope, walk)
 
 
 def _build_whitening(precision: Array, slope: float, walk: float) -> _Whitening | None:
     """Build the matrices that whiten K blocks with a given precision (K, K); None if too few have information.
 
-    `slope`, `walk`: scales of the priors on the linear change and on the random walk over all blocks, in the unit of
-    the coefficient (`Information`).
+    `slope`, `walk`: scales of the priors on the linear change and on the random walk over all blocks (`Information`).
     """
     count = len(precision)
     # z = Lambda^(-1/2) eta, restricted to the eigenvectors with information
@@ -575,20 +511,8 @@ def _build_whitening(precision: Array, slope: float, walk: float) -> _Whitening 
     )
 
 
-def two_sided_step_test(information: Information) -> StepTest | None:
-    """Test a coefficient for a step up or down at an unknown onset; None if too few blocks have information.
-
-    The direction with the higher score is returned, so the probability of a false alarm is twice the test's `chance`.
-    """
-    return step_test(information, (1.0, -1.0))
-
-
 def _prepend_level_prior(information: Information) -> tuple[Array, Array, Array]:
-    """Add the prior on a coefficient's level to its likelihood, as one more block before the first.
-
-    Returns time (K,) [s], precision (K, K) and vector (K,) as in `Information`, where K includes the added block. No
-    block is added if the likelihood has no prior on the level, or fewer than `MIN_BLOCKS` blocks.
-    """
+    """Return `time`, `precision` and `vector` with a prior on the level, if any, as a block before the first."""
     time, precision, vector, level, _, _ = information
     if not np.isfinite(level) or len(time) < MIN_BLOCKS:
         return time, precision, vector
@@ -600,7 +524,7 @@ def _prepend_level_prior(information: Information) -> tuple[Array, Array, Array]
 
 
 def _onset_times(time: Array, positions: Array) -> Array:
-    """Convert positions (o,), counted in blocks from the start of the first block, to times [s].
+    """Convert `positions` (o,), counted in blocks from the start of the first block, to times [s].
 
     `time` (K,): middles of the blocks [s].
     """
@@ -610,13 +534,13 @@ def _onset_times(time: Array, positions: Array) -> Array:
     return np.asarray(np.interp(positions, np.arange(len(edges)), edges))
 
 
-def _test_step_up(whitened: _Whitened, steps: Array, fits: _StepFits) -> StepTest:
-    """Test whitened values of a coefficient for a step up at any of o onsets, by the likelihood ratio to no step.
+def _test_step_up(whitening: _Whitening, onsets: Array, steps: Array, fits: _StepFits) -> StepTest:
+    """Test whitened values of a coefficient for a step up at any of o `onsets` [s], by the likelihood ratio to no step.
 
     `steps` (n, o): whitened unit steps; `fits`: their fits to the values z for each of w walks, or to -z to test for a
     step down. Both likelihoods are maximised over the variances of walk and noise, with the prior on the walk.
     """
-    n, walk_log_priors, unit = len(whitened.z), whitened.walk_log_priors, whitened.unit
+    n, walk_log_priors, unit = len(whitening.eigen), whitening.walk_log_priors, whitening.unit
     weight, total, moments, energies, residual_squares = fits
     # for each walk, twice the log of (square root of the determinant of the weights, times the prior)
     twice_log_factor = np.log(weight).sum(axis=1) + 2.0 * walk_log_priors
@@ -642,8 +566,8 @@ def _test_step_up(whitened: _Whitened, steps: Array, fits: _StepFits) -> StepTes
         score=score,
         chance=law.chance(score),
         best=int(best),
-        positions=whitened.positions,
-        onsets=whitened.onsets,
+        positions=whitening.positions,
+        onsets=onsets,
         likelihood=log_likelihood_with_step.max(axis=0),
         size=size,
         deviation=np.sqrt(np.maximum(squares, 0.0) / n) / np.sqrt(energies[walk_without_step]),

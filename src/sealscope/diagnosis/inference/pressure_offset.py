@@ -24,7 +24,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -41,10 +40,8 @@ N_GRID = 21
 def remove_pressure_offset(blocks: Blocks, columns: Sequence[ColumnRoles]) -> Blocks:
     """Estimate the sensor offset of p_A - p_B in a recording, and return the blocks after subtracting it.
 
-    `columns`: for each equation the indices of its columns by role (leak, motion, left side). The offset with the
-    highest posterior probability is subtracted in the Gram matrices and added to `Blocks.zero` [Pa], the offset removed
-    so far. Return the blocks unchanged if an equation has no column for a constant flow, or if too few blocks have
-    information.
+    The most probable offset is subtracted in the Gram matrices and added to `Blocks.zero` [Pa], the offset removed so
+    far. The blocks are unchanged without a column for a constant flow, or if too few have information.
     """
     if len(blocks) < MIN_BLOCKS or any(roles.bias is None for roles in columns):
         return blocks
@@ -78,8 +75,7 @@ def _find_relative_offset(leak_steps: Array, flow_offset_steps: Array, residuals
         residuals = size S[:, k] + noise,    cov noise = kappa (I + q S S'),
 
     where q S S' is the random walk of the leak's coefficient. The likelihood is maximised over size > 0, k, kappa and
-    q; `offset_cost` states the prior on the offset. The search is over asinh of the offset, which is linear near zero
-    and logarithmic for large offsets.
+    q; `offset_cost` states the prior on the offset. The search is over asinh of the offset.
     """
     usual, far = INFERENCE.zero.pressure, INFERENCE.zero.far  # standard deviations of the prior [Pa]
     # only walks up to the best one without an offset: else offset and walk describe changes that no leak explains
@@ -89,20 +85,13 @@ def _find_relative_offset(leak_steps: Array, flow_offset_steps: Array, residuals
     independent_fraction = min(1.0, INFERENCE.size.readings / len(residuals))
 
     def log_likelihood(position: float) -> float:
-        """Compute the log likelihood of a sensor offset, maximised over the leak's step and random walk.
-
-        It is scaled to the number of independent residuals. `position`: asinh of the offset in units of its usual
-        standard deviation.
-        """
+        """Compute the log likelihood at asinh(offset) = `position`, scaled to the number of independent residuals."""
         steps = leak_steps - np.sinh(position) * flow_offset_steps
         return independent_fraction * float(_walk_likelihoods(steps, residuals, walks).max())
 
     def cost(position: float) -> float:
-        """Compute minus the log posterior density of a sensor offset, up to a constant.
-
-        `position`: asinh of the relative offset. The log prior density is -1/2 times `offset_cost`.
-        """
-        return 0.5 * offset_cost(usual * float(np.sinh(position))) - log_likelihood(position)
+        """Compute minus the log posterior density at asinh(offset) = `position`, up to a constant."""
+        return 0.5 * float(offset_cost(usual * float(np.sinh(position)))) - log_likelihood(position)
 
     positions = np.arcsinh(3.0 * far / usual) * np.linspace(-1.0, 1.0, N_GRID)
     # indices of the positions to search about: offset 0, where the prior has its maximum, and the maximum of the
@@ -116,28 +105,13 @@ def _find_relative_offset(leak_steps: Array, flow_offset_steps: Array, residuals
     return float(np.sinh(position))
 
 
-class _WhitenedSteps(NamedTuple):
-    """Whitened `residuals` (n,), and their changes by unit steps that begin with each of K blocks.
-
-    `leak` (n, K): changes by a step of the leak's coefficient, including the flow at the recorded mean pressure
-    difference; `flow_offset` (n, K): changes by a step of the constant flow.
-    """
-
-    leak: Array
-    flow_offset: Array
-    residuals: Array
-
-
-def _whiten_steps(blocks: Blocks, roles: ColumnRoles) -> _WhitenedSteps | None:
+def _whiten_steps(blocks: Blocks, roles: ColumnRoles) -> tuple[Array, Array, Array] | None:
     """Convert the estimates of leak and constant flow in K blocks to residuals with independent unit noise.
 
-    The result also contains the changes of these residuals by unit steps of leak and constant flow (the flow offset).
-    `roles`: indices of the columns of the first equation by role (leak, motion, left side). Return None if the blocks
-    have too little information.
-
-    The 2 K estimates (K leaks, K constant flows) have the inverse covariance P. With R such that P = R' R, the
-    residuals are R times the estimates. Slow changes are then projected out: level and slope of the leak, and a
-    quadratic drift of the constant flow.
+    The 2 K estimates by the first equation (K leaks, K constant flows) have the inverse covariance P. With R such that
+    P = R' R, the residuals are R times the estimates. Slow changes are then projected out: level and slope of the leak,
+    and a quadratic drift of the constant flow. Returns the arguments of `_find_relative_offset`, with steps in m^3/s
+    per Pa and m^3/s; None if the blocks have too little information.
     """
     count = len(blocks)
     # the constant flow is stated at each block's mean pressure difference `pressure`; a leak g adds g `pressure` to it
@@ -163,7 +137,7 @@ def _whiten_steps(blocks: Blocks, roles: ColumnRoles) -> _WhitenedSteps | None:
     unit_steps = np.tril(np.ones((count, count)))  # column k: 1 from block k on
     flow_offset = complement @ whitening[:, count:]
     leak = complement @ whitening[:, :count] + flow_offset * pressure
-    return _WhitenedSteps(leak @ unit_steps, flow_offset @ unit_steps, residuals)
+    return leak @ unit_steps, flow_offset @ unit_steps, residuals
 
 
 def _walk_likelihoods(steps: Array, residuals: Array, walks: Array) -> Array:
@@ -171,8 +145,8 @@ def _walk_likelihoods(steps: Array, residuals: Array, walks: Array) -> Array:
 
     For each q the best step up and the variance kappa of the noise are fitted. A walk consists of steps of independent
     sizes in all blocks. Thus cov residuals = kappa (I + q S S'), with S = `steps` (n, K), the changes of the residuals
-    by unit steps. This covariance is diagonal along S times the eigenvectors of S' S. `walks` (w,): values of q, scaled
-    so that a walk with q = 1 changes the residuals as much as the noise does on average.
+    by unit steps. This covariance is diagonal along S times the eigenvectors of S' S. `walks` (w,): values of q; q = 1
+    changes the residuals as much as the noise does on average.
     """
     eigen, basis = np.linalg.eigh(steps.T @ steps)
     is_informative = eigen > RANK_TOLERANCE * max(float(eigen[-1]), np.finfo(float).tiny)

@@ -25,7 +25,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -43,8 +42,7 @@ MIN_STATE_BLOCKS = 2
 def apply_regime(blocks: Blocks, roles: ColumnRoles, shut: bool, *, has_holds: bool, is_certain: bool) -> Blocks:
     """Convert blocks to the volume balance for valves that are open, or `shut`, while the pump rests.
 
-    `roles`: indices of the columns of `blocks` by role; they include the leakage of a pump that moves or holds the
-    piston, and the flow offset in motion (`terms.with_rests`).
+    `roles`: roles of the columns of `blocks`, among them those of `terms.with_rests`.
 
     - Open valves: these columns are dropped from the Gram matrices.
     - Shut valves: the flow offset in motion replaces the flow offset of all times (`terms.shut_at_rest`). The column
@@ -60,7 +58,7 @@ def apply_regime(blocks: Blocks, roles: ColumnRoles, shut: bool, *, has_holds: b
     moving_bias, turning, holding = (names.index(name) for name in (MOVING_BIAS, TURNING, HOLDING))
     columns = [moving_bias if name == BIAS else k for k, name in enumerate(names) if name != MOVING_BIAS]
     gram = blocks.gram.copy()
-    is_always_on = _is_always_on(blocks, roles)
+    is_always_on = _rest_share(blocks, roles, TURNING, HOLDING) < NEGLIGIBLE  # the pump moves or holds the load
     if is_certain and not is_always_on and not has_holds:
         gram[..., turning, :] += gram[..., holding, :]
         gram[..., turning] += gram[..., holding]
@@ -86,25 +84,14 @@ def add_pump_columns(gram: Array, names: Sequence[str]) -> Array:
 
 
 def has_rests(blocks: Blocks, roles: ColumnRoles) -> bool:
-    """Return True if the pump or the piston rests in any block.
-
-    Rests must contribute more than the fraction `NEGLIGIBLE` of the sum of squares of p_A - p_B. `roles`: indices of
-    the columns of `blocks` by role; they include the leakage of a pump that moves or holds the piston, and the flow
-    offset in motion (`terms.with_rests`).
-    """
+    """Return True if pump or piston rest in any block, beyond rounding; `roles` include those of `terms.with_rests`."""
     return _rest_share(blocks, roles, TURNING) > NEGLIGIBLE
-
-
-def _is_always_on(blocks: Blocks, roles: ColumnRoles) -> bool:
-    """Return True if the pump always moves the piston or holds the load; `roles`: indices of the columns by role."""
-    return _rest_share(blocks, roles, TURNING, HOLDING) < NEGLIGIBLE
 
 
 def _rest_share(blocks: Blocks, roles: ColumnRoles, *states: str) -> float:
     """Compute the fraction of the sum of squares of p_A - p_B that lies outside of some states of the machine.
 
-    `states`: names of columns that are p_A - p_B in one state and 0 outside of it, such as `TURNING` (the pump moves
-    the piston); `blocks`: blocks whose Gram matrices have these columns; `roles`: indices of the columns by role.
+    `states`: names of columns that are p_A - p_B in one state and else 0, such as `TURNING` (in motion).
     """
     leak, *columns = (roles.names.index(name) for name in (LEAK, *states))
     energies = np.diagonal(blocks.gram[:, 0], axis1=1, axis2=2).sum(axis=0)
@@ -112,60 +99,28 @@ def _rest_share(blocks: Blocks, roles: ColumnRoles, *states: str) -> float:
 
 
 def shut_odds(blocks: Blocks, roles: ColumnRoles) -> float:
-    """Compute the log odds that valves cut the pump off from the cylinder while the pump rests.
+    """Compute the log odds that valves cut the pump off from the cylinder while the pump rests (`rest_log_odds`).
 
-    The leakage at rest is compared with zero and with the leakage in motion (`rest_log_odds`). Positive log odds mean
-    that valves cut the pump off. The log odds are limited to +-`rest.most` of `priors.toml`, and are 0 if the recording
-    says nothing about the valves, for example since the pump never rests for long. `roles`: indices of the columns of
-    `blocks` by role. The columns must include `TURNING` and `HOLDING`, the additional leakage while the pump moves the
-    piston and while it holds the load, and `MOVING_BIAS`, the additional flow offset in motion (`terms.with_rests`).
-    """
-    estimate = _estimate_leakage_by_state(blocks, roles)
-    if estimate is None or not (estimate.rest_variance > 0.0 and estimate.difference_variance > 0.0):
-        return 0.0
-    odds = rest_log_odds(
-        estimate.rest,
-        estimate.motion,
-        rest_variance=estimate.rest_variance,
-        difference_variance=estimate.difference_variance,
-    )
-    max_odds: float = INFERENCE.rest.most
-    return float(np.clip(odds, -max_odds, max_odds))
-
-
-class _LeakageByState(NamedTuple):
-    """Leakage conductances at `rest` and in `motion` [m^3/(s Pa)].
-
-    `rest_variance`, `difference_variance`: variances of the errors of `rest` and of `motion` - `rest`.
-    """
-
-    rest: float
-    motion: float
-    rest_variance: float
-    difference_variance: float
-
-
-def _estimate_leakage_by_state(blocks: Blocks, roles: ColumnRoles) -> _LeakageByState | None:
-    """Estimate the leakage in motion from blocks with motion, and that at rest from the other blocks, given the former.
-
-    Leakage at rest lets the pressures relax, and the rate shows only its ratio to the compliance. A regression over all
-    blocks could therefore make both zero at rest. Thus the compliances, and all coefficients but the leakage and the
-    flow offset, are those in motion. With the columns X of leakage and flow offset at rest, the left side y, the other
-    columns Z and their coefficients b in motion, the leakage r at rest is the first of
+    `roles`: roles of the columns of `blocks`, among them those of `terms.with_rests`. The leakage in motion is
+    estimated from blocks with motion, and that at rest from the other blocks, given the former. Leakage at rest lets
+    the pressures relax, and the rate shows only its ratio to the compliance. A regression over all blocks could
+    therefore make both zero at rest. Thus all coefficients but the leakage and the flow offset are those in motion.
+    With the columns X of leakage and flow offset at rest, the left side y, the other columns Z and their coefficients b
+    in motion, the leakage r at rest is the first of
 
         (X'X)^-1 X'(y - Z b),    variance = White's variance + J cov(b) J' + k^2 sum (J_c b_c)^2,
 
     where J = d r/db is the first row of -(X'X)^-1 X'Z. The last term is a relative error k = `rest.compliance`
     (`priors.toml`) of each compliance c: those of low pressures and of high ones differ by the air in the oil.
-    Pressures that stay the same at rest, or a pump that makes good the leakage, have no such error. Return None if
-    fewer than `MIN_STATE_BLOCKS` blocks lie in either state.
+    Pressures that stay the same at rest, or a pump that makes good the leakage, have no such error. The result is 0 if
+    fewer than `MIN_STATE_BLOCKS` blocks lie in either state, or without a variance.
     """
     gram, left = blocks.gram[:, 0], roles.left
     turning, holding, moving_bias = (roles.names.index(name) for name in (TURNING, HOLDING, MOVING_BIAS))
     energies = np.diagonal(gram, axis1=1, axis2=2)
     is_rest = energies[:, turning] + energies[:, holding] <= NEGLIGIBLE * energies[:, roles.leak]
     if min(np.count_nonzero(is_rest), np.count_nonzero(~is_rest)) < MIN_STATE_BLOCKS:
-        return None
+        return 0.0
     columns = [*roles.nuisance, turning, holding, moving_bias]
     coefficients, covariance = fit_with_robust_covariance(gram[~is_rest], columns, left)
     # in motion the leakage is the sum of the leak's coefficient and that of the turning pump
@@ -188,7 +143,10 @@ def _estimate_leakage_by_state(blocks: Blocks, roles: ColumnRoles) -> _LeakageBy
     motion_variance = float(covariance[np.ix_(in_motion, in_motion)].sum())
     common = float(sensitivity @ covariance[np.ix_(shared, in_motion)].sum(axis=1))
     motion = float(coefficients[in_motion].sum())
-    return _LeakageByState(float(rest[0]), motion, rest_variance, rest_variance + motion_variance - 2.0 * common)
+    difference_variance = rest_variance + motion_variance - 2.0 * common
+    if not (rest_variance > 0.0 and difference_variance > 0.0):
+        return 0.0
+    return rest_log_odds(float(rest[0]), motion, rest_variance=rest_variance, difference_variance=difference_variance)
 
 
 def rest_log_odds(rest: float, motion: float, *, rest_variance: float, difference_variance: float) -> float:
@@ -199,20 +157,19 @@ def rest_log_odds(rest: float, motion: float, *, rest_variance: float, differenc
         log odds = log N(r; rest_variance + (s g)^2) - log N(r - g; difference_variance + (w g)^2).
 
     `rest_variance` and `difference_variance` are the variances of the errors of r and of r - g. s and w are the prior
-    scatters of r relative to g (`rest.shut` and `rest.open` of `priors.toml`). All leakages are conductances
-    [m^3/(s Pa)], or all are flows [m^3/s].
+    scatters of r relative to g (`rest.shut` and `rest.open` of `priors.toml`). All leakages are conductances [m^3/(s
+    Pa)], or all are flows [m^3/s]. The result is limited to +-`rest.most`.
     """
     prior = INFERENCE.rest
     if_shut = _normal_log_density(rest, rest_variance + (prior.shut * motion) ** 2)
     if_open = _normal_log_density(rest - motion, difference_variance + (prior.open * motion) ** 2)
-    return if_shut - if_open
+    return float(np.clip(if_shut - if_open, -prior.most, prior.most))
 
 
 def fit_with_robust_covariance(gram: Array, columns: list[int], left: int) -> tuple[Array, Array]:
     """Fit coefficients (c,) by least squares, with White's covariance (c, c) for errors that differ between K blocks.
 
-    `gram` (K, m, m): Gram matrices of the columns in each block; `columns` (c,) and `left`: indices of the fitted
-    columns and of the left side.
+    `gram` (K, m, m): Gram matrices of the columns in each block; `columns`, `left`: those fitted and the left side.
     """
     grams, moments = gram[:, columns][:, :, columns], gram[:, columns, left]
     total = grams.sum(axis=0)

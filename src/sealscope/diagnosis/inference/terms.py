@@ -51,15 +51,14 @@ class RestLimits(NamedTuple):
 
 
 class Signals:
-    """Samples of recorded channels, and signals derived from them.
+    """Samples (n,) of recorded channels by name, in SI units, and signals derived from them.
 
-    - `channels`: samples (n,) of each channel by name, in SI units; `rate`: sampling rate [Hz];
-    - `to_absolute`: absolute minus gauge pressure [Pa] by the name of the channel, by default atmospheric pressure;
+    - `rate`: sampling rate [Hz];
+    - `to_absolute`: absolute minus gauge pressure [Pa] by channel, by default atmospheric pressure;
     - `offset`: sensor offset [Pa] that is subtracted from p_A - p_B;
     - `rest_limits`: speeds below which the machine rests, None to find no rests.
 
-    `step(name)` returns the differences of a channel between consecutive samples, and `mean(name)` the means of
-    neighbouring samples, (n - 1,) each. Both are computed only once for each channel.
+    `step(name)` gives the differences of neighbouring samples, and `mean(name)` their means, (n - 1,) each.
     """
 
     def __init__(
@@ -89,7 +88,7 @@ class Signals:
 
     @property
     def time_step(self) -> Array:
-        """Sampling interval dt [s], repeated for each pair of consecutive samples, shape (n - 1,)."""
+        """Sampling interval dt [s], repeated for each interval, shape (n - 1,)."""
         return np.full(len(next(iter(self._channels.values()))) - 1, self.dt)
 
     @cached_property
@@ -109,10 +108,7 @@ class Signals:
 
     @cached_property
     def absolute(self) -> Mapping[str, Array]:
-        """Absolute pressure [Pa] of each chamber at each of n samples, by the names "p_A" and "p_B".
-
-        Values below `MIN_ABSOLUTE_PRESSURE` are replaced by it.
-        """
+        """Absolute pressure [Pa] at each sample, at least `MIN_ABSOLUTE_PRESSURE`, by the names "p_A" and "p_B"."""
         return {
             name: np.maximum(self._channels[name] + self._to_absolute.get(name, P_ATM), MIN_ABSOLUTE_PRESSURE)
             for name in ("p_A", "p_B")
@@ -120,58 +116,37 @@ class Signals:
 
     @cached_property
     def speed(self) -> Array:
-        """Speed of the piston [m/s] at each sample, by a central difference of x, held constant beyond the ends."""
+        """Speed of the piston [m/s] at each sample, by a central difference of x; x stays constant beyond the ends."""
         half_width = max(1, round(HALF_DIFFERENCE * self.rate))  # [samples]
-        x = self._channels["x"]
-        padded = np.concatenate([x[:1].repeat(half_width), x, x[-1:].repeat(half_width)])
-        return np.asarray((padded[2 * half_width :] - padded[: -2 * half_width]) * (0.5 * self.rate / half_width))
+        return central_difference(self._channels["x"], half_width) * (0.5 * self.rate / half_width)
 
     @cached_property
     def carried_by_A(self) -> Array:
-        """Flags (n,) of the samples: 1 if side A carries the load, i.e. p_A - p_B exceeds the sensor offset, else 0."""
+        """1 for each sample (n,) in which side A carries the load, i.e. p_A - p_B exceeds the sensor offset, else 0."""
         return (self._channels["p_A"] > self._channels["p_B"] + self._offset).astype(float)
 
     def directed_step(self, outward: bool, by_A: bool) -> Array:
-        """Return the increments of the position x [m] in one direction while one side has the higher pressure.
+        """Compute the increments (n - 1,) of x [m] in one direction of motion under one loaded side, else 0.
 
-        An increment is the change of x between consecutive samples. `outward`: true for motion towards B or standstill,
-        false for motion towards A; `by_A`: true while p_A is higher than p_B, the sensor offset subtracted, false
-        otherwise. The result (n - 1,) is 0 with the other direction or side. If direction or side changes within an
-        interval, half of its increment counts.
+        `outward`: motion towards B or standstill, else towards A; `by_A`: p_A exceeds p_B, without the sensor offset.
+        If either changes within an interval, half of its increment counts.
         """
-        is_counted = (self._is_outward == outward) & (self.carried_by_A == by_A)
+        is_counted = ((self.speed >= 0.0) == outward) & (self.carried_by_A == by_A)
         return _interval_means(is_counted.astype(float)) * self.step("x")
 
-    @cached_property
-    def _is_outward(self) -> NDArray[np.bool_]:
-        """Flags (n,) of the samples in which the piston moves towards B or stands still."""
-        return np.asarray(self.speed >= 0.0)
-
     def moving(self, pump_volume: Callable[[Signals], Array]) -> Array:
-        """Flag each sampling interval in which both pump and piston move: 1 there, else 0; shape (n - 1,).
+        """Flag the sampling intervals (n - 1,) in which pump and piston move by 1, the others by 0.
 
-        `pump_volume` computes from these signals the volume [m^3] that the pump delivers in each interval. All flags
-        are 1 if this object has no `rest_limits`, i.e. speeds below which the machine counts as resting.
+        `pump_volume` computes the volume [m^3] that the pump delivers in each interval. Without `rest_limits` all move.
         """
-        is_moving, _ = self._find_states(pump_volume)
-        return is_moving
+        return self._find_states(pump_volume)[0]
 
     def holding(self, pump_volume: Callable[[Signals], Array]) -> Array:
-        """Flag each sampling interval in which the pump turns and the piston rests: 1 there, else 0; shape (n - 1,).
-
-        The pump then holds the load by replacing what leaks. `pump_volume` computes from these signals the volume [m^3]
-        that the pump delivers in each interval. All flags are 0 if this object has no `rest_limits`.
-        """
-        _, is_holding = self._find_states(pump_volume)
-        return is_holding
+        """Flag the intervals (n - 1,) in which the pump turns to hold a resting piston by 1, else 0, as in `moving`."""
+        return self._find_states(pump_volume)[1]
 
     def _find_states(self, pump_volume: Callable[[Signals], Array]) -> tuple[Array, Array]:
-        """Flag the sampling intervals in which pump and piston move, and those in which only the pump moves.
-
-        Returns both flags, 1 or 0, of shape (n - 1,) each. `pump_volume` computes the volume [m^3] that the pump
-        delivers in each interval. The flags are computed only once, since all terms of a balance have the same
-        `pump_volume`. Without `rest_limits` pump and piston always move.
-        """
+        """Compute the flags of `moving` and `holding`, only once: all terms of a balance have one `pump_volume`."""
         limits = self._rest_limits
         if limits is None:
             return np.ones_like(self.time_step), np.zeros_like(self.time_step)
@@ -186,9 +161,9 @@ class Signals:
 def find_rests(increments: Array, rate: float, limit: float) -> NDArray[np.bool_]:
     """Flag the sampling intervals at rest, i.e. with a speed of at most `limit` for a time of at least `MIN_REST`.
 
-    `increments` (n,): increments of the pump's volume [m^3] or of the position [m]; `rate`: sampling rate [Hz];
-    `limit` [m^3/s] or [m/s]. The speed is averaged over `AVERAGING_TIME`. Missing samples (NaN) are not at rest. Fewer
-    samples than the averaging time and a rest together contain no rest.
+    `increments` (n,): increments of the pump's volume [m^3] or of the position [m], NaN (not at rest) where missing;
+    `rate`: sampling rate [Hz]; `limit` [m^3/s] or [m/s]. The speed is averaged over `AVERAGING_TIME`. Fewer samples
+    than the averaging time and a rest together contain no rest.
     """
     window, min_length = max(1, round(AVERAGING_TIME * rate)), max(2, round(MIN_REST * rate))  # [samples]
     if len(increments) < window + min_length:
@@ -204,11 +179,17 @@ def find_rests(increments: Array, rate: float, limit: float) -> NDArray[np.bool_
     return _extend_flags(is_rest_start, min_length)
 
 
-def _extend_flags(starts: NDArray[np.bool_], length: int) -> NDArray[np.bool_]:
-    """Flag the `length` consecutive samples that begin at each flagged sample of `starts` (n,).
+def central_difference(values: Array, half_width: int) -> Array:
+    """Compute the difference (n,) of the values `half_width` samples after and before each of n samples.
 
-    The result has the shape (n + length - 1,).
+    It is not divided by the time. Beyond the ends the first and last values are repeated.
     """
+    padded = np.pad(values, half_width, mode="edge")
+    return np.asarray(padded[2 * half_width :] - padded[: -2 * half_width])
+
+
+def _extend_flags(starts: NDArray[np.bool_], length: int) -> NDArray[np.bool_]:
+    """Flag the `length` consecutive samples from each flagged sample of `starts` (n,) on, shape (n + length - 1,)."""
     changes = np.zeros(len(starts) + length, dtype=int)  # +1 where a run begins, -1 past its end
     changes[: len(starts)] += starts
     changes[length:] -= starts
@@ -216,7 +197,7 @@ def _extend_flags(starts: NDArray[np.bool_], length: int) -> NDArray[np.bool_]:
 
 
 def _interval_means(values: Array) -> Array:
-    """Compute the means of neighbouring samples (n,), i.e. the values in the middle of each interval, (n - 1,)."""
+    """Compute the means of neighbouring samples (n,), shape (n - 1,)."""
     means = values[1:] + values[:-1]
     means *= 0.5
     return means
@@ -234,24 +215,15 @@ Coefficient = Literal["motion", "speed", "compliance", "air", "bias", "leak", "p
 class Term(NamedTuple):
     """A term of a volume balance: an unknown coefficient times a function of recorded channels.
 
-    Parameters
-    ----------
-    name : str
-        Name of the term, for example "compliance A".
-    unit : str
-        Unit of the coefficient: m^3 over the unit of the increments.
-    increments : callable
-        Computes the increments f dg from `Signals` over each sampling interval, shape (n - 1,).
-    cause : str
-        Cause of a sudden change of the coefficient, for example "external leak".
-    drift : str
-        Entry of `priors.toml` with the prior on the coefficient's drift; "" if the coefficient is zero unless `cause`
-        is present.
-    needs : tuple of str
-        Channels from which the increments are computed.
-    driver : str
-        "pressure" if a pressure drives the flow, "root" if the square root of a pressure does, else "". In the first
-        two cases offsets of pressure sensors change the increments.
+    - `name`: name of the term, for example "compliance A"; `unit`: unit of the coefficient, m^3 over that of the
+      increments;
+    - `increments`: computes the increments f dg from `Signals` over each sampling interval, shape (n - 1,);
+    - `cause`: cause of a sudden change of the coefficient, for example "external leak";
+    - `drift`: entry of `priors.toml` with the prior on the coefficient's drift; "" if it is zero unless `cause` is
+      present;
+    - `needs`: channels from which the increments are computed;
+    - `driver`: "pressure" if a pressure drives the flow, "root" if the square root of a pressure does, else "". In the
+      first two cases offsets of pressure sensors change the increments.
     """
 
     name: str
@@ -264,15 +236,12 @@ class Term(NamedTuple):
 
     @property
     def nuisance(self) -> bool:
-        """True if the coefficient is fitted in every recording, as it is unknown even in a healthy machine."""
+        """True if the coefficient is fitted in every recording, since it is unknown even in a healthy machine."""
         return bool(self.drift) and not self.compared
 
     @property
     def compared(self) -> bool:
-        """True if the coefficient is fitted only when several recordings are compared, not in a single recording.
-
-        A single recording has too little variety of motion and load to determine it.
-        """
+        """True if only a comparison of recordings fits the coefficient: in one, the motion varies too little."""
         return self.drift == "speed"
 
 
@@ -341,13 +310,7 @@ def _conductance_term(
     needs: tuple[str, ...] = _PRESSURES,
     drift: Coefficient | Literal[""] = "",
 ) -> Term:
-    """Make a term of a flow that is an unknown conductance [m^3/(s Pa)] times a pressure.
-
-    `name`: name of the term; `increments` computes from `Signals` the pressure times the sampling interval [Pa s],
-    shape (n - 1,); `cause`: cause of a sudden change of the conductance; `needs`: channels that `increments` reads;
-    `drift`: entry of `priors.toml` with the prior on the drift, "" if the conductance is zero unless `cause` is
-    present.
-    """
+    """Make a `Term` of an unknown conductance [m^3/(s Pa)] times a pressure over the intervals [Pa s]."""
     return Term(name, "m^3/(s Pa)", increments, cause, drift=drift, needs=needs, driver="pressure")
 
 
@@ -359,11 +322,7 @@ _LEAKS = (
 
 
 def _motion_term(outward: bool, by_A: bool) -> Term:
-    """Make the term dx of the piston's motion in one direction while one side has the higher pressure.
-
-    dx is the change of the position between samples; the unknown coefficient is the area of the piston [m^2].
-    `outward`: true for motion towards B, false for motion towards A; `by_A`: true for p_A > p_B, false otherwise.
-    """
+    """Make the term of the piston's motion in one direction under one loaded side, with an area as coefficient."""
     name = f"motion {'out' if outward else 'in'}, {'A' if by_A else 'B'} carries"
     return _sensor_term(name, "m^2", lambda s: s.directed_step(outward, by_A), drift="motion", needs=("x",))
 
@@ -371,11 +330,9 @@ def _motion_term(outward: bool, by_A: bool) -> Term:
 def _chamber_terms(side: str) -> tuple[Term, ...]:
     """Make the four terms of one chamber, `side` "A" or "B": two of its compliance, and two of the air in its oil.
 
-    With the pressure p of the chamber, the position x of the piston, and changes d over a sampling interval, the
-    increments are
-
-    - dp for a constant compliance, and x dp for its change over the stroke;
-    - d(1/p) for free air, and d ln p for air that dissolves, where p is absolute.
+    With the chamber's pressure p, the piston's position x, and changes d over a sampling interval, the increments are
+    dp for a constant compliance, x dp for its change over the stroke, d(1/p) for free air, and d ln p (absolute) for
+    dissolving air.
     """
     p, name = f"p_{side}", f"compliance {side}"
     compliance_term = partial(Term, cause="air in the oil", drift="compliance")
@@ -392,8 +349,7 @@ def _free_air_term(rig: Rig, weight_A: Callable[[Signals], Array | float]) -> Te
     """Make the term of free air in both chambers: w V_A d(1/p_A) - (1 - w) V_B d(1/p_B).
 
     d is the change over a sampling interval; p_A and p_B are absolute. V_A and V_B are the volumes of the chambers at
-    the current position, from the rig's file. `weight_A` computes w from `Signals`: the weight, 0 to 1, of chamber A in
-    the volume balance.
+    the current position. `weight_A` computes w, the weight (0 to 1) of chamber A in the balance.
     """
     from sealscope.physics.cylinder import mid_stroke_volumes
 
@@ -403,17 +359,13 @@ def _free_air_term(rig: Rig, weight_A: Callable[[Signals], Array | float]) -> Te
     areas = {"A": cylinder.A_A, "B": -cylinder.A_B} if cylinder.volumes == "position" else {"A": 0.0, "B": 0.0}
 
     def expansion(s: Signals, side: str) -> Array:
-        """Compute V d(1/p) [m^3/Pa] of the chamber `side`, "A" or "B", in each sampling interval, shape (n - 1,).
-
-        p is the absolute pressure, d(1/p) the change of its inverse over the interval, and V the volume of the chamber
-        at the mean position in the interval.
-        """
+        """Compute V d(1/p) [m^3/Pa] of the chamber `side` in each interval, with the volume V at the mean position."""
         # at least a tenth of the volume at mid-stroke: x of an unknown origin may exceed the stroke
         volumes = np.maximum(mid_volumes[side] + areas[side] * s.mean("x"), 0.1 * mid_volumes[side])
         return np.asarray(volumes * np.diff(1.0 / s.absolute[f"p_{side}"]))
 
     def weighted_expansion(s: Signals) -> Array:
-        """Compute the increments w V_A d(1/p_A) - (1 - w) V_B d(1/p_B) of the term [m^3/Pa], shape (n - 1,)."""
+        """Compute the increments of the term [m^3/Pa], shape (n - 1,)."""
         weight = weight_A(s)
         return np.asarray(weight * expansion(s, "A") - (1.0 - weight) * expansion(s, "B"))
 
@@ -421,25 +373,21 @@ def _free_air_term(rig: Rig, weight_A: Callable[[Signals], Array | float]) -> Te
 
 
 def _external_leak_term(side: str, weight: float = 1.0) -> Term:
-    """Make the term of an external leak from one side of the cylinder: its increments are `weight` max(p, 0) dt [Pa s].
+    """Make the term of an external leak from `side` "A" or "B", with the increments `weight` max(p, 0) dt [Pa s].
 
-    p is the gauge pressure of the `side`, "A" or "B", and dt the sampling interval. `weight`: factor of this flow in
-    the volume balance, 1 for a leak from A, -1 for a leak from B, and 0 in a balance of the other chamber alone.
+    p is the gauge pressure of the side. `weight`: factor of this flow in the volume balance, 1 for a leak from A, -1
+    for a leak from B, and 0 in a balance of the other chamber alone.
     """
     p = f"p_{side}"
-
-    def lost_volume(s: Signals) -> Array:
-        """Compute the increments `weight` max(p, 0) dt of the term [Pa s], shape (n - 1,)."""
-        return np.asarray(weight * np.maximum(s.mean(p), 0.0) * s.dt)
-
-    return _conductance_term(f"external leak {side}", lost_volume, cause="external leak", needs=(p,))
+    return _conductance_term(
+        f"external leak {side}", lambda s: weight * np.maximum(s.mean(p), 0.0) * s.dt, "external leak", needs=(p,)
+    )
 
 
 def _compensated_leak_term(side: str) -> Term:
     """Make the term of an external leak from one side in a circuit whose check valve refills the low-pressure side.
 
-    The leak changes the volume balance only while its side has the higher pressure, since otherwise the check valve
-    replaces the lost oil: max(p, 0) dt for A, and -max(p, 0) dt for B. In all other intervals the term is 0.
+    The leak counts only while its side has the higher pressure: max(p, 0) dt [Pa s] for A, -max(p, 0) dt for B.
     """
 
     def lost_volume(s: Signals) -> Array:
@@ -500,27 +448,14 @@ def _metering_edge_terms(edge: str, upstream: str, downstream: str, sign: float)
         return _signed_root(s.mean(upstream) - s.mean(downstream))
 
     def proportional_flow(s: Signals) -> Array:
-        """Compute the increments abs(u) sign(dp) sqrt(abs(dp)) dt [V Pa^0.5 s] of the term "edge", shape (n - 1,).
-
-        The increments are 0 unless u has the sign that opens the edge.
-        """
+        """Compute the increments abs(u) sign(dp) sqrt(abs(dp)) dt [V Pa^0.5 s], 0 unless u opens the edge."""
         return np.asarray(np.maximum(sign * s.mean("u"), 0.0) * pressure_root(s) * s.dt)
 
-    def overlap_flow(s: Signals) -> Array:
-        """Compute the increments sign(dp) sqrt(abs(dp)) dt [Pa^0.5 s] of the term "overlap", shape (n - 1,).
-
-        The increments are 0 unless u has the sign that opens the edge.
-        """
-        return np.asarray((sign * s.mean("u") > 0.0) * pressure_root(s) * s.dt)
-
-    def make_term(name: str, unit: str, increments: Callable[[Signals], Array]) -> Term:
-        """Make a term of the flow over the metering edge: a coefficient, in `unit`, times `increments` (`Term`)."""
-        return _sensor_term(f"{name} {edge}", unit, increments, drift="edge", needs=("u", upstream, downstream))
-
+    edge_term = partial(_sensor_term, drift="edge", needs=("u", upstream, downstream))
     return (
-        make_term("edge", "m^3/(s V Pa^0.5)", proportional_flow),
-        make_term("late edge", "m^3/(V Pa^0.5)", lambda s: np.gradient(proportional_flow(s))),  # gain times lag
-        make_term("overlap", "m^3/(s Pa^0.5)", overlap_flow),
+        edge_term(f"edge {edge}", "m^3/(s V Pa^0.5)", proportional_flow),
+        edge_term(f"late edge {edge}", "m^3/(V Pa^0.5)", lambda s: np.gradient(proportional_flow(s))),  # gain times lag
+        edge_term(f"overlap {edge}", "m^3/(s Pa^0.5)", lambda s: (sign * s.mean("u") > 0.0) * pressure_root(s) * s.dt),
     )
 
 
@@ -529,8 +464,7 @@ def _chamber_equation(side: str, rig: Rig) -> Equation:
 
     The volume displaced by the piston equals the flow over the valve's edges, less compression and leakage. An overlap
     of the edges (dead band) reduces the flow in both directions of motion. So does a leak, if friction makes p_A - p_B
-    change its sign with the direction of motion. Only the prior on a healthy piston separates a leak from an overlap
-    and from a change of friction.
+    change its sign with the direction of motion. Only the prior on a healthy piston separates a leak from an overlap.
     """
     is_A = side == "A"
     area = rig.cylinder.A_A if is_A else rig.cylinder.A_B
@@ -550,12 +484,11 @@ def _chamber_equation(side: str, rig: Rig) -> Equation:
 
 
 def equations(rig: Rig, channels: frozenset[str]) -> tuple[Equation, ...]:
-    """Return the volume balances of a machine that can be computed from the recorded channels.
+    """Return the volume balances of a machine that can be computed from the recorded `channels`; empty if none can.
 
     Where a valve meters the flow into the chambers, and x, u, p_1 and p_2 are recorded, there is one balance for each
     chamber. Otherwise there is one balance of the cylinder, in which the pump's flow is computed from its angle, its
-    speed, a flow meter or, without these, the command. `channels`: names of the recorded channels. The result is empty
-    if they do not suffice.
+    speed, a flow meter or, without these, the command.
     """
     if not rig.circuit.pump_feeds_chambers and {"x", "u", "p_1", "p_2"} <= channels:
         if not channels.issuperset(_PRESSURES):
@@ -587,8 +520,8 @@ _STANDSTILL = (*(_chamber_terms(side)[0] for side in "AB"), *_STANDSTILL_LEAKS)
 def circulation(rig: Rig, channels: frozenset[str]) -> Equation | None:
     """Return the volume balance of a pump while the piston displaces no net volume.
 
-    The balance holds over whole cycles or at standstill, so the position need not be known. An offset of the flow
-    cannot be separated from leakage under a steady load, and is assumed to be zero. Return None if the pump does not
+    The balance holds over whole cycles or at standstill, so the position need not be known. The offset of the flow,
+    which cannot be separated from leakage under a steady load, is assumed to be zero. Return None if the pump does not
     feed the chambers, or if its delivery or a chamber's pressure is not recorded.
     """
     left = pump_volume(rig, channels)
@@ -600,9 +533,8 @@ def circulation(rig: Rig, channels: frozenset[str]) -> Equation | None:
 def locked(rig: Rig, channels: frozenset[str]) -> Equation | None:
     """Return the volume balance of a load that is held by shut valves; None if circuit or channels do not suffice.
 
-    The piston moves only as far as oil leaks from the loaded side. The left side of the balance is the volume that must
-    have leaked from A to B for that motion: -dx times the piston's area on the loaded side, where x is assumed to grow
-    as A fills. Leaks of seal, valve and line cannot be separated.
+    The left side is the volume that must have leaked from A to B for the piston's motion: -dx times the piston's area
+    on the loaded side, where x is assumed to grow as A fills. Leaks of seal, valve and line cannot be separated.
 
     The balance needs the position and both pressures. If a command or the pump's flow is recorded, the circuit must
     have valves that hold the load, and the command must be recorded: it is constant while they are shut. If neither is
@@ -619,10 +551,6 @@ def locked(rig: Rig, channels: frozenset[str]) -> Equation | None:
         """Return the side, "A" or "B", that on average carries the load."""
         return "A" if np.nanmean(s["p_A"] * areas["A"] - s["p_B"] * areas["B"]) > 0.0 else "B"
 
-    def leaked_volume(s: Signals) -> Array:
-        """Compute the volume [m^3] that has leaked from A to B in each interval, shape (n - 1,)."""
-        return -areas[loaded_side(s)] * s.step("x")
-
     compliance = Term(
         "compliance of the loaded side",
         "m^3/Pa",
@@ -631,16 +559,15 @@ def locked(rig: Rig, channels: frozenset[str]) -> Equation | None:
         drift="compliance",
         needs=_PRESSURES,
     )
-    return Equation(LOCKED, leaked_volume, (compliance, *_STANDSTILL_LEAKS))
+    return Equation(LOCKED, lambda s: -areas[loaded_side(s)] * s.step("x"), (compliance, *_STANDSTILL_LEAKS))
 
 
 def pump_volume(rig: Rig, channels: frozenset[str]) -> Callable[[Signals], Array] | None:
-    """Return a function that computes the volume [m^3] delivered by the pump in each sampling interval, from `Signals`.
+    """Return a function that computes from `Signals` the volume [m^3] that the pump delivers in each sampling interval.
 
     The volume follows from the best recorded channel (`flow_source`): the pump's angle, its speed, a flow meter, or the
     command, from which the speed is derived. Return None if none of them is recorded, or only the command of a pump
-    that does not feed the chambers. If a flow meter has different scale errors in the two directions, the fitted piston
-    areas of the two directions differ.
+    that does not feed the chambers. A flow meter's scale errors show as piston areas.
     """
     displacement, source = rig.pump.q_b / (2.0 * np.pi), flow_source(channels)
     if source == "theta":
@@ -655,7 +582,7 @@ def pump_volume(rig: Rig, channels: frozenset[str]) -> Callable[[Signals], Array
 def with_rests(equation: Equation) -> Equation:
     """Return a pump's volume balance with three more terms, which are zero in some states of the machine (`STATES`).
 
-    The new terms are inserted before the terms of the leak. Their increments are 0 except for
+    Inserted before the terms of the leak, they have the increments
 
     - (p_A - p_B) dt while the pump moves the piston (`TURNING`),
     - (p_A - p_B) dt while the pump turns and the piston rests, to hold the load (`HOLDING`),
@@ -669,8 +596,8 @@ def with_rests(equation: Equation) -> Equation:
 def shut_at_rest(equation: Equation) -> Equation:
     """Return a pump's volume balance for valves that cut the pump off from the cylinder while the pump rests.
 
-    Two terms are added for the leakage of the pump, driven by p_A - p_B: while it moves the piston, and while it only
-    holds the load. The constant flow (`BIAS`) counts only while pump and piston move.
+    The pump's leakage has two terms of its own: while it moves the piston, and while it only holds the load. The
+    constant flow (`BIAS`) counts only while pump and piston move.
     """
     left = equation.left
     shut = _insert_before_leaks(equation, *_pump_leakage_terms(left, drift="pump"))
@@ -685,23 +612,17 @@ def shut_at_rest(equation: Equation) -> Equation:
 def _pump_leakage_terms(
     pump_volume: Callable[[Signals], Array], drift: Coefficient | Literal[""] = ""
 ) -> tuple[Term, Term]:
-    """Make the terms of a pump's leakage, driven by p_A - p_B, while it moves the piston and while it holds the load.
+    """Make the terms (p_A - p_B) dt of a pump's leakage while it moves the piston, and while it holds the load; else 0.
 
-    `pump_volume` computes from `Signals` the volume [m^3] that the pump delivers in each interval; `drift`: entry of
-    `priors.toml` with the prior on the drift of both coefficients, or "" for terms that are not part of every fit.
+    `pump_volume` computes the volume [m^3] that the pump delivers in each interval; `drift`: entry of `priors.toml`
+    with the prior on the drift of both coefficients, or "" for terms that are not part of every fit.
     """
-
-    def turning(s: Signals) -> Array:
-        """Compute (p_A - p_B) dt [Pa s] in intervals in which pump and piston move, else 0, shape (n - 1,)."""
-        return s.moving(pump_volume) * s.pressure_difference * s.dt
-
-    def holding(s: Signals) -> Array:
-        """Compute (p_A - p_B) dt [Pa s] in intervals in which the pump holds the load, else 0, shape (n - 1,)."""
-        return s.holding(pump_volume) * s.pressure_difference * s.dt
-
     # no further channels are needed: the balance requires both pressures anyway
     make_term = partial(_conductance_term, cause="pump leak", needs=(), drift=drift)
-    return make_term(TURNING, turning), make_term(HOLDING, holding)
+    return (
+        make_term(TURNING, lambda s: s.moving(pump_volume) * s.pressure_difference * s.dt),
+        make_term(HOLDING, lambda s: s.holding(pump_volume) * s.pressure_difference * s.dt),
+    )
 
 
 def _insert_before_leaks(equation: Equation, *terms: Term) -> Equation:

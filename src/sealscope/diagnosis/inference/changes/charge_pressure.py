@@ -35,7 +35,6 @@ from sealscope.diagnosis.inference.differences import Estimate, PriorScatter, co
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.inference.terms import find_rests
 from sealscope.diagnosis.priors.changes import CHANGES
-from sealscope.diagnosis.priors.inference import StepSize
 from sealscope.recordings.channels import flow_source
 from sealscope.recordings.recording import Array, Recording
 from sealscope.signals.smoothing import average_over
@@ -70,12 +69,14 @@ class LowDrifts(NamedTuple):
     low_B_error: float
 
     def estimate(self, side: str) -> Estimate | None:
-        """Return the drift [Pa/s] of the pressure of chamber `side`, "A" or "B", near the charge pressure.
-
-        Return None if the drift is unknown.
-        """
-        drift = Estimate(self.low_A, self.low_A_error) if side == "A" else Estimate(self.low_B, self.low_B_error)
+        """Return the drift [Pa/s] of the low pressure of chamber `side`, "A" or "B"; None if it is unknown."""
+        drift = Estimate(*(self[:2] if side == "A" else self[2:]))
         return drift if np.isfinite(drift).all() else None
+
+    @property
+    def known_drifts(self) -> dict[str, Estimate]:
+        """Known drifts [Pa/s] by chamber, "A" and "B"."""
+        return {side: drift for side in "AB" if (drift := self.estimate(side)) is not None}
 
 
 @np.errstate(all="ignore")
@@ -92,9 +93,12 @@ def estimate_low_drifts(recording: Recording) -> LowDrifts | None:
     if len(recording) < MIN_SAMPLES or flow_channel not in PUMP or not {"p_A", "p_B"} <= set(recording.channels):
         return None
     prior, regressors = CHANGES.charge, _regressors(recording, flow_channel)
-    has_turned = np.arange(len(recording)) >= _first_turn(recording[flow_channel], flow_channel, recording.rate)
+    drive, rate = recording[flow_channel], recording.rate
+    turned = np.diff(drive) if flow_channel == "theta" else drive[1:] / rate  # [rad] in each interval
+    first_turn = int(np.argmax(~find_rests(turned, rate, max_rest_rate(turned, rate))))  # 0 if the pump always rests
+    has_turned = np.arange(len(recording)) >= first_turn
     is_known = np.isfinite(regressors).all(axis=1) & has_turned
-    pressures = [average_over(prior.seconds, recording[name], recording.rate) for name in ("p_A", "p_B")]
+    pressures = [average_over(prior.seconds, recording[name], rate) for name in ("p_A", "p_B")]
     lowest = [float(np.nanquantile(p[is_known], LOWEST)) if is_known.any() else np.nan for p in pressures]
     drifts = list[float]()
     for p, low in zip(pressures, lowest, strict=True):
@@ -102,17 +106,6 @@ def estimate_low_drifts(recording: Recording) -> LowDrifts | None:
         is_at_charge = low < min(lowest) + prior.near and is_low.mean() > prior.share  # else fit no samples: NaN
         drifts += _fit_drift(recording.t, p, regressors, np.flatnonzero(is_low & is_at_charge))
     return LowDrifts(*drifts) if np.isfinite(drifts).any() else None
-
-
-def _first_turn(drive: Array, flow_channel: str, rate: float) -> int:
-    """Find the index of the first sample at which the pump turns; 0 if it always rests.
-
-    `drive` (n,): the pump's angle, or its speed, as `flow_channel` "theta" or "omega" tells; `rate`: sampling rate
-    [Hz].
-    """
-    turned = np.diff(drive) if flow_channel == "theta" else drive[1:] / rate
-    is_turning = ~find_rests(turned, rate, max_rest_rate(turned, rate))
-    return int(np.argmax(is_turning))
 
 
 class ChargeTrend(NamedTuple):
@@ -136,8 +129,8 @@ class ChargeTrend(NamedTuple):
 
             fall = (pressure flow / V) (1 - f)^2 (1 + 2 f),
 
-        where f is the fraction of the recording before the onset. V has a log-normal prior, over which the likelihood
-        is averaged. A measured fall may also have another cause, with a small probability.
+        where f is the fraction of the recording before the onset. The likelihood is averaged over a log-normal prior on
+        V. A measured fall may also have another cause, with a small probability.
         """
         prior, z = CHANGES.accumulator, np.linspace(-3.0, 3.0, N_VOLUMES)  # log V in standard deviations
         weights = np.exp(-0.5 * z**2) / np.exp(-0.5 * z**2).sum()
@@ -154,17 +147,14 @@ class ChargeTrend(NamedTuple):
 
 
 def estimate_charge_trend(recording: Recording) -> ChargeTrend | None:
-    """Estimate how fast the charge pressure of a closed circuit falls [Pa/s], with its standard error [Pa/s].
+    """Estimate how fast the charge pressure of a closed circuit falls, as a weighted mean over `estimate_low_drifts`.
 
-    The fall is the weighted mean over the chambers that are at times near the charge pressure
-    (`estimate_low_drifts`). Return None if there is no such chamber, or if a pressure or the pump's angle or speed is
-    not recorded.
+    Return None if no chamber is at times near the charge pressure, or without the pump's angle or speed.
     """
     drifts = estimate_low_drifts(recording)
     if drifts is None:
         return None
-    known_drifts = {side: drift for side in "AB" if (drift := drifts.estimate(side)) is not None}
-    fall = _mean_fall(drifts, {side: max(drift.deviation**2, TINY) for side, drift in known_drifts.items()})
+    fall = _mean_fall(drifts, {side: max(drift.deviation**2, TINY) for side, drift in drifts.known_drifts.items()})
     if fall is None:
         return None
     lowest = min(float(np.nanquantile(recording[name], LOWEST)) for name in ("p_A", "p_B"))
@@ -176,9 +166,8 @@ def estimate_charge_trend(recording: Recording) -> ChargeTrend | None:
 def _regressors(recording: Recording, flow_channel: str) -> Array:
     """Compute the quantities (n, 2 or 3) that change the charge pressure besides a drift: pump flow and position.
 
-    The first two columns are the positive and the negative part of the flow, relative to its largest magnitude. The
-    third column, if the position is recorded, is the position [m] minus its mean. All are averaged over
-    `charge.seconds` of `priors.toml`. `flow_channel`: the pump's angle "theta" or its speed "omega".
+    The columns are the positive and the negative part of the flow, relative to its largest magnitude, and, if recorded,
+    the position [m] minus its mean, all averaged over `charge.seconds` of `priors.toml`.
     """
     drive = average_over(CHANGES.charge.seconds, recording[flow_channel], recording.rate)
     flow = np.gradient(drive) if flow_channel == "theta" else drive
@@ -191,12 +180,11 @@ def _regressors(recording: Recording, flow_channel: str) -> Array:
 
 
 def _fit_drift(t: Array, pressure: Array, regressors: Array, rows: NDArray[np.intp]) -> tuple[float, float]:
-    """Estimate the drift [Pa/s] of the lower envelope of a pressure, and the standard error of the drift.
+    """Estimate the drift [Pa/s] of the lower envelope of a pressure (n,) [Pa] at times `t` [s], and its standard error.
 
-    The envelope is a robust fit in which samples above it count less than those below. `t` [s] and `pressure` [Pa],
-    (n,): the samples; `regressors` (n, k): pump flow and position, which are fitted together with the drift; `rows`:
-    indices of the samples to fit, which are thinned out if they are many. Both results are NaN for fewer than
-    `MIN_SAMPLES` samples.
+    The envelope is a robust fit in which samples above it count less than those below. `regressors` (n, k): pump flow
+    and position, which are fitted together with the drift; `rows`: indices of the samples to fit, which are thinned out
+    if they are many. Both results are NaN for fewer than `MIN_SAMPLES` samples.
     """
     rows = rows[:: max(1, len(rows) // MAX_SAMPLES)]
     if len(rows) < MIN_SAMPLES:
@@ -225,9 +213,8 @@ def _fit_drift(t: Array, pressure: Array, regressors: Array, rows: NDArray[np.in
 def _envelope_error(time: Array, residual: Array) -> float:
     """Compute the standard error [Pa/s] of a lower envelope's slope from its scatter between n parts of a recording.
 
-    A part that lies off the envelope as a whole gets low weights in the robust fit. The standard error of that fit
-    therefore misses such a scatter. With the quantile r_k (`BEGIN`) of the residuals in part k, and the mean time t_k
-    of the part,
+    The standard error of the robust fit misses this scatter, since a part that lies off the envelope gets low weights.
+    With the quantile r_k (`BEGIN`) of the residuals in part k, and the mean time t_k of the part,
 
         error^2 = (sum (r_k - mean of r)^2 / (n - 2)) / sum (t_k - mean of t)^2.
     """
@@ -240,22 +227,20 @@ def _envelope_error(time: Array, residual: Array) -> float:
 def compare_low_drifts(judged: LowDrifts, healthy: Sequence[LowDrifts]) -> Iterator[Observable]:
     """Compare the drifts of the lowest readings of p_A and p_B with those of healthy recordings.
 
-    Without drifts the lowest readings stay at the charge pressure. `judged`, `healthy`: drifts in the judged recording,
-    and in each healthy one. Yields a test for each of three explanations, if enough healthy recordings have the drift:
-    the sensor of p_A drifts, the sensor of p_B drifts, or the charge pressure falls, which lowers both pressures alike.
-    A fall does not explain a difference between the two drifts. If both drifts are known, the p-value (`chance`) of a
-    fall is therefore
+    Yields a test for each of three explanations, if enough healthy recordings have the drift: the sensor of p_A drifts,
+    the sensor of p_B drifts, or the charge pressure falls, which lowers both pressures alike. A fall does not explain a
+    difference between the two drifts; if both are known, its p-value is
 
         chance = min(1, chance of the weighted mean of both drifts / chance of their difference).
     """
     prior = CHANGES.charge
     scatter = PriorScatter(deviation=prior.scatter, recordings=prior.recordings)
-    drifts = {side: drift for side in "AB" if (drift := judged.estimate(side)) is not None}
-    known = {side: [drift for other in healthy if (drift := other.estimate(side)) is not None] for side in drifts}
+    drifts = judged.known_drifts
+    known = {side: [other.known_drifts[side] for other in healthy if side in other.known_drifts] for side in drifts}
     for side, drift in drifts.items():
         change = compare_estimates(LOW.format(side), DRIFT, drift, known[side], scatter)
         if change is not None:
-            yield _with_size_prior(change, CHANGES.zero_drift)
+            yield replace(change, advantage=-size_penalty(CHANGES.zero_drift, change.size))
     # variance of each side's drift, including the variance between the healthy recordings (0 if there are none)
     healthy_var = {side: float(np.var([drift.value for drift in known[side]] or [0.0])) for side in drifts}
     variances = {side: prior.scatter**2 + drift.deviation**2 + healthy_var[side] for side, drift in drifts.items()}
@@ -270,18 +255,15 @@ def compare_low_drifts(judged: LowDrifts, healthy: Sequence[LowDrifts]) -> Itera
         difference = compare_estimates(FALL, DRIFT, _difference(judged), differences, scatter)
         chance = 1.0 if difference is None else min(1.0, fall.chance / max(difference.chance, TINY))
         fall = replace(fall, chance=chance)
-    yield _with_size_prior(fall, CHANGES.charge_fall)
+    yield replace(fall, advantage=-size_penalty(CHANGES.charge_fall, fall.size))
 
 
 def _mean_fall(drifts: LowDrifts, variances: Mapping[str, float]) -> Estimate | None:
     """Compute the rate at which the charge pressure falls [Pa/s], as a mean of both chambers, with its standard error.
 
-    The rate is -sum(drift / variance) / sum(1 / variance) over the chambers in `variances` whose drift is known.
-    `variances`: variance [Pa^2/s^2] of the drift by chamber, "A" or "B". Return None if none of these drifts is known.
+    The rate is -sum(drift / variance) / sum(1 / variance) over chambers with a known drift and variance [Pa^2/s^2].
     """
-    known = [
-        (drift, 1.0 / variance) for side, variance in variances.items() if (drift := drifts.estimate(side)) is not None
-    ]
+    known = [(drift, 1.0 / variances[side]) for side, drift in drifts.known_drifts.items() if side in variances]
     if not known:
         return None
     total_weight = sum(weight for _, weight in known)
@@ -291,17 +273,6 @@ def _mean_fall(drifts: LowDrifts, variances: Mapping[str, float]) -> Estimate | 
 
 
 def _difference(drifts: LowDrifts) -> Estimate:
-    """Compute the drift of p_A minus the drift of p_B near the charge pressure [Pa/s], with its standard error.
-
-    NaN if one of the two drifts is unknown.
-    """
+    """Compute the drift of p_A minus that of p_B [Pa/s] with its standard error; NaN if one is unknown."""
     error = float(np.hypot(drifts.low_A_error, drifts.low_B_error))
     return Estimate(drifts.low_A - drifts.low_B, error)
-
-
-def _with_size_prior(observable: Observable, prior: StepSize) -> Observable:
-    """Return the observable of a drift with the `advantage` that the `prior` on the size of drifts gives it.
-
-    advantage = 2 log(prior density of the drift / largest prior density).
-    """
-    return replace(observable, advantage=-size_penalty(prior, observable.size))

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.diagnosis.inference.changes.levels import motion_columns, top_speed
-from sealscope.diagnosis.inference.onset import MIN_BLOCKS, Information, StepTest, two_sided_step_test
+from sealscope.diagnosis.inference.onset import MIN_BLOCKS, Information, StepTest, step_test
 from sealscope.diagnosis.inference.terms import AVERAGING_TIME
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.cycle import find_cycle
@@ -35,11 +35,9 @@ _NEIGHBOURS = _PRIORS.neighbours
 
 
 def duty_tests(recording: Recording) -> list[StepTest]:
-    """Test the amplitudes of command and motion for a step, a sudden lasting change.
+    """Test the amplitudes of command and motion for a step, a sudden lasting change (`amplitude_step_tests`).
 
-    Returns a test for each of the two that is recorded. The list is empty if either amplitude cannot be tested
-    (`amplitude_step_tests`). A change of what the machine is commanded to do (its duty) changes both amplitudes alike;
-    a leak changes only one of them, in open or closed loop.
+    A change of what the machine is commanded to do (its duty) changes both amplitudes alike; a leak changes only one.
     """
     length, cycle = len(recording) // BLOCKS, find_cycle(recording)
     if "x" in recording and cycle is not None:
@@ -56,20 +54,15 @@ def duty_tests(recording: Recording) -> list[StepTest]:
 def time_in_motion(speeds: Array, max_speed: float, rate: float) -> Array:
     """Compute the fraction of each block's samples in which the piston moves, (K,).
 
-    `speeds` (K, length): speeds of K blocks at the sampling `rate` [Hz]; NaN counts as rest. A sample is in motion if
-    its speed, averaged over `AVERAGING_TIME` to remove the noise of a position, exceeds the fraction
-    `CHANGES.levels.slowest` of `max_speed` in magnitude.
+    `speeds` (K, length): speeds of K blocks at the sampling `rate` [Hz]; NaN counts as rest. The speed, averaged over
+    `AVERAGING_TIME`, must exceed the fraction `CHANGES.levels.slowest` of `max_speed`.
     """
     mean_speeds = average_over(AVERAGING_TIME, speeds, rate)
     return np.asarray((np.abs(mean_speeds) > CHANGES.levels.slowest * max_speed).mean(axis=1))
 
 
 def is_in_motion(fractions: Array) -> NDArray[np.bool_]:
-    """Flag the blocks (K,) in which the piston moves for long enough, compared with the block with the most motion.
-
-    `fractions` (K,): fraction of each block's time in motion (`time_in_motion`). A block is flagged if its fraction is
-    at least `features.busy` (`priors.toml`) times the largest one.
-    """
+    """Flag the blocks (K,) with at least `features.busy` (`priors.toml`) times the largest of all `time_in_motion`."""
     return np.asarray(fractions >= _PRIORS.busy * fractions.max(initial=0.0))
 
 
@@ -86,21 +79,22 @@ def _find_moving_blocks(recording: Recording, length: int) -> NDArray[np.bool_]:
 def log_amplitudes(blocks: Mapping[str, Array]) -> Iterator[tuple[str, Array]]:
     """Yield the names "command" and "motion", each with the log amplitude (K,) of its channel in K blocks.
 
-    The amplitude is the range from the 2 % to the 98 % quantile, NaN for a block without samples. `blocks`: samples
-    (K, length) of each channel, by the channel's name. "command" or "motion" is left out if none of its channels is
-    recorded.
+    The amplitude is the range from the 2 % to the 98 % quantile, NaN for a block without samples. `blocks`: samples (K,
+    length) by channel. "command" or "motion" is left out if none of its channels is recorded.
     """
     for name, candidates in (("command", COMMANDS), ("motion", MOTIONS)):
         if channel := next((candidate for candidate in candidates if candidate in blocks), None):
-            low, high = (_row_percentile(blocks[channel], percent) for percent in (2.0, 98.0))
+            low, high = (
+                _row_statistic(partial(np.percentile, q=q), partial(np.nanpercentile, q=q), blocks[channel])
+                for q in (2.0, 98.0)
+            )
             yield name, np.log(high - low)
 
 
 def amplitude_step_tests(time: Array, amplitudes: Mapping[str, Array]) -> list[StepTest]:
-    """Test the log amplitudes of command and motion in K blocks for a step; return one test for each.
+    """Test the log amplitudes (K,) of command and motion in K blocks for a step; one test for each.
 
-    `time` (K,): middles of the blocks [s]; `amplitudes`: log amplitudes (K,) by the names "command" and "motion". The
-    list is empty if one amplitude cannot be tested: if it is constant, has missing values or too few blocks.
+    `time` (K,): middles of the blocks [s]. The list is empty if one of them cannot be tested (`feature_step_test`).
     """
     tests = [feature_step_test(time, values) for values in amplitudes.values()]
     possible_tests = [test for test in tests if test is not None]
@@ -110,8 +104,8 @@ def amplitude_step_tests(time: Array, amplitudes: Mapping[str, Array]) -> list[S
 def sensor_tests(recording: Recording) -> list[tuple[str, StepTest]]:
     """Test features of the pressures, such as their noise, for a lasting change that only a sensor causes.
 
-    Returns pairs of a feature's name and its test; features that cannot be tested are left out. The list is empty if
-    a chamber pressure is not recorded, or if p_A has no samples in one of the blocks.
+    Returns pairs of a feature's name and its test, without features that cannot be tested. The list is empty if a
+    chamber pressure is not recorded, or if p_A has no samples in one of the blocks.
     """
     if not {"p_A", "p_B"} <= recording.channels.keys():
         return []
@@ -128,10 +122,9 @@ def sensor_tests(recording: Recording) -> list[tuple[str, StepTest]]:
 
 
 def _split_blocks(recording: Recording, length: int) -> tuple[Array, dict[str, Array]]:
-    """Split the channels of a recording into K blocks of `length` samples.
+    """Split the channels of a recording into K blocks of `length` samples, without samples after the last whole block.
 
-    Returns the middles of the blocks (K,) [s], and the samples (K, length) by channel name, NaN where missing. Samples
-    after the last whole block are left out.
+    Returns the middles of the blocks (K,) [s], and the samples (K, length) by channel name, NaN where missing.
     """
     count = len(recording) // length
     blocks = {name: values[: count * length].reshape(count, length) for name, values in recording.channels.items()}
@@ -153,10 +146,10 @@ SENSOR_FEATURES = (
 def sensor_features(blocks: Mapping[str, Array], rate: float) -> Iterator[tuple[str, Array]]:
     """Yield the name and the values (K,) of each feature of the pressures that only a change of a sensor shifts.
 
-    The features are the correlation of p_A - p_B with the flow, the noise of both pressures, the difference of their
-    noise, and the hum at the frequencies of the mains. The first word of a name, such as "noise", is its kind of data
-    (`Observable.data`). All names are in `SENSOR_FEATURES`. `blocks`: samples (K, length) of K blocks by channel name,
-    including p_A and p_B, NaN where missing; `rate`: sampling rate [Hz].
+    The features (`SENSOR_FEATURES`) are the correlation of p_A - p_B with the flow, the noise of both pressures, the
+    difference of their noise, and the hum at the frequencies of the mains. The first word of a name is its kind of data
+    (`Observable.data`). `blocks`: samples (K, length) by channel name, with p_A and p_B, NaN where missing; `rate`:
+    sampling rate [Hz].
     """
     p_A, p_B = blocks["p_A"], blocks["p_B"]
     if channel := next((name for name in ("omega", "u", "theta", "x") if name in blocks), None):
@@ -184,8 +177,8 @@ def sensor_features(blocks: Mapping[str, Array], rate: float) -> Iterator[tuple[
 def _log_hum(blocks: Array, frequency: float) -> Array:
     """Compute the log power (K,) of a spectral line in blocks (K, n), relative to the power of the neighbouring bins.
 
-    Ringing is wider than a line, so it raises the neighbouring bins as well and cancels. `frequency`: frequency of the
-    line over the sampling rate. The power is the mean over both halves of each block (Welch's estimate).
+    Ringing is wider than a line, so it raises the neighbouring bins as well and cancels. `frequency`: that of the line
+    over the sampling rate. The power is the mean over both halves of each block (Welch's estimate).
     """
     length = blocks.shape[1] // 2
     halves = blocks[:, : 2 * length].reshape(-1, 2, length)
@@ -197,16 +190,11 @@ def _log_hum(blocks: Array, frequency: float) -> Array:
     return np.asarray(log_power[:, 0] - log_power[:, 1:].mean(axis=1))
 
 
-def _row_percentile(values: Array, percent: float) -> Array:
-    """Compute the percentile `percent` of the known values of each row (K, n); NaN for a row without known values."""
-    return _row_statistic(partial(np.percentile, q=percent), partial(np.nanpercentile, q=percent), values)
-
-
 def _row_statistic(statistic: Callable[..., Array], without_missing: Callable[..., Array], values: Array) -> Array:
     """Compute a statistic of the known values of each row (K, n); NaN for a row without known values.
 
-    `statistic`: function for rows without missing values, such as `np.median`; `without_missing`: function that skips
-    missing values, such as `np.nanmedian`; ten times slower, it is used only for rows with missing values.
+    `statistic`: function for rows without missing values, such as `np.median`; `without_missing`: one that skips
+    missing values, such as `np.nanmedian`; ten times slower, it is used only where needed.
     """
     results = np.full(len(values), np.nan)
     is_known = np.isfinite(values)
@@ -220,12 +208,11 @@ def _row_statistic(statistic: Callable[..., Array], without_missing: Callable[..
 def feature_step_test(time: Array, values: Array) -> StepTest | None:
     """Test the values (K,) of a feature in K blocks for a step up or down, against their scatter between blocks.
 
-    `time` (K,): middles of the blocks [s]. Return None if the values are constant, if a value is missing, or for fewer
-    than `MIN_BLOCKS` blocks.
+    `time` (K,): middles of the blocks [s]. Return None for constant, missing or fewer than `MIN_BLOCKS` values.
     """
     if len(values) < MIN_BLOCKS or not np.isfinite(values).all() or not np.ptp(values) > 0.0:
         return None
     drift = _PRIORS.wander  # prior scale of a healthy machine's slow change, linear or as a random walk
     # independent errors of equal variance, which the test estimates; precision times values are the values
     precision = np.eye(len(values))
-    return two_sided_step_test(Information(time, precision, vector=values, slope=drift, walk=drift))
+    return step_test(Information(time, precision, vector=values, slope=drift, walk=drift), signs=(1.0, -1.0))

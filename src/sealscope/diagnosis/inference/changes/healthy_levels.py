@@ -36,12 +36,7 @@ from sealscope.diagnosis.inference.changes.motion_fit import (
 )
 from sealscope.diagnosis.inference.changes.pressure_bands import PAIRS, Octaves, compare_spectra, compute_octaves
 from sealscope.diagnosis.inference.changes.signals import SIGNALS
-from sealscope.diagnosis.inference.differences import (
-    MIN_HEALTHY,
-    Estimate,
-    PriorScatter,
-    compare_estimates,
-)
+from sealscope.diagnosis.inference.differences import MIN_HEALTHY, Estimate, PriorScatter, compare_estimates
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.chambers import CHAMBERS
@@ -52,7 +47,7 @@ TINY = 1e-300
 #: Names of the observables: of friction, and of drifts, which are rival descriptions of the same data.
 FRICTION, DRIFTS = "friction", ("drift of p_A", "drift of p_B", "drift of both")
 #: Keys of the drifts of p_A and p_B in motion, and of their standard errors.
-DRIFT_KEYS = {"drift_A", "drift_A_error", "drift_B", "drift_B_error"}
+DRIFT_KEYS = ("drift_A", "drift_A_error", "drift_B", "drift_B_error")
 #: Probability of the quantile of the healthy recordings' errors of sign.
 UPPER_QUARTILE = 0.75
 #: Keys of two estimates of the friction in a recording's summary, each with the key of its standard error. The second
@@ -66,21 +61,18 @@ class HealthyLevels:
     name = SIGNALS
 
     def learn(self, recording: Recording) -> Summary | None:
-        """Summarise a recording by friction, drifts and spectra, for comparison with other recordings.
+        """Summarise a recording by friction, drifts and spectra; None if nothing can be estimated.
 
         The summary maps names to numbers, such as "friction_pressure" [Pa], and each name in `PAIRS` (a pair of
-        channels) to spectra: an array (4, k) with the fields of `Octaves` in k octaves. Entries that the recorded
-        channels do not allow, or for which the piston moves too little, are missing. Return None if nothing can be
-        estimated. The summary is computed only once for a recording.
+        channels) to spectra: an array (4, k) with the fields of `Octaves` in k octaves. Unknown entries are missing. It
+        is computed once.
         """
         return compute_once(recording, ("healthy levels",), _estimate_levels)
 
     def compare(self, recording: Recording, baseline: Sequence[Healthy]) -> Iterator[Observable]:
-        """Compare friction, drifts and spectra of a recording with those of healthy ones; yield one test for each.
+        """Compare friction, spectra and drifts, in motion and of the lowest readings, with those of healthy recordings.
 
-        There are two kinds of drifts: of the pressures' lowest readings (`_low_drifts`), and of the pressures in motion
-        (`_compare_drifts`). Quantities that the recording or too many of the healthy recordings (`baseline`) lack are
-        left out.
+        Yields one test for each, without quantities that the recording or too many of the `baseline` lack.
         """
         judged = self.learn(recording)
         if judged is None:
@@ -102,7 +94,7 @@ def _octaves(summary: Summary) -> dict[str, Octaves]:
 
 
 def _low_drifts(summary: Summary) -> LowDrifts | None:
-    """Read the drifts of the low pressures from a recording's summary; None if the summary contains no such drift."""
+    """Read the drifts of the low pressures from a recording's summary; None if it contains no such drift."""
     if not set(LowDrifts._fields) & set(summary):
         return None
     return LowDrifts(*(float(summary.get(name, np.nan)) for name in LowDrifts._fields))
@@ -111,9 +103,9 @@ def _low_drifts(summary: Summary) -> LowDrifts | None:
 def _compare_friction(judged: Summary, healthy: Sequence[Summary]) -> Observable | None:
     """Test whether the friction of a recording, as a pressure difference, is higher than in healthy recordings.
 
-    `judged`, `healthy`: summaries of the recordings, with up to two estimates of the friction (`FRICTION_KEYS`).
-    The estimate whose logarithm scatters less between the healthy recordings is compared. Return None if the judged
-    recording has no usable value of this estimate, or if fewer than `MIN_HEALTHY` healthy recordings have one.
+    `judged`, `healthy`: summaries of the recordings. Of up to two estimates of the friction (`FRICTION_KEYS`), the one
+    whose logarithm scatters less between the healthy recordings is compared. Return None if the judged recording has no
+    usable value of it, or if fewer than `MIN_HEALTHY` healthy recordings have one.
     """
     prior = CHANGES.healthy
     choices = [
@@ -135,13 +127,12 @@ def _log_frictions(
 ) -> tuple[Estimate | None, list[Estimate]]:
     """Compute the logarithm of the friction in the judged recording and in the healthy ones, with standard errors.
 
-    `key`, `error_key`: keys of friction and standard error [Pa] in the summaries `judged` and `healthy`. The usual sign
-    of the friction depends on the motion's channel; the sum of friction / error over the healthy recordings has this
-    sign. As friction resists the motion, healthy frictions of the other sign show that the errors are too small. All
-    errors are therefore multiplied by the upper quartile of a ratio over the healthy recordings, but at least by 1. The
-    ratio is 0 for a friction of the usual sign, and abs(friction) / error for one of the other sign. A friction is
-    usable if it has the usual sign and exceeds its error. The result for the judged recording is None if its friction
-    is not usable; healthy frictions that are not usable are left out.
+    `key`, `error_key`: keys of friction and standard error [Pa] in the summaries. The usual sign of the friction
+    depends on the motion's channel; the sum of friction / error over the healthy recordings has this sign. As friction
+    resists the motion, healthy frictions of the other sign show that the errors are too small. All errors are therefore
+    multiplied by the upper quartile, but at least by 1, of abs(friction) / error over the healthy recordings, with 0
+    for a friction of the usual sign. A friction is usable if it has the usual sign and exceeds its error; others are
+    None or left out.
     """
     known = [summary for summary in healthy if {key, error_key} <= set(summary)]
     if not known or not {key, error_key} <= set(judged):
@@ -163,8 +154,10 @@ def _log_frictions(
 def _compare_drifts(judged: Summary, healthy: Sequence[Summary]) -> Iterator[Observable]:
     """Compare the drifts of p_A and p_B during motion with those of healthy recordings.
 
-    `judged`, `healthy`: summaries of the recordings. If the judged recording and enough healthy ones have both drifts,
-    yields a test for each of three explanations: p_A drifts, p_B drifts, both drift alike (`_describe_drifts`).
+    If the judged recording and enough healthy ones have both drifts, yields a test for each of three alternative
+    explanations: p_A drifts, p_B drifts, or both drift alike. In the last case p_A - p_B does not drift, so that
+
+        chance = min(1, chance_A chance_B / chance_difference),    score = max(0, score_A + score_B - score_difference).
     """
     judged_drifts = _drifts(judged)
     if judged_drifts is None:
@@ -172,46 +165,32 @@ def _compare_drifts(judged: Summary, healthy: Sequence[Summary]) -> Iterator[Obs
     healthy_drifts = [drifts for summary in healthy if (drifts := _drifts(summary)) is not None]
     prior = CHANGES.healthy
     scatter = PriorScatter(prior.drift, recordings=prior.drift_recordings, inflation=prior.drift_inflation)
-    tests = [  # tests of the drifts of p_A, p_B and p_A - p_B
+    drift_A, drift_B, difference = (
         compare_estimates(name, DRIFT, judged_drifts[k], [drifts[k] for drifts in healthy_drifts], scatter)
         for k, name in enumerate(DRIFTS)
-    ]
-    if None not in tests:
-        yield from _describe_drifts(*tests)  # type: ignore[arg-type]
+    )
+    if drift_A is None or drift_B is None or difference is None:
+        return
+    yield drift_A
+    yield drift_B
+    chance = drift_A.chance * drift_B.chance / max(difference.chance, TINY)
+    score = max(drift_A.score + drift_B.score - difference.score, 0.0)
+    yield replace(difference, chance=min(chance, 1.0), score=score)  # named DRIFTS[2], "drift of both"
 
 
 def _drifts(summary: Summary) -> tuple[Estimate, Estimate, Estimate] | None:
     """Read the drifts [Pa] of p_A, p_B and p_A - p_B in motion from a recording's summary; None if it has none."""
-    if not set(summary) >= DRIFT_KEYS:
+    if not set(summary) >= set(DRIFT_KEYS):
         return None
-    drift_A, drift_B = (
-        Estimate(float(summary[name]), float(summary[f"{name}_error"])) for name in ("drift_A", "drift_B")
-    )
+    values = [float(summary[key]) for key in DRIFT_KEYS]
+    drift_A, drift_B = Estimate(*values[:2]), Estimate(*values[2:])
     difference = Estimate(drift_A.value - drift_B.value, float(np.hypot(drift_A.deviation, drift_B.deviation)))
     return drift_A, drift_B, difference
 
 
-def _describe_drifts(drift_A: Observable, drift_B: Observable, difference_AB: Observable) -> Iterator[Observable]:
-    """Yield three alternative explanations of drifting pressures: p_A drifts, p_B drifts, or both drift alike.
-
-    `drift_A`, `drift_B`, `difference_AB`: tests of the drifts of p_A, p_B and p_A - p_B. The `chance` of a test is its
-    p-value. If both drift alike, p_A - p_B does not drift, so the third explanation gets
-
-        chance = min(1, chance_A chance_B / chance_difference),    score = max(0, score_A + score_B - score_difference).
-    """
-    yield drift_A
-    yield drift_B
-    chance = drift_A.chance * drift_B.chance / max(difference_AB.chance, TINY)
-    score = max(drift_A.score + drift_B.score - difference_AB.score, 0.0)
-    yield replace(difference_AB, chance=min(chance, 1.0), score=score)  # named DRIFTS[2], "drift of both"
-
-
 @np.errstate(all="ignore")
 def _estimate_levels(recording: Recording) -> Summary | None:
-    """Estimate friction, drifts and spectra in a recording, as numbers or arrays by their names.
-
-    Values that the recording does not allow are left out. The result is None if no value is left.
-    """
+    """Estimate friction, drifts and spectra in a recording, by their names; None if it allows none."""
     levels = dict[str, float]()
     for keys, without_slow_changes in zip(FRICTION_KEYS, (False, True), strict=True):
         fit = fit_difference(recording, without_slow_changes=without_slow_changes)
@@ -220,8 +199,7 @@ def _estimate_levels(recording: Recording) -> Summary | None:
     if (motion := select_motion(recording)) is not None:
         drifts = [_estimate_drift(motion, recording[name]) for name in CHAMBERS]
         if np.isfinite(drifts).all():
-            names = ("drift_A", "drift_A_error", "drift_B", "drift_B_error")
-            levels |= dict(zip(names, np.ravel(drifts).tolist(), strict=True))
+            levels |= dict(zip(DRIFT_KEYS, np.ravel(drifts).tolist(), strict=True))
     if (low_drifts := estimate_low_drifts(recording)) is not None:
         levels |= {name: value for name, value in low_drifts._asdict().items() if np.isfinite(value)}
     spectra = {
@@ -235,8 +213,7 @@ def _estimate_levels(recording: Recording) -> Summary | None:
 def _estimate_drift(motion: Motion, pressure: Array) -> Estimate:
     """Estimate the drift [Pa] of a `pressure` (n,) over the whole recording, from the samples in `motion`.
 
-    The standard error allows for residuals that are correlated within a stroke. It is infinite if the motion does not
-    determine the drift.
+    Its error allows for residuals that are correlated within a stroke; infinite if the drift is undetermined.
     """
     values = pressure[motion.rows]
     coefficients, weight = fit_robustly(motion.design, values)

@@ -27,8 +27,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.inference.onset import RANK_TOLERANCE, Information, two_sided_step_test
-from sealscope.diagnosis.inference.terms import HALF_DIFFERENCE
+from sealscope.diagnosis.inference.onset import RANK_TOLERANCE, Information, step_test
+from sealscope.diagnosis.inference.terms import HALF_DIFFERENCE, central_difference
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.recording import Array, Recording
@@ -55,8 +55,8 @@ PATTERNS: tuple[tuple[str, list[list[Array]]], ...] = (
 class PressureLevels(NamedTuple):
     """Levels of both chamber pressures in K blocks of a recording, at the times `time` (K,) [s].
 
-    `values` (K, 4) [Pa] has the columns level_A and level_B, the mean of each pressure over both directions of motion,
-    and half_A and half_B = (p for v > 0 - p for v < 0) / 2 of each pressure, at the same motion otherwise.
+    `values` (K, 4) [Pa]: level_A and level_B, the mean of each pressure over both directions of motion, and half_A and
+    half_B = (p for v > 0 - p for v < 0) / 2 of each pressure, at the same motion otherwise.
     """
 
     time: Array
@@ -68,8 +68,8 @@ class LevelChange(NamedTuple):
 
     `name`: cause that changes these levels, such as "friction"; `rank`: the score minus log(number of blocks) for each
     coefficient of the pattern after the first, by which patterns are compared; `score`: twice the log likelihood ratio
-    of a step to no step; `chance`: probability that a healthy recording scores as high; `onset`: time of the step [s];
-    `block`: length of a block [s].
+    of a step to no step; `chance`: probability of it in a healthy recording; `onset`: time of the step [s]; `block`:
+    length of a block [s].
     """
 
     name: str
@@ -83,8 +83,8 @@ class LevelChange(NamedTuple):
 def motion_columns(channels: Mapping[str, Array], rate: float) -> Array | None:
     """Compute the columns that describe a motion (n, 2 or 3): speed, acceleration and, if recorded, position.
 
-    `rate`: sampling rate [Hz]. The speed is the difference of x or theta over a fixed time, or else omega or u itself.
-    The acceleration is the difference of the speed over that time. The position is relative to its mean. Missing values
+    `rate`: sampling rate [Hz]. The speed is the difference of x or theta over a fixed time, or else omega or u itself;
+    the acceleration is the difference of the speed over that time; the position is relative to its mean. Missing values
     are NaN. Return None if none of these channels is recorded.
     """
     name = next((channel for channel in ("x", "theta", "omega", "u") if channel in channels), None)
@@ -92,43 +92,25 @@ def motion_columns(channels: Mapping[str, Array], rate: float) -> Array | None:
         return None
     values = channels[name]
     half_length = max(1, round(HALF_DIFFERENCE * rate))  # [samples]
-    speed = _central_difference(values, half_length) if name in ("x", "theta") else values
-    motion = [speed, _central_difference(speed, half_length)]
+    speed = central_difference(values, half_length) if name in ("x", "theta") else values
+    motion = [speed, central_difference(speed, half_length)]
     if name == "x":
         motion.append(values - np.nanmean(values))
     return np.column_stack(motion)
 
 
-def motion_scales(motion: Array) -> Array:
-    """Compute the 99 % quantile of the magnitude of each column of a motion (n, m), shape (m,).
-
-    The columns are speed, acceleration and, if m = 3, position (`motion_columns`).
-    """
-    return np.asarray(np.maximum(np.nanpercentile(np.abs(motion), 99.0, axis=0), _TINY))
-
-
 def top_speed(motion: Array) -> float:
     """Compute the 99 % quantile of the magnitude of the speed, the first column of a `motion` (`motion_columns`)."""
-    return float(motion_scales(motion[:, :1])[0])
-
-
-def _central_difference(values: Array, half_length: int) -> Array:
-    """Compute the difference (n,) between the values `half_length` samples after and before each of n samples.
-
-    The difference is not divided by the time. Beyond the ends the first and last values are repeated.
-    """
-    padded = np.pad(values, half_length, mode="edge")
-    return np.asarray(padded[2 * half_length :] - padded[: -2 * half_length])
+    return float(np.maximum(np.nanpercentile(np.abs(motion[:, :1]), 99.0, axis=0), _TINY)[0])
 
 
 def estimate_levels(recording: Recording) -> PressureLevels | None:
     """Estimate each pressure's mean over both directions of motion, and half its change with the direction, in blocks.
 
-    The samples in motion are fitted by least squares with p = level + half sign(v) + b v + c dv/dt + d x. Level and
-    half difference are free in each block; the slopes b, c and d on speed v, acceleration and position x are common to
-    the recording. Without a recorded motion the levels are means and the half differences zero. Several lengths of
-    blocks are tried, whole cycles first; the first length with enough samples of both directions in every block is
-    used. Return None if there is no such length, or if a pressure is not recorded.
+    The samples in motion are fitted by p = level + half sign(v) + b v + c dv/dt + d x. Level and half difference are
+    free in each block; the slopes b, c and d on speed v, acceleration and position x are common to the recording.
+    Without a recorded motion the levels are means and the half differences zero. Of several lengths of blocks, whole
+    cycles first, the first with enough samples of both directions in every block is used. Return None if there is none.
     """
     if not {"p_A", "p_B"} <= set(recording.channels):
         return None
@@ -158,9 +140,8 @@ def pressure_level_rows(
     """Build the rows (n, m) of the fit of pressure levels: 1, sign of the speed, motion (`motion_columns`), p_A, p_B.
 
     The rows of samples at rest or without a known motion are zero. If no motion is recorded, the rows are 1, p_A, p_B.
-    `channels`: samples by channel name; `rate`: sampling rate [Hz]; `means` (2,) [Pa]: subtracted from the pressures,
-    which limits rounding errors; `max_speed`: highest speed, by default the `top_speed` of `channels`. A sample is at
-    rest below the fraction `levels.slowest` (`priors.toml`) of this speed.
+    `rate`: sampling rate [Hz]; `means` (2,) [Pa]: subtracted from the pressures, against rounding; `max_speed`: highest
+    speed, by default `top_speed`, below whose fraction `levels.slowest` (`priors.toml`) a sample is at rest.
     """
     motion = motion_columns(channels, rate)
     pressures = np.column_stack([channels["p_A"], channels["p_B"]]) - means
@@ -177,10 +158,8 @@ def pressure_level_rows(
 def fit_pressure_levels(gram: Array, length: float, means: Array) -> Array | None:
     """Fit each pressure's mean over both directions of motion, and half its change with the direction, in K blocks.
 
-    The result (K, 4) contains level_A, level_B, half_A and half_B [Pa], with half = (p for v > 0 - p for v < 0) / 2
-    (`PressureLevels`). It is None if a block has too few samples of one direction. `gram` (K, m, m): Gram matrices of
-    the rows 1, sign(v), motion, p_A, p_B (`pressure_level_rows`); `length`: samples in a block; `means` (2,) [Pa]:
-    means that were subtracted from the pressures.
+    The result (K, 4) contains `PressureLevels.values`. It is None if a block has too few samples of one direction.
+    `gram` (K, m, m): Gram matrices of `pressure_level_rows`; `length`: samples in a block; `means` (2,) [Pa]: as there.
     """
     # free in each block: the constant and, if a motion is recorded, sign(v); the last two columns are p_A and p_B
     n_free = min(2, gram.shape[1] - 2)
@@ -202,22 +181,16 @@ def fit_pressure_levels(gram: Array, length: float, means: Array) -> Array | Non
 
 
 def level_tests(recording: Recording) -> tuple[LevelChange, ...]:
-    """Test the pressure levels of a recording for a step in each of several patterns, the most likely pattern first.
-
-    The levels are, of each pressure, the mean over both directions of motion, and half the change with the direction
-    (`PressureLevels`). A pattern is the combination of levels that one cause changes, such as friction or a sensor's
-    offset. The result is empty if the levels cannot be estimated.
-    """
+    """Test a recording for a step in each pattern of its pressure levels (`pattern_tests`); empty without levels."""
     levels = estimate_levels(recording)
     return () if levels is None else pattern_tests(*levels)
 
 
 def pattern_tests(time: Array, values: Array) -> tuple[LevelChange, ...]:
-    """Test pressure levels for a step in each of several patterns, the highest rank first.
+    """Test pressure levels for a step in each of several patterns, the highest rank, i.e. the most likely one, first.
 
     A pattern (`PATTERNS`) is the combination of levels that one cause changes, such as friction or a sensor's offset.
-    `time` (K,): times of K blocks [s]; `values` (K, 4): their levels, as in `PressureLevels`. A higher rank means a
-    more likely pattern. Patterns that cannot be tested are left out.
+    `time` (K,): times of K blocks [s]; `values` (K, 4): their levels, as in `PressureLevels`. Others are left out.
     """
     whitening = _whitening_matrix(values)
     mean = values.mean(axis=0)
@@ -242,8 +215,7 @@ def _whitening_matrix(values: Array) -> Array:
     """Compute the matrix (c, 4) that transforms pressure levels to c numbers with independent errors of equal variance.
 
     The matrix W is a root of the inverse of S, W' W = S^-1, where S is the covariance of the differences between
-    neighbouring blocks. `values` (K, 4): the four levels in each of K blocks (`PressureLevels`), of which c vary at
-    all.
+    neighbouring blocks. `values` (K, 4): `PressureLevels.values`, of whose four columns c vary at all.
     """
     varying = np.flatnonzero(np.ptp(values, axis=0) > 0.0)  # half differences are constant without a motion
     differences = np.diff(values[:, varying], axis=0)
@@ -258,16 +230,14 @@ def _whitening_matrix(values: Array) -> Array:
 def _test_pattern(name: str, rows: Array, whitened: Array, time: Array) -> LevelChange | None:
     """Test the pressure levels for a step in one pattern, i.e. within a subspace of their possible changes.
 
-    `name`: name of the pattern; `rows` (m, c): vectors that span the subspace; `whitened` (K, c): levels in K blocks;
-    `time` (K,): times of the blocks [s]. Vectors and levels must be multiplied by the `_whitening_matrix`, so that the
-    errors of the c numbers of a block are independent and have equal variances. Return None if no direction of the
-    subspace can be tested.
+    `rows` (m, c): vectors that span the subspace; `whitened` (K, c): levels in K blocks, both multiplied by the
+    `_whitening_matrix`; `time` (K,): times of the blocks [s]. Return None if none can be tested.
     """
     basis, triangle = np.linalg.qr(rows.T)
     # orthonormal directions, without those of vectors that depend on earlier ones
     basis = basis[:, np.abs(np.diag(triangle)) > RANK_TOLERANCE * np.abs(triangle).max()]
     components = [Information(time, np.eye(len(time)), whitened @ direction) for direction in basis.T]
-    tests = [test for component in components if (test := two_sided_step_test(component)) is not None]
+    tests = [test for component in components if (test := step_test(component, signs=(1.0, -1.0))) is not None]
     if not tests:
         return None
     n_blocks, n_directions = len(time), len(tests)

@@ -56,9 +56,8 @@ class Motion(NamedTuple):
     """Samples in which the piston moves, with the design matrix of their fit.
 
     `rows` (n,): indices of the samples; `design` (n, m): sign of the speed, time, speed, acceleration, and a hat
-    function of the position for each knot: 1 at the knot and, linearly, 0 at its neighbours; `strokes` (n,): number of
-    the stroke, a motion in one direction without a rest; `top_speed`: speed that counts as 1 in the column of the
-    speed.
+    function of the position for each knot (`_hat_functions`); `strokes` (n,): number of the stroke, a motion in one
+    direction without a rest; `top_speed`: speed that counts as 1 in the column of the speed.
     """
 
     rows: NDArray[np.intp]
@@ -68,12 +67,12 @@ class Motion(NamedTuple):
 
 
 def select_motion(recording: Recording) -> Motion | None:
-    """Select the samples in which the piston moves, and build the design matrix of their fit (`Motion`).
+    """Select the samples in which the piston moves, and build the design matrix of their fit.
 
     The piston moves if its speed, averaged over `AVERAGING_TIME`, exceeds both the noise of the speed and the fraction
     `healthy.slowest` (`priors.toml`) of the mean speed (`max_rest_rate`). At rest, friction may have any value between
-    those of both directions. Samples in motion are thinned out if they are many. Return None if a chamber pressure or
-    a channel of the motion is not recorded, or if the piston moves in fewer than `MIN_ROWS` samples.
+    those of both directions. Samples in motion are thinned out if they are many. Return None if a chamber pressure or a
+    channel of the motion is not recorded, or if the piston moves in fewer than `MIN_ROWS` samples.
     """
     name = next((channel for channel in ("x", "theta", "omega", "u") if channel in recording.channels), None)
     if name is None or len(recording) < MIN_ROWS or not set(CHAMBERS) <= set(recording.channels):
@@ -129,9 +128,9 @@ def stack_equations(design: Array, values: Array) -> Array:
 def solve_weighted(equations: Array, weight: Array) -> Array:
     """Solve a weighted least-squares problem by a QR decomposition; return the coefficients c (m,).
 
-    The coefficients minimise sum((weight (values - design c))^2). If the weighted design matrix does not have full
-    rank, c is the shortest of all solutions, as from `numpy.linalg.lstsq`. `equations` (m + 1, n): columns of the
-    design and values (`stack_equations`), with n > m; `weight` (n,): factors of the rows.
+    They minimise sum((weight (values - design c))^2). If the weighted design does not have full rank, c is the shortest
+    of all solutions, as from `numpy.linalg.lstsq`. `equations` (m + 1, n): columns of the design and values
+    (`stack_equations`), with n > m; `weight` (n,): factors of the rows.
     """
     _, triangle = qr((equations * weight).T, mode="raw", overwrite_a=True, check_finite=False)
     # R of the design and, in the last column, the values multiplied by Q^T
@@ -144,8 +143,8 @@ def fit_robustly(design: Array, values: Array) -> tuple[Array, Array]:
 
     The weights are 1/(1 + (residual/scale)^2), where the scale is `WEIGHT_SCALE` times the median of abs(residual),
     plus `MIN_RESIDUAL`. The iteration is run twice: from equal weights, and from weights by the distance of the values
-    from their median, which are small for the high pressure of contact with a workpiece. The fit with the smaller scale
-    is taken. Returns the coefficients and the weights (n,).
+    from their median, which are small in contact with a workpiece. Returns coefficients and weights of the fit with the
+    smaller scale.
     """
     equations = stack_equations(design, values)
     fits = list[tuple[float, Array, Array]]()
@@ -225,8 +224,8 @@ def remove_slow_changes(motion: Motion, design: Array, values: Array, t: Array) 
         (y_k - r_k y_(k-1)) / sqrt(1 - r_k^2),    r_k = exp(-(t_k - t_(k-1)) / tau),
 
     as if the residuals were an Ornstein-Uhlenbeck process, whose innovations are independent. `design` (n, m), `values`
-    (n,): rows of the samples `motion.rows`; `t`: times of all samples of the recording [s]. The results have n - 1
-    rows. tau is `healthy.load_seconds` of `priors.toml`.
+    (n,): rows of the samples `motion.rows`; `t`: times of all samples of the recording [s]; tau: `healthy.load_seconds`
+    of `priors.toml`. The results have n - 1 rows.
     """
     correlation = np.exp(-np.diff(t[motion.rows]) / CHANGES.healthy.load_seconds)
     scale = 1.0 / np.sqrt(1.0 - correlation**2)
@@ -236,10 +235,10 @@ def remove_slow_changes(motion: Motion, design: Array, values: Array, t: Array) 
 
 
 def fit_difference(recording: Recording, *, without_slow_changes: bool = False) -> Resistance | None:
-    """Fit p_A - p_B of a recording by friction, which reverses with the motion, and a viscous drop.
+    """Fit p_A - p_B in motion by friction, which reverses with the motion, and a viscous drop; computed only once.
 
-    `without_slow_changes`: first remove loads that change slowly (`remove_slow_changes`). This also removes most of the
-    viscous drop of a steady motion. The result is None without enough motion. It is computed only once for a recording.
+    `without_slow_changes`: first remove loads that change slowly (`remove_slow_changes`), and with them most of the
+    viscous drop of a steady motion. The result is None without enough motion.
     """
     key = ("motion fit of p_A - p_B", without_slow_changes)
     return compute_once(recording, key, lambda recording: _fit_difference(recording, without_slow_changes))
@@ -247,12 +246,7 @@ def fit_difference(recording: Recording, *, without_slow_changes: bool = False) 
 
 @np.errstate(all="ignore")
 def _fit_difference(recording: Recording, without_slow_changes: bool) -> Resistance | None:
-    """Fit friction and viscous drop to p_A - p_B in motion, with their standard errors.
-
-    With `without_slow_changes`, loads that change slowly are first removed (`remove_slow_changes`). The result is None
-    without enough motion, or if the motion does not determine both. The standard errors allow for residuals that are
-    correlated within parts of the recording (`equal_parts`).
-    """
+    """Compute what `fit_difference` returns, with standard errors that allow for correlation in `equal_parts`."""
     motion = select_motion(recording)
     if motion is None:
         return None

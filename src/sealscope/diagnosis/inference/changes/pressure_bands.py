@@ -119,9 +119,9 @@ def _octave_powers(
 ) -> tuple[Array, Array, NDArray[np.complex128]] | None:
     """Compute powers and cross-power of a pair of channels A and B in half-overlapping Hann windows, in octaves.
 
-    `length`: samples of a window; `edges` (k + 1,): limits of the octaves [Hz]. Single wrong samples are removed by a
-    median of three. The results are sums of abs(A)^2, abs(B)^2 and A B* over the lines of each octave, (windows, k)
-    each. Windows with missing samples are left out; None if no window is left.
+    `length`: samples of a window; `edges` (k + 1,): limits of the octaves [Hz]. A median of three removes single wrong
+    samples. The results are sums of abs(A)^2, abs(B)^2 and A B* over the lines of each octave, (windows, k) each.
+    Windows with missing samples are left out; None if no window is left.
     """
     from scipy.ndimage import median_filter
 
@@ -144,49 +144,37 @@ def _octave_powers(
 def compare_spectra(judged: Mapping[str, Octaves], healthy: Sequence[Mapping[str, Octaves]]) -> Observable | None:
     """Test for a new low-pass filter of one pressure, such as a clogged line, against healthy recordings.
 
-    `judged`, `healthy`: spectra of the pairs of channels in each recording, by the names of the pairs in `PAIRS`. The
-    observable is named after the pressure that is more probably filtered; its size is the most probable cut-off
-    frequency [Hz]. For each pair, healthy recordings with fewer octaves than the judged recording are left out. Return
-    None if no pair has enough healthy recordings.
+    `judged`, `healthy`: spectra in each recording, by the names of the pairs in `PAIRS`. The observable is named after
+    the pressure that is more probably filtered; its size is the most probable cut-off frequency [Hz]. Healthy
+    recordings with fewer octaves of a pair than the judged one are left out. Return None if too few are left.
     """
     from scipy.special import logsumexp
 
-    factors = list[_FilterFactor]()
-    for name, octaves in judged.items():
-        healthy_octaves = [spectra[name] for spectra in healthy if name in spectra]
-        factor = _compare_pair(octaves, healthy_octaves, PAIRS[name])
-        if factor is not None:
-            factors.append(factor)
+    comparisons = (
+        _compare_pair(octaves, [spectra[name] for spectra in healthy if name in spectra], PAIRS[name])
+        for name, octaves in judged.items()
+    )
+    factors = [factor for factor in comparisons if factor is not None]
     if not factors:
         return None
-    log_factor = float(logsumexp([factor.log_factor for factor in factors]) - np.log(len(factors)))
-    best = max(factors, key=lambda factor: factor.log_factor)
+    log_factor = float(logsumexp([log_factor for log_factor, _, _ in factors]) - np.log(len(factors)))
+    _, channel, cutoff = max(factors, key=lambda factor: factor[0])
     return Observable(
-        name=FILTER_NAMES[best.channel],
+        name=FILTER_NAMES[channel],
         data=SIDES,
         score=max(2.0 * log_factor, 0.0),
         chance=float(np.exp(-max(log_factor, 0.0))),
-        size=best.cutoff,
+        size=cutoff,
     )
 
 
-class _FilterFactor(NamedTuple):
-    """Log Bayes factor of a filter of one pressure, by the spectra of a pair of channels.
+def _compare_pair(
+    judged: Octaves, healthy: Sequence[Octaves], pair: tuple[str, str]
+) -> tuple[float, str, float] | None:
+    """Compute the log Bayes factor of a new low-pass filter of one pressure to no filter, from the spectra of a `pair`.
 
-    `channel`, `cutoff`: the pressure that is more probably filtered, and its most probable cut-off frequency [Hz].
-    """
-
-    log_factor: float
-    channel: str
-    cutoff: float
-
-
-def _compare_pair(judged: Octaves, healthy: Sequence[Octaves], pair: tuple[str, str]) -> _FilterFactor | None:
-    """Compute the Bayes factor of a new low-pass filter of one pressure to no filter, from the spectra of two channels.
-
-    `judged`, `healthy`: spectra of these channels (the `pair`) in the judged recording, and in each healthy one. The
-    factor is averaged over possible filters of each pressure in the pair. The result also states the channel and the
-    cut-off frequency of the most likely filter. It is None if too few healthy recordings have at least as many octaves
+    The factor is averaged over possible filters of each pressure in the pair. Returns it with the pressure and the
+    cut-off frequency [Hz] of the most probable filter; None if too few healthy recordings have at least as many octaves
     as the judged one, or if the factor is not finite.
     """
     from scipy.special import logsumexp
@@ -200,8 +188,7 @@ def _compare_pair(judged: Octaves, healthy: Sequence[Octaves], pair: tuple[str, 
     log_ratios = log_likelihoods[1:] - log_likelihoods[0]  # the first hypothesis is no filter
     log_factor = float(logsumexp(log_ratios) - np.log(len(log_ratios)))
     best = 1 + int(np.argmax(log_ratios))  # index in `filters`
-    factor = _FilterFactor(log_factor, channel=pair[filters.side[best]], cutoff=float(filters.cutoff[best]))
-    return factor if np.isfinite(log_factor) else None
+    return (log_factor, pair[filters.side[best]], float(filters.cutoff[best])) if np.isfinite(log_factor) else None
 
 
 class _Filters(NamedTuple):
@@ -220,10 +207,9 @@ class _Filters(NamedTuple):
 def _filter_effects(healthy: Sequence[Octaves], sides: Sequence[int]) -> _Filters:
     """Compute how a low-pass filter of one channel changes log amplitude ratio and phase of channel A to channel B.
 
-    The first entry of the result is without a filter. `sides`: channels that may be filtered, 0 for channel A and 1 for
-    channel B. Each side is combined with several cut-off frequencies and levels of the sensor's white noise, which is
-    not filtered. The power density of the noise is a fraction (`filtered.noises` in `priors.toml`) of the lowest power
-    density of any octave in the `healthy` recordings.
+    `sides`: channels that may be filtered, 0 for A and 1 for B. Each is combined with several cut-off frequencies and
+    levels of the sensor's white noise, which is not filtered: a fraction (`filtered.noises` in `priors.toml`) of the
+    lowest power density of any octave in the `healthy` recordings.
     """
     from itertools import product
 
@@ -245,10 +231,9 @@ def _filter_effects(healthy: Sequence[Octaves], sides: Sequence[int]) -> _Filter
 
 
 def _ratio_log_likelihoods(judged: Octaves, healthy: Sequence[Octaves], filters: _Filters) -> Array:
-    """Compute the log likelihood (m,) of the judged recording's log amplitude ratios for each filter, up to a constant.
+    """Compute the log likelihood (m,) of the judged log amplitude ratios for each of m filters, up to a constant.
 
-    The ratios of channel A to channel B in the octaves follow a multivariate t distribution about the mean of the
-    healthy recordings.
+    The ratios of A to B in the octaves follow a multivariate t distribution about the healthy mean.
     """
     prior = CHANGES.octaves
     ratios = np.array([octaves.log_A - octaves.log_B for octaves in healthy])
@@ -268,10 +253,10 @@ def _ratio_log_likelihoods(judged: Octaves, healthy: Sequence[Octaves], filters:
 
 
 def _phase_log_likelihoods(judged: Octaves, healthy: Sequence[Octaves], filters: _Filters) -> Array:
-    """Compute the log likelihood (m,) of the judged recording's phases between channels A and B for each filter.
+    """Compute the log likelihood (m,) of the judged phases between channels A and B for each of m filters.
 
-    The phase in each octave follows a von Mises distribution about the mean direction of the healthy recordings, or
-    is uniform with a small probability. The likelihood is relative to that of uniform phases.
+    The phase in each octave follows a von Mises distribution about the mean direction of the healthy recordings, or is
+    uniform with a small probability. The likelihood is relative to that of uniform phases.
     """
     from scipy.special import i0e
 

@@ -23,16 +23,13 @@ SIGNALS = "signals"
 
 
 def observe_signals(recording: Recording) -> Observed:
-    """Test duty, sensors and mean pressures of a recording for sudden lasting changes that a leak does not cause.
-
-    The duty is how far the machine is commanded to move. The report is computed only once for a recording.
-    """
+    """Test command, sensors and mean pressures of a recording for sudden lasting changes that no leak causes."""
     return compute_once(recording, (SIGNALS,), _test_signals)
 
 
 @np.errstate(all="ignore")
 def _test_signals(recording: Recording) -> Observed:
-    """Test duty, sensors and pressure levels for steps; if the recording is too short, report only this reason."""
+    """Compute what `observe_signals` returns; only the reason if the recording is too short."""
     shortest = CHANGES.features.shortest  # length of a block [s]
     if len(recording) < BLOCKS * max(ORDER + 2, shortest * recording.rate):  # differences of `ORDER` need samples
         return Observed(SIGNALS, lack="too short for changes of its signals")
@@ -45,10 +42,7 @@ def _test_signals(recording: Recording) -> Observed:
 
 
 def run_tests(*tests: Callable[[], Iterator[Observable]]) -> tuple[Observable, ...]:
-    """Run all tests and collect the observables that they yield.
-
-    If numbers overflow or a matrix is singular in a test, this test ends early, and its observables so far are kept.
-    """
+    """Collect the observables of all tests; a test in which numbers overflow or a matrix is singular ends early."""
     observables: list[Observable] = []
     for test in tests:
         with suppress(ArithmeticError, np.linalg.LinAlgError):
@@ -65,9 +59,8 @@ def duty_observables(tests: Sequence[StepTest]) -> Iterator[Observable]:
     """Yield an observable of a step of the duty if the amplitudes of command and motion change by similar ratios.
 
     `tests`: step tests of the log amplitudes of command and motion (`duty_tests`). The smaller step must exceed
-    `_MIN_STEP_RATIO` times the larger one. Otherwise nothing is yielded, since a leak changes only one of the
-    amplitudes. Score, onset and size are those of the test with the lower score. The p-value is twice the higher
-    p-value of the tests, since each test covers a rise and a fall.
+    `_MIN_STEP_RATIO` times the larger one, since a leak changes only one amplitude. Score, onset and size are those of
+    the test with the lower score. The p-value is twice the higher one, as each test covers a rise and a fall.
     """
     steps = np.abs([test.fitted.size for test in tests])
     if tests and steps.min() > _MIN_STEP_RATIO * steps.max():
@@ -84,10 +77,9 @@ def duty_observables(tests: Sequence[StepTest]) -> Iterator[Observable]:
 
 
 def sensor_observables(tests: Iterable[tuple[str, StepTest]]) -> Iterator[Observable]:
-    """Convert step tests of sensor features, such as noise and hum, to observables.
+    """Convert step tests of sensor features, such as noise and hum, with the features' names, to observables.
 
-    `tests`: pairs of a feature's name and its test (`sensor_tests`). The first word of the name is the kind of data.
-    Each test is the better of a rise and a fall, so its p-value is doubled.
+    The first word of a name is its kind of data. The p-value is doubled, as each test is the better of two.
     """
     for name, test in tests:
         yield Observable.from_test(name, name.split()[0], test, n_tests=2.0)
@@ -101,9 +93,9 @@ def level_observables(changes: Sequence[LevelChange]) -> Iterator[Observable]:
     """Convert tests for steps of the pressure levels to observables.
 
     `changes`: one test for each pattern of levels, the highest rank first. The rank (`LevelChange`) becomes the score.
-    The p-value of change k is chance_k = min(1, chance_1 exp(rank_1 - rank_k)). Half of the exponent rank_1 - rank_k is
-    the log Bayes factor of change 1 over change k (Schwarz's approximation), the other half a prior against patterns
-    that need further coefficients. The interval of an onset is one block to either side.
+    The p-value of change k is chance_k = min(1, chance_1 exp(rank_1 - rank_k)). Half of the exponent is the log Bayes
+    factor of change 1 over change k (Schwarz's approximation), the other half a prior against patterns that need
+    further coefficients. The interval of an onset is one block to either side.
     """
     for change in changes:
         onset = Interval(change.onset, change.onset - change.block, change.onset + change.block)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -49,6 +48,8 @@ SCALE = "scale"
 OUTSIDE = "loss to the outside"
 #: Observable of the offset of the flow's sensor.
 FLOW_ZERO = "zero of the flow"
+#: Exponents of the flow of leaks in p_A - p_B, by the name of the observable.
+_LEAK_EXPONENTS = {LEAK: 1.0, ORIFICE: 0.5} | {f"{LEAK} of exponent {e:g}": e for e in EXPONENTS if e < 1.0}
 #: Causes whose coefficients wear can only raise: leaks.
 _ONE_WAY = ("piston leak", "piston or pump leak", "pump leak", "external leak")
 
@@ -62,28 +63,30 @@ def volume_observables(
     volume_ratio: float = 1.0,
     charge: ChargeTrend | None = None,
     flow_scale: float = 1.0,
+    has_varied_duty: bool = True,
 ) -> tuple[Observable, ...]:
     """Test the coefficients of a volume balance for a step up or down, or only up for leaks; highest score first.
 
     A leak is tested as a laminar flow, and as a flow proportional to a power of p_A - p_B below 1. The coefficients of
-    the motion are tested together, for a change of their common scale. The result has one observable for each test. Its
-    `advantage` comes from the priors on its size and its law, the sensor offset, and the oil that the accumulator lost.
+    the motion are tested together, for a change of their common scale. The `advantage` of an observable comes from the
+    priors on its size and its law, the sensor offset, and the oil that the accumulator lost.
 
-    - `blocks`: Gram matrices of the columns in blocks of the recording, without the sensor offset of p_A - p_B, for the
-      tests of laminar leaks; `plain`: the same with the pressures as recorded, for all other tests.
-    - `balances`, `columns`: the equations, and for each the indices of its columns by role (leak, motion, left side).
+    - `blocks`, `plain`: blocks of the recording without the sensor offset of p_A - p_B, for the tests of laminar leaks,
+      and with the pressures as recorded, for all other tests.
+    - `balances`, `columns`: the equations, and the roles of their columns.
     - `oil_loss`: tests for an external leak by the oil that the accumulator lost, by the name of the term.
     - `volume_ratio`: measured over assumed ratio of piston area to pump displacement.
     - `charge`: trend of the charge pressure, None if it is unknown.
     - `flow_scale`: true flow over the flow of the balance.
+    - `has_varied_duty`: false for a few blocks of one duty. There the flow of an orifice looks like a change of the
+      motion's scale, and is not tested.
     """
     centred, recorded = (series.merge(max_blocks=INFERENCE.blocks.coarse) for series in (blocks, plain))
     # a laminar leak is tested without the sensor offset, so an improbable offset counts against the leak
-    leak_disadvantage = offset_cost(estimate_offset(blocks, columns))
-    law_prior = dict(zip(EXPONENTS, law_priors().tolist(), strict=True))
+    leak_disadvantage = float(offset_cost(estimate_offset(blocks, columns)))
     observables = []
-    for hypothesis in _step_hypotheses(centred, recorded, balances[0].terms, columns, has_accumulator=bool(oil_loss)):
-        name, signs, coefficient, shape, law = hypothesis
+    terms = [term for term in balances[0].terms if has_varied_duty or term.name != ORIFICE]
+    for name, signs, coefficient, shape in _step_hypotheses(centred, recorded, terms, columns, bool(oil_loss)):
         steps = step_tests(coefficient, signs, shape)
         if not steps:
             continue
@@ -92,7 +95,7 @@ def volume_observables(
             advantage = -leak_disadvantage
         else:
             advantage = -_size_penalty(name, step.fitted.size, recorded, columns[0].names, volume_ratio, flow_scale)
-        advantage += 2.0 * float(np.log(law_prior[law] / law_prior[1.0]))
+        advantage += 2.0 * _law_log_prior(name)
         # a leak whose oil a check valve makes up has a name of its own, which ends with MADE_UP
         if (accumulator_test := oil_loss.get(name.removesuffix(MADE_UP))) is not None:
             advantage += _accumulator_support(step, accumulator_test)
@@ -113,10 +116,9 @@ def _size_penalty(
 ) -> float:
     """Compute how improbable the size of a step is: -2 log(prior density / largest density), 0 without a prior on it.
 
-    `name`: name of the observable, whose coefficient in the volume balance steps; `size`: change of this coefficient;
-    `names`: names of the columns of `blocks`. `volume_ratio` is the measured over the assumed ratio of the piston's
-    area to the pump's displacement, `flow_scale` the true flow over that of the volume balance: they convert `size` to
-    the quantity that the prior describes. Where the prior only limits the size, small steps have no penalty (`above`).
+    `name`: name of the observable, whose coefficient in the volume balance changes by `size`; `names`: names of the
+    columns of `blocks`; `volume_ratio`, `flow_scale`: as in `volume_observables`; they convert `size` to the quantity
+    that the prior describes. Where the prior only limits the size, small steps have no penalty (`above`).
     """
     if name == SCALE:
         return size_penalty(INFERENCE.scale, size)
@@ -131,84 +133,67 @@ def _size_penalty(
     return 0.0
 
 
-class _Hypothesis(NamedTuple):
-    """A step (sudden lasting change) of one coefficient of the volume balance, to be tested.
+def _law_log_prior(name: str) -> float:
+    """Compute the log prior probability of the law by which an observable describes a leak, 0 if it is no leak.
 
-    `name`: name of the observable; `signs`: 1 to test for a step up, -1 for a step down; `coefficient`: likelihood of
-    the coefficient in K blocks; `shape` (K,): change of the coefficient in each block by a unit step, None for 1 in all
-    blocks; `law`: exponent e of a flow proportional to a pressure's power e, 1 for all but some leaks.
+    A law is a power of p_A - p_B (`law_priors`). An external leak is tested as a laminar flow alone.
     """
-
-    name: str
-    signs: Sequence[float]
-    coefficient: Information
-    shape: Array | None = None
-    law: float = 1.0
+    exponent = 1.0 if name.startswith("external leak") else _LEAK_EXPONENTS.get(name)
+    return 0.0 if exponent is None else float(np.log(law_priors()[EXPONENTS.index(exponent)]))
 
 
 def _step_hypotheses(
     centred: Blocks, recorded: Blocks, terms: Sequence[Term], columns: Sequence[ColumnRoles], has_accumulator: bool
-) -> Iterator[_Hypothesis]:
+) -> Iterator[tuple[str, Sequence[float], Information, Array | None]]:
     """Yield the steps to test: of each term's coefficient, of leaks under other laws, and of the motion's scale.
 
-    `centred`: blocks of the recording without the sensor offset of p_A - p_B, for the tests of laminar leaks;
-    `recorded`: the same blocks with the pressures as recorded, for all other tests; `terms`: the balance's terms;
-    `columns`: for each equation the indices of its columns by role (leak, motion, left side); `has_accumulator`: True
-    if the accumulator's volume shows external leaks.
+    `centred`, `recorded`: blocks of the recording without the sensor offset of p_A - p_B, for the tests of laminar
+    leaks, and with the pressures as recorded; `has_accumulator`: true if the accumulator's volume shows external leaks.
+    A step has the name of its observable, the signs of a step to test (1 up, -1 down), the likelihood of the
+    coefficient in K blocks, and its change in each block by a unit step (K,), None for 1.
     """
     first = columns[0]
-    for index, term in enumerate(terms):
+    for term in terms:
         if _is_tested(term, first, has_accumulator):
+            index = first.names.index(term.name)
             blocks = centred if term.name in (LEAK, PUMP) else recorded
             signs = (1.0,) if term.cause in _ONE_WAY and term.name != BIAS else (1.0, -1.0)
-            law = 0.5 if term.name == ORIFICE else 1.0
-            yield _Hypothesis(_observable_name(term), signs, information(blocks, columns, index), law=law)
+            name = term.name
+            if name == BIAS:  # the cause of a constant flow: an external leak, or an offset of the flow's sensor
+                name = OUTSIDE if term.cause == "external leak" else FLOW_ZERO
+            yield name, signs, information(blocks, columns, index), None
     # pressures as recorded: the removed offset was estimated for a laminar leak, and may be the effect of another law
     leak = information(recorded, columns, first.leak)
     for exponent, shape in apparent_conductances(recorded, columns).items():
         if exponent < 1.0:  # 1 is the laminar leak, tested above
-            yield _Hypothesis(f"{LEAK} of exponent {exponent:g}", (1.0,), leak, shape, law=exponent)
+            yield f"{LEAK} of exponent {exponent:g}", (1.0,), leak, shape
     scale = first.names.index(ORIFICE)  # the column of the orifice, no longer needed, takes the motion's volume
-    yield _Hypothesis(SCALE, (1.0, -1.0), information(_with_fitted_motion(recorded, columns, scale), columns, scale))
+    motion = information(_with_fitted_motion(recorded, columns, scale), columns, scale)
+    yield SCALE, (1.0, -1.0), motion._replace(level=np.inf), None  # without the prior on the orifice's leak
 
 
 def _is_tested(term: Term, roles: ColumnRoles, has_accumulator: bool) -> bool:
     """Return True if the coefficient of a term of the volume balance is tested for a step by itself.
 
-    A coefficient that changes only together with others is not tested by itself, nor one whose steps another test
-    covers. `roles`: names of the balance's columns, and their indices by role (leak, motion, left side);
-    `has_accumulator`: True if the recording shows the volume of an accumulator.
+    It is not if it changes only together with others, or if another test covers its steps. `has_accumulator`: true if
+    the recording shows the volume of an accumulator.
     """
-    if term.name.startswith("motion"):
-        # a change of area, displacement or a sensor's scale changes all coefficients of motion: the test of SCALE
+    # a change of area, displacement or a sensor's scale changes all coefficients of motion: the test of SCALE covers
+    # them; in one recording the motion varies too little for SPEED_LOSS; a leaking piston raises HOLDING as well: the
+    # test of the leak covers it
+    if term.name.startswith("motion") or term.name in (SPEED_LOSS, HOLDING):
         return False
-    if term.name == SPEED_LOSS:
-        return False  # the motion in a single recording varies too little to determine this coefficient
-    if term.name == HOLDING:
-        return False  # a leaking piston raises this coefficient as well: the test of the leak covers it
     if AIR in roles.names and term.cause == "air in the oil" and term.nuisance:
         return False  # free air changes all these coefficients: the test of AIR (not a nuisance term) covers it
     # BIAS, a constant flow, is an external leak that no pressure drives; with an accumulator a pressure drives the leak
     return not (has_accumulator and term.name == BIAS)
 
 
-def _observable_name(term: Term) -> str:
-    """Return the name under which a change of a term is reported: its own name, except for the constant flow.
-
-    A step of the constant flow is reported by the term's cause: as an external leak, or as an offset of the flow's
-    sensor.
-    """
-    if term.name != BIAS:
-        return term.name
-    return OUTSIDE if term.cause == "external leak" else FLOW_ZERO
-
-
 def _accumulator_support(balance_test: StepTest, accumulator_test: StepTest) -> float:
     """Compute twice the log likelihood ratio of an external leak to no leak, by the oil that the accumulator lost.
 
-    `balance_test`, `accumulator_test`: tests for a step of the leak by the volume balance and by the accumulator. With
-    the size b of the leak by the balance, and the size a by the accumulator for the same onset with the standard error
-    s, the result is (a/s)^2 - ((a - b)/s)^2.
+    With the size b of the leak by the volume balance, and the size a by the accumulator for the same onset with the
+    standard error s, the result is (a/s)^2 - ((a - b)/s)^2.
     """
     onset = balance_test.onsets[balance_test.best]
     nearest = int(np.abs(accumulator_test.onsets - onset).argmin())
@@ -220,9 +205,8 @@ def _accumulator_support(balance_test: StepTest, accumulator_test: StepTest) -> 
 def _with_fitted_motion(blocks: Blocks, columns: Sequence[ColumnRoles], index: int) -> Blocks:
     """Return the blocks with column `index` replaced by the volume that the piston's motion takes, as fitted.
 
-    The new column tests for a change of the scale of position or speed: a relative change by s is a step of the
-    column's coefficient by s. The column is the sum of the columns of motion, each times its coefficient in a fit to
-    the whole recording. `columns`: for each equation the indices of its columns by role (leak, motion, left side).
+    The new column tests for a change of the scale of position or speed: a relative change by s is a step of its
+    coefficient by s. It is the sum of the columns of motion, each times its fitted coefficient.
     """
     gram = blocks.gram.copy()
     for equation, (roles, total) in enumerate(zip(columns, sum_blocks(blocks, columns), strict=True)):

@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 def cycle_length(speed: Array, rate: float) -> float | None:
     """Estimate the period of a machine's cycle [s], from its strokes or else from the spectrum of a speed.
 
-    Without regular strokes the result is the period of the strongest spectral line, or None if the recording contains
-    fewer than `MIN_BLOCKS` of these periods. `speed` (n,): speed or flow at the sampling `rate` [Hz].
+    Without regular strokes it is the period of the strongest spectral line, or None for fewer than `MIN_BLOCKS` of
+    these periods. `speed` (n,): speed or flow at the sampling `rate` [Hz].
     """
     cycle = estimate_period(speed, rate)
     if cycle is None:
@@ -46,12 +46,10 @@ def cycle_length(speed: Array, rate: float) -> float | None:
 
 
 def recorded_oil_loss_tests(recording: Recording, rig: Rig, offset: float) -> dict[str, StepTest]:
-    """Test a recording that contains the position for an external leak of chamber A or B that begins within it.
+    """Test a recording with a position for an external leak that begins within it (`oil_loss_tests`).
 
-    The tests use the volume of oil in the accumulator, and are returned by the name of the leak (`oil_loss_tests`).
-    `rig`: sizes of the cylinder and the accumulator; `offset`: sensor offset of p_A - p_B [Pa]. The result is empty for
-    a double rod: as its strokes draw no oil from the accumulator, the check valves may stay shut, and the pressure of
-    neither chamber need be that of the accumulator.
+    `offset`: sensor offset of p_A - p_B [Pa]. The result is empty for a double rod: as its strokes draw no oil from the
+    accumulator, the check valves may stay shut, and the pressure of neither chamber need be that of the accumulator.
     """
     if not rig.cylinder.single_rod:
         return {}
@@ -64,16 +62,13 @@ def recorded_oil_loss_tests(recording: Recording, rig: Rig, offset: float) -> di
 def oil_loss_tests(signals: Signals, rig: Rig, cycle: float | None, begin: float) -> dict[str, StepTest]:
     """Test for an external leak of chamber A or B that begins within a recording, by the volume of the accumulator.
 
-    The accumulator is connected to the unloaded side. The volume of oil that the accumulator has delivered follows from
-    the pressure of this side by the polytropic law of the gas; the oil that the rod displaces is subtracted if the
-    position is recorded. Volume and pressure are averaged over blocks, and the leak's conductance is tested for a step
-    between blocks (`step_test`). `signals`: both pressures and, if recorded, the position; `rig`: sizes of cylinder
-    and accumulator; `begin`: time of the first sample [s]; `cycle`: duration of the machine's cycle [s], None if
-    there is no cycle. Blocks are whole multiples of the cycle, so that motion within a cycle averages out; without
-    a cycle they have any length.
+    The accumulator is connected to the unloaded side. The oil that it has delivered follows from the pressure of this
+    side by the polytropic law of the gas, less the oil that the rod displaces if the position is recorded. The leak's
+    conductance is tested for a step between blocks (`step_test`). Blocks are whole multiples of the machine's `cycle`
+    [s], so that motion within a cycle averages out, or of any length if it is None. `begin`: first time [s].
 
-    The result maps "external leak A" and "external leak B" to their tests. A side that cannot be tested is left out.
-    The result is empty without an accumulator (`makeup.check_valves` = "absent") or for fewer than `MIN_BLOCKS` blocks.
+    The result maps "external leak A" and "external leak B" to their tests, without a side that cannot be tested. It is
+    empty without an accumulator (`makeup.check_valves` = "absent") or for fewer than `MIN_BLOCKS` blocks.
     """
     if rig.makeup.check_valves == "absent":
         return {}
@@ -100,10 +95,7 @@ def oil_loss_tests(signals: Signals, rig: Rig, cycle: float | None, begin: float
 
 
 def _block_means(values: Array, edges: Array) -> Array:
-    """Average the known samples of each of K blocks; NaN for a block without known samples.
-
-    `edges` (K + 1,): indices in `values` (n,) between which the blocks lie.
-    """
+    """Average the known samples of `values` (n,) between K + 1 indices `edges`, (K,); NaN without known samples."""
     is_known = np.isfinite(values)
     sums, counts = (
         np.concatenate([[0.0], np.cumsum(series)])[edges] for series in (np.where(is_known, values, 0.0), is_known)
@@ -117,7 +109,7 @@ def _estimate_conductance(volume: Array, pressure: Array, block_s: float, begin:
 
     The initial volume and the effect of the gas temperature, linear and quadratic in time, are eliminated. `volume`
     (K,): mean volume that the accumulator has delivered by each block [m^3]; `pressure` (K,): mean pressure that drives
-    the leak in each block [Pa]; `begin`: start of the first block [s].
+    the leak [Pa]; `begin`: start of the first block [s].
     """
     n_blocks = len(volume)
     time = (np.arange(n_blocks, dtype=float) + 0.5) * block_s

@@ -49,8 +49,8 @@ class CycleBalance(NamedTuple):
     """Volume balance of a recording without position or flow, over whole cycles or times of standstill (holds).
 
     `blocks`: the recording, reduced to Gram matrices of the balance's columns; `equation`: the balance; `columns`:
-    indices of its columns by role (leak, left side and others); `oil_loss`: tests for an external leak of either side
-    by the volume that the accumulator loses, by the name of the term.
+    roles of its columns; `oil_loss`: tests for an external leak of either side by the volume that the accumulator
+    loses, by the name of the term.
     """
 
     blocks: Blocks
@@ -63,8 +63,7 @@ def cycle_balances(recording: Recording, rig: Rig) -> list[CycleBalance]:
     """Compute the volume balances of a recording without position or without flow, over whole cycles and over holds.
 
     A hold is a time in which the piston is held at standstill. A recording with a position but without flow gives only
-    a balance over the holds in which valves are shut. `rig`: circuit and sizes of the machine. The list is empty if no
-    balance is possible.
+    a balance over the holds in which valves are shut. The list is empty if no balance is possible.
     """
     channels, begin = frozenset(recording.channels), float(recording.t[0])
     equation = locked(rig, channels) if "x" in channels else circulation(rig, channels)
@@ -108,7 +107,7 @@ def cycle_balances(recording: Recording, rig: Rig) -> list[CycleBalance]:
 def _find_holds(flow: Array, rate: float, min_limit: float = 0.0) -> NDArray[np.bool_]:
     """Flag the samples (n,) in which the piston is held, i.e. the flow has been near zero for the settling time.
 
-    The averaged flow is near zero below a limit: a fraction of its largest value, or `min_limit` [m^3/s] if this is
+    The averaged flow is near zero below a fraction of its largest value, or below `min_limit` [m^3/s] if this is
     larger. `flow` (n,): flow [m^3/s] at the sampling `rate` [Hz], infinite where the piston is surely not held. The
     times of averaging and settling and the fraction are those of `held` in `priors.toml`.
     """
@@ -126,9 +125,9 @@ def _build_blocks(
 ) -> Blocks | None:
     """Compute the blocks of a volume balance from rows, each a mean over a triangular window of a `half_width` [s].
 
-    `signals`: samples of the recording; `equation`: the volume balance; `is_used` (n,): flags of the sampling intervals
-    that may be part of a row; `begin`: time of the first sample [s]; `one_sided`: use only rows in which the same side
-    has the higher pressure throughout. Return None if fewer than `MIN_BLOCKS` blocks have rows.
+    `is_used` (n,): flags of the sampling intervals that may be part of a row; `begin`: time of the first sample [s];
+    `one_sided`: use only rows in which the same side has the higher pressure throughout. Return None for fewer than
+    `MIN_BLOCKS`.
     """
     left, dp, rate = equation.left(signals), signals.pressure_difference, signals.rate
     rows = _integrate_rows([*(term.increments(signals) for term in equation.terms), left], is_used, half_width, rate)
@@ -161,10 +160,10 @@ def _build_blocks(
 def _integrate_rows(increments: list[Array], is_used: NDArray[np.bool_], half_width: float, rate: float) -> Rows:
     """Compute rows of a regression: mean rates of c columns over overlapping triangular windows.
 
-    `increments`: an array (n,) for each column, its increments in n sampling intervals; `is_used` (n,): flags of the
-    intervals that may be part of a row; a row with other intervals is flagged as not whole; `half_width`: half the
-    width of a window [s]; `rate`: sampling rate [Hz]. The middles of the windows are half of `half_width` apart. The
-    integral over a triangle is computed as the second difference of the twice integrated increments.
+    `increments`: those of each column in n sampling intervals; `is_used` (n,): flags of the intervals that may be part
+    of a row, which is flagged as not whole if it has others; `half_width`: half the width of a window, and twice the
+    distance of windows [s]; `rate`: sampling rate [Hz]. The integral over a triangle is the second difference of the
+    twice integrated increments.
     """
     half_length, n_samples = half_width * rate, len(is_used)
     centres = np.arange(half_length, n_samples - half_length, 0.5 * half_length)
@@ -191,8 +190,7 @@ def _shrink_offset(values: Array, names: list[str]) -> None:
 
     `values` (r, c): rows of the volume balance, each a mean over one window of time; `names`: names of the columns. The
     mean pressure difference d of a row, in the column of a laminar leak, becomes d - z^2/d, or 0 if |d| is smaller than
-    the largest usual offset z (Breiman's garrote). The column of a leak through an orifice is scaled by the same
-    factor.
+    the largest usual offset z (Breiman's garrote). That of an orifice is scaled alike.
     """
     max_offset = WITHIN_95 * INFERENCE.zero.pressure
     mean_pressure = values[:, names.index(LEAK)]

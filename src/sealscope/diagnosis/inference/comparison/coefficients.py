@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -24,34 +23,45 @@ from sealscope.recordings.recording import Array
 def coefficient_level(gram: Array, columns: Sequence[ColumnRoles]) -> tuple[float, float]:
     """Estimate the leak coefficient, at least 0, and its standard error from the Gram matrices `gram` (E, m, m).
 
-    `columns`: for each equation the indices of its columns by role (leak, motion, left side). The coefficients of the
-    other terms (nuisances) are eliminated from each equation by the Schur complement, and the equations are added up;
-    those that recordings do not share are already eliminated from `gram` (`eliminate_unshared`). Both results are 0 if
-    the matrices have no information on the leak.
+    Coefficients that recordings do not share are already eliminated (`eliminate_unshared`). The precisions and moments
+    of the equations are added up. Both results are 0 without information on the leak.
     """
     precision, moment = 0.0, 0.0
     for e, roles in enumerate(columns):
         nuisance = [k for k in roles.compared if k != roles.leak and np.isfinite(roles.between_deviation[k])]
-        cross = gram[e][nuisance, roles.leak]
-        solved = solve(gram[e][np.ix_(nuisance, nuisance)], np.column_stack([cross, gram[e][nuisance, roles.left]]))
-        precision += float(gram[e][roles.leak, roles.leak] - cross @ solved[:, 0])
-        moment += float(gram[e][roles.leak, roles.left] - cross @ solved[:, 1])
+        parts = reduce_to_tested(gram[e], gram[e][:, roles.left], roles.leak, nuisance)
+        precision, moment = precision + parts[0], moment + parts[1]
     return (max(moment, 0.0) / precision, precision**-0.5) if precision > 0.0 else (0.0, 0.0)
+
+
+def reduce_to_tested(
+    gram: Array, products: Array, tested: int, nuisance: list[int], prior: Array | None = None
+) -> tuple[float, float]:
+    """Eliminate the `nuisance` coefficients of an equation by the Schur complement: precision x coefficient = moment.
+
+    `gram` (m, m): Gram matrix of the columns; `products` (m,): their products with the left side, or with a residual;
+    `tested`: column of the coefficient; `prior`: precisions of the priors on the nuisance coefficients. Returns
+    precision and moment of the tested coefficient.
+    """
+    cross = gram[nuisance, tested]
+    matrix = gram[np.ix_(nuisance, nuisance)]
+    if prior is not None:  # limited to 1e9 times the recording's precision, which is enough to fix a coefficient
+        matrix = matrix + np.diag(np.minimum(prior, 1e9 * np.diag(matrix)))
+    solved = solve(matrix, np.column_stack([cross, products[nuisance]]))
+    return float(gram[tested, tested] - cross @ solved[:, 0]), float(products[tested] - cross @ solved[:, 1])
 
 
 def motion_change(judged: Array, healthy: Array, roles: ColumnRoles) -> tuple[float, float]:
     """Estimate the log ratio of a recording's motion coefficient (area of the piston) to that of healthy recordings.
 
-    Returns the logarithm and its standard error, which contains the error of the recording's fit but not the error of
-    the healthy fit. The ratio differs from 1 if area over displacement changed: another machine, or another scale of a
-    sensor.
+    Returns it with its standard error, without the error of the healthy fit. The ratio differs from 1 if area over
+    displacement changed: another machine, or another scale of a sensor.
 
-    The regression is the volume balance. `judged`, `healthy`: its Gram matrices (m, m) of the recording and of the sum
-    of the healthy ones; `roles`: indices of their columns by role (leak, motion, left side). Each of the two fits gives
-    a coefficient for each direction of the motion and each loaded side. Their mean, weighted by the sums of squares of
-    these columns in the recording, is the motion coefficient [m^2]. In the recording's fit the motion, its delay
-    (`terms.LAG`) and the leak are free; without the leak, the motion would absorb leakage in proportion to the speed.
-    The other coefficients differ from the healthy ones by a normal prior (`between` in `priors.toml`).
+    `judged`, `healthy`: Gram matrices (m, m) of the volume balance in the recording and of the sum of the healthy ones.
+    Each of the two fits gives a coefficient for each direction of the motion and each loaded side. Their mean, weighted
+    by the sums of squares of these columns in the recording, is the motion coefficient [m^2]. In the recording's fit
+    the motion, its delay (`terms.LAG`) and the leak are free; without it, the motion would absorb leakage in proportion
+    to the speed. The others differ from the healthy ones by a normal prior (`between` in `priors.toml`).
     """
     motion = [k for k in roles.motion if roles.names[k] != LAG]
     fitted = [k for k in roles.compared if k == roles.leak or np.isfinite(roles.between_deviation[k])]
@@ -74,11 +84,9 @@ def motion_change(judged: Array, healthy: Array, roles: ColumnRoles) -> tuple[fl
 def eliminate_unshared(gram: Array, columns: Sequence[ColumnRoles]) -> Array:
     """Eliminate the coefficients that recordings do not share, such as a constant loss of oil, from each equation.
 
-    These are the coefficients without a prior on differences between recordings. The leakage of a pump that holds the
-    load is not eliminated, but set to zero first, since it counts only within a recording (`ColumnRoles.hold_leak`).
-    `gram` (E, m, m): Gram matrices of E equations; `columns`: for each equation the indices of its columns by role
-    (leak, motion, left side). The result is the Schur complement of the same shape, in which the rows and columns of
-    the eliminated coefficients are zero.
+    These have no prior on differences between recordings. The leakage of a pump that holds the load, which counts only
+    within a recording, is not eliminated but set to zero first (`ColumnRoles.hold_leak`). `gram` (E, m, m): Gram
+    matrices of E equations. In the result, the Schur complement, their rows and columns are zero.
     """
     reduced = gram.copy()
     for e, roles in enumerate(columns):
@@ -91,26 +99,15 @@ def eliminate_unshared(gram: Array, columns: Sequence[ColumnRoles]) -> Array:
     return reduced
 
 
-class Residual(NamedTuple):
-    """Residual of a recording's volume balance under the coefficients of healthy recordings.
+def residual_products(
+    gram: Array, reference: Array, roles: ColumnRoles, *, has_leak: bool = False
+) -> tuple[Array, list[int], Array]:
+    """Compute the residual of a recording under the coefficients fitted to other recordings.
 
-    `products` (m,): scalar products of the residual with each column, and last with itself; `nuisance`: indices of
-    the c columns whose coefficients may differ between recordings; `prior_precision` (c,): precisions of the priors
-    on these differences.
-    """
-
-    products: Array
-    nuisance: list[int]
-    prior_precision: Array
-
-
-def residual_products(gram: Array, reference: Array, roles: ColumnRoles, *, has_leak: bool = False) -> Residual:
-    """Compute the residual of a recording under the coefficients fitted to other recordings (`Residual`).
-
-    `gram`, `reference` (m, m): Gram matrices of the recording and of the sum of the others; `roles`: indices of their
-    columns by role (leak, motion, left side). Compared coefficients with a prior on their differences may differ from
-    the coefficients of the other recordings within this prior. The leak's coefficient may differ only with `has_leak`,
-    by the prior `between.pump`.
+    `gram`, `reference` (m, m): Gram matrices of the recording and of the sum of the others. Returns the products (m,)
+    of the residual with each column, and last with itself; the indices of the c columns whose coefficients may differ
+    between recordings; and the precisions (c,) of the priors on these differences. They are the compared coefficients
+    with such a prior, and with `has_leak` the leak's, with the prior `between.pump`.
     """
     compared = [k for k in roles.compared if k == roles.leak or np.isfinite(roles.between_deviation[k])]
     coefficients = np.zeros(len(gram))
@@ -122,7 +119,7 @@ def residual_products(gram: Array, reference: Array, roles: ColumnRoles, *, has_
     products[roles.left] = coefficients @ products  # the residual's sum of squares
     # limited, as the prior on a coefficient of zero has an infinite precision
     prior = np.minimum(prior, 1e9 * np.diag(gram)[nuisance])
-    return Residual(products, nuisance, prior_precision=prior)
+    return products, nuisance, prior
 
 
 def estimate_leak_excess(
@@ -130,28 +127,19 @@ def estimate_leak_excess(
 ) -> tuple[Array, Array]:
     """Estimate by how much a recording's leak coefficient exceeds that of other recordings, and the standard errors.
 
-    Both results have the shape (s,), for s widths of a prior, and are 0 where there is no information.
+    `gram`, `reference` (E, m, m): Gram matrices of the recording, and of the sum of the others, for E equations;
+    `widths` (s,): factors on the prior standard deviations by which the coefficients of the other terms differ between
+    recordings. Both results (s,) are 0 where there is no information.
 
-    - `gram`, `reference` (E, m, m): Gram matrices of the recording, and of the sum of the others, for E equations.
-    - `columns`: for each equation the indices of its columns by role (leak, nuisances, left side).
-    - `widths` (s,): factors on the prior standard deviations by which the nuisance coefficients, i.e. those of the
-      other terms, differ between recordings.
-
-    The excess is fitted to the residual under the coefficients of the others (`residual_products`). The nuisance
-    coefficients are eliminated (Schur complement). Each equation then states precision x excess = moment. Precisions
-    and moments are summed over the equations, and the excess is moment / precision.
+    The excess is fitted to the residual under the coefficients of the others (`residual_products`), with the other
+    coefficients eliminated. The precisions and moments of the equations are added up.
     """
     precision, moment = np.zeros((2, len(widths)))
     for e, roles in enumerate(columns):
         residual, nuisance, prior = residual_products(gram[e], reference[e], roles)
-        matrix, cross = gram[e][np.ix_(nuisance, nuisance)], gram[e][nuisance, roles.leak]
-        right_sides = np.column_stack([cross, residual[nuisance]])
         for index, width in enumerate(widths):
-            # the prior's precision is limited to 1e9 times the recording's, which is enough to fix a coefficient
-            regularised = matrix + np.diag(np.minimum(prior / width**2, 1e9 * np.diag(matrix)))
-            solved = solve(regularised, right_sides)
-            precision[index] += float(gram[e][roles.leak, roles.leak] - cross @ solved[:, 0])
-            moment[index] += float(residual[roles.leak] - cross @ solved[:, 1])
+            parts = reduce_to_tested(gram[e], residual, roles.leak, nuisance, prior / width**2)
+            precision[index], moment[index] = precision[index] + parts[0], moment[index] + parts[1]
     is_known = precision > 0.0
     divisor = np.where(is_known, precision, 1.0)
     return np.where(is_known, moment / divisor, 0.0), np.where(is_known, divisor**-0.5, 0.0)

@@ -14,9 +14,9 @@ from sealscope.diagnosis.priors.inference import INFERENCE
 class UnusualCondition(NamedTuple):
     """Operating condition of a recording that lies outside of the range `low` to `high` of the healthy recordings.
 
-    `name`: "load" [Pa], "speed" (of the pump, as mean flow [m^3/s]) or "oil" (temperature [degC]); `value`: load, speed
-    or temperature in the recording; `log_excess`: log ratio of load or speed to the nearer end of the range. It is 0
-    for oil, since the uncertain slope in temperature already covers it.
+    `name`: "load" [Pa], "speed" (of the pump, as mean flow [m^3/s]) or "oil" (temperature [degC]), with its `value` in
+    the recording; `log_excess`: log ratio of load or speed to the nearer end of the range. It is 0 for oil, since the
+    uncertain slope in temperature already covers it.
     """
 
     name: str
@@ -29,8 +29,8 @@ class UnusualCondition(NamedTuple):
 def find_unusual_conditions(judged: RecordingSums, baseline: Sequence[RecordingSums]) -> list[UnusualCondition]:
     """List the conditions (load, speed, oil temperature) of a recording outside of the range of healthy recordings.
 
-    A condition counts if it lies outside of the healthy range by more than a tolerance (`conditions` in
-    `priors.toml`). Unknown temperatures are not compared, nor loads (or speeds) if any of them is 0.
+    A tolerance (`conditions` in `priors.toml`) is added to the range. Unknown temperatures are not compared, nor loads
+    (or speeds) if any of them is 0.
     """
     allowed = INFERENCE.conditions
     unusual: list[UnusualCondition] = []

@@ -33,9 +33,8 @@ def compare_laws(
     """Compare how well a turbulent leak through an orifice and a laminar leak explain a recording's excess flow.
 
     Each leak is fitted to the residual of the recording `judged` under the coefficients of the healthy recordings,
-    `baseline`. `columns`: for each equation the indices of its columns by role (leak, motion, left side). Return None
-    if the volume balance has no column of an orifice, if the recording has no information on one of the two leaks, or
-    if the columns of the two leaks are not positively correlated.
+    `baseline`. Return None if the volume balance has no column of an orifice, if the recording has no information on
+    one of the two leaks, or if their columns are not positively correlated.
     """
     if any(ORIFICE not in roles.names for roles in columns):
         return None
@@ -64,16 +63,13 @@ def compare_with_leak(
     """Compare how well the leak and another term of the volume balance, `rival`, explain a recording's excess flow.
 
     Each is fitted in turn to the residual of the recording under the coefficients of the healthy recordings,
-    `baseline`. Returns the log likelihood ratio of the rival to the leak for one independent residual,
+    `baseline`. Returns the log likelihood ratio of the rival to the leak for one residual,
 
         -log(residual sum of squares with the rival / the same with the leak) / 2.
 
-    The caller multiplies it by the number of independent residuals of a recording. While the rival (for example an
-    external leak) is fitted, the leak may differ as it does between healthy recordings. A negative coefficient is not
-    fitted, except that of free air, of which there may be less. `columns`: for each equation the indices of its columns
-    by role (leak, motion, left side).
-    Return None if the balance has no column named `rival`, or if the recording has no information on the leak or on the
-    rival.
+    While the rival (for example an external leak) is fitted, the leak may differ as it does between healthy recordings.
+    A negative coefficient is not fitted, except that of free air, of which there may be less. Return None if the
+    balance has no column named `rival`, or if the recording has no information on the leak or on the rival.
     """
     if any(rival not in roles.names for roles in columns):
         return None

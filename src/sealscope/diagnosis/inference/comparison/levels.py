@@ -64,13 +64,9 @@ MAX_Z = 30.0
 def rise(judged: RecordingSums, baseline: Sequence[RecordingSums], columns: Sequence[ColumnRoles]) -> Rise:
     """Estimate by how much a recording's leak coefficient exceeds that of healthy recordings of the same machine.
 
-    `judged`: summary of the recording, i.e. Gram matrices of its volume balance, mean flow and mean pressure;
-    `baseline`: summaries of the healthy recordings; `columns`: for each equation the indices of its columns by role
-    (leak, motion, left side), the same for all recordings. The rise and its standard deviation are in the unit of the
-    leak's coefficient, for the laminar leak m^3/(s Pa).
-
-    The other coefficients may differ between recordings within a prior. As its width is uncertain, the rises are
-    estimated for several widths, and the result is an average over them (`_compare_levels`).
+    `columns`: roles of the columns of each equation, the same for all recordings. The rise and its standard deviation
+    are in the unit of the leak's coefficient, for the laminar leak m^3/(s Pa). The other coefficients may differ
+    between recordings within a prior. The result is an average over widths of it (`_compare_levels`).
     """
     healthy_sums = np.sum([recording.sums for recording in baseline], axis=0)
     count, prior = len(baseline), INFERENCE.scatter
@@ -95,43 +91,42 @@ def rise(judged: RecordingSums, baseline: Sequence[RecordingSums], columns: Sequ
 
 
 def held_rise(judged: RecordingSums, baseline: Sequence[RecordingSums]) -> Rise | None:
-    """Estimate the rise of the leakage past the piston over healthy recordings, from holds.
+    """Estimate the rise of the leakage past the piston over healthy recordings, from holds behind shut valves.
 
-    A hold is a time in which shut valves keep the load in place. `judged`: summary of the recording; `baseline`:
-    summaries of the healthy recordings. The leak may have begun within the recording, whose mean then contains only a
-    part of it (`Rise.may_be_partial`). Return None if the judged recording has no holds, or if fewer than
-    `MIN_WITH_HOLDS` healthy recordings have holds.
+    The leak may have begun within the recording, whose mean then contains only a part of it (`Rise.may_be_partial`).
+    Return None if the judged recording has no holds, or fewer than `MIN_WITH_HOLDS` healthy recordings have them.
     """
-    baseline = [recording for recording in baseline if recording.held is not None]
-    if judged.held is None or len(baseline) < MIN_WITH_HOLDS:
-        return None
-    # the first two values of `HeldLeaks`: leak past the piston, and its standard deviation
-    leaks = np.array([recording.held[:2] for recording in (*baseline, judged) if recording.held is not None])
     min_crossover = INFERENCE.scatter.largest * judged.conductance_of_flow
-    return _compare_held(judged, baseline, leaks, min_crossover=min_crossover)._replace(may_be_partial=True)
+    held = _compare_held(judged, baseline, "held", min_crossover=min_crossover)
+    return None if held is None else held._replace(may_be_partial=True)
 
 
 def held_pump_rise(judged: RecordingSums, baseline: Sequence[RecordingSums]) -> Rise | None:
     """Estimate the rise of the pump's leakage over healthy recordings, from the time just before holds.
 
-    `judged`: summary of the recording; `baseline`: summaries of the healthy recordings. Return None if the pump's
-    leakage is unknown in the judged recording, or known in fewer than `MIN_WITH_HOLDS` healthy recordings.
+    Return None if it is unknown in the judged recording, or known in fewer than `MIN_WITH_HOLDS` healthy ones.
     """
-    baseline = [recording for recording in baseline if recording.held_pump is not None]
-    if judged.held_pump is None or len(baseline) < MIN_WITH_HOLDS:
+    return _compare_held(judged, baseline, "held_pump", session_share=INFERENCE.held_oil.pump_session)
+
+
+def _compare_held(
+    judged: RecordingSums,
+    baseline: Sequence[RecordingSums],
+    name: str,
+    *,
+    min_crossover: float = 0.0,
+    session_share: float | None = None,
+) -> Rise | None:
+    """Estimate the rise of a leak that holds measure over its mean in the healthy recordings, `baseline`.
+
+    `name`: field of `RecordingSums` whose first two values are conductance and standard deviation [m^3/(s Pa)] of the
+    leak; `min_crossover`: as in `_Estimates`; `session_share`: its `session_deviation` over the healthy mean. Return
+    None if the judged recording has no such field, or fewer than `MIN_WITH_HOLDS` healthy recordings have it.
+    """
+    baseline = [recording for recording in baseline if getattr(recording, name) is not None]
+    if getattr(judged, name) is None or len(baseline) < MIN_WITH_HOLDS:
         return None
-    leakages = np.array([r.held_pump for r in (*baseline, judged) if r.held_pump is not None])
-    # the relative deviation between sessions, times the mean leakage of the healthy recordings
-    session_deviation = INFERENCE.held_oil.pump_session * abs(float(leakages[:-1, 0].mean()))
-    return _compare_held(judged, baseline, leakages, session_deviation=session_deviation)
-
-
-def _compare_held(judged: RecordingSums, baseline: Sequence[RecordingSums], leaks: Array, **priors: float) -> Rise:
-    """Estimate the rise of a leak that holds measure over its mean in the healthy recordings.
-
-    `leaks` (n + 1, 2): conductance and standard deviation [m^3/(s Pa)] in each of the n recordings `baseline`, and last
-    in the recording `judged`; `priors`: `min_crossover` and `session_deviation` of `_Estimates`.
-    """
+    leaks = np.array([getattr(recording, name)[:2] for recording in (*baseline, judged)])
     *healthy_leaks, leak = leaks[:, 0]
     level = float(np.mean(healthy_leaks))
     min_error = max(INFERENCE.scatter.finest * judged.conductance_of_flow, 1.0 / MAX_READING)  # above 0
@@ -142,7 +137,8 @@ def _compare_held(judged: RecordingSums, baseline: Sequence[RecordingSums], leak
         errors=error[None],
         level=max(level, 0.0),
         level_error=error / np.sqrt(len(baseline)),
-        **priors,
+        min_crossover=min_crossover,
+        session_deviation=None if session_share is None else session_share * abs(level),
     )
     # `error` is included already; a less precise judged recording adds the difference
     return _compare_levels(judged, baseline, estimates).widen(float(leaks[-1, 1]) ** 2 - float(error) ** 2)
@@ -151,12 +147,14 @@ def _compare_held(judged: RecordingSums, baseline: Sequence[RecordingSums], leak
 class _Estimates(NamedTuple):
     """Rises of the leak coefficient, estimated with each of s prior standard deviations of the other coefficients.
 
-    These priors are on the differences of the coefficients between recordings. `values` (s,): rises of the judged
-    recording; `rises` (s, n): rises of n healthy recordings over their mean; `errors` (s,): standard error of one rise;
-    `level`: mean coefficient of the healthy recordings; `level_error`: its standard error; `min_crossover`: minimum of
-    `_LevelScale.crossover`, large where healthy levels are about zero; `session_deviation`: prior standard deviation
-    between sessions with the same oil, None for that of the whole leakage (`scatter.session` of `priors.toml`). All
-    have the unit of the coefficient.
+    The priors are on differences between recordings. All fields have the unit of the coefficient.
+
+    - `values` (s,): rises of the judged recording; `rises` (s, n): rises of n healthy recordings over their mean;
+    - `errors` (s,): standard error of one rise;
+    - `level`, `level_error`: mean coefficient of the healthy recordings, and its standard error;
+    - `min_crossover`: minimum of `_LevelScale.crossover`, large where healthy levels are about zero;
+    - `session_deviation`: prior standard deviation between sessions with the same oil, None for that of the whole
+      leakage (`scatter.session` of `priors.toml`).
     """
 
     values: Array
@@ -171,14 +169,11 @@ class _Estimates(NamedTuple):
 def _compare_levels(judged: RecordingSums, baseline: Sequence[RecordingSums], estimates: _Estimates) -> Rise:
     """Estimate by how much the judged leak coefficient exceeds the coefficient that the healthy recordings predict.
 
-    `judged`, `baseline`: summaries of the judged recording and of n healthy ones; `estimates`: rises of all of them
-    over the healthy mean, with their errors. Each of its s rows belongs to one width of the prior on the other
-    coefficients; there is one row if no such prior is used.
-
-    The sum of healthy mean and rise is the leak coefficient a of a recording. Leak coefficients are compared as z =
-    asinh(a / (2 c)), which is logarithmic for large a (`_LevelScale`). From z the predicted effect of the oil is
-    subtracted. The rest is normal about an unknown mean, with an unknown standard deviation sigma of single recordings;
-    sessions, oil and unusual conditions add covariances (see the module).
+    Each of the s rows of `estimates` belongs to one width of the prior on the other coefficients; there is one row if
+    no such prior is used. The coefficients a, the sums of healthy mean and rise, are compared as z = asinh(a / (2 c)),
+    which is logarithmic for large a (`_LevelScale`). From z the predicted effect of the oil is subtracted. The rest is
+    normal about an unknown mean, with an unknown standard deviation sigma of single recordings; sessions, oil and
+    unusual conditions add covariances (see the module).
     """
     values, rises, errors, level, level_error, min_crossover, session_deviation = estimates
     prior = INFERENCE.scatter
@@ -236,29 +231,15 @@ def _candidate_covariances(
     session_deviation: float,
     condition_deviation: float,
 ) -> tuple[Array, Array]:
-    """Build the candidate covariances of transformed leak coefficients z between recordings, with log priors.
+    """Build g candidate covariances (g, n + 1, n + 1) of transformed leak coefficients, with log priors (g,).
 
-    z = asinh(a / (2 c)) of a leak coefficient a (`_LevelScale`) is logarithmic for large coefficients.
+    The transform z = asinh(a / (2 c)) of a leak coefficient a (`_LevelScale`) is logarithmic for large coefficients.
 
-    Parameters
-    ----------
-    sessions : sequence of int, length n + 1
-        Session number of each recording, the judged one last.
-    oil : OilHypothesis
-        Hypothesis on the oil of the recordings.
-    relative_slopes : array of float, shape (n + 1,)
-        Change of z per relative change of each recording's leak coefficient.
-    oil_deviation : float
-        Standard deviation of z between sessions by unknown oil; 0 if the oil is known.
-    session_deviation : float
-        Prior standard deviation of z between sessions with the same oil.
-    condition_deviation : float
-        Standard deviation of the judged z due to unusual load and speed.
-
-    Returns
-    -------
-    covariances : array of float, shape (g, n + 1, n + 1)
-    log_priors : array of float, shape (g,)
+    - `sessions` (n + 1,): session number of each recording, the judged one last;
+    - `relative_slopes` (n + 1,): change of z per relative change of each recording's leak coefficient;
+    - `oil_deviation`: standard deviation of z between sessions by unknown oil, 0 if the oil is known;
+    - `session_deviation`: prior standard deviation of z between sessions with the same oil;
+    - `condition_deviation`: standard deviation of the judged z due to unusual load and speed.
     """
     # grid of the standard deviation between sessions over its prior, denser near zero; the log priors are those of a
     # half-normal density times the distance of the grid points, which grows with the root of the ratio
@@ -294,26 +275,19 @@ class _LevelScale(NamedTuple):
     crossover: float
 
     def transform(self, excess: Array) -> Array:
-        """Compute z = asinh(a / (2 c)) of leak coefficients a = `level` + `excess`, of any shape, with c = `crossover`.
-
-        `level` is the mean coefficient of the healthy recordings.
-        """
+        """Compute z = asinh(a / (2 c)) of leak coefficients a = `level` + `excess`, of any shape."""
         return np.asarray(np.arcsinh((self.level + excess) / (2.0 * self.crossover)))
 
     def slope(self, level: Any) -> Any:
-        """Compute dz/da = 1 / sqrt(a^2 + (2 c)^2) of z = asinh(a / (2 c)) at leak coefficients a = `level`.
-
-        c is the `crossover`. `level`: a number or an array; the result has the same shape.
-        """
+        """Compute dz/da = 1 / sqrt(a^2 + (2 c)^2) at leak coefficients a = `level`, a number or an array."""
         return 1.0 / np.hypot(level, 2.0 * self.crossover)
 
     def to_levels(self, predicted: Mixture, transformed: Array) -> Mixture:
         """Convert a distribution of z to a distribution of the leak coefficient, relative to the healthy mean `level`.
 
-        `predicted`: mixture of normal distributions of z, shape (s, g, nodes) as from `Population.predict`, whose
-        weights are logarithms and whose centres are relative to `transformed` (s,), the z of the judged recording. Each
-        normal distribution is split into `PARTS` narrower ones, along a new last axis, within which the coefficient is
-        nearly linear in z. Their mixture has the mean and the variance of the original distribution.
+        `predicted`: mixture of normal distributions of z, shape (s, g, nodes) as from `Population.predict`, with log
+        weights and centres relative to `transformed` (s,), the z of the judged recording. Each normal distribution is
+        split into `PARTS` narrower ones, along a new last axis, with the same mean and variance together.
         """
         x, part_weights = np.polynomial.hermite_e.hermegauss(PARTS)  # centres of the parts [standard deviations]
         centres, deviations = predicted.centres + transformed[:, None, None], predicted.deviations[..., None]
@@ -328,9 +302,8 @@ class _LevelScale(NamedTuple):
 def leak_deviations_from_mean(recordings: Sequence[RecordingSums], columns: Sequence[ColumnRoles]) -> Array:
     """Compute the deviation of each recording's leak coefficient from the mean of all n recordings, shape (n,).
 
-    It is (n - 1)/n times the difference of the recording's coefficient from the common coefficient of the other n - 1
-    recordings. The coefficients of all other terms may differ between recordings within the usual prior; only the flow
-    offset may differ freely. `columns`: for each equation the indices of its columns by role (leak, motion, left side).
+    It is (n - 1)/n times the difference from the common coefficient of the other n - 1 recordings. The other
+    coefficients may differ between recordings within the usual prior, the flow offset freely.
     """
     usual_width, columns = np.ones(1), [roles.with_free_zero() for roles in columns]  # a factor of 1 on the priors
     all_sums = [eliminate_unshared(recording.sums, columns) for recording in recordings]

@@ -37,17 +37,16 @@ class OilHypothesis(NamedTuple):
 def predict_thinning(recordings: Sequence[RecordingSums]) -> Array:
     """Predict by how much thin oil raised the log leakage of each recording (n + 1,), the judged one last.
 
-    The predictions are relative to the mean over the n healthy recordings. They are all 0 if nothing shows the oil's
-    viscosity.
+    It is relative to the healthy mean, and 0 if nothing shows the oil's viscosity.
     """
     return oil_hypotheses(recordings)[0].thinning
 
 
 def oil_hypotheses(recordings: Sequence[RecordingSums]) -> list[OilHypothesis]:
-    """List the hypotheses on how the oil changed the leakage of `recordings`, the judged one last.
+    """List the hypotheses on how the oil changed the leakage of `recordings`, the judged one last, most probable first.
 
-    If all recordings have an oil temperature, the temperature predicts the effect. Otherwise the viscous drop of the
-    motion may show the viscosity (`_oils_by_drop`), or the oil is unknown. The most probable hypothesis is the first.
+    If all recordings have an oil temperature, it predicts the effect. Otherwise the viscous drop of the motion may show
+    the viscosity (`_oils_by_drop`), or the oil is unknown.
     """
     prior, zeros = INFERENCE.oil, np.zeros(len(recordings))
     temperatures = [recording.oil_degC for recording in recordings if recording.oil_degC is not None]

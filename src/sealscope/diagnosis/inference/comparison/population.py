@@ -51,12 +51,11 @@ class Population:
         Parameters
         ----------
         values : array of float, shape (s,)
-            The judged value by s alternative estimates, which are weighted by the likelihood of the healthy values.
+            The judged value by s alternative estimates, weighted by the likelihood of the healthy values.
         healthy_values : array of float, shape (s, n)
             The healthy values by the same estimates.
         prior_sigma, freedom : float
-            Scale and degrees of freedom of the prior on the scatter sigma of the values: sigma^2 has a scaled inverse
-            chi-squared prior with scale `prior_sigma`^2.
+            Scale and degrees of freedom of the scaled inverse chi-squared prior on the variance of the values.
 
         Returns
         -------
@@ -93,22 +92,20 @@ class Population:
 
         Parameters
         ----------
-        values : array of float, shape (s,)
-            The judged value by s alternative estimates.
-        healthy_values : array of float, shape (s, n)
-            The healthy values x by the same estimates.
+        values, healthy_values : array of float, shape (s,) and (s, n)
+            The judged value and the healthy values x, by s alternative estimates.
         sigma : array of float, shape (s, nodes)
-            Standard deviations of the values: a log-spaced grid of `NODES` for each alternative estimate.
+            Standard deviations of the values: a log-spaced grid of `NODES` for each estimate.
         log_priors : array of float, shape (s,)
-            Log prior of each alternative estimate.
+            Log prior of each estimate.
         sigma_log_prior : array of float, shape (s, nodes), or float
             Log prior density of log sigma at the grid points.
 
         Returns
         -------
         Mixture
-            Log weights, standard deviations and centres of shape (s, g, nodes), for g candidate covariances and the
-            grid of `sigma`. The centres are relative to `values`.
+            Log weights, standard deviations, and centres relative to `values`, of shape (s, g, nodes), for g candidate
+            covariances.
         """
         healthy = healthy_values[:, self._sample]
         variance = sigma[:, None] ** 2  # (s, 1, nodes)
@@ -134,8 +131,8 @@ class Population:
 def number_sessions(starts: Sequence[float | None], pause: float) -> list[int]:
     """Assign each recording to a session; a gap above `pause` [s] between two dates begins a new session.
 
-    `starts` (n,): dates of the recordings [s since 1970], None if unknown. Return the session number of each
-    recording, from 1 on in the order of the dates; -1 for an undated recording.
+    `starts` (n,): dates of the recordings [s since 1970], None if unknown. Sessions are numbered from 1 on in the order
+    of the dates; an undated recording has the number -1.
     """
     dates = sorted(start for start in starts if start is not None)
     session_starts = [date for before, date in zip([-np.inf, *dates], dates, strict=False) if date - before > pause]

@@ -35,8 +35,7 @@ class RecordingSums(NamedTuple):
     - `flow`, `pressure`: mean magnitudes of the pump's flow [m^3/s] and of p_A - p_B [Pa];
     - `start_s`, `oil_degC`: date [s since 1970] and temperature of the oil, None if unknown;
     - `held` (6,): leaks while shut valves hold the load, in the order of `holds.leaks.HeldLeaks`, or None;
-    - `held_pump` (2,): leakage conductance of the pump [m^3/(s Pa)] just before such holds, and its standard deviation,
-      or None;
+    - `held_pump` (2,): leakage of the pump [m^3/(s Pa)] just before such holds, with standard deviation, or None;
     - `resistance` (5,): what resists the motion (`Resistance`), or None.
     """
 
@@ -51,19 +50,9 @@ class RecordingSums(NamedTuple):
 
     @classmethod
     def from_blocks(
-        cls,
-        blocks: Blocks,
-        columns: Sequence[ColumnRoles],
-        start_s: float | None = None,
-        oil_degC: float | None = None,
+        cls, blocks: Blocks, columns: Sequence[ColumnRoles], start_s: float | None = None, oil_degC: float | None = None
     ) -> RecordingSums:
-        """Summarise a recording from its `blocks`: sum of the Gram matrices, mean flow and mean pressure.
-
-        The sum is divided by the residual variance of a row; coefficients that recordings do not share are eliminated.
-        The means are weighted by the numbers of rows. `columns`: for each equation the indices of its columns by role
-        (leak, motion, left side); `start_s`, `oil_degC`: date [s since 1970] and oil temperature, None if unknown,
-        which are stored as they are.
-        """
+        """Summarise a recording from its `blocks`; the means of flow and pressure are weighted by numbers of rows."""
         weights = np.maximum(blocks.rows, 1e-9)  # positive, so that the means exist
         flow = float(np.average(blocks.flow, weights=weights))
         pressure = float(np.average(blocks.mean_pressure(), weights=weights))

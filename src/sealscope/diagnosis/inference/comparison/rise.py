@@ -35,7 +35,7 @@ class Mixture(NamedTuple):
     centres: Array
 
     def quantile(self, probability: float) -> float:
-        """Compute the quantile of the mixture: the value below which it lies with the given probability."""
+        """Compute the value below which the mixture lies with the given probability."""
         from scipy.special import ndtr, ndtri
 
         # scale by a typical deviation (very large ones count in part), so that the quantile is of the order of one
@@ -65,11 +65,11 @@ class Mixture(NamedTuple):
 class Rise(NamedTuple):
     """Amount by which a recording's leak coefficient exceeds that of healthy recordings, with its distribution.
 
-    `value`: the estimate, and `deviation`: its standard deviation, both in the unit of the coefficient (of a laminar
-    leak m^3/(s Pa)). In a healthy recording `value` has the distribution `mixture`. If `mixture` is None, `value` over
-    `deviation` has Student's t distribution with `degrees_of_freedom`. `may_be_partial`: the leak may have begun within
-    the recording, whose mean then contains only a part of the rise. `share`: fraction of the allowed false alarms that
-    is left to this rise, by which its p-value is divided (`share_alarms`).
+    - `value`, `deviation`: estimate and standard deviation, in the unit of the coefficient;
+    - `mixture`: distribution of `value` in a healthy recording. If None, `value` / `deviation` is Student's t with
+      `degrees_of_freedom`;
+    - `may_be_partial`: the leak may have begun within the recording, whose mean then contains only a part of the rise;
+    - `share`: fraction of the allowed false alarms that is left to this rise, by which its p-value is divided.
     """
 
     value: float
@@ -80,18 +80,11 @@ class Rise(NamedTuple):
     share: float = 1.0
 
     def share_alarms(self, share: float) -> Rise:
-        """Return this rise with its p-value divided by `share`, for use beside another rise of which the best counts.
-
-        `share`: fraction of the false-alarm probability of both that this rise may use.
-        """
+        """Return this rise with its p-value divided by `share`, for use beside another one of which the best counts."""
         return self._replace(share=share)
 
     def widen(self, variance: float) -> Rise:
-        """Return the rise with an additional independent error of the given variance, in the square of its unit.
-
-        The variance is added to the variance of the rise and to the variance of each part of its mixture. The rise
-        remains unchanged if it has no mixture, or if the variance is not positive.
-        """
+        """Return the rise, if it has a mixture, with an additional independent error of the `variance`, if positive."""
         if self.mixture is None or not variance > 0.0:
             return self
         mixture = self.mixture._replace(deviations=np.sqrt(self.mixture.deviations**2 + variance))
@@ -99,15 +92,12 @@ class Rise(NamedTuple):
 
     @property
     def score(self) -> float:
-        """The estimated rise, `value`, divided by its standard deviation."""
+        """The estimated rise divided by its standard deviation."""
         return self.value / self.deviation
 
     @property
     def chance(self) -> float:
-        """Probability that a healthy recording has a higher score (a one-sided p-value), over `share`, at most 1.
-
-        The score is the estimated rise over its standard deviation.
-        """
+        """Probability that a healthy recording has a higher score (a one-sided p-value), over `share`, at most 1."""
         from scipy.special import ndtr, stdtr
 
         if self.mixture is None:
@@ -118,10 +108,7 @@ class Rise(NamedTuple):
         return min(chance / max(self.share, TINY), 1.0)
 
     def threshold(self, chance: float) -> float:
-        """Compute the score whose p-value (`chance`) is the argument `chance`, between 0 and 1.
-
-        The score is the estimated rise of the leakage over its standard deviation.
-        """
+        """Compute the score whose p-value (the property `chance`) is the argument `chance`, between 0 and 1."""
         from scipy.special import stdtrit
 
         probability = 1.0 - chance * self.share
@@ -132,24 +119,17 @@ class Rise(NamedTuple):
     def log_ratio(self, rise: float, log_deviation: float = 0.0) -> float:
         """Compute the log likelihood ratio of a true rise of the leak's coefficient by `rise` to no rise.
 
-        Both hypotheses are compared with the estimate `value`; `rise` is in its unit. `log_deviation`: standard
-        deviation of the logarithm of the true rise about log(`rise`); 0 if the true rise is known to be `rise`. If the
-        true rise is known and `may_be_partial`, `value` may contain any fraction of it.
+        `rise` is in the unit of `value`, with which both hypotheses are compared. `log_deviation`: standard deviation
+        of the logarithm of the true rise about log(`rise`); 0 if the true rise is known to be `rise`. Then, if
+        `may_be_partial`, `value` may contain any fraction of it, over which the likelihood is averaged.
         """
         if log_deviation > 0.0 and rise > 0.0:
             return self._log_ratio_lognormal(rise, log_deviation)
+        densities = [self._log_density(self.value - rise)]
         if self.may_be_partial and rise > 0.0:
-            return self._log_ratio_partial(rise)
-        return self._log_density(self.value - rise) - self._log_density(self.value)
-
-    def _log_ratio_partial(self, rise: float) -> float:
-        """Compute the log likelihood ratio of a true rise by `rise` to none, if the recording shows a fraction of it.
-
-        `rise` is in the unit of `value`. The likelihood is averaged over fractions from 0 to 1.
-        """
-        densities = [self._log_density(self.value - part) for part in np.linspace(0.0, rise, NODES)]
-        if 0.0 < self.value < rise:  # the likeliest fraction, which the grid may miss
-            densities.append(self._log_density(0.0))
+            densities = [self._log_density(self.value - part) for part in np.linspace(0.0, rise, NODES)]
+            if 0.0 < self.value < rise:  # the likeliest fraction, which the grid may miss
+                densities.append(self._log_density(0.0))
         return float(np.logaddexp.reduce(densities) - np.log(len(densities))) - self._log_density(self.value)
 
     def log_ratio_within(self, rise: float, tail: float) -> float:
@@ -166,8 +146,7 @@ class Rise(NamedTuple):
     def _log_ratio_lognormal(self, rise: float, log_deviation: float) -> float:
         """Compute the log likelihood ratio of a true rise with a log-normal prior about `rise` to no rise.
 
-        `log_deviation`: standard deviation of the logarithm of the true rise. The likelihood is integrated over a
-        grid of true rises, which resolves both the prior and the likelihood.
+        `log_deviation`: standard deviation of its logarithm. The grid resolves both the prior and the likelihood.
         """
         grid_deviations = np.linspace(-MAX_LOG, MAX_LOG, NODES)
         grid = np.concatenate(
@@ -182,10 +161,7 @@ class Rise(NamedTuple):
         return log_max + float(np.log(max(np.trapezoid(np.exp(log_integrand - log_max), grid), TINY)))
 
     def _log_density(self, value: float) -> float:
-        """Compute the log probability density at `value` of the estimated rise if the recording is healthy.
-
-        `value` is in the unit of the leak's coefficient. A constant is left out.
-        """
+        """Compute the log probability density of the estimate `value` in a healthy recording, up to a constant."""
         if self.mixture is None:
             z = value / self.deviation
             if np.isinf(self.degrees_of_freedom):  # Student's t is then normal
@@ -195,17 +171,14 @@ class Rise(NamedTuple):
         log_weights = np.log(np.maximum(weights, np.finfo(float).tiny)) - np.log(deviations)
         return float(np.logaddexp.reduce(log_weights - 0.5 * ((value - centres) / deviations) ** 2))
 
-    def bound(self, probability: float = BOUND_PROBABILITY) -> float:
-        """Compute the upper bound of the true rise of the leakage, in the unit of the estimate.
+    def bound(self) -> float:
+        """Compute the 95 % upper bound of the true rise, in the unit of `value`; a negative `value` counts as zero.
 
-        The true rise is below it with the given probability. A negative estimate counts as zero:
+        The score threshold(0.95), which a healthy recording exceeds with this probability, is usually negative:
 
-            bound = max(value, 0) - threshold(probability) deviation,
-
-        where threshold(probability), usually negative, is the score that a healthy recording exceeds with this
-        probability.
+            bound = max(value, 0) - threshold(0.95) deviation.
         """
-        return max(self.value, 0.0) - self.threshold(probability) * self.deviation
+        return max(self.value, 0.0) - self.threshold(BOUND_PROBABILITY) * self.deviation
 
     def interval(self, probability: float = BOUND_PROBABILITY) -> tuple[float, float]:
         """Compute the central interval (low, high) that contains the true rise with the given `probability`."""
@@ -217,10 +190,9 @@ class Rise(NamedTuple):
 def rise_of_mixture(predicted: Mixture, values: Array) -> Rise:
     """Estimate the rise of a judged value over the value that healthy recordings predict for it.
 
-    `values` (s,): the judged value by s alternative estimates; `predicted`: mixture of predicted values of shape
-    (s, ...), for each of these estimates along the first axis, with log weights. The difference of judged and predicted
-    value follows the mixture over all estimates. The rise is its median, and the standard deviation half of its central
-    68 % interval.
+    `values` (s,): the judged value by s alternative estimates; `predicted`: mixture of predicted values of shape (s,
+    ...), with log weights. Their difference follows the mixture over all estimates. The rise is its median, and the
+    standard deviation half of its central 68 % interval.
     """
     judged = np.reshape(values, (-1, *[1] * (predicted.centres.ndim - 1)))  # (s, 1, ..., 1)
     log_weights, deviations = predicted.weights.ravel(), predicted.deviations.ravel()
@@ -237,8 +209,8 @@ def student_rise(value: float, deviations: Sequence[float] | Array, prior_scatte
     """Make a rise by `value` whose error follows Student's t, with the scatter of n healthy recordings as its scale.
 
     `deviations` (n,): deviation d_j of each healthy recording from the mean of the others; `prior_scatter`: prior
-    standard deviation s of a recording, which counts as much as m recordings (`scatter.freedom` of `priors.toml`). All
-    are in the unit of `value`. With m + n - 1 degrees of freedom,
+    standard deviation s of a recording, which counts as much as m recordings (`scatter.freedom` of `priors.toml`). With
+    m + n - 1 degrees of freedom,
 
         deviation^2 = (m s^2 + ((n - 1)/n)^2 sum d_j^2) / (m + n - 1) (1 + 1/n).
     """

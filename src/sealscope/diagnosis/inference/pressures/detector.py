@@ -33,31 +33,24 @@ class PressureResponse:
         self.rig = rig
 
     def usable(self, recording: Recording) -> str | None:
-        """Return the reason why this detector cannot use a recording; None means that the recording is usable."""
+        """Return the reason why this detector cannot use a recording; None means that it can."""
         return find_unmet_requirement(recording, self.rig)
 
     def reading(self, recording: Recording) -> ResponseLeak | None:
-        """Measure the leakage of a recording by the response of its pressures to the command.
-
-        None if the recording does not meet the requirements, or if no parameters of the model describe the response.
-        """
+        """Measure the leakage of a recording by the response of its pressures; None if that fails."""
         return response.measure_leak(recording, self.rig)
 
     def learn(self, recording: Recording) -> Summary | None:
-        """Summarise a healthy recording by the mean conductance past the piston [m^3/(s Pa)], with the key "level".
-
-        Return None if the leakage of the recording cannot be measured (`reading`).
-        """
+        """Summarise a healthy recording by its mean conductance past the piston [m^3/(s Pa)], or return None."""
         leak = self.reading(recording)
         return None if leak is None else {"level": leak.level[0]}
 
     def observe(self, recording: Recording, baseline: Sequence[Healthy] = ()) -> Observed:
         """Report on a recording: tests of the response's parameters for a step, and the leakage.
 
-        The leakage is compared with the leakage of the healthy recordings in `baseline`. The report also states how
-        much of the recording is judged: the fraction of samples that were recorded and not filled in, and the end of
-        the last of these samples. If the leakage cannot be measured or a leak would not show, the report states only
-        the reason (`lack`).
+        The leakage is compared with that of the healthy recordings in `baseline`. `share` and `judged_until` of the
+        report follow from the samples that were recorded and not filled in. If the leakage cannot be measured or a leak
+        would not show, the report states only the reason (`lack`).
         """
         leak = self.reading(recording)
         if leak is None:
@@ -75,8 +68,7 @@ def score_response_steps(information: Mapping[str, Information]) -> tuple[Observ
     """Test each parameter of the pressure response for a step, a sudden lasting change, up or down.
 
     `information`: likelihood of each parameter, by its name. The conductance "G" is tested for a step up only, since
-    leaks do not heal. The observables are sorted by score, the highest first; parameters that cannot be tested are
-    left out.
+    leaks do not heal. The highest score comes first; parameters that cannot be tested are left out.
     """
     observables = []
     for name, likelihood in information.items():

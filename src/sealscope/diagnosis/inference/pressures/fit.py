@@ -53,10 +53,7 @@ class Priors(NamedTuple):
 
     @property
     def unit(self) -> Array:
-        """Units (p,) in which the parameters are counted, small enough for finite differences.
-
-        They are `_DIFFERENCE` times the smaller of `width` and `wander`.
-        """
+        """Units (p,) in which the parameters are counted, small enough for finite differences."""
         return np.asarray(_DIFFERENCE * np.minimum(self.width, self.wander))
 
     @property
@@ -70,17 +67,17 @@ class Priors(NamedTuple):
         return np.asarray((self.width / self.unit) ** 2)
 
     def wander_variance(self, seconds: float) -> Array:
-        """Compute the variances (p,) that the random walks add within a time `seconds` [s], in squares of `unit`."""
+        """Compute the variances (p,) that the random walks add within a time [s], in squares of `unit`."""
         return np.asarray((self.wander / self.unit) ** 2 * (seconds / PRESSURE.blocks.wander))
 
 
 class Linearisation(NamedTuple):
     """Linearisation of the model's output over n samples about p parameters `theta` (p,).
 
-    `rows` (1 + p, n): residual [Pa], and derivative of the output by each parameter [Pa per unit]; `gram`
-    (1 + p, 1 + p): sums over the samples of the products of these rows with each other, after removal of the mains hum;
-    `ends`: simulated states at the last sample; `squares`: residual sums of squares [Pa^2] of all simulated parameter
-    sets, `theta` being the first.
+    `rows` (1 + p, n): residual [Pa], and derivative of the output by each parameter [Pa per unit]; `gram` (1 + p, 1 +
+    p): sums over the samples of the products of these rows with each other, after removal of the mains hum; `ends`:
+    simulated states at the last sample; `squares`: residual sums of squares [Pa^2] of all simulated parameter sets,
+    first `theta`.
     """
 
     theta: Array
@@ -90,10 +87,7 @@ class Linearisation(NamedTuple):
     squares: Array
 
     def cost(self, variance: float, prior: Normal) -> float:
-        """Compute -2 log posterior of the parameters `theta`, up to a constant.
-
-        `variance`: variance of the noise [Pa^2]; `prior`: prior on the parameters.
-        """
+        """Compute -2 log posterior of the parameters `theta`, up to a constant; `variance`: of the noise [Pa^2]."""
         deviations = prior.deviations(self.theta)
         # gram[0, 0] is the residual sum of squares
         return float(self.gram[0, 0] / variance + deviations @ prior.precision @ deviations)
@@ -103,9 +97,8 @@ class Block(NamedTuple):
     """Sums over a block of samples, from the linearisation about the block's parameters `theta` (p,).
 
     `gram` (1 + p, 1 + p): products of the residual and of the derivatives by each parameter with each other; `samples`:
-    number of known samples; `scores` (s, 1 + p): products of the residual and of the derivatives with the derivative by
-    the tested parameter, in each of s pieces of the block. The scatter of the scores shows the autocorrelation of the
-    residual.
+    number of known samples; `scores` (s, 1 + p): products of the same with the derivative by the tested parameter, in
+    each of s pieces of the block, whose scatter shows the autocorrelation of the residual.
     """
 
     theta: Array
@@ -134,9 +127,7 @@ class Joint:
     def fit(blocks: Sequence[Block], priors: Priors, block_s: float, parameter: int) -> Joint:
         """Fit the parameters of all blocks, each `block_s` [s] long, together.
 
-        `blocks`: sums over the samples of each block; `priors`: priors on the parameters; `parameter`: index of the
-        tested parameter, whose scores (`Block`) show how much the correlation of the noise inflates the variance of the
-        estimates.
+        `parameter`: index of the tested parameter, whose scores (`Block`) show the correlation of the noise.
         """
         theta = np.array([block.theta for block in blocks])
         prior_precision = _prior_precision(len(blocks), priors, block_s)
@@ -157,10 +148,8 @@ class Joint:
     def information(self, parameter: int, time: Array, wander: float) -> Information:
         """Compute the likelihood of one parameter in K blocks, with all other parameters eliminated, as `Information`.
 
-        A likelihood is stored as its precision matrix and the vector precision @ estimate. Both follow from the fitted
-        posterior by subtracting the prior of the fit. The result then has another prior: on a linear change and on a
-        random walk, both with the scale `wander` over all blocks. `parameter`: index of the parameter; `time` (K,):
-        middles of the blocks [s].
+        It follows from the fitted posterior by subtracting the prior of the fit. The result then has another prior: on
+        a linear change and on a random walk, both with the scale `wander` over all blocks. `time` (K,): [s].
         """
         indices = slice(parameter, None, self.theta.shape[1])  # the parameter in all blocks
         unit = self.priors.unit[parameter]
@@ -180,8 +169,7 @@ class Joint:
 def _prior_precision(n_blocks: int, priors: Priors, block_s: float) -> Array:
     """Compute the joint prior precision of p parameters in K blocks, each `block_s` [s] long, shape (K p, K p).
 
-    K is `n_blocks`. The parameters are in units of `priors.unit`. Each parameter is a random walk from block to block,
-    and its mean over the blocks has the prior standard deviation `priors.width` (`priors.normal`).
+    The parameters are in units of `priors.unit`. Each is a random walk whose mean has the prior `priors.normal`.
     """
     differences = np.diff(np.eye(n_blocks), axis=0)  # matrix (K - 1, K) of the changes from block to block
     walks = np.kron(differences.T @ differences, np.diag(1.0 / priors.wander_variance(block_s)))
@@ -193,9 +181,9 @@ def _prior_precision(n_blocks: int, priors: Priors, block_s: float) -> Array:
 def _estimate_noise(blocks: Sequence[Block], deviations: Array, parameter: int) -> tuple[float, float]:
     """Compute the variance of the residual [Pa^2], and its inflation in estimates by the correlation of the noise.
 
-    The inflation is the variance of the scores (`Block`) over their variance under white noise, at least 1. `blocks`:
-    sums over the samples of each block; `deviations` (K p,): deviations of the parameters from `theta` of each block,
-    in multiples of `Priors.unit`; `parameter`: index of the tested parameter.
+    The inflation is the variance of the scores (`Block`) over their variance under white noise, at least 1.
+    `deviations` (K p,): deviations of the parameters from `theta` of each block, in `Priors.unit`; `parameter`: the
+    tested one.
     """
     # residual at these deviations: (1, -deviations) times the rows of residual and Jacobian
     directions = [np.append(1.0, -deviation) for deviation in deviations.reshape(len(blocks), -1)]

@@ -35,10 +35,7 @@ def conductance_scale_error() -> float:
 
 
 def states_flow(rig: Rig) -> bool:
-    """Return True if the rig's file states the sizes that convert a fitted conductance to a flow in L/min.
-
-    These sizes are the piston areas and the moving mass.
-    """
+    """Return True if the rig's file states piston areas and moving mass, which convert a conductance to L/min."""
     return rig.states("cylinder.A_A", "cylinder.A_B", "cylinder.M_eq")
 
 
@@ -92,10 +89,9 @@ class ResponseLeak:
     def step_flow(self) -> Flow:
         """Mean flow [m^3/s] of a leak that begins within the recording, at the recording's mean abs(p_A - p_B).
 
-        It is the fitted step of the conductance, converted to a flow. The law of the leak is not known: an orifice of
-        the same fitted conductance has `ORIFICE_RATIO` times the flow of a laminar leak. The result is the mean of the
-        two flows. Its standard error includes their difference, as if the two were the ends of a 95 % interval. Without
-        a step test the flow is 0 with an infinite standard error.
+        The law of the leak is not known: an orifice of the same fitted conductance has `ORIFICE_RATIO` times the flow
+        of a laminar leak. The result is the mean of the two flows. Its standard error includes their difference, as if
+        the two were the ends of a 95 % interval. Without a step test the flow is 0 with an infinite standard error.
         """
         if self.step is None:
             return Flow(0.0, np.inf)
@@ -113,10 +109,7 @@ class ResponseLeak:
 
     @cached_property
     def rise(self) -> Rise | None:
-        """Excess of the mean conductance [m^3/(s Pa)] over that of the healthy recordings, with its distribution.
-
-        None if there are no healthy recordings.
-        """
+        """Excess of the mean conductance [m^3/(s Pa)] over that of the healthy recordings; None without these."""
         count = len(self.healthy)
         if not count:
             return None
@@ -143,23 +136,14 @@ class ResponseLeak:
     def step_rise(self) -> LeakRise | None:
         """Leakage above that of healthy recordings, and the evidence that a step within the recording caused it.
 
-        The step would raise the mean conductance of the recording by a certain amount. The evidence (`step_log_ratio`)
-        is the log likelihood ratio of such a rise to no rise. None without healthy recordings.
+        The evidence (`step_log_ratio`) is the log likelihood ratio of the rise of the mean conductance that the step
+        would cause to no rise. None without healthy recordings.
         """
         if self.rise is None:
             return None
         step = self.step
-        rise_by_step = 0.0 if step is None else step.fitted.size * self._fraction_after(step)
+        rise_by_step = 0.0 if step is None else step.fitted.size * self.information.fraction_after(step.onset().value)
         return LeakRise(self.rise, step_log_ratio=self.rise.log_ratio(rise_by_step))
-
-    def _fraction_after(self, step: StepTest) -> float:
-        """Compute the weight of the blocks after a step's onset in the mean conductance of the recording, 0 to 1.
-
-        A block has the weight of its precision.
-        """
-        weights = self.information.precision.sum(axis=0)
-        is_after = self.information.time >= step.onset().value
-        return float(np.clip(weights[is_after].sum() / max(weights.sum(), np.finfo(float).tiny), 0.0, 1.0))
 
     @property
     def lpm_per_flow(self) -> float | None:
@@ -171,11 +155,9 @@ class ResponseLeak:
         return None
 
     def total(self, detectable_flow: float | None) -> TotalLeakage:
-        """Return a `TotalLeakage` that states only the smallest detectable leak.
+        """Return a `TotalLeakage` that states only the smallest detectable leak, as the pressures show only changes.
 
-        The total leakage itself is None, as the pressures alone show only changes of it. `detectable_flow`: flow
-        [m^3/s] of the smallest leak that would be detected if it began within the recording, None if that was not
-        tested. The fields `findable_lpm` and `findable_share` state it in L/min and as a fraction of the pump's flow.
+        `detectable_flow`: flow [m^3/s] of the smallest leak that would be detected within the recording, or None.
         """
         (pump_flow, _), lpm_per_flow = self.pump_flow, self.lpm_per_flow
         return TotalLeakage(
@@ -187,10 +169,10 @@ class ResponseLeak:
         )
 
     def history(self, onset_s: float | None) -> LeakCourse | None:
-        """Compute the leakage over time [L/min], with its 95 % interval, relative to its mean before the onset.
+        """Compute the leakage over time [L/min], with its 95 % interval, relative to its mean before `onset_s` [s].
 
-        `onset_s`: onset of the leak [s]. The flow is midway between those of a laminar leak and of an orifice. Return
-        None without an onset or a step test, or if the rig's file does not state the machine's sizes.
+        The flow is midway between those of a laminar leak and of an orifice. Return None without an onset or a step
+        test, or if the rig's file does not state the machine's sizes.
         """
         if onset_s is None or self.step is None or not self.stated:
             return None

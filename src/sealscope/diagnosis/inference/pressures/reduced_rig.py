@@ -70,7 +70,7 @@ _MAX_STEP, _SEGMENT = 1.01e-3, 256
 def _direction_factor(v: float, theta: Parameters) -> float:
     """Compute the factor on the friction for the direction of the piston's speed v [m/s].
 
-    It is 1 + theta[SIDE] for motion out (v >= 0) and 1 - theta[SIDE] for motion in. `theta`: fitted parameters.
+    It is 1 + theta[SIDE] for motion out (v >= 0) and 1 - theta[SIDE] for motion in.
     """
     return select(v < 0.0, 1.0 - theta[SIDE], 1.0 + theta[SIDE])  # type: ignore[no-any-return]
 
@@ -80,8 +80,8 @@ def _steady_friction(v: float, theta: Parameters, m: Reduced) -> tuple[float, fl
     """Compute the friction of steady sliding at a speed v [m/s] by Stribeck's law.
 
     Returns the friction force [N], which falls linearly to zero below the creep speed `m.v_th`; the magnitude of the
-    force without this reduction [N]; and the magnitude of the speed, at least the creep speed [m/s]. `theta`: fitted
-    parameters; `m`: sizes of the rig.
+    force without this reduction [N]; and the magnitude of the speed, at least the creep speed [m/s]. `theta`:
+    parameters; `m`: sizes.
     """
     speed = max(abs(v), m.v_th)
     magnitude = stribeck_force(speed, theta[F_C], theta[K_BRK], theta[C_C]) * _direction_factor(v, theta)
@@ -94,8 +94,8 @@ def _advance_friction(
 ) -> tuple[float, float]:
     """Advance the friction force by LuGre's law over a time step h [s].
 
-    Returns the friction force after the step and the friction of steady sliding at the speed v, both [N].
-    `friction_0`, `steady_0`: the same two forces before the step; `theta`: fitted parameters; `m`: sizes of the rig.
+    Returns the friction force after the step and the friction of steady sliding at the speed v, both [N]. `friction_0`,
+    `steady_0`: the same two forces before the step; `theta`: fitted parameters; `m`: sizes of the rig.
 
     The law, without the damping of the contact, is c dF/dt = v - |v| F/F_m for the friction force F, with the contact's
     compliance c and the magnitude F_m of the steady friction (`_steady_friction`). The step is L-stable and of order 2:
@@ -115,9 +115,9 @@ def _advance_friction(
 def _rates(y: State, friction: float, omega_ref: float, theta: Parameters, m: Reduced) -> State:
     """Compute the time derivative of the state y = (p, v, omega, i, I, x) of the reduced rig.
 
-    The state contains p_A - p_B [Pa], the piston's speed [m/s], the motor's speed [rad/s] and current [A], the
-    integral of the speed error [rad], and the position [m]. `friction` [N]; `omega_ref`: commanded speed [rad/s];
-    `theta`: fitted parameters; `m`: sizes of the rig.
+    The state contains p_A - p_B [Pa], the piston's speed [m/s], the motor's speed [rad/s] and current [A], the integral
+    of the speed error [rad], and the position [m]. `friction` [N]; `omega_ref`: commanded speed [rad/s]; `theta`:
+    fitted parameters; `m`: sizes of the rig.
     """
     # p_A = p/2 and p_B = -p/2, so p changes twice as fast as p_A; 0.0: no leakage of the pump, no force of an end stop
     p, v, omega, i, integral, x = y
@@ -137,7 +137,7 @@ def _rates(y: State, friction: float, omega_ref: float, theta: Parameters, m: Re
 
 @contracted
 def _advance(y: State, h: float, k: State) -> State:
-    """Compute the state y + h k, i.e. the state y after a step h [s] with the derivative k."""
+    """Compute the state y + h k after a step h [s] with the derivative k."""
     return y[0] + h * k[0], y[1] + h * k[1], y[2] + h * k[2], y[3] + h * k[3], y[4] + h * k[4], y[5] + h * k[5]
 
 
@@ -209,8 +209,7 @@ def response_priors(rig: Rig, law: str = STRIBECK) -> Priors:
     """Compute the priors on the parameters `PARAMETERS` of the pressure response from the parameters of a rig.
 
     The table `[response]` of `priors.toml` states the prior of a parameter relative to the rig's value, or absolutely
-    if the rig has no such parameter. `law`: law of friction, one of `LAWS`. The Coulomb friction of the rig is that at
-    the charge pressure in both chambers.
+    if the rig has none; the Coulomb friction is that at the charge pressure. `law`: law of friction, one of `LAWS`.
     """
     friction, gain = rig.friction, rig.motor.omega_per_volt
     p_charge, of_difference = rig.fluid.p_charge, friction.coulomb_pressure == "difference"
@@ -225,8 +224,7 @@ def response_priors(rig: Rig, law: str = STRIBECK) -> Priors:
 class Machine(NamedTuple):
     """Simulator of the reduced rig.
 
-    `numbers`: sizes of the rig; `rate`: sampling rate [Hz]; `n_substeps`: number of integration steps from sample to
-    sample; `law`: law of friction, one of `LAWS`.
+    `rate`: sampling rate [Hz]; `n_substeps`: integration steps per sample; `law`: law of friction, one of `LAWS`.
     """
 
     numbers: Reduced
@@ -236,7 +234,7 @@ class Machine(NamedTuple):
 
     @staticmethod
     def from_rig(rig: Rig, rate: float, law: str = STRIBECK) -> Machine:
-        """Make the simulator of a rig for samples at a `rate` [Hz] and a `law` of friction, one of `LAWS`.
+        """Make the simulator of a rig for samples at a `rate` [Hz] and a `law` of friction.
 
         The piston has the mean area of both sides. The creep speed `v_th` is that of the law, else that of the rig.
         """
@@ -249,8 +247,7 @@ class Machine(NamedTuple):
         """Simulate p_A - p_B [Pa] at n samples for each of up to 16 parameter sets (m, p).
 
         `command` (n + 1,): command [V] at the sample before the first and at each of the n samples; `states` (8, m):
-        states at the sample before the first (`simulate_response`). Returns p_A - p_B (m, n), and the states at the
-        last sample (8, m).
+        states at the sample before the first (`simulate_response`). Returns p_A - p_B (m, n), and the last states.
         """
         lanes = np.minimum(np.arange(SINGLE_WIDTH), len(sets) - 1)  # unused lanes repeat the last set
         theta = np.ascontiguousarray(sets[lanes, : LAG + 1].T, dtype=np.float32)  # without scale and offset
@@ -272,9 +269,9 @@ class Machine(NamedTuple):
     def ringing_stiffnesses(self, dp: Array, total: Array, priors: Priors) -> Array:
         """Find the two stiffnesses of the oil [Pa] that correspond to the strongest ringing of p_A - p_B, shape (2,).
 
-        The ringing shows in the spectrum of `dp` (n,), i.e. p_A - p_B [Pa], minus the spectrum of `total` (n,), i.e.
-        p_A + p_B [Pa], which has the same noise and hum but does not ring. `priors`: priors on the parameters. If no
-        frequency of the spectrum lies within the prior of the stiffness, both results are the centre of this prior.
+        The ringing shows in the spectrum of `dp` (n,), i.e. p_A - p_B [Pa], minus that of `total` (n,), i.e. p_A + p_B
+        [Pa], which has the same noise and hum but does not ring. If no frequency of the spectrum lies within the prior
+        of the stiffness, both results are the centre of this prior.
         """
         relative_width = priors.width[K_OIL] / priors.centre[K_OIL]
         n_padded = 4 * _SEGMENT  # samples of a segment with zeros, for a finer grid of frequencies

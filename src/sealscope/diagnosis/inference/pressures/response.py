@@ -105,8 +105,7 @@ class Segment:
     def _project_on_waves(self, rows: Array) -> tuple[Array, Array, Array]:
         """Smooth rows (m, n) of n samples, set samples without a weight to 0, and fit k waves of mains hum to each row.
 
-        Returns the smoothed rows (m, n), their products with the waves (m, k), and the fitted amplitudes of the waves
-        (m, k).
+        Returns the smoothed rows (m, n), their products with the waves, and the waves' amplitudes, (m, k) each.
         """
         rows = gaussian_filter1d(rows, self.smooth) if self.smooth > 0.0 else rows
         if self.n_samples < rows.shape[1]:
@@ -115,10 +114,9 @@ class Segment:
         return rows, products, products @ self._wave_gram_inverse
 
     def residual_squares(self, sets: Array) -> Array:
-        """Compute the residual sum of squares of p_A - p_B [Pa^2] for each of up to 16 parameter sets (m, p).
+        """Compute the residual sum of squares of p_A - p_B [Pa^2] for each of up to 16 parameter sets (m, p), (m,).
 
-        The residual is recorded minus simulated p_A - p_B, without its mean and the mains hum. The result (m,) is
-        infinite for a set whose simulation diverges.
+        Its mean and the mains hum do not count. The result is infinite for a set whose simulation diverges.
         """
         states = self.states[:, np.zeros(len(sets), dtype=int)]  # each set starts from the state in column 0
         simulated, _ = self.machine.simulate(self.command, sets, states)
@@ -131,7 +129,7 @@ class Segment:
 
         The residual is dp - scale * simulated response - offset. The rows of the result are the residual of the first
         set, and the derivatives of scale * response + offset by each parameter, per unit of `priors.unit`. The other
-        sets are simulated only for their residual sums of squares, which `squares` of the result contains.
+        sets are simulated only for their residual sums of squares, `squares` of the result.
         """
         theta, n_sets = sets[0], len(sets)
         n_slopes = SPRING + 1  # the derivatives by the first parameters, up to SPRING, are simulated
@@ -153,7 +151,7 @@ class Segment:
         return Linearisation(theta, gram[:n_rows, :n_rows], rows[:n_rows], ends[:, : n_slopes + 1], squares)
 
     def _analytic_slopes(self, theta: Array, response: Array) -> Array:
-        """Compute the derivatives of the response by three parameters without simulation, (3, n).
+        """Compute the derivatives (3, n) of the response by three parameters without simulation.
 
         The parameters are the lead of the command, the lag of the transducers, and the scale of p_A - p_B, in units of
         `priors.unit`. `theta` (p,): all parameters; `response` (n,): simulated p_A - p_B [Pa].
@@ -169,10 +167,10 @@ class Segment:
     def descend(self, fit: Linearisation, prior: Normal, n_steps: int, noise: float | None = None) -> Linearisation:
         """Fit the parameters by up to `n_steps` Gauss-Newton steps, and return the linearisation at the best fit.
 
-        `fit`: linearisation at the start. The steps minimise -2 log posterior under a `prior`, with
-        Levenberg-Marquardt damping. `noise`: variance of the noise [Pa^2], None to estimate it from the residual.
-        Fractions of each step are simulated together with the Jacobian at the full step; if none is an improvement,
-        the step is damped. The fit ends if the expected decrease of -2 log posterior is below `_MIN_GAIN`.
+        `fit`: linearisation at the start. The steps minimise -2 log posterior under a `prior`, with Levenberg-Marquardt
+        damping. `noise`: variance of the noise [Pa^2], None to estimate it from the residual. Fractions of each step
+        are simulated together with the Jacobian at the full step; if none is an improvement, the step is damped. The
+        fit ends if the expected decrease of -2 log posterior is below `_MIN_GAIN`.
         """
         damping = 0.0
         for _ in range(n_steps):
@@ -199,8 +197,7 @@ class Segment:
     def bounds(self, theta: Array) -> tuple[Array, Array]:
         """Return lower and upper limits (p,) of the parameters after one step from `theta` (p,).
 
-        Parameters that must be positive can at most halve or double. The lag is at least 0, and the compliance at least
-        `_MIN`. The other parameters are not limited.
+        Parameters that must be positive can at most halve or double. Lag and compliance have lower limits.
         """
         low, high = np.full(theta.size, -np.inf), np.full(theta.size, np.inf)
         low[_POSITIVE], high[_POSITIVE] = 0.5 * theta[_POSITIVE], 2.0 * theta[_POSITIVE]
@@ -208,29 +205,25 @@ class Segment:
         return low, high
 
     def residual_variance(self, squares: float) -> float:
-        """Compute the variance of a residual [Pa^2] from its sum of squares [Pa^2].
+        """Compute the variance of a residual [Pa^2] from its sum of squares and the number of independent samples.
 
-        The sum is divided by the number of independent samples: smoothing by a Gaussian of width sigma [samples]
-        correlates the noise over 2 sqrt(pi) sigma samples.
+        Smoothing by a Gaussian of width sigma [samples] correlates the noise over 2 sqrt(pi) sigma samples.
         """
         count = max(self.n_samples - len(PARAMETERS), 1.0)
         # a sum of at least 1 Pa^2, since the variance is a divisor elsewhere
         return max(squares, 1.0) / count * max(1.0, 2.0 * math.sqrt(math.pi) * self.smooth)
 
     def is_explained(self, cost: float) -> bool:
-        """Return True if a fit explains the n samples: its chi-squared `cost` does not exceed n by much.
+        """Return True if a fit explains the n samples: its chi-squared `cost` is at most n + c sqrt(2 n).
 
-        The limit is n + c sqrt(2 n), i.e. c standard deviations above the mean of the chi-squared distribution, with
-        c = `follow.unexplained` of `priors.toml`.
+        That is c = `follow.unexplained` (`priors.toml`) standard deviations above the mean of chi-squared.
         """
         return bool(cost <= self.n_samples + _FOLLOW.unexplained * math.sqrt(2.0 * self.n_samples))
 
     def block_sums(self, fit: Linearisation) -> Block:
         """Reduce a linearised fit of these samples to the sums for the joint fit of all blocks (`fit.Joint`).
 
-        With d_G, the derivative by the leakage conductance G, the scores of one second are the sums over its samples of
-        d_G times the residual, and of d_G times the derivative by each parameter. The scores have the shape (s, 1 + p)
-        for s seconds, of which the last may be incomplete. The mains hum is projected out.
+        The tested parameter is the leakage conductance G, with scores for each second; the mains hum is projected out.
         """
         rows = fit.rows - (fit.rows @ self.waves.T) @ self._wave_gram_inverse @ self.waves
         first = np.arange(0, self.dp.size, round(self.machine.rate))  # index of the first sample of each second
@@ -243,8 +236,8 @@ def fit_from_priors(segment: Segment, total: Array, noise: float) -> Linearisati
 
     The ringing causes many local minima. Therefore the slow part of p_A - p_B is fitted first, from the best of several
     gains and stiffnesses of the load. Then the unsmoothed p_A - p_B is fitted from several breakaway forces and several
-    stiffnesses of the oil, two of them by the strongest ringing (`Machine.ringing_stiffnesses`). `total` (n,): sum
-    p_A + p_B of the pressures [Pa]; `noise`: variance of the noise [Pa^2].
+    stiffnesses of the oil, two of them by the strongest ringing (`Machine.ringing_stiffnesses`). `total` (n,): p_A +
+    p_B [Pa]; `noise`: variance of the noise [Pa^2].
     """
     priors = segment.priors
 
@@ -252,8 +245,7 @@ def fit_from_priors(segment: Segment, total: Array, noise: float) -> Linearisati
         """Sort 16 variants of the parameters `theta` (p,) by their fit to a section, within each of several groups.
 
         `values` maps the index of a varied parameter to its value in each variant (16,). Consecutive variants form
-        `n_groups` groups. The result has the shape (16/n_groups, n_groups, p); row 0 contains the variant with the
-        smallest residual of each group.
+        `n_groups` groups. The result has the shape (16/n_groups, n_groups, p), the best of each group first.
         """
         sets = np.tile(theta, (SINGLE_WIDTH, 1))
         for parameter, column in values.items():
@@ -282,8 +274,7 @@ def fit_from_priors(segment: Segment, total: Array, noise: float) -> Linearisati
 def fit_from_starts(segment: Segment, starts: Sequence[Array] | Array, noise: float, n_best: int) -> Linearisation:
     """Fit the parameters to the samples `segment` from several starts (s, p), and return the best fit.
 
-    The fit makes a few Gauss-Newton steps from all starts, and then more steps from the `n_best` best results. `noise`:
-    variance of the noise [Pa^2].
+    A few Gauss-Newton steps from all starts are followed by more from the `n_best` best. `noise`: variance [Pa^2].
     """
     fits, prior = [segment.linearise(start[None]) for start in starts], segment.priors.normal
     for n_steps, n_kept in ((_N_STEPS // 6, n_best), (_N_STEPS, 1)):
@@ -296,8 +287,7 @@ def fit_from_starts(segment: Segment, starts: Sequence[Array] | Array, noise: fl
 class Follower:
     """Iterated Kalman filter that tracks the parameters of the pressure response from block to block.
 
-    `machine`: simulator; `priors`: priors of its parameters; `sense`: 1 if p_A - p_B rises with the command, -1 if it
-    falls.
+    `machine`: simulator; `priors`: priors of its parameters; `sense`: 1 if p_A - p_B rises with the command, else -1.
     """
 
     def __init__(self, machine: Machine, priors: Priors, sense: float) -> None:
@@ -341,10 +331,7 @@ class Follower:
         return follower
 
     def _converge_on_beginning(self, recording: Recording) -> None:
-        """Refine the parameters by filtering the beginning of a recording, then reset covariance and simulated states.
-
-        The filter can then start again at the first sample, with better parameters.
-        """
+        """Refine the parameters by filtering the beginning of a recording, to start again at the first sample."""
         covariance, states = self.covariance, self.states
         length = round(_FOLLOW.block * recording.rate)
         # blocks that begin before `stop` lie within the recording
@@ -354,10 +341,9 @@ class Follower:
         self.covariance, self.states, self.last = covariance, states, math.nan
 
     def at_rate(self, rig: Rig, rate: float) -> Follower:
-        """Make a filter for samples at another `rate` [Hz] that starts from the state of this filter.
+        """Make a filter for samples of the same machine at another `rate` [Hz] that continues from this one.
 
-        `rig`: the same machine as before. Parameters, covariance and simulated states are kept, but there is no
-        previous sample: as after a gap, the next block starts the simulation anew (`next_segment`).
+        There is no previous sample: as after a gap, the next block starts the simulation anew (`next_segment`).
         """
         follower = Follower(Machine.from_rig(rig, rate, self.machine.law), self.priors, self.sense)
         follower.theta, follower.covariance = self.theta, self.covariance
@@ -376,8 +362,7 @@ class Follower:
     def next_segment(self, block: Recording) -> Segment:
         """Prepare the samples of the next block for a fit.
 
-        At the start and after a gap, the simulation starts at a position that centres the stroke, and the first
-        samples have no weight because the drive is still settling.
+        At the start and after a gap the stroke is centred, and while the drive settles samples have no weight.
         """
         u, n = block["u"], len(block)
         sample_weights = np.ones(n) if block.bridged is None else (~block.bridged).astype(float)
@@ -399,10 +384,9 @@ class Follower:
         )
 
     def _prior(self, block_s: float, jumped: int | None = None) -> Normal:
-        """Compute the prior on the parameters in the next block, which is `block_s` [s] long.
+        """Compute the prior on the parameters in the next block, of `block_s` [s].
 
-        `jumped`: index of a parameter that may have jumped, whose variance increases by its whole prior variance. None
-        if no parameter has jumped.
+        The parameter with the index `jumped` may have jumped: its variance increases by its whole prior variance.
         """
         variance = self.priors.wander_variance(block_s)
         if jumped is not None:
@@ -412,10 +396,9 @@ class Follower:
     def _fit_block(self, segment: Segment, block_s: float) -> tuple[Linearisation, Normal]:
         """Fit the parameters to the next block of samples; return the fit and the prior that it used.
 
-        `segment`: the samples of that block as prepared by `next_segment`; `block_s` [s]: their duration, by which the
-        prior is widened. If slow variations of the parameters do not explain the block, fits with a jump of the
-        conductance or of the oil's stiffness are tried as well, and the one with the highest posterior density is
-        returned. The state of the filter is not changed; `update` advances it.
+        `block_s` [s]: duration of the `segment`, by which the prior is widened. If slow variations of the parameters do
+        not explain the block, fits with a jump of the conductance or of the oil's stiffness are tried as well, and the
+        one with the highest posterior density is returned. `update` advances the filter.
         """
 
         def fit_candidate(start: Array, prior: Normal) -> tuple[float, Linearisation, Normal]:
@@ -436,11 +419,7 @@ class Follower:
         return fit, prior
 
     def update(self, block: Recording) -> Block:
-        """Fit the next block of samples, and return its sums for a joint fit of all blocks (`fit.Joint`).
-
-        This updates the filter: the parameters, their covariance, the simulated states, the last command, and the
-        misfit `excess` of the block, (chi squared - n) / sqrt(2 n) for n samples.
-        """
+        """Advance the filter by the next block of samples, and return its sums for a joint fit of all blocks."""
         segment = self.next_segment(block)
         fit, prior = self._fit_block(segment, block.duration)
         chi_squared = fit.cost(self.variance, prior)
@@ -461,10 +440,7 @@ def fit_response(recording: Recording, rig: Rig) -> Joint | None:
     """
 
     def compute_fit(recording: Recording) -> Joint | None:
-        """Track the parameters of the pressure response through all blocks, then fit all blocks together.
-
-        Returns None if the fit fails or explains too little of the variance of p_A - p_B.
-        """
+        """Track the parameters through all blocks, then fit these together; None if that fails or explains little."""
         edges = block_edges(recording).tolist()
         with np.errstate(over="ignore", invalid="ignore"):
             try:
@@ -483,8 +459,7 @@ def fit_response(recording: Recording, rig: Rig) -> Joint | None:
 def measure_leak(recording: Recording, rig: Rig) -> ResponseLeak | None:
     """Measure the leakage of a recording without position by the response of its pressures.
 
-    Return None if the recording does not meet the requirements, or if no parameters of the response describe it. `rig`:
-    assumed machine, which gives sizes and priors.
+    Return None if it does not meet the requirements, or if no parameters describe the response under `rig`.
     """
     joint = fit_response(recording, rig) if find_unmet_requirement(recording, rig) is None else None
     if joint is None:
@@ -499,13 +474,11 @@ def measure_leak(recording: Recording, rig: Rig) -> ResponseLeak | None:
 
 
 def parameter_information(joint: Joint, time: Array, seconds: float) -> dict[str, Information]:
-    """Compute how well the fit of K blocks determines each parameter of the pressure response in each block.
+    """Compute the likelihood of each parameter's values in K blocks, by its name, from the joint fit of all blocks.
 
-    Returns, by the name of the parameter, the Gaussian likelihood of its K values (`Information`), from which all other
-    parameters are eliminated. The likelihood has priors on a linear change and on a random walk of the parameter. Their
-    standard deviations over a recording grow with the root of the recording's length. The priors of the leakage
-    conductance G are those of a healthy machine. `joint`: fit of all blocks; `time` (K,): middles of the blocks [s];
-    `seconds`: length of the recording [s].
+    All other parameters are eliminated. The priors on a linear change and on a random walk of the parameter grow with
+    the root of the recording's length; those of the leakage conductance G are those of a healthy machine. `time` (K,):
+    middles of the blocks [s]; `seconds`: length of the recording [s].
     """
     growth = math.sqrt(seconds / PRESSURE.blocks.wander)  # random walk in the recording over that in `blocks.wander`
     wander = growth * joint.priors.wander

@@ -18,11 +18,10 @@ if TYPE_CHECKING:
 
 
 def find_unmet_requirement(recording: Recording, rig: Rig) -> str | None:
-    """Find the first requirement of a fit of the pressure response that a recording does not meet.
+    """Find the first requirement of a fit of the pressure response that a recording does not meet, as a text, or None.
 
     The fit needs the command [V] and both pressures [Pa] of a pump that drives a cylinder of two equal areas, recorded
-    for long enough and at a high enough rate, without missing samples. Return the requirement as a text, or None if all
-    requirements are met.
+    for long enough and at a high enough rate, without missing samples.
     """
     blocks = PRESSURE.blocks
     if not rig.circuit.pump_feeds_chambers:
@@ -58,8 +57,8 @@ def block_edges(recording: Recording) -> NDArray[np.int64]:
 def mains_waves(total: Array, rate: float) -> Array:
     """Compute the cosine and sine waves of the mains hum and its harmonics at n samples, shape (2 m, n).
 
-    The fundamentals are the strongest lines near 50 and near 60 Hz in the spectrum of `total` (n,), the sum p_A + p_B
-    of the pressures. `rate`: sampling rate [Hz]. Only the m frequencies below half the rate are used.
+    The fundamentals are the strongest lines near 50 and near 60 Hz in the spectrum of `total` (n,), p_A + p_B. `rate`:
+    sampling rate [Hz]. Only the m frequencies below half the rate are used.
     """
     n_padded = 4 * total.size  # zero-padded for a finer grid of frequencies
     spectrum = np.abs(np.fft.rfft((total - total.mean()) * np.hanning(total.size), n_padded))

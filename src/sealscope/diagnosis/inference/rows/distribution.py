@@ -26,9 +26,9 @@ _ORDER = 6
 def sorted_part_means(pressure: Array, rate: float) -> Array:
     """Summarise the distribution of a pressure by the means of `PARTS` equal parts of its sorted samples [Pa].
 
-    The spread due to white noise is removed first, as described in the module. `pressure` (n,): samples [Pa] at the
-    sampling `rate` [Hz], NaN where missing. Samples are used in pieces of `SMOOTHED` seconds, and only whole pieces
-    within whole strides of the weak form count. The means, of shape (PARTS,), are zeros if all samples are missing.
+    The spread due to white noise is removed first (see the module). `pressure` (n,): samples [Pa] at the sampling
+    `rate` [Hz], NaN where missing. They are used in pieces of `SMOOTHED` seconds, and only whole pieces within whole
+    strides of the weak form count. The means (PARTS,) are zeros if all samples are missing.
     """
     piece = max(1, round(SMOOTHED * rate))  # averaging time [samples]
     stride = min(stride_samples(rate), max(len(pressure), 1))  # [samples]

@@ -36,8 +36,7 @@ _Indices = NDArray[np.intp]
 class Workspace(NamedTuple):
     """Scratch arrays of `weigh_rows`, for r rows of K blocks.
 
-    The c columns are fast ones with a coefficient in each block, s slow ones with one coefficient for all blocks, and
-    the left side.
+    The c columns are fast ones with a coefficient in each block, s slow ones with one for all, and the left side.
 
     - `weights`, `residual` (r,): weight and magnitude of the residual of each row;
     - `ordered` (r,): copy of `residual`, which the median reorders;
@@ -57,8 +56,7 @@ class Workspace(NamedTuple):
 def workspace_shapes(rows: int, blocks: int, columns: int, slow: int) -> tuple[tuple[int, ...], ...]:
     """Return the shapes of the scratch arrays of a `Workspace`, in the order of its fields.
 
-    `columns`: number of columns, including the left side; `slow`: number of slow columns, i.e. with the same
-    coefficient in all blocks, without the left side.
+    `columns` includes the left side, `slow` (the number of columns with one coefficient for all blocks) does not.
     """
     return (rows,), (rows,), (rows,), (blocks, columns, columns), (blocks, columns - 1), (slow + 1, slow + 1)
 
@@ -112,10 +110,7 @@ def median(values: Any, n: int) -> float:
 
 @law
 def _sum_products(values: Any, begin: int, end: int, weights: Any, gram: Any) -> None:
-    """Compute the Gram matrix of the rows `begin` to `end` - 1 of `values` (r, m), with `weights` (r,).
-
-    The result is written to `gram` (m, m).
-    """
+    """Write the Gram matrix of the rows `begin` to `end` - 1 of `values` (r, m), with `weights` (r,), to `gram`."""
     width = values.shape[1]
     for i in range(width):
         for j in range(width):
@@ -144,9 +139,8 @@ def _eliminate_fast(gram: Any, column_order: Any, n_fast: int, reduced: Any) -> 
 def _reweigh(values: Any, ends: Any, column_order: Any, workspace: Any) -> bool:
     """Compute Huber's weights of the rows from the residuals of the current fit; return True once they have converged.
 
-    They have converged if their mean relative change is below `TOLERANCE`, or if the median residual is 0. `values`
-    (r, m): rows; `ends`: index past the last row of each block; `column_order`: indices of the fitted columns, the left
-    side last; `workspace`: a `Workspace` with the fit, whose weights and residuals are replaced.
+    Their mean relative change is then below `TOLERANCE`, or the median residual is 0. `values`, `ends`, `column_order`,
+    `workspace`: as in `weigh_rows`; weights and residuals of the workspace are replaced.
     """
     count, left, block = len(values), len(column_order) - 1, 0  # left: position of the left side in `column_order`
     for r in range(count):
@@ -234,10 +228,8 @@ def block_gram_matrices(
 ) -> Array:
     """Compute the Gram matrices (K, m, m) of K blocks from rows with Huber's weights, and update `earlier_sums`.
 
-    `values` (r, m): rows of all blocks; `ends` (K,): index past the last row of each block; `fast`: indices of the
-    columns whose coefficients are free in each block; `slow`: indices of the columns with one coefficient for all
-    blocks, the left side last. `earlier_sums`: sums over earlier blocks for the slow columns, the prior of the fit;
-    they move towards the sums of these blocks by the fraction `update_fraction` of the difference (`weigh_rows`).
+    `fast`: indices of the columns whose coefficients are free in each block; `slow`: those with one coefficient for all
+    blocks, the left side last. For the other arguments see `weigh_rows`.
     """
     column_order = np.concatenate([fast, slow])
     shapes = workspace_shapes(rows=len(values), blocks=len(ends), columns=len(column_order), slow=len(slow) - 1)

@@ -50,10 +50,7 @@ class Rows(NamedTuple):
 
 
 def stride_samples(rate: float) -> int:
-    """Compute the distance of neighbouring test functions of the weak form [samples], at least 1.
-
-    `rate`: sampling rate [Hz]. The distance is `STRIDE` seconds at any rate.
-    """
+    """Compute the distance of neighbouring test functions of the weak form [samples], at least 1, at a `rate` [Hz]."""
     return max(1, round(STRIDE * rate))
 
 
@@ -72,18 +69,12 @@ def test_function(rate: float) -> Array:
 
 @lru_cache(maxsize=8)
 def _transposed_test_function(rate: float) -> Array:
-    """Return the transpose of `test_function`, shape (stride, SPAN), in the memory order that BLAS reads fastest.
-
-    `rate`: sampling rate [Hz].
-    """
+    """Return the transpose (stride, SPAN) of `test_function`, in the memory order that BLAS reads fastest."""
     return np.ascontiguousarray(test_function(rate).T)
 
 
 def _variance_inflation() -> float:
-    """Compute by how much the overlap of test functions increases the variance of a sum over rows of white noise.
-
-    The factor is the sum of the correlations of a test function with itself and with its neighbours on either side.
-    """
+    """Compute the factor by which the overlap of test functions inflates the variance of a sum over their rows."""
     phi = test_function(_FINE_RATE).ravel()
     stride, energy = len(phi) // SPAN, float(phi @ phi)
     return 1.0 + 2.0 * sum(float(phi[k * stride :] @ phi[: -k * stride]) / energy for k in range(1, SPAN))
@@ -98,10 +89,9 @@ def weak_form_rows(increments: Sequence[Array], rate: float) -> Rows:
 
     `increments`: an array (n,) for each of the c columns, with NaN for missing samples; `rate`: sampling rate [Hz].
 
-    The samples are divided into pieces whose length is the distance of neighbouring test functions (`stride_samples`).
-    A test function spans `SPAN` pieces; there is one row for each test function that lies within the samples. A piece
-    with a missing sample, or with integrals beyond `MAX_READING`, counts as zeros, and the rows that contain it are not
-    flagged as `whole`.
+    The samples are divided into pieces as long as the distance of neighbouring test functions (`stride_samples`), of
+    which a test function spans `SPAN`. There is one row for each test function that lies within the samples. A piece
+    with a missing sample, or with integrals beyond `MAX_READING`, counts as zeros, and its rows are not `whole`.
     """
     stride = stride_samples(rate)
     n_pieces = len(increments[0]) // stride
@@ -121,10 +111,10 @@ def weak_form_rows(increments: Sequence[Array], rate: float) -> Rows:
 
 
 def weights_near_holes(holes: Array, rate: float) -> Array:
-    """Compute the weight of each row of the regression: the fraction of its test function outside of holes.
+    """Compute the weight (r,) of each row of the regression: the fraction of its test function outside of holes.
 
-    Holes are long gaps of missing samples that were filled in. `holes` (n,): 1 for a sample in a hole, else 0;
-    `rate`: sampling rate [Hz]. The weights (r,) are between 0 and 1; a weight below `MIN_WEIGHT` is replaced by 0.
+    `holes` (n,): 1 for a sample in a hole, a long gap of missing samples that was filled in, else 0; `rate`: sampling
+    rate [Hz]. A weight below `MIN_WEIGHT` is replaced by 0.
     """
     # length [s] of each sampling interval that touches a hole, else 0: its integral is the fraction in holes
     hole_time = np.maximum(holes[1:], holes[:-1]) / rate

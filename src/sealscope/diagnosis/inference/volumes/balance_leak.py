@@ -17,14 +17,13 @@ from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSum
 from sealscope.diagnosis.inference.comparison.rise import Mixture, Rise
 from sealscope.diagnosis.inference.leak_law import (
     EXPONENTS,
-    LawWeight,
     estimate_rise_flow,
     estimate_step_flow,
     law_priors,
     mixture_flow,
 )
 from sealscope.diagnosis.inference.observable import Flow, LeakRise, Remark
-from sealscope.diagnosis.inference.onset import BOUND_PROBABILITY, UPPER_95, WITHIN_95, Interval, StepTest
+from sealscope.diagnosis.inference.onset import BOUND_PROBABILITY, UPPER_95, WITHIN_95, Interval, StepTest, fit_history
 from sealscope.diagnosis.inference.volumes.recorded import RecordedBalance
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.diagnosis.verdict.evidence import Cause, LeakCourse, RelativeLeak, TotalLeakage
@@ -37,8 +36,8 @@ class _HoldLaws(NamedTuple):
     """Leak past the piston, fitted to the times in which shut valves hold the load, under k laws of flow.
 
     A law is an exponent of `EXPONENTS` (1 laminar, 0.5 orifice) with a growth of the leak; the first law is laminar
-    without growth. All fields have the shape (k,). `weights`: probability of each law, with the sum 1; `units`: mean
-    flow [m^3/s] for a coefficient of 1; `flows`, `deviations`: fitted mean flows and their standard deviations [m^3/s].
+    without growth. `weights` (k,): probability of each law, with the sum 1; `units`: mean flow [m^3/s] for a
+    coefficient of 1; `flows`, `deviations`: fitted mean flows and their standard deviations [m^3/s].
     """
 
     weights: Array
@@ -73,10 +72,9 @@ class BalanceLeak:
         """Cause of a leak, such as "piston leak", or "piston or pump leak" if the balance cannot separate them.
 
         - "internal or external leak" if only the creep of a held load is known: leaking valves and lines cause it, too.
-        - "piston leak" if a servo valve drives the cylinder.
-        - "piston leak" also if holds measure the leakage, i.e. times in which shut valves separate the pump from the
-          loaded cylinder. The balance must assume such valves at every rest, or the leakage in the holds must be too
-          high for a healthy machine.
+        - "piston leak" if a servo valve drives the cylinder, or if holds measure the leakage, i.e. times in which shut
+          valves separate the pump from the loaded cylinder. The balance must assume such valves at every rest, or the
+          leakage in the holds must be too high for a healthy machine.
         - "piston or pump leak" otherwise.
         """
         if self.balance.is_creep:
@@ -96,8 +94,8 @@ class BalanceLeak:
     def step_flow(self) -> Flow:
         """Mean flow [m^3/s] of a leak that begins within the recording, from its onset to the end.
 
-        The flow is averaged over the laws, growths and onsets of the leak, and combined with the flow that shows while
-        shut valves hold the load (`_mix_with_holds`). Without a step test it is 0 with an infinite standard error.
+        It is averaged over the laws, growths and onsets of the leak, and combined with the flow in holds
+        (`_mix_with_holds`). Without a step test it is 0 with an infinite standard error.
         """
         balance, test = self.balance, self.balance.test
         if test is None:
@@ -111,11 +109,7 @@ class BalanceLeak:
         return self.balance.mean_pressure()
 
     def _add_law_uncertainty(self, flow: Flow) -> Flow:
-        """Add to a flow's standard error the uncertainty of how the leak's flow depends on the pressure (its law).
-
-        The law lies between laminar flow and an orifice. Its uncertainty, which includes the error of averaged
-        pressures, is the fraction `size.law` (`priors.toml`) of the flow; the two errors are added in quadrature.
-        """
+        """Add the uncertainty of a leak's law, the fraction `size.law` (`priors.toml`), to a flow's standard error."""
         law: float = INFERENCE.size.law
         return Flow(flow.value, float(np.hypot(flow.deviation, flow.value * law)))
 
@@ -123,8 +117,7 @@ class BalanceLeak:
     def rise(self) -> Rise | None:
         """Amount by which the mean leakage [m^3/(s Pa)] exceeds that of healthy recordings; None without these.
 
-        Of `_rises`, measured over the whole recording and while shut valves hold the load, the one with the smallest
-        p-value counts, that in holds if both are equal.
+        Of `_rises`, the one with the smallest p-value counts, that in holds if both are equal.
         """
         return min(self._rises.values(), key=lambda rise: rise.chance, default=None)
 
@@ -132,10 +125,9 @@ class BalanceLeak:
     def _rises(self) -> dict[bool, Rise]:
         """Rises of the leakage over healthy recordings, with their shares of the false alarms; empty without these.
 
-        The key False is for the rise over the whole recording, True for that in holds, i.e. while shut valves hold the
-        load (`_hold_rise`). Holds do not show a leak that begins after them. With the prior probability s of such a
-        leak, the rise over the whole recording may use the fraction s of the false alarms, that in holds the rest
-        (weighted Bonferroni correction).
+        The key False is for the rise over the whole recording, True for that in holds (`_hold_rise`). Holds do not show
+        a leak that begins after them. With the prior probability s of such a leak, the rise over the whole recording
+        may use the fraction s of the false alarms, that in holds the rest (weighted Bonferroni correction).
         """
         motion_rise, hold_rise, chambers = self._motion_rise, self._hold_rise, self.balance.chambers
         if motion_rise is None:
@@ -156,8 +148,7 @@ class BalanceLeak:
     def _hold_rise(self) -> Rise | None:
         """Rise of the leakage over healthy recordings [m^3/(s Pa)], from the times in which shut valves hold the load.
 
-        None without such times (holds). Also None if the rise from holds shows no leak and is not precise enough to
-        replace the rise from the whole recording.
+        None without such times (holds), or if it shows no leak and is less precise than that of the whole recording.
         """
         motion_rise = self._motion_rise
         if not self.balance.locked or motion_rise is None:
@@ -171,10 +162,7 @@ class BalanceLeak:
 
     @cached_property
     def rise_flow(self) -> Flow:
-        """Mean flow [m^3/s] of the leakage above that of healthy recordings, from the onset of the leak to the end.
-
-        Without healthy recordings it is the mean of the total leakage over the recording.
-        """
+        """Mean flow [m^3/s] of the leakage above healthy recordings from its onset on; of all leakage without these."""
         balance = self.balance
         if self.rise is None:
             value, low, high = (balance.mean_pressure() * conductance for conductance in balance.conductance)
@@ -195,8 +183,8 @@ class BalanceLeak:
     def _mix_with_holds(self, flow: Flow) -> Flow:
         """Combine the flow of a leak over the whole recording with its flow during holds, if the holds show a leak.
 
-        A hold is a time in which shut valves hold the load. The two estimates are averaged; the one from holds has the
-        weight `held_oil.right` of `priors.toml`, the probability that it is right if the two disagree.
+        In a hold shut valves keep the load in place. The estimate from holds has the weight `held_oil.right` of
+        `priors.toml`, the probability that it is right if the two disagree.
         """
         hold_rise, prior = self._hold_rise, INFERENCE.held_oil
         if hold_rise is None or not hold_rise.chance < prior.rare:
@@ -206,9 +194,9 @@ class BalanceLeak:
 
     @property
     def rise_onset(self) -> Interval | None:
-        """Onset [s] of the leakage above that of healthy recordings, from the times in which shut valves hold the load.
+        """Onset [s] of the leakage above healthy recordings, from holds, in which shut valves keep the load in place.
 
-        None if these times (holds) do not clearly show the leakage, or if the leak may have begun before them.
+        None if these do not clearly show the leakage, or if the leak may have begun before them.
         """
         hold_rise, chambers = self._hold_rise, self.balance.chambers
         if hold_rise is None or chambers is None or not hold_rise.chance < INFERENCE.held_oil.rare:
@@ -216,10 +204,9 @@ class BalanceLeak:
         return chambers.piston_onset
 
     def _hold_flow(self, hold_rise: Rise) -> Flow:
-        """Estimate the mean flow of the leak that shows while shut valves hold the load.
+        """Estimate the mean flow of the leak that shows while shut valves hold the load, averaged over its laws.
 
-        The flow is averaged over the laws of the leak, weighted by their likelihoods. `hold_rise`: rise of the leakage
-        over healthy recordings in these times, whose variance is added to the variance of the fits.
+        The variance of `hold_rise`, the rise over healthy recordings in these times, is added to that of the fits.
         """
         laws = self._hold_laws
         low, high = hold_rise.interval()
@@ -232,9 +219,8 @@ class BalanceLeak:
         """Fit a leak past the piston to the times in which shut valves hold the load, for each law and piston area.
 
         A law is an exponent of `EXPONENTS` and a relative growth of the coefficient between onset and end
-        (`growth_priors`); the flow is the coefficient times abs(p_A - p_B)^exponent. Each law is fitted with each area
-        of `HeldChambers.area_variants`. The weights of the laws with one area are proportional to the likelihood of the
-        fit times the prior probabilities of exponent and growth, and their sum is the probability of that area.
+        (`growth_priors`); the flow is the coefficient times abs(p_A - p_B)^exponent. Each is fitted with each area of
+        `HeldChambers.area_variants`, whose weights sum to the probability of that area.
         """
         chambers = self.balance.chambers
         assert chambers is not None
@@ -261,7 +247,7 @@ class BalanceLeak:
         deviations = np.sqrt(noise_deviations**2 + oil_deviations**2 + (start_errors * values) ** 2)
         return _HoldLaws(weights / weights.sum(), np.array(units), values * units, deviations * units)
 
-    def _rise_laws(self) -> list[LawWeight]:
+    def _rise_laws(self) -> list[tuple[float, float]]:
         """Weigh the laws of a leak's flow, such as laminar, by their fit to the rise over healthy recordings.
 
         Returns for each law its mean flow for a fitted laminar coefficient of 1, and its log weight. A law with an
@@ -270,20 +256,19 @@ class BalanceLeak:
             flow = laminar^(1 - f) orifice^f,    log weight = log prior + f N L,
 
         where L is the log likelihood ratio of an orifice to a laminar leak for one residual, and N = `size.readings`
-        (`priors.toml`) the number of independent residuals in a recording. If the laws cannot be compared, each has the
-        laminar flow and the log weight 0.
+        (`priors.toml`) the number of independent residuals. If L is unknown, all laws have the laminar flow.
         """
         balance = self.balance
         laminar_flow = balance.mean_pressure()
         fit = compare_laws(balance.recording_sums, self.healthy, balance.columns)
         if fit is None:
-            return [LawWeight(laminar_flow, 0.0)] * len(EXPONENTS)
+            return [(laminar_flow, 0.0)] * len(EXPONENTS)
         # an orifice with the coefficient 1 / `regression` looks like a laminar leak with the coefficient 1
         orifice_flow = balance.mean_of_blocks(balance.blocks.mean_root()) / fit.regression
         log_ratio = INFERENCE.size.readings * fit.log_ratio
         fractions = 2.0 * (1.0 - np.array(EXPONENTS))
         return [
-            LawWeight(laminar_flow ** (1.0 - f) * orifice_flow**f, float(log_prior) + f * log_ratio)
+            (laminar_flow ** (1.0 - f) * orifice_flow**f, float(log_prior) + f * log_ratio)
             for f, log_prior in zip(fractions, np.log(law_priors()), strict=True)
         ]
 
@@ -309,10 +294,8 @@ class BalanceLeak:
     def bound_flow(self) -> float:
         """95 % upper bound of the leak's mean flow over the recording [m^3/s]; infinite if nothing was tested.
 
-        With healthy recordings the bound is on the leakage above that of these recordings; without them, on a leak that
-        begins within the recording. If the rise comes from holds, the times in which shut valves hold the load,
-        `_hold_bound` computes the bound. The bound is widened by the uncertainty of the scale of the flows
-        (displacement, area or flow meter) and of the leak's law (laminar or orifice).
+        With healthy recordings it is that of the leakage above theirs (by `_hold_bound` if holds measure it); without
+        them, of a leak that begins within the recording. The uncertainties of scale and law widen it.
         """
         test = self.step if self._motion_rise is None else self._motion_rise
         if test is None:
@@ -323,9 +306,9 @@ class BalanceLeak:
     def _hold_bound(self) -> float:
         """Compute the 95 % upper bound of a leak's mean flow [m^3/s] from holds and from the whole recording.
 
-        A hold is a time in which shut valves hold the load. The bound is a quantile of a mixture of three hypotheses:
-        the holds contain no information about the leak, so that the whole recording counts; the holds show a leak past
-        the piston; the holds show a leak to the outside.
+        In a hold shut valves keep the load in place. The bound is a quantile of a mixture of three hypotheses: the
+        holds say nothing about the leak, so that the whole recording counts; the holds show a leak past the piston; the
+        holds show a leak to the outside.
         """
         motion_rise, hold_rise, chambers = self._motion_rise, self._hold_rise, self.balance.chambers
         assert motion_rise is not None and hold_rise is not None and chambers is not None
@@ -365,50 +348,29 @@ class BalanceLeak:
         """Leakage above that of healthy recordings, and the evidence that a step within the recording caused it.
 
         The evidence (`step_log_ratio`) is the log likelihood ratio of the rise that the step would cause to no rise.
-        Holds after the step's onset, in which shut valves hold the load, show the whole step. Without such holds, the
-        mean over the recording shows a part of the step. Without a step test there is no such evidence. The result is
-        None without healthy recordings.
+        Holds after the step's onset, in which shut valves keep the load in place, show the whole step; without them,
+        the mean over the recording shows a part of it. None without healthy recordings.
         """
         step, total_rise, motion_rise = self.step, self.rise, self._motion_rise
         if total_rise is None:
             return None
         if step is None or motion_rise is None:
             return LeakRise(total_rise)
-        rise_after = self._hold_rise_since(step.onset().value)
+        chambers = self.balance.chambers
+        leaks = None if self._hold_rise is None or chambers is None else chambers.leaks_since(step.onset().value)
+        sums = self.balance.recording_sums._replace(held=leaks)
+        rise_after = None if leaks is None else held_rise(sums, self.healthy)
         if rise_after is None:
-            mean_rise = step.fitted.size * self._fraction_after(step)  # mean over the recording
+            fraction = self.balance.compared_leak.fraction_after(step.onset().value)
+            mean_rise = step.fitted.size * fraction  # mean over the recording
             return LeakRise(total_rise, motion_rise.log_ratio_within(mean_rise, tail=INFERENCE.scatter.tail))
         log_deviation: float = INFERENCE.held_oil.agrees  # standard deviation of log(rise / step)
         whole_rise = rise_after._replace(may_be_partial=False)  # after the onset the holds show the whole step
         return LeakRise(total_rise, whole_rise.log_ratio(step.fitted.size, log_deviation))
 
-    def _hold_rise_since(self, onset: float) -> Rise | None:
-        """Estimate the rise of the leakage [m^3/(s Pa)] over healthy recordings in the holds after an onset [s].
-
-        In a hold shut valves hold the load. Return None if holds do not replace the rise from the whole recording
-        (`_hold_rise`), if no hold shows a flow past the piston after the onset, or if too few healthy recordings have
-        holds.
-        """
-        chambers = self.balance.chambers
-        leaks = None if self._hold_rise is None or chambers is None else chambers.leaks_since(onset)
-        return None if leaks is None else held_rise(self.balance.recording_sums._replace(held=leaks), self.healthy)
-
-    def _fraction_after(self, step: StepTest) -> float:
-        """Compute the fraction, 0 to 1, of the information on the mean leakage that lies after a step's onset.
-
-        The information of a block is the sum of its row of the precision matrix (`onset.Information`).
-        """
-        is_after = self.balance.running_blocks.time >= step.onset().value
-        weights = self.balance.compared_leak.precision.sum(axis=0)
-        return float(np.clip(weights[is_after].sum() / max(weights.sum(), np.finfo(float).tiny), 0.0, 1.0))
-
     @property
     def lpm_per_flow(self) -> float | None:
-        """Factor from a flow [m^3/s] computed with assumed dimensions of the machine to the true flow [L/min].
-
-        The dimensions are the pump's displacement or the piston's areas. None if no flow can be stated in L/min
-        (`Size.stated`).
-        """
+        """Factor from a computed flow [m^3/s] to the true one [L/min]; None if it is not known (`Size.stated`)."""
         size = self.balance.size
         return size.scale / LITRE_PER_MINUTE if size.stated else None
 
@@ -419,17 +381,13 @@ class BalanceLeak:
 
     @property
     def ratio(self) -> Interval | None:
-        """Measured over assumed ratio of the pump's displacement to the piston's area, with 95 % interval (no unit).
-
-        None if it is not measured.
-        """
+        """Measured over assumed ratio of the pump's displacement to the piston's area; None if it is not measured."""
         return self.balance.size.ratio
 
     def relative(self, flow: Flow) -> RelativeLeak:
         """Convert a leak's flow to a fraction of the pump's mean flow, and to the speed [m/s] of a creeping piston.
 
-        Both have 95 % intervals. The fraction is None if the pump's flow is zero, the speed if the piston's area is
-        unknown.
+        Both have 95 % intervals. The fraction is None for a flow of zero, the speed if the area is unknown.
         """
         pump_flow, area = self.balance.mean_flow, self.balance.size.area
         half_width = WITHIN_95 * flow.deviation
@@ -444,10 +402,9 @@ class BalanceLeak:
     def total(self, detectable_flow: float | None) -> TotalLeakage:
         """Return the total leakage of pump and piston, with its interval and the limit for a healthy machine.
 
-        Behind a servo valve, with a balance for each chamber, the flow is not stated, since the valve's edges leak as
-        well. `detectable_flow`: flow [m^3/s], by the assumed sizes, of the smallest leak that would be detected if it
-        began within the recording; None if that was not tested. The result states this flow in L/min and as a fraction
-        of the pump's flow (`findable_lpm`, `findable_share`).
+        Behind a servo valve the flow is not stated, since the valve's edges leak as well. `detectable_flow`: flow
+        [m^3/s], by the assumed sizes, of the smallest leak that would be detected if it began within the recording;
+        None if that was not tested. The result states it as `findable_lpm` and `findable_share`.
         """
         balance = self.balance
         size, pressure, pump_flow = balance.size, balance.mean_pressure(), balance.mean_flow
@@ -472,8 +429,7 @@ class BalanceLeak:
     def history(self, onset_s: float | None) -> LeakCourse | None:
         """Return the leakage over time [L/min] with its 95 % interval; None if L/min cannot be stated (`Size.stated`).
 
-        With an onset `onset_s` [s] of a leak the result is the growth of the leakage since the onset; with None it is
-        the total leakage.
+        With an onset `onset_s` [s] it is the growth of the leakage since then, with None the total leakage.
         """
         balance = self.balance
         if not balance.size.stated:
@@ -482,7 +438,7 @@ class BalanceLeak:
             blocks, history = balance.blocks, balance.total_history
         else:
             blocks = balance.running_blocks
-            history = balance.leak_history(with_step=True).relative_to(blocks.time < onset_s)
+            history = fit_history(balance.leak, balance.test, with_step=True).relative_to(blocks.time < onset_s)
         value, deviation = history.mean, np.sqrt(np.maximum(np.diag(history.covariance), 0.0))
         lpm = blocks.mean_pressure(balance.pressure_offset) * balance.size.scale / LITRE_PER_MINUTE  # per conductance
         half_width = WITHIN_95 * np.hypot(deviation, value * balance.size.deviation)
@@ -519,10 +475,10 @@ class BalanceLeak:
 def _flow_mixture(rise: Rise, value: float, *, unit: float, weight: float, oil_deviation: float = 0.0) -> Mixture:
     """Compute the distribution of a leak's mean flow [m^3/s] from the rise of its coefficient.
 
-    The result consists of normal distributions whose weights sum to `weight`, as a part of a larger mixture. `rise`:
-    rise over healthy recordings, of which only the distribution of the error is used; `value`: estimate of the rise, a
-    negative one counting as 0; `unit`: mean flow [m^3/s] for a coefficient of 1; `oil_deviation`: additional standard
-    deviation of the coefficient due to the uncertain properties of the oil.
+    It is a part, with the sum of weights `weight`, of a larger mixture. `rise`: rise over healthy recordings, of which
+    only the distribution of the error is used; `value`: estimate of the rise, a negative one counting as 0; `unit`:
+    mean flow [m^3/s] for a coefficient of 1; `oil_deviation`: additional standard deviation of the coefficient due to
+    the uncertain properties of the oil.
     """
     # the true rise is `value` minus an error that is distributed as a healthy recording's rise
     weights, deviations, centres = rise.mixture or Mixture(np.ones(1), np.array([rise.deviation]), np.zeros(1))
@@ -530,10 +486,7 @@ def _flow_mixture(rise: Rise, value: float, *, unit: float, weight: float, oil_d
 
 
 def _divide_interval(interval: tuple[float, float], divisor: float | None) -> tuple[float, float] | None:
-    """Divide both ends of an interval by `divisor`; a negative lower end counts as zero.
-
-    Return None if the divisor is None or not positive.
-    """
+    """Divide both ends of an interval, at least 0, by `divisor`; None unless the divisor is positive."""
     if divisor is None or not divisor > 0.0:
         return None
     return max(interval[0], 0.0) / divisor, interval[1] / divisor

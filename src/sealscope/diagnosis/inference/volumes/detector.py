@@ -28,15 +28,7 @@ from sealscope.diagnosis.inference.differences import Estimate, PriorScatter, co
 from sealscope.diagnosis.inference.observable import Observable, Observed
 from sealscope.diagnosis.inference.regimes import add_pump_columns
 from sealscope.diagnosis.inference.rows.weak_form import STRIDE, stride_samples
-from sealscope.diagnosis.inference.terms import (
-    CYLINDER,
-    HOLDING,
-    TURNING,
-    circulation,
-    equations,
-    locked,
-    shut_at_rest,
-)
+from sealscope.diagnosis.inference.terms import CYLINDER, HOLDING, TURNING, circulation, equations, locked, shut_at_rest
 from sealscope.diagnosis.inference.volumes.balance_leak import BalanceLeak
 from sealscope.diagnosis.inference.volumes.recorded import RecordedBalance
 from sealscope.diagnosis.inference.volumes.rivals import rival_rises
@@ -68,8 +60,7 @@ def compensates_leakage(balance: RecordedBalance) -> bool:
     """Return True if the pump replaces the oil that leaks, so that the volume balance shows the leakage.
 
     The pump does so if a control loop holds the piston or returns it. The balance then shows at least the leakage of
-    the pump itself, which is at least a fraction of the pump's mean flow (`held.share` in `priors.toml`). The lower end
-    of the 95 % interval of the leakage must exceed this flow.
+    the pump itself: the lower end of its interval must exceed `held.share` (`priors.toml`) of the flow.
     """
     min_fraction: float = INFERENCE.held.share
     return balance.conductance.low * balance.mean_pressure() > min_fraction * balance.mean_flow
@@ -123,8 +114,8 @@ class VolumeBalance:
         """Set up the volume balance of a recording; None if its channels or its length allow none.
 
         `odds`: log odds, prior and from healthy recordings, that valves cut a resting pump off from the cylinder;
-        `is_locked`: true if valves certainly cut the pump off, whatever this recording shows; `sign_log_odds` (E,):
-        log odds of each balance, from healthy recordings, that the recorded flow has the right sign.
+        `is_locked`: true if valves certainly cut the pump off, whatever this recording shows; `sign_log_odds` (E,): log
+        odds of each balance, from healthy recordings, that the recorded flow has the right sign.
         """
         if not equations(self.rig, frozenset(recording.channels)):
             return self._balance_without_position(recording)
@@ -140,8 +131,7 @@ class VolumeBalance:
     def _balance_without_position(self, recording: Recording) -> RecordedBalance | None:
         """Choose the volume balance with the smallest upper bound of a leak, among those that need no position.
 
-        A balance of a load that shut valves hold is always usable. Any other balance is usable only if the pump
-        compensates the leakage (`compensates_leakage`). Return None if no balance is usable.
+        It must be that of a load behind shut valves, or of a pump that `compensates_leakage`. Return None if none is.
         """
         balances = compute_once(
             recording, (self.name, self.rig), lambda samples: cycle_balances(samples, self.rig), READ
@@ -154,33 +144,27 @@ class VolumeBalance:
         return min(usable, key=lambda candidate: BalanceLeak(self.name, candidate).bound_flow, default=None)
 
     def _compute_blocks(self, recording: Recording) -> RecordedBlocks | None:
-        """Compute the blocks of a recording for a volume balance with a position; None if it allows no such balance.
-
-        The result is cached with the recording, since several methods of this class need it.
-        """
+        """Compute the blocks of a recording for a volume balance with a position, only once; None if it allows none."""
+        if not equations(self.rig, frozenset(recording.channels)):
+            return None
         return compute_once(recording, (self.name, self.rig), lambda samples: recorded_blocks(samples, self.rig), READ)
 
     def _build_balance(self, recording: Recording, regime: RegimeBlocks) -> RecordedBalance:
-        """Build the volume balance of a recording from its blocks.
-
-        `regime`: the blocks for one assumption on the valves while the pump rests, open or shut. Shut valves hold the
-        load (`locked`), so that the holds measure leaks.
-        """
+        """Build the volume balance of a recording from its blocks for one assumption on the valves at rest."""
         offset = float(regime.blocks.zero[0])  # sensor offset that was removed from p_A - p_B [Pa]
         oil_loss = compute_once(
             recording, ("lost oil", self.rig), lambda samples: recorded_oil_loss_tests(samples, self.rig, offset), READ
         )
         return RecordedBalance(
             regime.blocks, regime.equations, regime.columns, self.rig, recording, oil_loss,
-            plain=regime.plain, shut=regime.shut, locked=regime.shut,
+            plain=regime.plain, shut=regime.shut, locked=regime.shut,  # shut valves hold the load
         )  # fmt: skip
 
     def learn(self, recording: Recording) -> Summary | None:
         """Summarise a healthy recording for later comparisons; None if it allows no volume balance.
 
-        While the pump rests, do valves cut it off from the cylinder? A single recording may leave this open. The
-        summary therefore has the sums for both cases, and log odds, which are later combined over all healthy
-        recordings. Its entries are:
+        A single recording may leave open whether valves cut the pump off from the cylinder while it rests. The summary
+        therefore has the sums for both cases, and log odds, which are later combined over all healthy recordings:
 
         - the fields of `recording_sums.RecordingSums` that are known, for a pump that stays connected at rest;
         - `terms`: names of the balance's terms;
@@ -193,8 +177,7 @@ class VolumeBalance:
         - `stroke`, with a position: ends of the recorded motion [m];
         - `creep_odds`, if no pump's flow is recorded (`is_creep`): log odds that the load creeps by leakage.
         """
-        has_position_balance = bool(equations(self.rig, frozenset(recording.channels)))
-        recorded = self._compute_blocks(recording) if has_position_balance else None
+        recorded = self._compute_blocks(recording)
         balance = self.balance(recording) if recorded is None else self._build_balance(recording, recorded.open)
         if balance is None:
             return None
@@ -222,8 +205,7 @@ class VolumeBalance:
         The rise is the leakage of a recording minus that of the healthy recordings with the given `summaries`
         (`learn`). Without a leak it scatters about 0, by differences between days and errors of the estimates; a leak
         must exceed this scatter. The later recording is taken to have the Gram matrices of the first healthy one, and
-        the median flow and pressure. `channels`: names of the recorded channels; `n_repeats`: number of times that the
-        healthy recordings count, as if they had been repeated on other days.
+        the median flow and pressure. `n_repeats`: how often the healthy recordings count, as if repeated.
         """
         shut = _are_valves_shut(summaries) or self._shut_log_odds(summaries, channels) > 0.0
         healthy = [_sums_from_summary(summary, shut) for summary in summaries]
@@ -238,15 +220,11 @@ class VolumeBalance:
         """Compute the log odds that valves cut the pump off at rest, from summaries of healthy recordings (`learn`).
 
         The prior log odds are `rest.valves` (`priors.toml`). The leakage at rest and in motion of each recording adds
-        its log odds (`regimes.shut_odds`), limited to +-`rest.alone`. The right assumption on the valves also makes the
-        estimated leakage scatter less between recordings: n recordings with rests, at least `MIN_FOR_SCATTER`, add
-        (n - 1) log(scatter if connected / scatter if cut off). `channels`: names of the recorded channels, which
-        determine the balances.
+        its log odds (`regimes.shut_odds`). The right assumption on the valves also makes the estimated leakage scatter
+        less between recordings: n (`MIN_FOR_SCATTER` or more) add (n - 1) log(scatter if connected / if cut off).
         """
         with_rests = [summary for summary in summaries if "shut_sums" in summary]
-        max_odds: float = INFERENCE.rest.alone
-        odds_by_rests = np.clip([summary.get("shut_odds", 0.0) for summary in with_rests], -max_odds, max_odds)
-        odds = float(INFERENCE.rest.valves + np.sum(odds_by_rests))
+        odds = float(INFERENCE.rest.valves + _sum_log_odds(with_rests, "shut_odds"))
         if len(with_rests) < MIN_FOR_SCATTER:
             return odds
         scatter = []
@@ -256,24 +234,8 @@ class VolumeBalance:
             scatter.append(max(float(values.std(ddof=1)), np.finfo(float).tiny))
         return odds + (len(with_rests) - 1) * float(np.log(scatter[0] / scatter[1]))
 
-    def _is_held_by_valves(self, balance: RecordedBalance, summaries: Sequence[Summary]) -> bool:
-        """Return True unless a control loop may hold the load in a volume balance without a pump (`terms.locked`).
-
-        In such a balance valves hold the load if the command is recorded. Otherwise the load must creep in the healthy
-        recordings, by the sum of the log odds in their `summaries`, since a control loop would replace the leakage.
-        """
-        if not balance.is_creep or flow_source(balance.recording.channels) is not None:
-            return True
-        max_odds: float = INFERENCE.rest.alone
-        creep_odds = np.clip([summary.get("creep_odds", 0.0) for summary in summaries], -max_odds, max_odds)
-        return float(creep_odds.sum()) > 0.0
-
     def _columns(self, channels: frozenset[str], shut: bool) -> list[ColumnRoles]:
-        """Return for each volume balance the indices of its columns by role: leak, left side, motion and so on.
-
-        `channels`: names of the recorded channels, which determine the balances; `shut`: True if valves cut the pump
-        off at rest.
-        """
+        """Return the column roles of each volume balance of the recorded channels, for open or `shut` valves."""
         balances = equations(self.rig, channels)
         if not balances and (hold_balance := locked(self.rig, channels)) is not None:
             balances = (hold_balance,)
@@ -283,8 +245,7 @@ class VolumeBalance:
         """Report on a recording: tests of each term of the volume balance for a step, and the leakage.
 
         The leakage is compared with that of the healthy recordings in `baseline` that have the same terms. Without a
-        recorded flow of the pump, the creep of a load that valves hold shows the leakage. If neither can be judged, the
-        report says what is missing.
+        recorded flow of the pump, the creep of a load that valves hold shows the leakage. Else it says what is missing.
         """
         summaries = healthy_summaries(self, baseline)
         is_locked = _are_valves_shut(summaries)
@@ -295,7 +256,10 @@ class VolumeBalance:
         has_flow, has_position = flow_source(recording.channels) is not None, "x" in recording
         if balance is None and (has_flow or not has_position):
             return Observed(self.name, lack=_NO_BALANCE[has_position].format(recording.duration))
-        if balance is None or not self._is_held_by_valves(balance, summaries):
+        # without a pump (`terms.locked`), valves hold the load if the command is recorded; otherwise it must creep in
+        # the healthy recordings, since a control loop would replace the leakage
+        is_held = has_flow or _sum_log_odds(summaries, "creep_odds") > 0.0
+        if balance is None or (balance.is_creep and not is_held):
             return Observed(self.name, lack=_NO_CREEP.format(self.rig.circuit.needed_channels))
         balance = replace(balance, locked=is_locked, known_stroke=_joint_stroke(summaries))
         # summaries do not list the leakage of a pump that turns or holds the load, which has terms of its own if valves
@@ -308,11 +272,9 @@ class VolumeBalance:
     def observe_regimes(self, recording: Recording) -> Mapping[bool, Observed]:
         """Report on a recording without healthy ones, under both assumptions on the valves while the pump rests.
 
-        The report with the key False is for a pump that stays connected to the cylinder. The report with the key True
-        is for valves that cut the pump off, and exists only if the recording has rests.
+        The key False is for a pump that stays connected; True, for a recording with rests, for one that is cut off.
         """
-        has_position_balance = bool(equations(self.rig, frozenset(recording.channels)))
-        recorded = self._compute_blocks(recording) if has_position_balance else None
+        recorded = self._compute_blocks(recording)
         if recorded is None:
             balances = [self.balance(recording)]  # a balance without a position, or None
         else:
@@ -323,10 +285,9 @@ class VolumeBalance:
     def _report(self, balance: RecordedBalance, healthy: Sequence[RecordingSums]) -> Observed:
         """Make the report of a volume balance: tests, leakage, and how much of the recording is judged.
 
-        `healthy`: summaries of the healthy recordings, which may be empty. `Observed.share` is the fraction of the
-        samples that were used, `Observed.judged_until` the end of the last block with used samples, as a fraction of
-        the recording. The report contains only a reason if the leakage can be tested neither for a step nor against
-        healthy recordings.
+        `Observed.share` is the fraction of the samples that were used, `Observed.judged_until` the end of the last
+        block with used samples, as a fraction of the recording. The report contains only a reason if the leakage can be
+        tested neither for a step nor against the healthy recordings, of which there may be none.
         """
         leak, rows = BalanceLeak(self.name, balance, healthy), balance.blocks.rows
         if leak.step is None and leak.rise is None:
@@ -359,8 +320,6 @@ def compare_motion(
     Yields one observable, or nothing if there are too few healthy recordings. A change means that the recording is from
     another machine, or that the scale of a sensor has changed. A load or speed outside of the range of the healthy
     recordings adds `further_deviation` to the error of the comparison.
-    `judged_sums`, `healthy`: summaries of the judged and of the healthy recordings; `roles`: indices of the columns of
-    the volume balance by role (leak, motion, left side).
     """
     prior, healthy_sums = INFERENCE.repeats, np.sum([recording.sums[0] for recording in healthy], axis=0)
 
@@ -382,10 +341,10 @@ def compare_motion(
 
 
 def _healthy_sign_log_odds(summaries: Sequence[Summary], n_balances: int) -> Array:
-    """Compute the log odds of each volume balance, from healthy recordings, that the recorded flow has the right sign.
+    """Compute for each balance the log odds, from healthy recordings, that the recorded flow has the right sign.
 
-    The log odds in the `summaries` with as many balances are added, to an array (n_balances,). The sums are limited,
-    since the sensor may have been reversed since then (`sense.rewired` of `priors.toml`).
+    Those in the `summaries` with `n_balances` balances are added. The sums are limited, since the sensor may have been
+    reversed since then (`sense.rewired` of `priors.toml`).
     """
     recorded = (summary.get("sign_log_odds", ()) for summary in summaries)
     total = sum((values for values in recorded if len(values) == n_balances), start=np.zeros(n_balances))
@@ -400,12 +359,16 @@ def _joint_stroke(summaries: Sequence[Summary]) -> tuple[float, float] | None:
     return (float(min(low for low, _ in strokes)), float(max(high for _, high in strokes))) if strokes else None
 
 
+def _sum_log_odds(summaries: Sequence[Summary], key: str) -> float:
+    """Add the log odds `key` of all summaries, each limited to +-`rest.alone` (`priors.toml`) and 0 if missing."""
+    max_odds: float = INFERENCE.rest.alone
+    return float(np.sum(np.clip([summary.get(key, 0.0) for summary in summaries], -max_odds, max_odds)))
+
+
 def _are_valves_shut(summaries: Sequence[Summary]) -> bool:
     """Return True if the healthy recordings show that valves cut the pump off at rest.
 
-    A summary may state the log odds that they do so, by all rests ("shut_odds") and by those rests alone in which a
-    load is held ("held_odds"). The mean of one of the two over the summaries that state it must exceed `rest.locked` of
-    `priors.toml`.
+    Their mean log odds by all rests ("shut_odds"), or by rests with a load ("held_odds"), must exceed `rest.locked`.
     """
     log_odds = ([summary[key] for summary in summaries if key in summary] for key in ("shut_odds", "held_odds"))
     return any(bool(odds) and float(np.mean(odds)) > INFERENCE.rest.locked for odds in log_odds)
@@ -414,8 +377,7 @@ def _are_valves_shut(summaries: Sequence[Summary]) -> bool:
 def _shift_start(recorded: RecordingSums, n_ages: int) -> float | None:
     """Return the start of a recording [s since 1970], postponed by `n_ages` times the longest life of a machine.
 
-    Copies of a recording that are postponed by different multiples therefore count as recordings of different days.
-    Return None if the recording is undated.
+    Copies with different `n_ages` count as recordings of different days. Return None for an undated recording.
     """
     return None if recorded.start_s is None else recorded.start_s + n_ages * _MAX_AGE_S
 
@@ -424,8 +386,7 @@ def _sums_from_summary(summary: Summary, shut: bool = False, locked: bool = Fals
     """Restore the Gram matrices, flow, pressure and date of a healthy recording from its summary (`learn`).
 
     `shut`: true for the Gram matrices under the assumption that valves cut the pump off at rest, which have separate
-    columns of the pump (added here for a recording without rests); `locked`: true to include the leaks while shut
-    valves hold the load, if the summary has them.
+    columns of the pump (added here for a recording without rests); `locked`: true to include the leaks in holds.
     """
     sums = np.asarray(summary["sums"], dtype=float)
     if shut:

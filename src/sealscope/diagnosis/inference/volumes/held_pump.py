@@ -37,21 +37,9 @@ def estimate_pump_leakage(
 ) -> Estimate | None:
     """Estimate the leakage conductance of the pump [m^3/(s Pa)] from the time just before each hold.
 
-    Parameters
-    ----------
-    recording : Recording
-        Both chamber pressures and the position.
-    pumped : array of float, shape (n - 1,)
-        Volume that the pump delivers between the samples of the recording [m^3].
-    holds : sequence of LockedHold
-        Holds of the recording, in which shut valves keep the load in place.
-    leaks : HeldLeaks
-        Leaks measured in the holds; those of the loaded side are subtracted.
-
-    Returns
-    -------
-    Estimate or None
-        None for fewer than two holds or too few samples, or if they do not determine the conductance.
+    `pumped` (n - 1,): volume that the pump delivers between the samples of the recording [m^3]; `holds`: holds of the
+    recording, in which shut valves keep the load in place; `leaks`: those measured in the holds, of which those of the
+    loaded side are subtracted. Return None for fewer than two holds or too few samples.
     """
     rate, t = recording.rate, 0.5 * (recording.t[1:] + recording.t[:-1])
     difference = recording["p_A"] - recording["p_B"]

@@ -16,7 +16,7 @@ from sealscope.diagnosis.inference.blocks import (
     estimate_offset,
     estimate_weighted_mean,
     information,
-    offset_costs,
+    offset_cost,
     solve,
 )
 from sealscope.diagnosis.inference.changes.charge_pressure import estimate_charge_trend
@@ -45,15 +45,7 @@ from sealscope.diagnosis.inference.onset import (
     step_test,
 )
 from sealscope.diagnosis.inference.regimes import fit_with_robust_covariance, rest_log_odds
-from sealscope.diagnosis.inference.terms import (
-    LAG,
-    LOCKED,
-    MIN_ABSOLUTE_PRESSURE,
-    PUMP,
-    Equation,
-    Signals,
-    find_rests,
-)
+from sealscope.diagnosis.inference.terms import LAG, LOCKED, MIN_ABSOLUTE_PRESSURE, PUMP, Equation, Signals, find_rests
 from sealscope.diagnosis.inference.volumes.held_pump import estimate_pump_leakage
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.diagnosis.verdict.evidence import RAREST
@@ -86,8 +78,7 @@ class Size(NamedTuple):
     - `stated`: true if flows can be stated in L/min. The pressures must have units, and a flow meter must be recorded
       or the rig's file must state the size.
     - `ratio`: measured over assumed ratio of displacement to area, None if it is not measured.
-    - `area`: area of the piston's loaded side as measured with the assumed displacement or the flow meter [m^2], None
-      if unknown.
+    - `area`: area of the piston's loaded side, measured with the assumed displacement or a flow meter [m^2], or None.
     - `disagrees`: true if stated displacement and stated area contradict each other.
     """
 
@@ -104,9 +95,7 @@ class RecordedBalance:
     """Volume balance of a recording, and the estimates that follow from it.
 
     - `blocks`: blocks of the recording with the Gram matrices of the balance.
-    - `equations`: the volume balances, behind a servo valve one for each chamber, otherwise a single one.
-    - `columns`: for each equation the indices of its columns by role (leak, motion, left side).
-    - `rig`: sizes of the machine.
+    - `equations`, `columns`: the balances, behind a servo valve one for each chamber, and the roles of their columns.
     - `oil_loss`: tests for external leaks by the volume of the accumulator, by the name of the term.
     - `plain`: the blocks without the correction of the pressure offset, None if there is no such correction.
     - `shut`: true if valves cut the pump off at rest, so that only the piston leaks then (`regimes`).
@@ -145,8 +134,7 @@ class RecordedBalance:
     def running_blocks(self) -> Blocks:
         """Blocks from the first motion on, which are tested for steps.
 
-        Before the first motion the machine may be off with its valves shut. If the pump then begins to hold the load,
-        its flow rises without a leak.
+        Before, the machine may be off; if its pump then begins to hold the load, its flow rises without a leak.
         """
         return self.blocks[self._first_motion :]
 
@@ -157,11 +145,7 @@ class RecordedBalance:
 
     @cached_property
     def compared_leak(self) -> Information:
-        """Likelihood of the leak's conductance in each of `running_blocks`, for comparison with other recordings.
-
-        It differs from `leak` if the volume balance has a separate term for the leakage of a pump that holds the load.
-        This term is left out here, so that all rests have one common leakage.
-        """
+        """Likelihood as `leak`, for comparison of recordings: without a separate leakage in holds of the pump."""
         roles = self.columns[0]
         return information(self.running_blocks, self.columns, roles.leak, left_out=roles.hold_leak)
 
@@ -182,20 +166,13 @@ class RecordedBalance:
 
     @property
     def volume_ratio(self) -> float:
-        """Measured over assumed ratio of the piston's area to the pump's displacement; 1 if it is not measured.
-
-        In the volume balance the volumes of the cylinder are larger by this factor than those from the rig's file.
-        """
+        """Measured over assumed ratio of the piston's area to the pump's displacement; 1 if it is not measured."""
         ratio = self.size.ratio
         return 1.0 if ratio is None else 1.0 / max(ratio.value, np.finfo(float).tiny)
 
     @cached_property
     def recording_sums(self) -> RecordingSums:
-        """Summary of the recording for comparison with other recordings.
-
-        It has the Gram matrices, the mean flow and pressure, and, if known, the leaks in holds, the leakage of the pump
-        just before holds, and the resistance to the motion.
-        """
+        """Summary of the recording for comparison with other recordings."""
         start_s, oil_degC = start_seconds(self.recording), oil_temperature(self.recording)
         sums = RecordingSums.from_blocks(self.blocks, self.columns, start_s, oil_degC)
         if self.is_creep:
@@ -211,8 +188,7 @@ class RecordedBalance:
     def chambers(self) -> HeldChambers | None:
         """Estimator of the chambers' leaks from holds: times in which the pump rests and shut valves hold the load.
 
-        None if valves do not hold the load (`locked`), if no hold is long enough and loaded, if the pressures have no
-        unit, or if the piston's areas are unknown.
+        None without `locked`, a long and loaded hold, a unit of the pressures, or known areas of the piston.
         """
         sides = self._cylinder_sides() if self.locked and self.recording.units["p_A"] != COUNTS else None
         if sides is None:
@@ -248,10 +224,10 @@ class RecordedBalance:
         return self.equations[0].left(Signals(dict(self.recording.channels), self.recording.rate, {}))
 
     def _lost_flow(self, sides: CylinderSides) -> Array:
-        """Compute the magnitude of the pump's flow [m^3/s] that does not move the piston, shape (n - 1,).
+        """Compute the magnitude of the pump's flow [m^3/s] that does not move the piston, averaged, shape (n - 1,).
 
         It is positive while the pump holds a load or compresses oil. The area is that of the side with the higher
-        pressure, from `sides`. The flow is averaged over `LOST_FLOW_TIME`.
+        pressure.
         """
         recording = self.recording
         is_A_higher = recording["p_A"][1:] > recording["p_B"][1:]
@@ -263,10 +239,7 @@ class RecordedBalance:
         return np.asarray(np.maximum(flow - displaced, 0.0))
 
     def _is_pump_off(self, hold: LockedHold) -> bool:
-        """Return True if the pump probably rests in a hold, and does not hold the load by replacing the leakage.
-
-        The mean flow is compared with zero and with the typical flow of a pump that holds a load.
-        """
+        """Return True if the pump probably rests in a hold: the mean flow is rather zero than that of holding it."""
         recording = self.recording
         # time in which the pump's flow may still fall: the first interval, and the longest extension by `extend_rests`
         falling = hold.t[hold.edges[1]] - hold.t[0] + INFERENCE.rest.averaged
@@ -296,24 +269,20 @@ class RecordedBalance:
         return float(self._load_log_odds(np.array([pressure]))[0]) > oil.loaded
 
     def _load_log_odds(self, pressure: Array) -> Array:
-        """Compute the log odds that magnitudes of p_A - p_B (n,) [Pa] are loads, not the sensors' offset.
-
-        All loads up to the largest pressure difference of the recording are equally probable.
-        """
+        """Compute the log odds that values abs(p_A - p_B) (n,) [Pa] are loads (all equally probable), not an offset."""
         # minus the log density of an offset is this constant plus half of its cost
         log_offset_norm = float(np.log(INFERENCE.zero.pressure * np.sqrt(2.0 * np.pi)))
         difference = np.abs(self.recording["p_A"] - self.recording["p_B"])
         max_load = float(np.nanquantile(difference, 1.0 - END_QUANTILE))
         log_load_density = -float(np.log(max(max_load, np.finfo(float).tiny)))
-        return np.asarray(log_load_density + 0.5 * offset_costs(pressure) + log_offset_norm)
+        return np.asarray(log_load_density + 0.5 * offset_cost(pressure) + log_offset_norm)
 
     def locked_log_odds(self, conductance: Interval) -> float | None:
         """Compute the log odds that valves are shut in holds, and not open; None without holds.
 
-        A hold is a time in which shut valves are supposed to hold the load. With open valves the leakage in holds would
-        be the total leakage of pump and piston; with shut valves it is smaller. The two are compared. The total leakage
-        is measured just before the holds, at the same pressures, or else it is the `conductance` [m^3/(s Pa)] over the
-        whole recording, by the balance for open valves. The log odds are limited to +-`rest.most` of `priors.toml`.
+        With open valves the leakage in holds would be the total leakage of pump and piston; with shut valves it is
+        smaller. The total leakage is measured just before the holds, at the same pressures, or else it is the
+        `conductance` [m^3/(s Pa)] over the whole recording, by the balance for open valves.
         """
         if self.chambers is None:
             return None
@@ -324,15 +293,12 @@ class RecordedBalance:
         else:
             deviation = (conductance.high - conductance.low) / (2.0 * WITHIN_95)
             total, difference_variance = conductance.value, variance + deviation**2
-        max_odds: float = INFERENCE.rest.most
-        odds = rest_log_odds(hold_leak.value, total, rest_variance=variance, difference_variance=difference_variance)
-        return float(np.clip(odds, -max_odds, max_odds))
+        return rest_log_odds(hold_leak.value, total, rest_variance=variance, difference_variance=difference_variance)
 
     def _cylinder_sides(self) -> CylinderSides | None:
-        """Estimate the piston areas and the ends of the stroke; None if they are not determined.
+        """Estimate piston areas and ends of the stroke; None at rest, or if the ratio of the areas is implausible.
 
-        They are not determined if nothing moves, or if the ratio of the areas is implausible. The stroke is that of all
-        known recordings (`known_stroke`).
+        The stroke is that of all known recordings (`known_stroke`).
         """
         area_A, area_B, deviation_A, deviation_B = self._signed_areas()
         if (stroke := self.recorded_stroke) is None:
@@ -361,9 +327,9 @@ class RecordedBalance:
         Returns both areas, and the standard deviations of the logarithms of their magnitudes. The areas are negative if
         the position x is reversed, and zero if nothing moves. The area of a side is the mean of the coefficients of the
         motion under its load in the volume balance, weighted by the sums of squares of their columns. The main side is
-        the side with more motion in which it surely carries the load. The area of the other side is corrected for
-        motion that may belong to the main side (`log_area_ratio`). If the rig's file states the areas, these are used
-        instead, scaled to the flows of the volume balance.
+        the one with more motion in which it surely carries the load. The area of the other side is corrected for motion
+        that may belong to the main side (`log_area_ratio`). Areas in the rig's file are used instead, scaled to the
+        flows of the balance.
         """
         roles, total = self.columns[0], self.blocks.gram[:, 0].sum(axis=0)
         nuisance = list(roles.nuisance)
@@ -412,24 +378,20 @@ class RecordedBalance:
 
     @cached_property
     def pressure_offset(self) -> float:
-        """Sensor offset of p_A - p_B [Pa], i.e. the recorded difference at equal pressures.
-
-        Only a change of the leak reveals the offset; without such a change the estimate stays near 0.
-        """
+        """Sensor offset of p_A - p_B [Pa]; near 0 without a change of the leak, which alone reveals it."""
         return estimate_offset(self.blocks, self.columns)
 
     @cached_property
     def position_delay(self) -> Estimate | None:
-        """Time by which the recorded position lags behind the flow [s], and its standard deviation; negative if early.
+        """Time by which the recorded position lags behind the flow [s], with its standard deviation; negative if early.
 
-        It is the fitted coefficient of the term `LAG` [m^2 s] over the measured piston area [m^2]. None if the balance
-        has no such term or no motion, or if the measured area is not positive.
+        It is the coefficient of the term `LAG` [m^2 s] over the measured piston area [m^2]. None if the balance has no
+        such term or no motion, or if the measured area is not positive.
         """
         roles = self.columns[0]
-        motion = [k for k in roles.motion if roles.names[k].startswith("motion")]
-        if LAG not in roles.names or not motion:
+        if LAG not in roles.names or self._loaded_area is None:
             return None
-        area = _loaded_area(self, motion).measured
+        area = self._loaded_area.measured
         value, deviation = estimate_weighted_mean(self.blocks, roles, {roles.names.index(LAG): 1.0})
         return Estimate(value / area, deviation / area) if area > 0.0 else None
 
@@ -438,10 +400,7 @@ class RecordedBalance:
         return self.mean_of_blocks(self.blocks.mean_pressure(self.pressure_offset), since)
 
     def outside_unit_flows(self) -> dict[str, float]:
-        """Compute the flow [m^3/s] of an external leak of 1 m^3/(s Pa), for each term of such a leak by its name.
-
-        It is the flow at the root mean square of the pressure that drives the leak, with the pressures as recorded.
-        """
+        """Compute the flow [m^3/s] of each external leak of 1 m^3/(s Pa) at the rms of its pressure, by its name."""
         names, recorded = self.columns[0].names, self.blocks if self.plain is None else self.plain
         return {
             name: recorded.driving_pressure(names, name) * self.size.scale
@@ -451,21 +410,14 @@ class RecordedBalance:
 
     @cached_property
     def mean_flow(self) -> float:
-        """Mean magnitude of the pump's flow over the recording [m^3/s].
-
-        If only the creep of a held load is known (`is_creep`), the result is the mean flow that the larger side of the
-        piston displaces.
-        """
+        """Mean magnitude of the pump's flow [m^3/s]; with `is_creep`, that of the flow which the piston displaces."""
         if not self.is_creep:
             return self.mean_of_blocks(self.blocks.flow)
         area = max(self.rig.cylinder.A_A, self.rig.cylinder.A_B)
         return area * float(np.nanmean(np.abs(np.diff(self.recording["x"])))) * self.recording.rate
 
     def mean_of_blocks(self, values: Array, since: float = -np.inf) -> float:
-        """Average `values` (K,) of K blocks over the blocks from the time `since` [s] on, weighted by numbers of rows.
-
-        A block counts if its middle is at `since` or later. If no block is that late, the last block counts.
-        """
+        """Average `values` (K,) over the blocks from `since` [s] on, at least the last, weighted by numbers of rows."""
         is_after = self.blocks.time >= since
         if not is_after.any():
             is_after[-1] = True
@@ -474,26 +426,70 @@ class RecordedBalance:
 
     @cached_property
     def size(self) -> Size:
-        """True flow over the flow computed with assumed dimensions, such as the pump's displacement (`Size`)."""
-        return _flow_scale(self)
+        """Factor from computed to true flows and its uncertainty, from the sizes in the rig's file.
+
+        - Behind a servo valve, and for a load that shut valves hold, the areas give the flow, and the factor is 1.
+          While a held load creeps, its oil also expands, which adds to the uncertainty.
+        - The factor is also 1 for a flow meter.
+        - A stated displacement gives the factor 1. If a stated area disagrees, the difference is the uncertainty.
+        - If only the area is stated, the factor follows from the measured ratio of displacement to area.
+        """
+        rig, is_meter = self.rig, measures_flow(self.recording.units)
+        prior, source = INFERENCE.size, flow_source(self.recording.channels)
+        has_flow_unit = source == "q_pump" or (source, COUNTS) not in self.units  # the area scales a meter without unit
+        has_pressure_unit = not {("p_A", COUNTS), ("p_B", COUNTS)} & self.units
+        states_displacement = rig.states("pump.q_b") and has_flow_unit
+        states_areas = rig.states("cylinder.A_A", "cylinder.A_B")
+        if len(self.columns) > 1 or self.is_creep:  # behind a servo valve, or for a load that shut valves hold
+            deviation = float(np.hypot(prior.area, prior.creep)) if self.is_creep else prior.area
+            return Size(1.0, deviation, stated=states_areas and has_pressure_unit)
+        area = self._loaded_area if ("x", "m") in self.units else None
+        if area is None or not area.measured > 0.0 or not has_flow_unit:
+            deviation = prior.meter if is_meter else prior.displacement
+            return Size(1.0, deviation, stated=(is_meter or states_displacement) and has_pressure_unit)
+        if is_meter:
+            return Size(1.0, prior.meter, stated=has_pressure_unit, area=area.measured)
+        # the ratio is inverse to the measured area, so that its lower end follows from the largest area
+        ratio = Interval(*(area.assumed / end for end in (area.measured, area.high, max(area.low, 1e-12))))
+        disagreement = abs(1.0 / ratio.value - 1.0)
+        both_deviation = float(np.hypot(prior.displacement, prior.area))
+        size = Size(1.0, both_deviation, stated=False, ratio=ratio, area=area.measured)
+        if states_displacement:
+            disagrees = states_areas and disagreement > WITHIN_95 * both_deviation
+            deviation = disagreement if disagrees else prior.displacement
+            return size._replace(deviation=deviation, stated=has_pressure_unit, disagrees=disagrees)
+        if states_areas:
+            return size._replace(scale=ratio.value, deviation=prior.area, stated=has_pressure_unit)
+        return size
+
+    @cached_property
+    def _loaded_area(self) -> _Area | None:
+        """Piston area of the loaded side, a weighted mean over directions of motion and loaded sides, or None.
+
+        Each has a column of the balance, whose weight is its sum of squares: a side counts by its motion under load.
+        """
+        roles, cylinder = self.columns[0], self.rig.cylinder
+        motion = [k for k in roles.motion if roles.names[k].startswith("motion")]
+        if not motion:
+            return None
+        squares = np.einsum("kii->i", self.blocks.gram[:, 0])[motion]  # sums over all blocks
+        weights = squares / max(float(squares.sum()), np.finfo(float).tiny)
+        value, deviation = estimate_weighted_mean(self.blocks, roles, dict(zip(motion, weights, strict=True)))
+        value, half_width = abs(value), WITHIN_95 * deviation  # the coefficients are negative if x is reversed
+        assumed = [cylinder.A_A if roles.names[k].endswith("A carries") else cylinder.A_B for k in motion]
+        return _Area(value, value - half_width, value + half_width, float(weights @ assumed))
 
     @cached_property
     def conductance(self) -> Interval:
-        """Mean total leakage of pump and piston, as a conductance [m^3/(s Pa)] with its 95 % interval.
-
-        The pressures at the pump's ports hardly differ from those of the chambers, so only the sum of both leaks is
-        determined.
-        """
+        """Mean total leakage of pump and piston [m^3/(s Pa)], which cannot be separated, with its 95 % interval."""
         weights = np.maximum(self.blocks.rows, 0.0)
         return self.total_history.average(weights / weights.sum())
 
     def creep_log_odds(self) -> float:
         """Compute the log odds that a held load creeps by leakage, rather than that a control loop holds it.
 
-        A loop replaces the leakage, so that the piston hardly moves, whatever the pressures do. A displaced volume near
-        zero in holds therefore speaks against creep. A displaced flow near the typical leakage of a machine that holds
-        a load (a fraction of its mean flow) speaks for creep. The log odds are limited to +-`rest.most` of
-        `priors.toml`.
+        A loop replaces the leakage, so that the piston hardly moves: a flow near zero in holds speaks against creep,
+        one near the leakage of a typical machine for it.
         """
         holding_flow, roles = INFERENCE.rest.holding * self.mean_flow, self.columns[0]
         # conductance: displaced volume over the integral of p_A - p_B, the chambers' compliance being neglected
@@ -502,29 +498,20 @@ class RecordedBalance:
         variance = float(conductance_variance[0, 0]) * self.mean_pressure() ** 2
         if not variance > 0.0:
             return 0.0
-        max_odds: float = INFERENCE.rest.most
-        loop_odds = rest_log_odds(flow, holding_flow, rest_variance=variance, difference_variance=variance)
-        return float(np.clip(-loop_odds, -max_odds, max_odds))
+        return -rest_log_odds(flow, holding_flow, rest_variance=variance, difference_variance=variance)
 
     @cached_property
     def total_history(self) -> History:
         """Total leakage of pump and piston in each block, as a conductance [m^3/(s Pa)] with its covariance.
 
         A separate term of the pump's leakage is left out, so that the leak's term contains both. The history includes a
-        step of the leakage if a test finds a step with a p-value below `RAREST`.
+        step of the leakage if a test finds one with a p-value below `RAREST`.
         """
         roles = self.columns[0]
         pump = roles.names.index(PUMP) if PUMP in roles.names else None
         total = information(self.blocks, self.columns, roles.leak, left_out=pump)
         test = step_test(total)
         return fit_history(total, test, with_step=test is not None and test.chance < RAREST)
-
-    def leak_history(self, *, with_step: bool) -> History:
-        """Estimate the leak's conductance [m^3/(s Pa)] in each block, with a step at its likeliest onset or without.
-
-        The blocks are those from the first motion on (`running_blocks`).
-        """
-        return fit_history(self.leak, self.test, with_step=with_step)
 
 
 def log_area_ratio(measured: float, loaded_share: float, *, is_larger: bool) -> Estimate:
@@ -534,9 +521,9 @@ def log_area_ratio(measured: float, loaded_share: float, *, is_larger: bool) -> 
     that was attributed to the first side belongs to it, and the rest to the other side, whose area is well known; thus
     log `measured` = w r, with the standard error `size.area` (`priors.toml`). The unknown w is 1 with the probability
     `held_oil.sides_told`. Otherwise log w is uniform between 0 and the logarithm of `loaded_share`, the fraction of
-    that motion in which the first side surely carries the load. r has a normal prior with the standard deviation
-    `held_oil.sides_deviation`. The mean of the prior is `held_oil.sides` if the first side is probably the larger one
-    (`is_larger`), else -`held_oil.sides`.
+    that motion in which the first side surely carries the load. r has a normal prior with the mean `held_oil.sides`,
+    negative unless the first side is probably the larger one (`is_larger`), and the standard deviation
+    `held_oil.sides_deviation`.
     """
     prior = INFERENCE.held_oil
     mean, deviation = prior.sides if is_larger else -prior.sides, prior.sides_deviation
@@ -554,68 +541,13 @@ def log_area_ratio(measured: float, loaded_share: float, *, is_larger: bool) -> 
     return Estimate(value, float(np.sqrt(weights @ (ratios - value) ** 2)))
 
 
-def _flow_scale(balance: RecordedBalance) -> Size:
-    """Determine the factor from computed to true flows (`Size`) and its uncertainty, from the sizes in the rig's file.
-
-    - Behind a servo valve, and for a load that shut valves hold, the areas give the flow, and the factor is 1. While a
-      held load creeps, the oil of the loaded side also expands, by an unknown volume; this adds to the uncertainty.
-    - The factor is also 1 for a flow meter.
-    - A stated displacement gives the factor 1. If a stated area disagrees, the difference is the uncertainty.
-    - If only the area is stated, the factor follows from the ratio of displacement to area, which the balance measures.
-    """
-    roles, rig, is_meter = balance.columns[0], balance.rig, measures_flow(balance.recording.units)
-    prior, source = INFERENCE.size, flow_source(balance.recording.channels)
-    has_flow_unit = source == "q_pump" or (source, COUNTS) not in balance.units  # the area scales a meter without unit
-    has_pressure_unit = not {("p_A", COUNTS), ("p_B", COUNTS)} & balance.units
-    states_displacement = rig.states("pump.q_b") and has_flow_unit
-    states_areas = rig.states("cylinder.A_A", "cylinder.A_B")
-    if len(balance.columns) > 1 or balance.is_creep:  # behind a servo valve, or for a load that shut valves hold
-        deviation = float(np.hypot(prior.area, prior.creep)) if balance.is_creep else prior.area
-        return Size(1.0, deviation, stated=states_areas and has_pressure_unit)
-    motion = [k for k in roles.motion if roles.names[k].startswith("motion")]
-    area = _loaded_area(balance, motion) if motion and ("x", "m") in balance.units else None
-    if area is None or not area.measured > 0.0 or not has_flow_unit:
-        deviation = prior.meter if is_meter else prior.displacement
-        return Size(1.0, deviation, stated=(is_meter or states_displacement) and has_pressure_unit)
-    if is_meter:
-        return Size(1.0, prior.meter, stated=has_pressure_unit, area=area.measured)
-    # the ratio is inverse to the measured area, so that its lower end follows from the largest area
-    ratio = Interval(*(area.assumed / end for end in (area.measured, area.high, max(area.low, 1e-12))))
-    disagreement = abs(1.0 / ratio.value - 1.0)
-    both_deviation = float(np.hypot(prior.displacement, prior.area))
-    size = Size(1.0, both_deviation, stated=False, ratio=ratio, area=area.measured)
-    if states_displacement:
-        disagrees = states_areas and disagreement > WITHIN_95 * both_deviation
-        deviation = disagreement if disagrees else prior.displacement
-        return size._replace(deviation=deviation, stated=has_pressure_unit, disagrees=disagrees)
-    if states_areas:
-        return size._replace(scale=ratio.value, deviation=prior.area, stated=has_pressure_unit)
-    return size
-
-
 class _Area(NamedTuple):
-    """Piston area of the loaded side [m^2]: as `measured` by the volume balance, and as `assumed`.
+    """Piston area of the loaded side [m^2]: as `measured` by the volume balance, and as `assumed` in the rig's file.
 
-    The measurement uses the assumed displacement or a flow meter. `low`, `high`: 95 % interval of the measured area;
-    `assumed`: the area in the rig's file.
+    The measurement uses the assumed displacement or a flow meter. `low`, `high`: 95 % interval of the measured area.
     """
 
     measured: float
     low: float
     high: float
     assumed: float
-
-
-def _loaded_area(balance: RecordedBalance, motion: list[int]) -> _Area:
-    """Estimate the piston area of the loaded side, as a weighted mean over directions of motion and loaded sides.
-
-    `motion`: indices of the columns of the piston's motion, one for each direction and loaded side. The weight of a
-    column is its sum of squares, so that a side counts by its motion under load.
-    """
-    roles, cylinder = balance.columns[0], balance.rig.cylinder
-    squares = np.einsum("kii->i", balance.blocks.gram[:, 0])[motion]  # sums over all blocks
-    weights = squares / max(float(squares.sum()), np.finfo(float).tiny)
-    value, deviation = estimate_weighted_mean(balance.blocks, roles, dict(zip(motion, weights, strict=True)))
-    value, half_width = abs(value), WITHIN_95 * deviation  # the coefficients are negative if x is reversed
-    assumed = [cylinder.A_A if roles.names[k].endswith("A carries") else cylinder.A_B for k in motion]
-    return _Area(value, value - half_width, value + half_width, float(weights @ assumed))

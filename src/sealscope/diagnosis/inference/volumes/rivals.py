@@ -16,7 +16,7 @@ import numpy as np
 
 from sealscope.diagnosis.inference.blocks import ColumnRoles, solve
 from sealscope.diagnosis.inference.circuit.holds.leaks import HeldLeaks
-from sealscope.diagnosis.inference.comparison.coefficients import coefficient_level
+from sealscope.diagnosis.inference.comparison.coefficients import coefficient_level, reduce_to_tested
 from sealscope.diagnosis.inference.comparison.laws import compare_laws, compare_with_leak
 from sealscope.diagnosis.inference.comparison.levels import MIN_WITH_HOLDS, held_pump_rise, rise
 from sealscope.diagnosis.inference.comparison.oil import predict_thinning
@@ -43,27 +43,12 @@ def rival_rises(
 ) -> tuple[Observable, ...]:
     """Test for faults other than a leak past the piston that explain a change since the healthy recordings.
 
-    These rivals of the leak are external leaks, leakage of the turning pump, and free air. External leaks are compared
-    only while shut valves hold the load, if `held_rivals` can compare them.
+    These rivals of the leak are external leaks, leakage of the turning pump, and free air; there is one observable for
+    each that can be compared. External leaks are compared only while shut valves hold the load, if `held_rivals` can.
 
-    Parameters
-    ----------
-    judged : RecordingSums
-        Summary of the judged recording.
-    healthy : sequence of RecordingSums
-        Summaries of healthy recordings of the same machine.
-    columns : sequence of ColumnRoles
-        For each equation the indices of its columns by role (leak, motion, left side).
-    volume_ratio : float
-        Measured over assumed ratio of the piston's area to the pump's displacement, by which volumes of air scale.
-    unit_flows : mapping of str to float, optional
-        Flow [m^3/s] of an external leak with a conductance of 1 m^3/(s Pa), by the name of its term. For a term that is
-        not listed it is the mean of abs(p_A - p_B) in the judged recording.
-
-    Returns
-    -------
-    tuple of Observable
-        One for each rival that can be compared.
+    `volume_ratio`: measured over assumed ratio of the piston's area to the pump's displacement, by which volumes of air
+    scale; `unit_flows`: flow [m^3/s] of an external leak with a conductance of 1 m^3/(s Pa), by the name of its term,
+    by default the mean of abs(p_A - p_B) in the judged recording.
     """
     names = columns[0].names
     hold_rivals = held_rivals(judged, healthy, unit_flows)
@@ -129,10 +114,9 @@ def rival_rises(
 
 
 def _without_oil(coefficients: Array, thinning: Array) -> Array:
-    """Remove the effect of the oil's viscosity from leakage coefficients (n + 1,), the judged one last.
+    """Remove the effect of the oil's viscosity from leakage coefficients (n + 1,), if they then scatter less.
 
-    `thinning` (n + 1,): logarithm by which thinner oil raises each coefficient. If this correction does not reduce the
-    scatter among the n healthy recordings, relative to their mean, the coefficients are returned unchanged.
+    `thinning` (n + 1,): logarithm by which thinner oil raises each. The last one is judged, the others are healthy.
     """
     corrected = coefficients * np.exp(-thinning)
     scatters = [
@@ -144,19 +128,16 @@ def _without_oil(coefficients: Array, thinning: Array) -> Array:
 def held_rivals(
     judged: RecordingSums, healthy: Sequence[RecordingSums], unit_flows: Mapping[str, float] | None = None
 ) -> tuple[Observable, ...] | None:
-    """Test for external leaks of chambers A and B, measured in holds, above those of healthy recordings.
+    """Test for external leaks of chambers A and B, measured while shut valves hold the load, above healthy recordings.
 
-    In a hold shut valves hold the load. Return one observable for each chamber that can be compared, or None if the
-    recording `judged` has no holds, or if fewer than `MIN_WITH_HOLDS` healthy recordings have holds. `unit_flows`: flow
-    [m^3/s] of an external leak with a conductance of 1 m^3/(s Pa), by its name, as in `rival_rises`.
+    Return one observable for each chamber that can be compared, or None if the judged recording has no such holds, or
+    fewer than `MIN_WITH_HOLDS` healthy recordings have them. `unit_flows`: as in `rival_rises`.
     """
     healthy_leaks = [HeldLeaks(*recording.held) for recording in healthy if recording.held is not None]
     if judged.held is None or len(healthy_leaks) < MIN_WITH_HOLDS:
         return None
     judged_leaks = HeldLeaks(*judged.held)
-    # a leak with this conductance takes the pump's mean flow; a small fraction of it is the smallest error
-    max_conductance = judged.flow / judged.pressure if judged.pressure > 0.0 else 0.0
-    min_error = INFERENCE.scatter.finest * max_conductance
+    min_error = INFERENCE.scatter.finest * judged.conductance_of_flow
     observables = list[Observable]()
     for side in "AB":
         value, *healthy_values = (float(getattr(leaks, f"outside_{side}")) for leaks in (judged_leaks, *healthy_leaks))
@@ -173,9 +154,6 @@ def _penalise_size(observable: Observable, judged: RecordingSums, unit_flows: Ma
 
     A large external leak is improbable, since oil outside is seen: the advantage is 2 log(prior density / largest prior
     density) of the flow, and 0 for flows below the centre of the prior (`outside` in `priors.toml`).
-
-    `unit_flows`: flow [m^3/s] for a conductance of 1 m^3/(s Pa), by the name of the observable. Without an entry it is
-    the mean of abs(p_A - p_B) in the recording `judged`.
     """
     flow = observable.size * (unit_flows or {}).get(observable.name, judged.pressure)
     return replace(observable, advantage=-size_penalty(INFERENCE.outside, flow, above=True))
@@ -184,14 +162,10 @@ def _penalise_size(observable: Observable, judged: RecordingSums, unit_flows: Ma
 def _estimate_change(gram: Array, reference: Array, columns: Sequence[ColumnRoles], tested: int) -> tuple[float, float]:
     """Estimate by how much a coefficient of a recording differs from healthy recordings, with the standard error.
 
-    - `gram`, `reference` (E, m, m): for each of E equations with m columns the Gram matrix of the recording, and the
-      sum of the Gram matrices of the healthy recordings.
-    - `columns`: for each equation the indices of its columns by role (leak, motion, left side).
-    - `tested`: index of the column whose coefficient is tested; in the healthy recordings this coefficient counts as 0.
-
-    The differences of the other coefficients from the healthy ones have normal priors, and are eliminated (Schur
-    complement). Except for the leak, columns without a finite prior deviation are left out. Without information on the
-    tested coefficient the change is 0 and the error infinite.
+    `gram`, `reference` (E, m, m): Gram matrices of the recording, and of the sum of the healthy recordings, for E
+    equations; `tested`: index of the column, whose coefficient counts as 0 in the healthy recordings. The differences
+    of the other coefficients have normal priors, and are eliminated. Except for the leak, columns without a finite
+    prior deviation are left out. Without information the change is 0 and the error infinite.
     """
     precision, moment = 0.0, 0.0
     for e, roles in enumerate(columns):
@@ -200,10 +174,6 @@ def _estimate_change(gram: Array, reference: Array, columns: Sequence[ColumnRole
         coefficients = solve(reference[e][np.ix_(free, free)], reference[e][free, roles.left])
         residual = gram[e][:, roles.left] - gram[e][:, free] @ coefficients
         prior_precisions = roles.difference_precisions(free, coefficients, coefficients[free.index(leak)])
-        matrix, cross = gram[e][np.ix_(free, free)], gram[e][free, tested]
-        # prior deviations are fractions of the coefficients: near 0 the precision is nearly infinite, and is limited
-        regularised = matrix + np.diag(np.minimum(prior_precisions, 1e9 * np.diag(matrix)))
-        solution = solve(regularised, np.column_stack([cross, residual[free]]))
-        precision += float(gram[e][tested, tested] - cross @ solution[:, 0])
-        moment += float(residual[tested] - cross @ solution[:, 1])
+        parts = reduce_to_tested(gram[e], residual, tested, free, prior_precisions)
+        precision, moment = precision + parts[0], moment + parts[1]
     return (moment / precision, precision**-0.5) if precision > 0.0 else (0.0, np.inf)

@@ -97,8 +97,7 @@ class HeldChambers:
 
         The logarithm of the area takes the three values of the Gauss-Hermite quadrature of its normal distribution. How
         well a variant fits the holds does not change its probability: errors by delays of the sensors repeat from hold
-        to hold, so that a good fit proves nothing. If both areas are known to within `size.area` (`priors.toml`), the
-        only variant is this estimator itself.
+        to hold. If both areas are known (`size.area` in `priors.toml`), there is only this estimator.
         """
         sides = self.sides
         if max(sides.deviation_A, sides.deviation_B) <= INFERENCE.size.area:
@@ -114,10 +113,7 @@ class HeldChambers:
 
     @property
     def n_readings(self) -> float:
-        """Effective number of independent readings (means of neighbouring samples) in all holds.
-
-        Each of the two sides of a hold counts as `held_oil.independent` readings (`priors.toml`).
-        """
+        """Effective number of independent readings (means of neighbouring samples) of both sides in all holds."""
         independent: float = INFERENCE.held_oil.independent
         return independent * 2.0 * len(self.holds)
 
@@ -143,9 +139,8 @@ class HeldChambers:
     def _is_closed(self, hold: LockedHold, p: Array) -> NDArray[np.bool_]:
         """Flag the samples (n,) of a hold in which no check valve refills a chamber.
 
-        The valve is closed while the chamber's pressure exceeds the charge pressure by a relative and an absolute
-        margin, `held_oil.charge` and `held_oil.resolved` (`priors.toml`). `p` (n,): absolute pressure of the chamber in
-        the `hold` [Pa], here averaged over `held_oil.steady` to remove noise.
+        Its absolute pressure `p` (n,) [Pa], averaged, then exceeds the charge pressure by a relative and an absolute
+        margin, `held_oil.charge` and `held_oil.resolved` (`priors.toml`).
         """
         prior = INFERENCE.held_oil
         steady_pressure = average_over(prior.steady, p, 1.0 / float(np.diff(hold.t).mean()))
@@ -166,9 +161,8 @@ class HeldChambers:
     def _closed_share(self, refilled: tuple[bool, bool]) -> float:
         """Compute the fraction of the samples of both sides in all holds in which no check valve refills the chamber.
 
-        `refilled`: true for A, and for B, if a check valve refills that side once it is at the charge pressure. While a
-        chamber is refilled, its readings (sample means) fit any leak, so that the variance of all readings is too small
-        by this factor.
+        `refilled`: as in `_closed_flags`. While a chamber is refilled, its readings (sample means) fit any leak, so
+        that the variance of all readings is too small by this factor.
         """
         share = float(np.concatenate(self._closed_flags(refilled), axis=1).mean())
         return max(share, 1.0 / self.n_readings)  # above 0, since its logarithm is used
@@ -179,9 +173,7 @@ class HeldChambers:
         """Compute the flow past the piston in each hold for a leak with a coefficient of 1, in Pa^e.
 
         The flow is sign(dp) |dp|^e, times the growth of the leak since its onset, with dp = p_A - p_B - z. The sensor
-        offset z in a hold may differ a little from the `offset` [Pa] of the recording (`LockedHold.driving_pressure`).
-        `refilled`: true for A, and for B, if check valves replace displaced oil of that side; `law`: exponent e, and
-        growth.
+        offset z in a hold may differ from the recording's `offset` [Pa] (`LockedHold.driving_pressure`).
         """
         flows = []
         for hold in self.holds:
@@ -205,20 +197,18 @@ class HeldChambers:
         return np.asarray(difference - offsets)
 
     def _unit_outside_leak(self, is_A: bool) -> UnitLeak:
-        """Compute the flow of a laminar leak with a conductance of 1 from one chamber to the outside.
+        """Compute the flow [Pa] of a laminar leak with a conductance of 1 from chamber A, or B, to the outside.
 
-        The chamber is A if `is_A` is True, else B. The flow is the chamber's gauge pressure [Pa], or 0 while a check
-        valve refills the chamber.
+        It is the chamber's gauge pressure, or 0 while a check valve refills the chamber.
         """
         pressures = [(hold, hold.p_A if is_A else hold.p_B) for hold in self.holds]
         flows = [np.maximum(p - P_ATM, 0.0) * self._is_closed(hold, p) for hold, p in pressures]
         return UnitLeak([flow_of_side(flow, is_A) for flow in flows], refilled=BOTH)
 
     def _unit_pump_leak(self, is_A: bool) -> UnitLeak:
-        """Compute the flow from one chamber through open valves and the pump to the other, for a conductance of 1.
+        """Compute the flow from A, or from B, through open valves and the pump, for a conductance of 1.
 
-        The oil leaves chamber A if `is_A` is True, else B. No flow counts for the other chamber, since check valves or
-        a shuttle valve keep it at the charge pressure.
+        No flow counts for the other chamber, since check valves or a shuttle valve keep it at the charge pressure.
         """
         sign = 1.0 if is_A else -1.0
         flows = []
@@ -239,12 +229,7 @@ class HeldChambers:
         }
 
     def fit_piston_leak(self, conditions: PistonFit, law: LeakLaw = LAMINAR) -> LeakFit:
-        """Fit the coefficient of a leak past the piston to the times in which shut valves hold the load.
-
-        `conditions`: onset of the leak, sensor offset of p_A - p_B, and whether check valves replace displaced oil;
-        `law`: exponent of the leak over the pressure difference, and its growth. The likelihood includes the prior on
-        the offset.
-        """
+        """Fit the coefficient of a leak past the piston; the likelihood includes the prior on the sensor offset."""
         unit_leak = self._unit_piston_leak(conditions.offset, conditions.refilled, law)
         fit = self._fit_leak(unit_leak, conditions.onset)
         return fit._replace(log_likelihood=fit.log_likelihood - 0.5 * self._offset_cost(conditions.offset))
@@ -260,7 +245,6 @@ class HeldChambers:
             s sqrt(sum of u_0^2) / (sum of the integrals of u), summed over the holds.
 
         Only the time after the onset counts, so that a leak which begins within a hold has no such error there.
-        `conditions`: onset and sensor offset; `law`: law of the leak.
         """
         start_flows, integrals = [0.0], [0.0]
         for hold in self.holds:
@@ -273,15 +257,14 @@ class HeldChambers:
 
     def _offset_cost(self, offset: float) -> float:
         """Compute -2 log of the prior density of a sensor offset [Pa] and of the holds' deviations from this offset."""
-        return offset_cost(offset) + sum(hold.offset_in_hold(offset)[1] for hold in self.holds)
+        return float(offset_cost(offset)) + sum(hold.offset_in_hold(offset)[1] for hold in self.holds)
 
     def leaks_since(self, onset: float) -> Array | None:
         """Estimate the conductances of three leaks from the holds, each followed by its standard deviation, shape (6,).
 
-        The leaks are past the piston, to the outside from A, and to the outside from B, as in `HeldLeaks`. The
-        conductance past the piston is that of a leak since `onset` [s], times the probability of this leak
-        (`piston_leak`); the standard deviation is not multiplied by the probability. The leaks to the outside are means
-        over the recording. Return None if no hold shows a flow past the piston after the onset.
+        They are in the order of `HeldLeaks`. The conductance past the piston is that of a leak since `onset` [s], times
+        the probability of this leak (`piston_leak`); the leaks to the outside are means over the recording. Return None
+        if no hold shows a flow past the piston after the onset.
         """
         fits = self._fits_over_offsets(onset)
         if not fits:
@@ -291,9 +274,9 @@ class HeldChambers:
         return np.array(self.leaks._replace(piston=probable, deviation=leak.deviation))
 
     def _fits_over_offsets(self, onset: float) -> list[LeakFit]:
-        """Fit a leak past the piston since `onset` [s] for each sensor offset of a grid; omit fits without any flow.
+        """Fit a leak past the piston since `onset` [s] for several sensor offsets, on which it may depend strongly.
 
-        The offset is varied since at small pressure differences the fitted leak depends strongly on it.
+        Fits without any flow are omitted.
         """
         best = self.piston_fit._replace(onset=onset)
         fits = [
@@ -302,11 +285,7 @@ class HeldChambers:
         return [fit for fit in fits if fit.deviation < UNKNOWN]
 
     def _fit_leak(self, leak: UnitLeak, onset: float) -> LeakFit:
-        """Fit the coefficient, at least 0, of a leak that begins at `onset` [s] to all holds of the recording.
-
-        `leak`: flow of the leak with a coefficient of 1. If no oil would flow in the holds after the onset, the
-        coefficient is 0 with the standard deviation `UNKNOWN`.
-        """
+        """Fit the coefficient, at least 0, of a leak since `onset` [s] to all holds; 0 +- `UNKNOWN` if no oil flows."""
         column = self._leak_columns(leak, np.array([onset]))
         fit_without_leak = self._fits_without_leak[leak.refilled]
         value, deviation, by_oil, variance = 0.0, UNKNOWN, 0.0, fit_without_leak.variance
@@ -320,10 +299,9 @@ class HeldChambers:
 
     @cached_property
     def onsets(self) -> Array:
-        """Possible onsets of a leak [s], in order of time.
+        """Possible onsets of a leak [s] in order of time: the beginning of the recording, between holds, within them.
 
-        They are the beginning of the recording, and times between the holds and within each. A large leak equalises
-        the pressures at once; therefore one of the onsets in each hold is the time at which p_A - p_B changes most.
+        As a large leak equalises the pressures at once, one of those in a hold is the time of its largest change.
         """
         onsets = [self.begin]
         for k, hold in enumerate(self.holds):
@@ -335,19 +313,14 @@ class HeldChambers:
 
     @cached_property
     def _onset_log_priors(self) -> Array:
-        """Log prior probability of each possible onset of a leak in `onsets`, shape (o,).
-
-        With the probability `held_oil.from_start` (`priors.toml`) a leak exists from the start. The later onsets are
-        equally probable.
-        """
+        """Log prior probability (o,) of each of `onsets`: `held_oil.from_start` for the first; the others are equal."""
         from_start, n_later = INFERENCE.held_oil.from_start, len(self.onsets) - 1
         return np.asarray(np.log(np.append(from_start, np.full(n_later, (1.0 - from_start) / max(n_later, 1)))))
 
     def _leak_columns(self, leak: UnitLeak, onsets: Array) -> Array:
         """Compute the volume lost by each of r readings through a leak that begins at each of o `onsets`, (r, o).
 
-        The leak has a coefficient of 1. A reading is a mean of samples. The volumes are those that leave each side,
-        relative to their mean over the hold. `leak`: flow of the leak out of both sides in each hold.
+        The volumes (sample means) are those that leave each side, relative to their mean over the hold.
         """
         columns = []
         for hold, sides in zip(self.holds, leak.flows, strict=True):
@@ -368,9 +341,8 @@ class HeldChambers:
         """Compute the log posterior probability of each possible onset of a leak (`onsets`), shape (o,).
 
         The result is log prior - N/2 log(residual sum of squares), up to a constant, for N independent readings and a
-        coefficient >= 0, with the properties of the oil eliminated. `leak`: flow of the leak with a coefficient of 1.
-        The variance of the readings weights the priors of the properties: at first the variance without a leak, then
-        the variance with the most probable onset.
+        coefficient >= 0, with the properties of the oil eliminated. The variance of the readings weights the priors of
+        the properties: at first the variance without a leak, then the variance with the most probable onset.
         """
         regression = self._regressions[leak.refilled]
         variance, n_rows = self._fits_without_leak[leak.refilled].variance, len(regression.displaced)
@@ -382,20 +354,16 @@ class HeldChambers:
 
     @cached_property
     def _offset_grid(self) -> Array:
-        """Candidates of the sensor offset of p_A - p_B [Pa], in ascending order.
+        """Candidates of the sensor offset of p_A - p_B [Pa] in ascending order: a fixed grid, and the ends of holds.
 
-        They are a fixed grid, and the recorded p_A - p_B at the end of each hold. If a leak has equalised the pressures
-        by then, this difference is the offset.
+        If a leak has equalised the pressures by the end of a hold, the offset is the recorded p_A - p_B.
         """
         ends = [hold.mean(hold.difference)[-1] for hold in self.holds]
         return np.unique(np.concatenate([np.append(-OFFSET_GRID, OFFSET_GRID) * INFERENCE.zero.pressure, ends]))
 
     @cached_property
     def piston_fits(self) -> dict[float, PistonFit]:
-        """Most probable onset of a leak past the piston, sensor offset and effect of check valves, for several laws.
-
-        The keys are the exponents of the laws, `EXPONENTS`.
-        """
+        """Most probable onset of a leak past the piston, sensor offset, and effect of check valves, by exponent."""
         return {exponent: self._find_piston_fit(exponent) for exponent in EXPONENTS}
 
     @property
@@ -407,8 +375,7 @@ class HeldChambers:
         """Find the most probable onset of a leak past the piston, sensor offset, and effect of check valves.
 
         They have the highest joint posterior probability, on a grid of onsets and a grid of offsets that is refined
-        once, with and without check valves that replace displaced oil (equally probable). `exponent`: exponent of the
-        leak's law (`LeakLaw`).
+        once, with and without check valves that replace displaced oil (equally probable). `exponent`: as in `LeakLaw`.
         """
         grid, fits = self._offset_grid, list[tuple[float, PistonFit]]()
         is_never_refilled = self._closed_share(self._refillable_sides) == 1.0
@@ -434,9 +401,8 @@ class HeldChambers:
     def _fit_growing_leak(self, leak: UnitLeak, onset: float) -> LeakFit:
         """Fit a leak that may grow from its `onset` [s] on; its coefficient is the mean from the onset to the end.
 
-        The leak is fitted for each growth of `growth_priors`. The result has the coefficient of the most probable
-        growth, and the log of the likelihood that is averaged over the growths by their prior probabilities. `leak`:
-        flow of the leak with a coefficient of 1, without growth.
+        The result has the coefficient of the most probable growth of `growth_priors`, and the log of the likelihood
+        that is averaged over the growths by their prior probabilities.
         """
         fits, log_weights = list[LeakFit](), list[float]()
         for growth, probability in growth_priors():
@@ -452,10 +418,7 @@ class HeldChambers:
         return most_probable._replace(log_likelihood=float(np.logaddexp.reduce(log_weights)))
 
     def _mean_unit_flow(self, conditions: PistonFit, law: LeakLaw) -> float:
-        """Compute the mean magnitude of the flow past the piston in the holds, for a leak with a coefficient of 1.
-
-        The mean is over the time after the onset. `conditions`: onset and sensor offset; `law`: law of the leak.
-        """
+        """Compute the mean magnitude of the flow past the piston in holds after the onset, for a coefficient of 1."""
         leak = self._unit_piston_leak(conditions.offset, law=law)
         flows = [  # row 0 is the flow out of A
             np.abs(sides[0])[hold.t >= conditions.onset] for hold, sides in zip(self.holds, leak.flows, strict=True)
@@ -466,8 +429,7 @@ class HeldChambers:
     def _find_onset(self, offset: float, refilled: tuple[bool, bool], exponent: float) -> tuple[float, PistonFit]:
         """Find the most probable onset of a leak past the piston, given the sensor offset of p_A - p_B [Pa].
 
-        `refilled`: true for A, and for B, if check valves replace displaced oil of that side; `exponent`: exponent of
-        the leak's law. Return the log posterior of onset and offset, and the fit with this onset.
+        `refilled`, `exponent`: as in `PistonFit` and `LeakLaw`. Return its log posterior and the fit with it.
         """
         posteriors = self._onset_posteriors(self._unit_piston_leak(offset, refilled, LeakLaw(exponent)))
         index = int(posteriors.argmax())
@@ -484,10 +446,9 @@ class HeldChambers:
     def _weigh_hypotheses(self, leaks: Sequence[UnitLeak]) -> list[LeakHypothesis]:
         """Fit a leak past the piston and each of the other `leaks`, and compute their probabilities, in this order.
 
-        Each leak may grow from its onset on. The coefficient of the leak past the piston is that of its most probable
-        law, converted to the conductance of a laminar leak with the same mean flow in the holds. The coefficients of
-        the other leaks are means from the onset to the end. The likelihood of a leak is a mean over its laws and
-        growths, weighted by their prior probabilities.
+        Each leak may grow from its onset on. The coefficient past the piston is that of the most probable law,
+        converted to the conductance of a laminar leak with the same mean flow in the holds; the others are means from
+        the onset to the end. The likelihood of a leak is a mean over its laws and growths, by their priors.
         """
         best = max(self.law_fits, key=lambda fit: fit.log_weight)
         unit_ratio = self._mean_unit_flow(best.conditions, best.law) / self._mean_unit_flow(best.conditions, LAMINAR)
@@ -510,9 +471,8 @@ class HeldChambers:
     def total_leak(self) -> Flow:
         """Estimate the mean conductance [m^3/(s Pa)] of all leaks in the holds, even if the valves are open.
 
-        The leak is past the piston, to the outside, or through open valves and the pump (`_unit_pump_leak`); the
-        estimates are weighted by the probabilities of these hypotheses. A check valve that refills a chamber would hide
-        the oil that leaves the chamber, so no refilling is assumed.
+        The leak is past the piston, to the outside, or through open valves and the pump, each weighted by its
+        probability. A check valve would hide the oil that leaves a chamber, so no refilling is assumed.
         """
         # without a charge pressure check valves stay closed
         chambers = self if self._closed_share(BOTH) == 1.0 else replace(self, charge=0.0)
@@ -531,8 +491,7 @@ class HeldChambers:
     def leaks(self) -> HeldLeaks:
         """Mean leaks over the recording, from the times in which shut valves hold the load.
 
-        Each leak is its estimate times the probability of that leak. The standard deviations are not multiplied by the
-        probability, and exclude the uncertainty of the oil's properties.
+        Each leak is its estimate times its probability. Its deviation is not, and excludes that of the oil.
         """
         values_and_deviations = []
         for leak in self._leak_hypotheses:
@@ -545,15 +504,14 @@ class HeldChambers:
 
     @property
     def piston_leak(self) -> LeakHypothesis:
-        """Hypothesis of a leak past the piston while shut valves hold the load, with its probability and fit."""
+        """Hypothesis of a leak past the piston while shut valves hold the load."""
         return self._leak_hypotheses[0]
 
     @property
     def probability_after_holds(self) -> float:
-        """Prior probability that a leak begins after the last time that shut valves hold the load (the last hold).
+        """Prior probability that a leak begins after the last hold, so that no hold shows it.
 
-        No hold shows such a leak. Its probability is (1 - `held_oil.from_start`), the probability of a leak that begins
-        within the recording, times the fraction of the recording's time after the last hold.
+        It is that of a leak that begins within the recording, times the fraction of the time after the last hold.
         """
         time_after, begins_within = self.end - float(self.holds[-1].t[-1]), 1.0 - INFERENCE.held_oil.from_start
         return begins_within * time_after / max(self.end - self.begin, np.finfo(float).tiny)

@@ -28,8 +28,7 @@ class LockedHold:
     """Samples of one hold, in which shut valves hold the load.
 
     `t`: time [s]; `p_A`, `p_B`: absolute pressures [Pa]; `x`: position [m], (n,) each. `edges` (k + 1,): indices of the
-    samples that bound k intervals; the mean of the samples of an interval is a reading. In the first interval the
-    valves may still be shutting.
+    samples that bound k intervals, whose means are readings. In the first interval the valves may still be shutting.
     """
 
     t: Array
@@ -40,8 +39,7 @@ class LockedHold:
 
     def mean(self, values: Array) -> Array:
         """Average `values` (..., n) of n samples over the intervals between `edges`, to k readings, shape (..., k)."""
-        sums = np.add.reduceat(values, self.edges[:-1], axis=-1)
-        return np.asarray(sums / self.sizes)
+        return np.asarray(np.add.reduceat(values, self.edges[:-1], axis=-1) / self.sizes)
 
     @cached_property
     def sizes(self) -> NDArray[np.intp]:
@@ -63,17 +61,10 @@ class LockedHold:
         settling = slice(self.edges[0], self.edges[1])
         return float(self.p_A[settling].mean()) > float(self.p_B[settling].mean())
 
-    @cached_property
-    def _last_pressures(self) -> tuple[float, float]:
-        """Mean pressures [Pa] of A and of B in the last interval."""
-        last = slice(self.edges[-2], None)
-        return float(self.p_A[last].mean()), float(self.p_B[last].mean())
-
     def centre(self, readings: Array, is_A: bool) -> Array:
         """Subtract the mean over the hold from `readings` (k, ...) of side A, or of side B if `is_A` is False.
 
-        The first reading of the side with the higher pressure becomes 0 and does not count towards the mean, since the
-        valves may still be shutting.
+        The first reading of the side with the higher pressure becomes 0: the valves may still be shutting.
         """
         first = int(self.carries(is_A))  # first reading that counts: 1 on the side with the higher pressure, else 0
         centred = np.asarray(readings - readings[first:].mean(axis=0))
@@ -88,12 +79,12 @@ class LockedHold:
         at the end of the hold. The more probable of two cases is assumed:
 
         - A leak has equalised the pressures. The recorded p_A - p_B at the end is then the offset of the hold.
-        - A load causes p_A - p_B at the end, and all values up to the higher pressure are equally probable. The offset
-          of the hold is then `offset`.
+        - A load causes p_A - p_B at the end, equally probable up to the higher pressure. The offset of the hold is
+          `offset`.
 
         Returns the offset of the hold, and ((offset of the hold - `offset`) / s)^2.
         """
-        last_A, last_B = self._last_pressures
+        last_A, last_B = (float(p[self.edges[-2] :].mean()) for p in (self.p_A, self.p_B))
         pressure, difference = max(last_A, last_B), last_A - last_B
         deviation = INFERENCE.held_oil.gain * pressure
         cost = ((difference - offset) / deviation) ** 2
@@ -101,11 +92,11 @@ class LockedHold:
         return (difference, cost) if is_equalised else (offset, 0.0)
 
     def driving_pressure(self, offset: float) -> Array:
-        """Compute p_A - p_B [Pa] at each sample (n,), given the recording's sensor `offset` [Pa] of this difference.
+        """Compute p_A - p_B [Pa] at each sample (n,), without the offset of the hold, given that of the recording.
 
-        The offset of the hold itself is subtracted (`offset_in_hold`). Once a leak has equalised the pressures, small
-        differences d are errors of the sensors. Their integral over the hold may exceed the integral of the large but
-        short-lived difference before. In such holds d is therefore multiplied by d^2 / (d^2 + `held_oil.resolved`^2).
+        Once a leak has equalised the pressures, small differences d are errors of the sensors. Their integral over the
+        hold may exceed the integral of the large but short-lived difference before. In such holds d is therefore
+        multiplied by d^2 / (d^2 + `held_oil.resolved`^2).
         """
         offset_here, cost = self.offset_in_hold(offset)
         difference = np.asarray(self.difference - offset_here)
@@ -114,10 +105,9 @@ class LockedHold:
         return difference
 
     def steepest_time(self) -> float:
-        """Find the time [s] at which the largest change of p_A - p_B in the hold begins.
+        """Find the time [s] from which p_A - p_B changes most over `held_oil.equalises` (`priors.toml`).
 
-        Changes are differences over the time `held_oil.equalises` (`priors.toml`), in which a large leak equalises the
-        pressures.
+        In this time a large leak equalises the pressures.
         """
         n_equalising = int(np.searchsorted(self.t, self.t[0] + INFERENCE.held_oil.equalises))  # [samples]
         difference = self.difference
@@ -128,10 +118,10 @@ def find_charge_pressure(lower_pressure: Array, rests: NDArray[np.bool_], rate: 
     """Find the pressure [Pa] that check valves maintain in a chamber without load.
 
     It is the lowest pressure while the pump rests, but at most the median while the pump turns, since a leak may
-    equalise the pressures in every rest. If the pump never rests, it is the lowest pressure of the recording. This may
-    be too low, by the pressure drop of lines and check valves through which a moving piston draws oil. `lower_pressure`
-    (n,): the lower of both chamber pressures in each sample [Pa]; `rests` (n - 1,): flags of the sampling intervals in
-    which the pump rests; `rate`: sampling rate [Hz].
+    equalise the pressures in every rest. If the pump never rests, it is the lowest pressure of the recording, which may
+    be too low by the drop of check valves through which a moving piston draws oil. `lower_pressure` (n,): the lower of
+    both chamber pressures [Pa]; `rests` (n - 1,): flags of the intervals in which the pump rests; `rate`: sampling rate
+    [Hz].
     """
     steady_pressure = average_over(INFERENCE.held_oil.steady, lower_pressure, rate)
     if not rests.any():
@@ -194,8 +184,7 @@ def find_locked_holds(channels: Sequence[Array], rests: NDArray[np.bool_], rate:
 def _reading_edges(n_samples: int, width: float) -> NDArray[np.intp]:
     """Divide the samples of a hold into k intervals that lengthen geometrically; return their bounds, shape (k + 1,).
 
-    The samples of an interval will be averaged to one reading. The first interval has `width` samples, and each later
-    interval `GROWTH` times as many as its predecessor. The last interval extends to the end of the hold.
+    The first interval has `width` samples, each later one `GROWTH` times as many; the last one takes the rest.
     """
     edges = [0]
     while edges[-1] + max(round(width), 1) < n_samples:

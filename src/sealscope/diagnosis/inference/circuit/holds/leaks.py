@@ -18,8 +18,7 @@ UNKNOWN = 1e30
 class LeakLaw(NamedTuple):
     """Law of a leak past the piston: its flow is a coefficient times |p_A - p_B|^`exponent`, and grows from its onset.
 
-    `growth`: increase of the coefficient from the `onset` [s] to the end of the recording, relative to that at the
-    onset.
+    `growth`: relative increase of the coefficient from the `onset` [s] to the end of the recording.
     """
 
     exponent: float = 1.0
@@ -27,10 +26,7 @@ class LeakLaw(NamedTuple):
     onset: float = 0.0
 
     def growth_factor(self, t: Array, end: float) -> Array:
-        """Compute the coefficient at times `t` (n,) [s], relative to its value at the onset.
-
-        `end`: end of the recording [s].
-        """
+        """Compute the coefficient at times `t` (n,) [s], up to `end`, relative to its value at the onset."""
         return 1.0 + self.growth * np.clip((t - self.onset) / max(end - self.onset, np.finfo(float).tiny), 0.0, 1.0)
 
 
@@ -45,9 +41,9 @@ NEITHER, BOTH = (False, False), (True, True)
 class UnitLeak(NamedTuple):
     """Flow of a leak with a coefficient of 1 while shut valves hold the load.
 
-    `flows`: for each hold of n samples the flow out of A (first row) and out of B, over the coefficient, (2, n), in
-    Pa^e for the exponent e of the law (laminar: 1); `refilled`: true for A, and for B, if a check valve refills that
-    side while it is at the charge pressure. The flow of the side does not count then.
+    `flows`: for each hold of n samples the flow out of A (first row) and out of B, (2, n), in Pa^e for the exponent e
+    of the law (laminar: 1); `refilled`: true for A, and for B, if a check valve refills that side while it is at the
+    charge pressure. The flow of the side does not count then.
     """
 
     flows: Sequence[Array]
@@ -57,8 +53,7 @@ class UnitLeak(NamedTuple):
 class HeldLeaks(NamedTuple):
     """Mean conductances of three leaks over a recording with holds, each with its standard deviation [m^3/(s Pa)].
 
-    The leaks are past the `piston`, and to the outside from A and from B. They are measured with the pump's assumed
-    displacement.
+    They are past the `piston`, and to the outside from A and from B, as measured with the pump's assumed displacement.
     """
 
     piston: float
@@ -93,10 +88,7 @@ class LeakFit(NamedTuple):
     log_likelihood: float
 
     def scale(self, factor: float, log_likelihood: float) -> LeakFit:
-        """Multiply coefficient and standard deviations by a `factor`, and set the `log_likelihood` of the fit.
-
-        The deviation `UNKNOWN` of a leak without information is kept.
-        """
+        """Multiply coefficient and standard deviations (except `UNKNOWN`) by a `factor`; set the `log_likelihood`."""
         deviation = factor * self.deviation if self.deviation < UNKNOWN else UNKNOWN
         return LeakFit(factor * self.value, deviation, factor * self.by_oil, log_likelihood)
 
@@ -129,9 +121,6 @@ def flow_of_side(flow: Array, is_A: bool) -> Array:
 
 
 def average_fits(fits: Sequence[LeakFit]) -> Flow:
-    """Average the coefficients of alternative fits of a leak, weighted by their likelihoods.
-
-    Returns the mean and the standard deviation, due to noise and to the uncertain properties of the oil.
-    """
+    """Average alternative fits of a leak by their likelihoods; the deviation includes noise and uncertain oil."""
     values, deviations, by_oil, log_likelihoods = np.array(fits).T
     return mixture_flow(np.exp(log_likelihoods - log_likelihoods.max()), values, np.hypot(deviations, by_oil))

@@ -55,8 +55,7 @@ class OilRegression(NamedTuple):
     - `strained`, `aired` (r, 3): volumes [m^3] taken up by the compression of the oil and of the free air, with the
       usual properties, in the stroke, in the dead volume of A, and in that of B.
     - `inflation`: number of readings over the number of independent readings.
-    - `misfit_variance`: variance of a reading [m^6] in addition to the variance of the noise, since the model describes
-      the compressed volume only to within a fraction.
+    - `misfit_variance`: variance of a reading [m^6] in addition to the noise, as the model is not exact.
     """
 
     displaced: Array
@@ -66,19 +65,12 @@ class OilRegression(NamedTuple):
     misfit_variance: float
 
     def leaked(self, changes: Array) -> Array:
-        """Compute the volume that left a chamber by each reading (r,) [m^3]: the displaced minus the compressed volume.
-
-        `changes` (4,): changes of the oil's properties (`_oil_factors`).
-        """
+        """Compute the volume that left a chamber by each reading (r,) [m^3], for `changes` (4,) of the oil."""
         oil, air, volumes = _oil_factors(changes)
         return self.displaced - (oil * self.strained + air * self.aired) @ volumes
 
     def slopes(self, changes: Array) -> Array:
-        """Compute the derivatives (r, 4) of the compressed volumes [m^3] by the changes of the oil's properties.
-
-        A compressed volume is the part of the displaced volume that the compression of oil and free air takes up.
-        `changes` (4,): the changes at which the derivatives are taken.
-        """
+        """Compute the derivatives (r, 4) of the compressed volumes [m^3] by the `changes` (4,) of the oil."""
         oil, air, volumes = _oil_factors(changes)
         strained, aired = oil * self.strained, air * self.aired
         dead = strained[:, 1:] + aired[:, 1:]  # derivatives by the relative changes of the dead volumes of A and B
@@ -86,31 +78,23 @@ class OilRegression(NamedTuple):
 
 
 def _oil_factors(changes: Array) -> tuple[float, float, Array]:
-    """Convert changes of the oil's properties to factors, in the order in which compressed volumes are computed.
+    """Convert `changes` (4,) of the oil's properties (`OilRegression`) to factors on compressed volumes.
 
-    `changes` (4,): log of the factor on the compressibility, relative changes of the dead volumes of A and of B, and
-    log of the factor on the free air. Returns three items:
-
-    - factor on the compressibility;
-    - factor on the free air;
-    - factors (3,) on the volume of the stroke (always 1, as it is not estimated) and on the dead volumes of A and B.
+    Returns the factor on the compressibility, that on the free air, and those (3,) on the volume of the stroke (always
+    1, as it is not estimated) and on the dead volumes of A and B.
     """
     compressibility, dead_A, dead_B, air = changes
     return float(np.exp(compressibility)), float(np.exp(air)), np.array([1.0, 1.0 + dead_A, 1.0 + dead_B])
 
 
 def _oil_deviations() -> Array:
-    """Return prior standard deviations (4,) of the relative changes of the oil's properties.
-
-    They are those of the compressibility, the dead volumes of A and of B, and the free air, as in `_oil_factors`.
-    """
+    """Return prior standard deviations (4,) of the changes of the oil's properties (`OilRegression`)."""
     prior = INFERENCE.held_oil
-    dead_volume_deviation = prior.dead_deviation
-    return np.array([prior.deviation, dead_volume_deviation, dead_volume_deviation, prior.air_deviation])
+    return np.array([prior.deviation, prior.dead_deviation, prior.dead_deviation, prior.air_deviation])
 
 
 def _lowest_changes() -> Array:
-    """Return the lower limits (4,) of the changes of the oil's properties, in the order of `_oil_factors`."""
+    """Return the lower limits (4,) of the changes of the oil's properties (`OilRegression`)."""
     prior = INFERENCE.held_oil
     lowest_dead = prior.least_dead / prior.dead - 1.0
     return np.array([-np.inf, lowest_dead, lowest_dead, -np.inf])
@@ -134,10 +118,9 @@ def build_regression(
 ) -> OilRegression:
     """Build the regression of displaced volumes on the oil's properties from all holds (`OilRegression`).
 
-    The rows are the readings (sample means) of each hold, side A before side B, relative to their mean over the
-    hold. `flags`: for each hold of n samples, flags (2, n) of the samples in which no check valve refills A, and B, so
-    that the displacement of this side counts; `sides`: areas and stroke of the cylinder; `n_readings`: effective number
-    of independent readings.
+    The rows are the readings (sample means) of each hold, side A before side B, relative to their mean over the hold.
+    `flags`: for each hold of n samples, flags (2, n) of the samples in which no check valve refills A, and B, so that
+    the displacement of this side counts; `n_readings`: effective number of independent readings.
     """
     prior, stroke = INFERENCE.held_oil, sides.high - sides.low
     displaced, strained, aired = list[Array](), list[Array](), list[Array]()
@@ -170,10 +153,9 @@ def build_regression(
 def fit_leaks(regression: OilRegression, columns: Array, n_readings: float) -> LeakRegression:
     """Fit the coefficients of c leaks together with the properties of the oil.
 
-    `regression`: volumes displaced and compressed in the holds; `columns` (r, c): volumes leaked with coefficients of 1
-    by each reading (mean of samples); `n_readings`: effective number of independent readings. The properties are found
-    by iteration, and so is the variance of a reading, which weights their priors against the readings. A dead volume
-    that reaches its lower limit stays there.
+    `columns` (r, c): volumes leaked with coefficients of 1 by each reading (mean of samples); `n_readings`: effective
+    number of independent readings. The properties are found by iteration, and so is the variance of a reading, which
+    weights their priors against the readings. A dead volume that reaches its lower limit stays there.
     """
     n_leaks = columns.shape[1]
     changes = np.zeros(4)  # changes of the oil's properties, at first none
@@ -221,10 +203,10 @@ def fit_leaks(regression: OilRegression, columns: Array, n_readings: float) -> L
 def residual_squares(regression: OilRegression, columns: Array, variance: float) -> Array:
     """Compute the residual sum of squares of the fit of a leak with a coefficient >= 0, for each of o onsets, (o,).
 
-    `regression`: regression on the properties of the oil, linearised at their usual values; `columns` (r, o): volume
-    leaked with a coefficient of 1 since each onset, at each reading; `variance`: variance of a reading, which weights
-    the priors on the properties against the readings. The properties are changes relative to their usual values, each
-    with a lower limit, which is -1 (nothing left) for compressibility and free air.
+    The `regression` is linearised at the usual properties of the oil. `columns` (r, o): volume leaked with a
+    coefficient of 1 since each onset, at each reading; `variance`: variance of a reading, which weights the priors on
+    the properties against the readings. The properties are changes relative to their usual values, each with a lower
+    limit, which is -1 (nothing left) for compressibility and free air.
     """
     usual = np.zeros(4)
     leaked, oil = regression.leaked(usual), regression.slopes(usual)
