@@ -17,20 +17,20 @@ R = TypeVar("R")
 V = TypeVar("V")
 
 
-#: Longest word for which suggestions are searched, as the time grows faster than its length.
+#: Longest word for which suggestions are searched: the time of the search grows faster than the word's length.
 _MAX_WORD = 200
 
 
 def nearest(word: str, known: Iterable[str], count: int = 1, share: float = 0.5) -> list[str]:
     """Find up to `count` words of `known` that resemble `word`, the most similar first.
 
-    `share` (0 to 1): lowest similarity, by the `ratio` of difflib. A `word` longer than 200 characters has none.
+    `share` (0 to 1): lowest similarity, by the `ratio` of difflib. A `word` over 200 characters gets no suggestion.
     """
     return difflib.get_close_matches(word, known, n=count, cutoff=share) if len(word) <= _MAX_WORD else []
 
 
 def suggestion(word: str, known: Iterable[str]) -> str:
-    """Format the end of an error message that suggests the known name nearest to `word`, in upper or lower case.
+    """Format the end of an error message that suggests the name in `known` most similar to `word`, ignoring case.
 
     It is ``; did you mean NAME?``, or empty if no known name is similar.
     """

@@ -80,7 +80,7 @@ def source_hash(root: Path) -> str:
 
 
 def _user_cache_folder() -> Path | None:
-    """Choose the cache folder: `SEALSCOPE_CACHE_DIR`, or the user's; None if that is empty, or without a home."""
+    """Return the cache folder, `SEALSCOPE_CACHE_DIR` or else the user's; None if that is empty or no home is known."""
     setting = os.environ.get("SEALSCOPE_CACHE_DIR")
     if setting is not None:
         return Path(setting) if setting else None
@@ -89,7 +89,7 @@ def _user_cache_folder() -> Path | None:
 
 
 def _prune(kernels: Path, current: str) -> None:
-    """Remove subfolders of `kernels` but `current` and the `_MAX_GENERATIONS` - 1 most recently used others."""
+    """Remove all subfolders of `kernels` but `current` and the `_MAX_GENERATIONS` - 1 most recently used others."""
     older = sorted(
         (entry for entry in kernels.iterdir() if entry.is_dir() and entry.name != current),
         key=lambda entry: entry.stat().st_mtime,
@@ -166,7 +166,7 @@ def kernel(function: _F, fastmath: Any = False) -> _F:
 
 
 def _compile_law(function: _F, fastmath: Any, inlined: bool = True) -> _F:
-    """Compile a law, a function for other compiled functions; `inlined`: True to insert its code in their place.
+    """Compile a law, a function that compiled functions call; `inlined`: True to insert its code in place of each call.
 
     `fastmath`: LLVM's fast-math flags, False for none. Without numba's compilation, the law is returned as it is.
     """
@@ -181,20 +181,21 @@ def law(function: _F) -> _F:
 
 
 def large_law(function: _F) -> _F:
-    """Compile a large function that other compiled functions call, instead of containing its code, and Python, too."""
+    """Compile a large function for calls from Python and from compiled functions, which do not contain its code."""
     return _compile_law(function, fastmath=False, inlined=False)
 
 
 def contracted(function: _F) -> _F:
     """Compile a small function like `law`, with fused multiply-adds and divisions by reciprocals allowed.
 
-    The last digits of the results then depend on the processor, but not on the split into blocks or lanes.
+    The last digits of the results then depend on the processor, but not on how samples are divided into blocks
+    and vector lanes.
     """
     return _compile_law(function, fastmath={"contract", "arcp"})  # fused multiply-adds, reciprocals
 
 
 class Entry:
-    """A function double f(double *memory, double *input), compiled when its `address` is first requested."""
+    """A C function `double f(double *memory, double *input)`, compiled when its `address` is first requested."""
 
     _SIGNATURE = numba.float64(types.CPointer(numba.float64), types.CPointer(numba.float64))
 
@@ -219,7 +220,7 @@ def call_at(context: Any, address: Any, memory: Any, sample: Any) -> Any:
     """
 
     def emit_call(target: Any, builder: Any, signature: Any, values: Any) -> Any:
-        """Emit the LLVM instructions that call the function at the first of the addresses `values` with the others."""
+        """Emit LLVM instructions that call the function at the address `values[0]` with the pointers `values[1:]`."""
         double = target.get_value_type(numba.float64)
         pointer = double.as_pointer()
         function = builder.inttoptr(values[0], llvm.FunctionType(double, [pointer, pointer]).as_pointer())
@@ -237,16 +238,16 @@ def address_of(context: Any, pointer: Any) -> Any:
 
 
 def record_dtype(*numbers: str, **parts: Any) -> np.dtype[Any]:
-    """Build the NumPy dtype of a record of doubles: the single doubles `numbers`, then `parts` by name.
+    """Build the NumPy dtype of a record: a field of one double for each name in `numbers`, then the fields `parts`.
 
-    A part is the shape of an array of doubles, or the dtype of a nested record.
+    `parts`: name -> shape of an array of doubles, or dtype of a nested record.
     """
     further = [(name, part) if isinstance(part, np.dtype) else (name, "f8", part) for name, part in parts.items()]
     return np.dtype([*((name, "f8") for name in numbers), *further])  # f8: NumPy's name of a double
 
 
 def make_record(layout: np.dtype[Any], source: object = None, **values: Any) -> np.recarray[Any, Any]:
-    """Make a record array (1,), each field from `values`, else from the attribute of `source`, else 0."""
+    """Make a record array (1,) of dtype `layout`: a field is from `values`, else an attribute of `source`, else 0."""
     record = np.zeros(1, layout).view(np.recarray)
     for name in layout.fields or ():
         record[name] = values.get(name, getattr(source, name, 0.0))

@@ -26,7 +26,7 @@ LEAK = "0.0042 L/min from 30 s"
 class Demo:
     """Results of the demo: the commissioned machine, two diagnoses, the simulated leak, and the files written.
 
-    `healthy`, `diagnosis`: of a healthy recording and of the leaking recording; `page`: on the latter.
+    `healthy`, `diagnosis`: diagnoses of a healthy and of the leaking recording; `page`: report on the latter.
     """
 
     machine: CommissionedMachine
@@ -43,14 +43,14 @@ def run_demo(folder: Path, seed: int = 1, progress: Progress | None = None) -> D
 
     All files are written into `folder`. `progress`: called with the name of a task and its completed fraction.
     """
-    update = progress or (lambda task, share: None)
+    report_progress = progress or (lambda task, share: None)
     names = [*(f"healthy/run{k + 1}.nc" for k in range(N_HEALTHY)), "healthy.nc"]
     recordings = {}  # name of the file -> recording
     for k, name in enumerate(names):
         run_seed = len(names) * seed + k  # a different one for each recording and each `seed`
         healthy_experiment = Experiment.of(command=COMMAND, duration=SECONDS, seed=run_seed)
         recordings[name] = simulate_experiment(healthy_experiment).recording
-        update("simulating healthy recordings", (k + 1) / len(names))
+        report_progress("simulating healthy recordings", (k + 1) / len(names))
     experiment = Experiment.of(command=COMMAND, leak=LEAK, duration=60.0, seed=seed)
     result = simulate_experiment(experiment, progress)
     file, page = folder / "recording.nc", folder / "report.html"
@@ -58,13 +58,13 @@ def run_demo(folder: Path, seed: int = 1, progress: Progress | None = None) -> D
     make_folder(folder / "healthy")
     for name, recording in recordings.items():
         write(recording, folder / name)
-    update("commissioning", 0.0)
+    report_progress("commissioning", 0.0)
     machine = commission(folder / "healthy", rig=experiment.rig, name="demo")
     machine_file = write_machine(machine, folder / "machine.toml")
-    update("diagnosing", 0.0)
+    report_progress("diagnosing", 0.0)
     healthy = _diagnose_file(machine, folder, "healthy.nc")
     diagnosis = _diagnose_file(machine, folder, file.name)
-    update("writing the page", 0.5)
+    report_progress("writing the page", 0.5)
     report(
         read(file),
         page,
@@ -74,7 +74,7 @@ def run_demo(folder: Path, seed: int = 1, progress: Progress | None = None) -> D
         truth_leak_lpm=result.truth.mean_leak_lpm,
         title=f"Sealscope demo: a leak of {LEAK}",
     )
-    update("writing the page", 1.0)
+    report_progress("writing the page", 1.0)
     return Demo(machine, healthy, diagnosis, result.truth, machine_file, file, page)
 
 

@@ -50,12 +50,12 @@ class ConstantLengths(FunctionPass):  # type: ignore[misc]
         FunctionPass.__init__(self)
 
     def run_pass(self, state: Any) -> bool:
-        """Replace each `len` of an argument of fixed size in the compiled code; return True if it was changed."""
+        """Replace `len` of arguments of known size by constants in numba's `state.func_ir`; return True if any was."""
         code, changed = state.func_ir, False
         find_definition = partial(guard, get_definition, code)  # the one expression that defines a variable, or None
 
         def type_of(source: Any) -> Any:
-            """Find the numba type of an argument of the compiled function or of an argument's attribute, else None."""
+            """Find the numba type of `source`, an argument of the compiled function or its attribute; else None."""
             if isinstance(source, ir.Arg):
                 return state.args[source.index]
             owner = find_definition(source.value) if getattr(source, "op", None) == "getattr" else None
@@ -67,7 +67,7 @@ class ConstantLengths(FunctionPass):  # type: ignore[misc]
             return None
 
         def find_length(value: Any) -> int | None:
-            """Find the number that an expression in intermediate code returns if it is a call of `len`, else None."""
+            """Find the result of the expression `value` if it is `len` of a tuple or array of known size, else None."""
             if getattr(value, "op", None) != "call" or len(value.args) != 1:
                 return None
             if getattr(find_definition(value.func), "value", None) is not len:

@@ -102,7 +102,7 @@ class TolerantCache(FunctionCache):  # type: ignore[misc]
             _log.debug("cannot save compiled code in %s: %s", self.cache_path, error)
 
 
-#: Passes that code of numbers and arrays needs, without closures, literals and array expressions.
+#: Passes that code of numbers and arrays needs; those for closures, literals and array expressions are left out.
 _PASSES = (
     *(TranslateByteCode, FixupArgs, IRProcessing, RewriteSemanticConstants, ConstantLengths, DeadBranchPrune),
     *(GenericRewrites, ReconstructSSA, NopythonTypeInference, PreLowerStripPhis, IRLegalization, AnnotateTypes),
@@ -126,7 +126,10 @@ _config_lock = Lock()
 
 
 def _dispatcher(function: Callable[..., Any], options: dict[str, Any], folder: Path | None) -> Any:
-    """Build numba's dispatcher of a function, which compiles it when it is called; `folder`: cache, None for none."""
+    """Build numba's dispatcher of a function, which compiles it when it is called.
+
+    `options`: additional options of `numba.njit`; `folder`: folder of the cache, None for no cache.
+    """
     dispatcher = numba.njit(pipeline_class=_ShortCompiler, nogil=True, error_model="numpy", **options)(function)
     if folder is None:
         return dispatcher
@@ -162,7 +165,7 @@ class _LawLibrary(JITCodeLibrary):  # type: ignore[misc]
 
 
 class _LawCompiler(_ShortCompiler):
-    """Compiler of functions for other compiled functions, to LLVM code in a `_LawLibrary`, in a fifth of the time."""
+    """Compiler of laws, functions for other compiled functions, to LLVM code in a `_LawLibrary`, not machine code."""
 
     def define_pipelines(self) -> list[Any]:
         """Build the list of numba's pipelines: one, with the passes in `_PASSES` but without machine code."""

@@ -40,7 +40,7 @@ _Conversion = tuple[Fraction, float, Fraction, Fraction]
 
 
 class Unit(NamedTuple):
-    """A unit of measurement: SI value = (value + offset) * factor * pi**pi_power, in base units with exponents."""
+    """A unit of measurement: SI value = (value + offset) * factor * pi**pi_power; `powers`: exponents of base units."""
 
     factor: Fraction = Fraction(1)
     pi_power: Fraction = Fraction(0)
@@ -69,7 +69,10 @@ def _build_unit(row: Mapping[str, Any]) -> Unit:
 
 
 def _absolute_unit(unit: Unit) -> Unit:
-    """Build the unit of absolute pressure for one of gauge pressure, the SI value: the offset is -1 atmosphere."""
+    """Build the unit of absolute pressure that belongs to `unit`, a unit of gauge pressure.
+
+    SI values are gauge pressures: the offset is -1 atmosphere.
+    """
     return unit._replace(offset=-_TABLES["absolute"]["atmosphere"] / unit.factor)
 
 
@@ -134,7 +137,7 @@ def _parse_name(name: str) -> Unit:
 
 
 def _tokenize(text: str) -> list[str]:
-    """Split the text of a unit into names, powers such as `^2`, brackets and slashes; raise ValueError for others."""
+    """Split a unit's text into names, powers such as `^2`, brackets and slashes; raise ValueError for other text."""
     tokens, position = [], 0
     while position < len(text):
         match = _TOKEN.match(text, position)
@@ -251,9 +254,9 @@ def is_familiar(unit: str) -> bool:
 
 @lru_cache(maxsize=1024)
 def _conversion(unit: str, si_unit: str) -> _Conversion:
-    """Compute the exact conversion between two units: (factor, power of pi, first offset, second offset).
+    """Compute the exact conversion from `unit` to `si_unit`: (factor, power of pi, first offset, second offset).
 
-    Target value = (value + first offset) * factor * pi**power - second offset. Raises InputError for other dimensions.
+    SI value = (value + first offset) * factor * pi**power - second offset. Raises InputError if the dimensions differ.
     """
     source, target = parse_unit(unit), parse_unit(si_unit)
     if source.powers != target.powers:
@@ -262,7 +265,7 @@ def _conversion(unit: str, si_unit: str) -> _Conversion:
 
 
 def _find_conversion(unit: str, si_unit: str, name: str, place: str | None) -> _Conversion:
-    """Compute the `_conversion` from `unit` to `si_unit`, or raise an InputError with `name` and `place`."""
+    """Compute the `_conversion` from `unit` to `si_unit`; errors name the quantity, `name`, and the file, `place`."""
     try:
         return _conversion(unit, si_unit)
     except InputError as error:

@@ -46,7 +46,7 @@ def unit_of(field: FieldInfo) -> str:
 
 
 def absent_of(field: FieldInfo) -> float | str | None:
-    """Return the value of a parameter in a rig without the part or effect it describes; None if all must state it."""
+    """Return a parameter's value in a rig without the part or effect it describes; None if every rig must state it."""
     extra = field.json_schema_extra
     return extra["absent"] if isinstance(extra, dict) else None  # type: ignore[return-value]
 
@@ -63,7 +63,7 @@ def with_unit(number: float, unit: str) -> str:
 
 
 def format_broken_rule(error: ValidationError, model: type[BaseModel]) -> str:
-    """Format the first of the errors found by pydantic, or an unknown name, as a line "SYMBOL must be ..., got ...".
+    """Format pydantic's error on an unknown name, else its first error, as a line "SYMBOL must be ..., got ...".
 
     `model`: class of the group of parameters that could not be made. The parameter's unit follows a broken bound.
     """
@@ -88,7 +88,7 @@ class Part(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
     def __init__(self, **values: Any) -> None:
-        """Make the group from its values by name; raise InputError, or PartsDisagreeError if a rule relates several."""
+        """Make the group from its values by name; raise InputError, or PartsDisagreeError if several disagree."""
         try:
             super().__init__(**values)
         except ValidationError as error:

@@ -124,7 +124,7 @@ def valve_rig_text(
 
 
 def _check_arguments(name: str, sizes: dict[str, float]) -> None:
-    """Raise InputError unless the name of a new rig is valid, and its sizes, by argument, are finite and > 0."""
+    """Raise InputError unless a new rig's `name` is valid, and its `sizes`, argument -> value, are finite and > 0."""
     for argument, value in sizes.items():
         if not (math.isfinite(value) and value > 0):
             raise InputError(f"{argument} must be > 0, got {value:g}")
@@ -138,7 +138,7 @@ def _read_template(file: str) -> Template:
 
 
 def _volume_ratio(base: Rig, area_A: float, area_B: float, stroke: float) -> float:
-    """Compute a new cylinder's chamber volume, with an assumed dead volume, over the volume V of the rig `base`."""
+    """Compute a new cylinder's volume at mid-stroke, with an assumed dead volume, over V of the rig `base`."""
     return (0.5 + _DEAD_VOLUME_RATIO) * max(area_A, area_B) * stroke / base.cylinder.V
 
 

@@ -340,8 +340,8 @@ class Rig(Part):
     def present_values(self) -> dict[str, Value]:
         """Return the SI values of the parameters whose part or effect is in the model, by dotted name.
 
-        Without `absent` values, such as the volume 0 of a hose, it identifies a machine across versions of the package,
-        as a parameter that a later version adds is absent in older rigs.
+        `absent` values, such as the volume 0 of a hose, are left out. The result thus identifies a machine across
+        versions of the package, as a parameter that a later version adds is absent in older rigs.
         """
         return {name: self[name] for name, field in declared_fields().items() if self[name] != absent_of(field)}
 
@@ -476,7 +476,7 @@ def _si_value(full_name: str, field: FieldInfo, entry: ParameterEntry) -> Value:
 
 
 def _make_entry(full_name: str, value: Any, source: str, place: str) -> ParameterEntry:
-    """Make the entry of a parameter's new value, in SI and the SI unit, or the option of a choice without unit.
+    """Make the entry of a parameter's new value: a number in SI with its unit, or an option of a choice, without unit.
 
     `value`: a number in SI, a text with a unit such as "50[cm^3]", or an option. Raises InputError for a text that is
     not a quantity of the parameter's dimension; range and options are checked later.

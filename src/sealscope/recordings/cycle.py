@@ -15,7 +15,7 @@ from sealscope.recordings.recording import Recording, compute_once
 _CYCLE = RECORDINGS.cycle
 #: Fewest repetitions of a cycle, its shortest period [s], and fewest samples from which it is estimated.
 _MIN_REPETITIONS, _MIN_PERIOD, _MIN_SAMPLES = 5, 0.2, 32
-#: Peaks of the autocorrelation this much below the highest are as high, to within noise.
+#: Peaks of the autocorrelation up to this much below the highest count as equally high, because of noise.
 _EQUAL_PEAKS = 0.05
 
 
@@ -40,9 +40,9 @@ def duty_signal(channels: Sequence[Array]) -> Array:
 def estimate_period(signal: Array, rate: float) -> float | None:
     """Estimate the period [s] of a signal (n,) sampled at `rate` [Hz]; None if nothing repeats.
 
-    It is the lag of the first maximum of the autocorrelation after a negative value that is nearly as high as the
-    highest, refined by a parabola. The maximum must reach 0.6 of that at lag 0, and the period must be between 0.2 s
-    and 20 s and at most a fifth of the signal.
+    It is the lag of a maximum of the autocorrelation, refined by a parabola. Of the maxima after the first negative
+    value, it is the first that is nearly as high as the highest. It must reach 0.6 of the value at lag 0, and the
+    period must be between 0.2 s and 20 s and at most a fifth of the signal.
     """
     stride = max(1, int(rate / _CYCLE.rate))  # samples averaged to one, to save time
     n = signal.size // stride

@@ -211,7 +211,7 @@ def _iter_parts(file: Path, every: float, request: Request) -> Iterator[Recordin
 
 @contextmanager
 def _unpacked_file(file: Path) -> Iterator[tuple[Path, str]]:
-    """Yield path and format of a file, unpacked meanwhile if it is an archive; errors then name both files."""
+    """Yield the path and format of a file, or of the file unpacked from it if it is an archive; errors name both."""
     with ExitStack() as folders:
         inner, kind = file, _detect_format(file)
         max_bytes = max_unpacked_size(file) if kind in _ARCHIVES else 0

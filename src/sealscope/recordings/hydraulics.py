@@ -60,9 +60,10 @@ def _describe_speed_mismatch(recording: Recording) -> str | None:
 
 
 def _is_noise(values: Array) -> bool:
-    """Test whether a signal (n,) is mostly white noise, or lacks samples.
+    """Test whether a signal (n,) is mostly white noise, or has missing samples.
 
-    The mean square of the third difference of white noise is 20 times its variance (`readings.noise` of `priors.toml`).
+    White noise must have over the fraction `readings.noise` (`priors.toml`) of the signal's variance. The mean square
+    of the third difference of white noise is 20 times its variance.
     """
     # `not <=`, so that missing samples count as noise
     return not np.mean(np.diff(values, 3) ** 2) <= 20.0 * _PRIORS.noise * np.var(values)

@@ -32,7 +32,7 @@ _TWELVE_HOURS = re.compile(
 def start_seconds(recording: Recording, file: str = "") -> float | None:
     """Find the time of a recording's first sample [s since 1970]; None if it is not known.
 
-    The time of t = 0 is the entry `start` of the provenance, else the date in the file's name, which is that in the
+    The time of t = 0 is the entry `start` of the provenance, else the date in the file's name. This name is that in the
     provenance, else `file`. Dates and times are taken as UTC; a date without a time of day means midnight.
     """
     start = parse_epoch(str(recording.provenance.get("start", "")))
@@ -42,7 +42,7 @@ def start_seconds(recording: Recording, file: str = "") -> float | None:
 
 
 def file_seconds(recording: Recording, path: Path) -> float:
-    """Find the time of a file's first sample [s since 1970]: stated, or from the time of its last modification."""
+    """Find the time of a file's first sample [s since 1970]: as stated, else last modification less duration."""
     start = start_seconds(recording, path.name)
     if start is not None:
         return start

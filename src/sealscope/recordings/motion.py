@@ -22,7 +22,7 @@ ROUNDING = 1e-9
 _HOLD = RECORDINGS.hold
 #: Shortest run of equal values that can be stuck, and number of samples on either side with which it is compared.
 _MIN_STUCK, _NEIGHBOURHOOD = 5, 100
-#: Expected number of such long runs in a channel below which a run is stuck.
+#: A run is stuck if fewer runs of its length than this are expected in the channel.
 _MAX_EXPECTED = 1e-6
 #: Smallest jump at an end of a stuck run, in quantisation steps: more than three.
 _MIN_JUMP = 3.5
@@ -73,7 +73,7 @@ def find_holds(values: Array, rate: float, before: float = math.nan) -> Holds:
 def describe_hold(recording: Recording) -> str | None:
     """Describe a chamber pressure that does not move, although its noise should move it; None if there is none.
 
-    It repeats one value for too long (`find_holds`), or is a straight line. No sample may be missing.
+    It repeats one value for too long (`find_holds`), or follows a straight line. No sample may be missing.
     """
     for name in chambers_of(recording):
         values = recording[name]
@@ -96,7 +96,7 @@ def find_runs(flags: NDArray[np.bool_]) -> NDArray[np.intp]:
 
 
 def smallest_step(values: Array) -> float:
-    """Find the smallest step in sorted `values` (n,) above rounding (`ROUNDING` of their range), else 0."""
+    """Find the smallest step between sorted `values` (n,) above rounding, `ROUNDING` of their range; 0 if none."""
     steps = np.diff(values)
     steps = steps[steps > ROUNDING * (values[-1] - values[0])]
     return float(steps.min()) if steps.size else 0.0
@@ -131,7 +131,7 @@ def find_stuck(values: Array) -> NDArray[np.intp]:
     n_unchanged = np.r_[0, np.cumsum(is_same)]
 
     def unchanged_fraction(begin: NDArray[Any], end: NDArray[Any]) -> Array:
-        """Estimate the fraction of samples between these indices (k,) that equal the one before, never 0 or 1."""
+        """Estimate the fraction of samples from `begin` to `end` (k,) that equal the one before; never 0 or 1."""
         begin, end = np.maximum(begin, 0), np.minimum(end, is_same.size)
         return np.asarray((n_unchanged[end] - n_unchanged[begin] + 1) / (end - begin + 2), dtype=np.float64)
 

@@ -14,7 +14,7 @@ def oil_temperature(recording: Recording) -> float | None:
 
 
 def measured_oil_temperature(recording: Recording) -> float | None:
-    """Compute the mean plausible reading [deg C] of the channel T_oil (`oil` in `priors.toml`); None without one."""
+    """Compute the mean [deg C] of the plausible readings (`oil` in `priors.toml`) of T_oil; None if there are none."""
     if "T_oil" not in recording or recording.units["T_oil"] != "K":
         return None
     limits, kelvin = RECORDINGS.oil, recording["T_oil"]

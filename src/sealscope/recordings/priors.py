@@ -36,8 +36,8 @@ class StalePriors(PriorTable):
 
     Repeated rows and stuck channels:
 
-    - `repeats`: rows are repeated if they are this many times as many as expected by chance.
-    - `fewest`: smallest fraction of all rows that is assumed to be expected by chance.
+    - `repeats`: smallest ratio of the number of repeated rows to that expected by chance.
+    - `fewest`: smallest fraction of all rows that is assumed to repeat by chance.
     - `moves`: smallest range over a run that counts as motion, as a fraction of the channel's range.
     - `leap`: quantile of a channel's changes that a jump exceeds.
     - `stuck`: largest fraction of stuck samples in a pressure that is used.
@@ -59,7 +59,7 @@ class SpikePriors(PriorTable):
 
     - `times`: smallest ratio of a spike to the changes around it.
     - `share`: largest fraction of samples that a logger gets wrong, on average.
-    - `tail`: probability by chance, below which so many spikes are a signal.
+    - `tail`: smallest probability of as many errors as spikes; below it, the spikes are a signal.
     """
 
     times: float
@@ -70,12 +70,12 @@ class SpikePriors(PriorTable):
 class UnsignedPriors(PriorTable):
     """Assumptions on a motor speed or flow that is recorded without its sign.
 
-    - `noise`: largest value of the other sign, relative to the largest value.
+    - `noise`: largest magnitude on the other side of zero, relative to the largest magnitude.
     - `half` [s]: time on either side of a sample over which the piston speed is taken.
     - `nearby` [s]: time on either side of a sample over which noise is averaged.
     - `error`: relative error of the flow computed from the position.
     - `changes` [1/s]: usual number of reversals per second.
-    - `least`: smallest ratio of the motions in the two directions.
+    - `least`: smallest ratio of the motion in the less used direction to that in the other.
     - `correlation`: smallest correlation of the magnitude with the absolute piston speed or command.
     """
 
@@ -127,7 +127,7 @@ class CreepPriors(PriorTable):
 class RailPriors(PriorTable):
     """Marks of a rail, i.e. an end of its range at which a pressure is clipped.
 
-    - `samples` [samples]: fewest samples there.
+    - `samples` [samples]: fewest samples at the rail.
     - `crowd`: smallest ratio of these samples to those at any of the values next to it.
     - `jump` [quantisation steps]: smallest jump to or from it.
     - `run` [samples]: length of a run from which a smaller jump suffices.

@@ -244,13 +244,13 @@ def _describe_missing(values: Array, rate: float) -> tuple[str, int, int, str] |
 
 
 def flag_impossible(values: Array, unit: str) -> NDArray[np.bool_]:
-    """Flag the finite samples (n,) over the largest that sensors read in `unit` (`possible` of `priors.toml`)."""
+    """Flag the finite samples (n,) over the magnitude that any sensor reads in `unit` (`possible` of `priors.toml`)."""
     limit: float = _SENSOR_LIMITS.get(unit, _SENSOR_LIMITS["any"])
     return np.asarray(np.isfinite(values) & (np.abs(values) > limit))
 
 
 def _row_period(present: NDArray[np.intp]) -> int:
-    """Find the k >= 2 for which a channel has a value on every k-th row only, here `present`; 0 if there is none."""
+    """Find k >= 2 if a channel has a value on every k-th row only, else 0; `present`: indices of rows with values."""
     steps = np.diff(present)
     period = int(np.median(steps)) if present.size >= 3 else 0
     is_regular = period >= 2 and np.mean(steps == period) > 0.95  # some values may be missing
@@ -283,7 +283,10 @@ def uniform_segments(recording: Recording, channels: Sequence[str] | None = None
 
 
 class Rail(NamedTuple):
-    """An end ("low" or "high" `side`) of a channel's range at which it is clipped: value, count, and first index."""
+    """An end of a channel's range, "low" or "high" (`side`), at which it is clipped.
+
+    `samples`: number of samples with this `value`; `first`: index of the first of them.
+    """
 
     side: str
     value: float
@@ -336,7 +339,7 @@ def find_rails(values: Array, stuck: NDArray[np.intp] | None = None, low_end: bo
 
 @lru_cache(maxsize=16)
 def fast_length(count: int) -> int:
-    """Find the smallest length n >= `count` for which a fast Fourier transform is fast, with prime factors 2, 3 and 5.
+    """Find the smallest length n >= `count` with no prime factors but 2, 3 and 5, for a fast Fourier transform.
 
     The result equals `scipy.fft.next_fast_len(count, real=True)`, but scipy.fft is not loaded.
     """

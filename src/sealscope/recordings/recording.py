@@ -40,7 +40,7 @@ _PLOT_UNITS = {"m": "mm", "rad/s": "rpm", "m^3/s": "L/min", "K": "degC"}
 
 
 def _freeze(values: Any) -> Array:
-    """Convert values to a read-only array of doubles, by a copy unless they are one that owns its memory."""
+    """Convert values to a read-only array of doubles; copy them unless they are such an array that owns its memory."""
     if type(values) is np.ndarray and values.dtype == np.float64 and values.base is None and not values.flags.writeable:
         return values
     array = np.array(values, dtype=np.float64)

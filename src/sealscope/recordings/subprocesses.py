@@ -79,7 +79,7 @@ class _Process:
         """
         process = self._process
         assert process.stdin is not None and process.stdout is not None
-        # kills the process 1 s after the alarm of `_set_limits` should have; a fresh process also needs time to start
+        # kills the process 1 s after the alarm of `_set_limits` should have done; a fresh one also needs time to start
         killer = Timer(limit + 1.0 + _MAX_START_TIME * self._is_fresh, process.kill)
         killer.daemon = True
         killer.start()
@@ -157,7 +157,7 @@ def run_on_file(work: Callable[..., T], file: Path, *arguments: Any, **limits: A
 def _set_limits(seconds: float, memory: int, disk: int) -> None:
     """Limit the time [s], the `memory` [bytes] and the size of written files, `disk` [bytes], of this process.
 
-    The operating system's timer ends it even if its parent is dead; 0 is no limit. Other systems limit nothing.
+    The system's timer ends the process even if its parent is dead; 0 s is no limit. Only Unix has these limits.
     """
     with suppress(ImportError, AttributeError, OSError, ValueError):
         signal.setitimer(signal.ITIMER_REAL, seconds)

@@ -69,7 +69,7 @@ class Details:
         return np.vstack([self.values, self.product()])
 
     def inside(self, level: int | None = None) -> slice:
-        """Return the slice of the samples that do not depend on padding in a level, or in any level with None."""
+        """Return the slice of the samples that do not depend on padding in a level, by default in any level."""
         before, after = self.edges[(level or self.levels) - 1]  # the deepest level has the longest edges
         return slice(int(before), self.values.shape[1] - int(after))
 
@@ -146,7 +146,7 @@ def details(
 
 
 def mean_squares(transformed: Details, bounds: ArrayLike) -> Array:
-    """Compute the mean squares (k, 5) of the details d1, d2, d3, d4 and d3 times d4 in segments (`segment_means`)."""
+    """Compute the mean squares (k, 5) of d1, d2, d3, d4 and d3 d4 in k segments; `bounds`: see `segment_means`."""
     return segment_means(np.square(transformed.quantities()), bounds).T
 
 

@@ -149,7 +149,7 @@ class DetailStream:
         target = out.reshape(*self._shape_2d, self.levels, n)
 
         def filter_part(part: tuple[int, int], work: Array) -> int:
-            """Filter the groups (first, last + 1) in one thread; return the number of rows then used in the buffers."""
+            """Filter the groups `part` = (first, last + 1), with the array `work`; return the number of rows in use."""
             return advance_details(part, x, self.buffers, self._fill, self._history, *self.taps, work, target)
 
         run = map if len(self._parts) == 1 else self._pool.map

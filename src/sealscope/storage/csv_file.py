@@ -31,7 +31,7 @@ def guard_cell(value: Any) -> Any:
 
 
 def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> None:
-    """Write rows, mappings from column to value, as a CSV file, with texts escaped by `guard_cell`.
+    """Write rows, mappings from column to value, as a CSV file with these `columns`; `guard_cell` escapes the texts.
 
     Raises ValueError if a row has another column, and InputError if the file cannot be written.
     """

@@ -34,7 +34,7 @@ def make_inner_folder(folder: Path, *names: str) -> Path:
 
 
 def iter_inner_files(folder: Path, paths: Iterable[Path]) -> Iterator[Path]:
-    """Yield those of `paths` that are files in `folder`, itself perhaps a link; skip links out of it, and log them."""
+    """Yield the files of `folder`, which may be a link, among `paths`; skip and log links that lead out of it."""
     root = folder.resolve()
     for path in paths:
         try:

@@ -44,8 +44,8 @@ def open_regular(path: str | os.PathLike[str], what: str) -> BinaryIO:
 def open_inner(path: str | os.PathLike[str], what: str, mode: Literal["rb", "ab+"] = "rb") -> BinaryIO:
     """Open a file in a folder of results that may come from others, in binary mode.
 
-    `mode`: `rb` to read, `ab+` to append or create; `what`: name in messages. Raises InputError for a link, another
-    file that is not regular or, to write, several hard links; else OSError.
+    `mode`: `rb` to read, `ab+` to append or create; `what`: name in messages. Raises InputError for a link and any
+    other file that is not regular, and in mode `ab+` for a file with several hard links; OSError if opening fails.
     """
     if Path(path).is_symlink():
         raise InputError(f"{what} must be a file, got a link ({path})")
@@ -53,7 +53,7 @@ def open_inner(path: str | os.PathLike[str], what: str, mode: Literal["rb", "ab+
 
 
 def _open_checked(path: str | os.PathLike[str], what: str, mode: Literal["rb", "ab+"], extra_flags: int) -> BinaryIO:
-    """Open a regular file with `extra_flags` of `os.open`; raise InputError for any other file."""
+    """Open a regular file, as `open_inner`, with `extra_flags` of `os.open`; raise InputError for any other file."""
     flags = os.O_RDONLY if mode == "rb" else os.O_RDWR | os.O_CREAT | os.O_APPEND
     flags |= extra_flags | getattr(os, "O_BINARY", 0) | getattr(os, "O_CLOEXEC", 0)
     try:

@@ -29,7 +29,7 @@ def plain_array(values: NDArray[Any]) -> dict[str, Any]:
 
 
 def _as_plain_array(values: NDArray[Any]) -> NDArray[Any]:
-    """Convert a structured array of floats to a plain array whose last axis holds the columns."""
+    """Convert a structured array of floats to a plain array whose last axis holds the columns; keep other arrays."""
     names = values.dtype.names
     return values if names is None else values.view(float).reshape(*values.shape, len(names))
 
@@ -55,7 +55,7 @@ def restore_array(value: Any, name: str) -> NDArray[np.float64]:
 
 
 def require_part(state: Any, name: str, kind: type | tuple[type, ...]) -> Any:
-    """Return an entry of a saved state; raise InputError if it is missing or not of the type `kind`."""
+    """Return the entry `name` of a saved state; raise InputError if it is missing or not of the type `kind`."""
     if not isinstance(state, Mapping) or name not in state:
         raise InputError(f"saved state must have {name!r}, got {type(state).__name__} without")
     value = state[name]
@@ -65,7 +65,7 @@ def require_part(state: Any, name: str, kind: type | tuple[type, ...]) -> Any:
 
 
 def require_count(state: Any, name: str) -> int:
-    """Return an entry of a saved state; raise InputError if it is not a whole number of 0 or more."""
+    """Return the entry `name` of a saved state; raise InputError if it is not a whole number of 0 or more."""
     value = require_part(state, name, object)
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 0:
         raise InputError(f"saved state's {name} must be a whole number >= 0, got {value!r}")

@@ -19,7 +19,7 @@ MAX_WHOLE = 2**53
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Parse JSON; raise ValueError if it is not valid, or has a number that is not finite or a whole one over 2^53."""
+    """Parse JSON; raise ValueError if it is not valid, has a number that is not finite, or a whole number over 2^53."""
     try:
         return json.loads(text, parse_float=_parse_finite, parse_int=_parse_whole, parse_constant=_parse_finite)
     except RecursionError:
@@ -35,7 +35,7 @@ def _parse_finite(text: str) -> float:
 
 
 def _parse_whole(text: str) -> int:
-    """Parse a whole number; raise ValueError if its size exceeds 2^53."""
+    """Parse a whole number; raise ValueError if its magnitude exceeds 2^53."""
     if len(text) > len(f"-{MAX_WHOLE}") or abs(int(text)) > MAX_WHOLE:  # `int` takes long for long texts
         raise ValueError(f"a whole number must be at most 2^53, got {text[:40]}")
     return int(text)

@@ -39,9 +39,9 @@ def read_rows(
 ) -> dict[str, Row]:
     """Read the results of jobs that `store_rows` stored in a folder; return the last row of each job by its id.
 
-    `row_of` makes a row from a parsed line, or None to ignore it; `what` names the folder in errors. A last line that
-    was cut off is ignored, and a missing file has no rows. Raises UnreadableFile if the file cannot be read or a line
-    is not a row, and InputError if the file is a link.
+    `parse` parses a line; `row_of` makes a row of the result, or None to ignore it; `what` names the folder in errors.
+    A last line that was cut off is ignored, and a missing file has no rows. Raises UnreadableFile if the file cannot
+    be read or a line is not a row, and InputError if the file is a link.
     """
     path = folder / ROWS
     rows: dict[str, Row] = {}
@@ -91,7 +91,10 @@ def store_rows(folder: Path, rows: Generator[Row, None, None], what: str, allow_
 
 @contextmanager
 def lock_rows(folder: Path, what: str) -> Iterator[None]:
-    """Lock the rows of a folder against other processes, or raise InputError; remove old temporary files."""
+    """Lock the rows of a folder against other processes while the block runs; remove old temporary files.
+
+    Raises InputError if another process holds the lock; `what` names the folder in the error.
+    """
     busy = f"{what} must be run by one process at a time, got another at work ({folder})"
     with folders.lock_file(folder / LOCK, busy):
         remove_temporaries(folder)

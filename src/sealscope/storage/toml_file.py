@@ -147,7 +147,7 @@ def _parse_number(value: Any, kind: type, place: str) -> Any:
 
 
 def _check_keys(rows: Collection[str], names: Collection[str], optional: Collection[str], place: str) -> None:
-    """Check that a table has all keys in `names`, except perhaps the `optional`, and no others, or raise InputError."""
+    """Raise InputError unless the keys `rows` of a table are those in `names`; the `optional` ones may be absent."""
     for name in rows:
         if name not in names:
             raise InputError(f"{place} must be {', '.join(names)}, got {name!r}")

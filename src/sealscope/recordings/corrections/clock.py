@@ -1,7 +1,7 @@
 """An even clock for samples that were polled at uneven times.
 
 The diagnosis integrates over an even clock. Uneven samples are interpolated linearly to the median rate; integrated,
-that is the trapezoidal rule over the recorded times. Between samples that are far apart values are missing;
+that is the trapezoidal rule over the recorded times. Between samples that are far apart, values are missing;
 `corrections.gaps` bridges and marks them. Called by the inspection.
 """
 
@@ -28,9 +28,9 @@ MAX_LATE_FRACTION: float = _PRIORS.late
 def resample_evenly(recording: Recording) -> Recording:
     """Resample a recording to evenly spaced times, with NaN in rows that the logger has lost.
 
-    Evenly spaced samples stay. If the intervals are whole numbers of sampling steps (`clock.scatter` of `priors.toml`),
-    rows of NaN are inserted for lost ones; else the samples are interpolated linearly. Rows without a time, or not
-    later than all rows before, are dropped. Of several recordings in one file only the longest is used.
+    Evenly spaced samples stay. If the intervals are whole numbers of sampling steps, to within `clock.scatter` of
+    `priors.toml`, rows of NaN are inserted for lost samples; else the samples are interpolated linearly. Rows without a
+    time, or not later than all rows before, are dropped. Of several recordings in one file only the longest is used.
     """
     rows = _ordered_rows(recording.t)
     rows = rows[_longest_dense_stretch(recording.t[rows], recording.rate)]
@@ -49,7 +49,8 @@ def resample_evenly(recording: Recording) -> Recording:
 def _ordered_rows(t: Array) -> NDArray[np.intp]:
     """Find the indices of the rows that are later than all rows before; `t` (n,): times [s], NaN if missing.
 
-    If over `MAX_LATE_FRACTION` of them are not, it is the longest run of rows without a step back or repeated time.
+    If over the fraction `MAX_LATE_FRACTION` of the rows are not later, the longest run of rows without a step back is
+    used, without repeated times.
     """
     timed = np.flatnonzero(np.isfinite(t))
     if timed.size < 2:
@@ -68,8 +69,8 @@ def _longest_dense_stretch(t: Array, rate: float) -> slice:
 
     `t` (n,): increasing times [s]; `rate` [Hz]: number of samples that a complete recording has per second.
     """
-    # surplus of a row: number of rows before it, less the smallest number permitted up to its time. A stretch is dense
-    # enough if the surplus of its last row is not below that of its first row
+    # surplus of a row: number of rows before it, less the smallest number for a dense stretch up to its time. A stretch
+    # is dense enough if the surplus of its last row is not below that of its first row
     first_time = t[:1].sum()  # 0 if there are no rows
     surplus = np.arange(t.size) - (1.0 - MAX_GAP_FRACTION) * rate * (t - first_time)
     max_later_surplus = np.maximum.accumulate(surplus[::-1])[::-1]

@@ -109,10 +109,10 @@ def bridge(recording: Recording, needed: Sequence[str]) -> Recording:
 
 
 def interpolate_short_gaps(recording: Recording, needed: Sequence[str]) -> Recording:
-    """Interpolate short gaps linearly in all channels but the `needed` ones, which `bridge` fills, and not at the ends.
+    """Interpolate short gaps linearly, except at the ends, in all channels but the `needed` ones, which `bridge` fills.
 
-    A sensor that is slower than the logger leaves such gaps. They are short up to `SPLINE` samples in a pressure, and
-    up to `gaps.motion` [s] of `priors.toml` in other channels, because a moving mass moves evenly over that time.
+    A sensor that is slower than the logger leaves such gaps. A gap is short up to `SPLINE` samples in a pressure,
+    and up to `gaps.motion` [s] of `priors.toml` in other channels, because a moving mass moves evenly over that time.
     """
     max_motion_gap = _GAPS.motion * recording.rate
     channels: dict[str, Array] = {}
@@ -130,7 +130,10 @@ def interpolate_short_gaps(recording: Recording, needed: Sequence[str]) -> Recor
 
 
 def flag_bridged(recording: Recording, bounds: Array | NDArray[np.integer]) -> Flags:
-    """Flag the blocks (n,) between the indices `bounds` (n + 1,) with over `MAX_BRIDGED_FRACTION` filled samples."""
+    """Flag the blocks (n,) of samples of which over the fraction `MAX_BRIDGED_FRACTION` was filled.
+
+    `bounds` (n + 1,): index of the first sample of each block, and the end of the last block.
+    """
     bounds = np.asarray(bounds)
     if recording.bridged is None:
         return np.zeros(max(bounds.size - 1, 0), dtype=bool)
@@ -139,7 +142,7 @@ def flag_bridged(recording: Recording, bounds: Array | NDArray[np.integer]) -> F
 
 
 def flag_holes(recording: Recording) -> Flags:
-    """Flag the rows (n,) of filled gaps longer than `gaps.hole` [s] of `priors.toml` and `MAX_INTERVAL` steps."""
+    """Flag the rows (n,) of filled gaps longer than both `gaps.hole` [s] (`priors.toml`) and `MAX_INTERVAL` steps."""
     flags = np.zeros(len(recording), dtype=bool)
     if recording.bridged is not None:
         max_gap = max(_GAPS.hole, MAX_INTERVAL / recording.rate)
@@ -158,8 +161,8 @@ def _finite_mean(values: Array) -> float:
 def _copy_other_cycle(channels: dict[str, Array], needed: Sequence[str], first: int, stop: int, period: float) -> bool:
     """Fill a gap in all channels, in place, from a nearby cycle of motion; return False if no cycle is similar enough.
 
-    `channels`: name -> values (n,); the gap has the samples `first` to `stop` - 1; `needed`: channels that must be
-    complete in the other cycle, one of the nearest two on either side; `period`: length of a cycle [samples].
+    The two nearest cycles on either side are tried. `channels`: name -> values (n,); the gap has the samples `first` to
+    `stop` - 1; `needed`: channels that must be complete in the copied cycle; `period`: length of a cycle [samples].
     """
     half_cycle = round(0.5 * period)
     # the gap, and half a cycle beside it, must not overlap the copied samples

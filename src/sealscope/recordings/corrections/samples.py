@@ -110,5 +110,5 @@ def remove_holes(recording: Recording) -> Recording:
 
 
 def _resample(recording: Recording) -> tuple[Recording, list[Finding]]:
-    """Resample a recording to evenly spaced times; like other corrections, also return its findings, here none."""
+    """Resample a recording to evenly spaced times; the findings, which every correction returns, are empty."""
     return resample_evenly(recording), []

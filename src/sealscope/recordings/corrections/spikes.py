@@ -47,8 +47,9 @@ def find_spikes(values: Array) -> NDArray[np.intp]:
     """Find the indices of the samples at which a channel (n,) leaps and returns at once.
 
     Such a sample lies above both neighbours, or below both, by several times (`spike.times` of `priors.toml`) the usual
-    changes, other leaps nearby and the local slope. The errors of a logger have a Poisson distribution with the mean
-    `spike.share` times the number of samples; if there are too many, the signal itself leaps, and none is found.
+    changes, other leaps nearby and the local slope. The number of a logger's errors has a Poisson distribution with
+    the mean `spike.share` times the number of samples. If the probability of as many errors as spikes is below
+    `spike.tail`, the signal itself leaps, and none is returned.
     """
     known = np.flatnonzero(np.isfinite(values))
     if known.size < _MIN_SAMPLES:

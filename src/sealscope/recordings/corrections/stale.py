@@ -35,8 +35,8 @@ _MAX_REPEAT = 3
 def interpolate_stale_samples(recording: Recording) -> tuple[Recording, list[Finding]]:
     """Replace samples that repeat the previous one by linear interpolation between new readings; also return findings.
 
-    A channel holds each sample for a fixed time (`estimate_holding_period`), or all repeat a row
-    (`_flag_repeated_rows`).
+    Either a channel holds each reading for a fixed time (`estimate_holding_period`), or the logger repeats a row of all
+    channels (`_flag_repeated_rows`).
     """
     names = [name for name in recording.channels if name not in SLOW and name != "u"]
     channels, findings = dict(recording.channels), list[Finding]()
@@ -180,8 +180,9 @@ def _flag_repeated_rows(channels: list[Array]) -> NDArray[np.bool_]:
     """Flag the rows (n,) in which a logger got no new readings and repeated the previous row.
 
     All of `channels` (n,) that vary repeat their samples there, in one or two rows, and one channel jumps, by more than
-    `_MIN_JUMP` quantisation steps, before and after. There must be at least `stale.repeats` (`priors.toml`) times as
-    many such rows as chance explains, if channels repeat independently, or the fraction `stale.fewest` of all rows.
+    `_MIN_JUMP` quantisation steps, before and after. They are flagged only if they are at least `stale.repeats`
+    (`priors.toml`) times as many as expected by chance. That is the fraction of rows that repeat if the channels repeat
+    independently, or `stale.fewest` if this is larger.
     """
     moving = [values for values in channels if np.isfinite(values).any() and np.nanmax(values) > np.nanmin(values)]
     if not moving or moving[0].size < _PRIORS.runs:

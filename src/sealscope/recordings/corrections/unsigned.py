@@ -33,7 +33,7 @@ _NAMES = {"omega": "speed", "q_pump": "flow"}
 def restore_speed_sign(recording: Recording) -> tuple[Recording, list[Finding]]:
     """Restore the sign of a speed or flow that stays on one side of zero while position or command moves both ways.
 
-    It is positive for flow into chamber A. Also returns a finding for each channel that was changed.
+    The result is positive for flow into chamber A. Also returns a finding for each channel that was changed.
     """
     channels, findings = dict(recording.channels), list[Finding]()
     for name, quantity in _NAMES.items():
@@ -63,8 +63,8 @@ def _has_one_sign(values: Array) -> bool:
 def _find_sign(recording: Recording, magnitude: Array) -> tuple[Array | None, str]:
     """Find the signs (n,), +1 or -1, of the flow into chamber A; also return the source of the signs, in words.
 
-    They are fitted to the position (`_fit_signs`), or without one those of the command. Returns (None, "") if neither
-    is recorded, correlates with the `magnitude` (n,) of the flow, and moves in both directions.
+    They are fitted to the position (`_fit_signs`), or are those of the command if there is none. Returns (None, "") if
+    neither is recorded, correlates with the `magnitude` (n,) of the flow, and moves in both directions.
     """
     if "x" in recording:
         speed = _piston_speed(recording["x"], recording.rate)
@@ -88,7 +88,10 @@ def _piston_speed(x: Array, rate: float) -> Array:
 
 
 def _moves_both_ways(values: Array) -> bool:
-    """Test whether a speed or command (n,) moves either way at least `unsigned.least` times as far as the other."""
+    """Test whether a speed or command (n,) moves far enough in both directions.
+
+    The shorter way must be over `unsigned.least` (`priors.toml`) times the longer one.
+    """
     smaller, larger = sorted(float(np.nansum(np.maximum(signed, 0.0))) for signed in (values, -values))
     return smaller > _PRIORS.least * larger > 0.0
 
@@ -142,7 +145,7 @@ def _fit_signs(recording: Recording, speed: Array, magnitude: Array) -> Array:
 
 
 def _noise_variance(speed: Array, rate: float) -> float:
-    """Estimate the noise variance [(m/s)^2] of a piston speed (n,), from differences, robustly to motion."""
+    """Estimate the noise variance [(m/s)^2] of a piston speed (n,) by a median, which motion hardly changes."""
     n_lag = max(1, round(2.0 * _PRIORS.half * rate))
     steps = speed[n_lag:] - speed[:-n_lag]
     return 0.5 * float(np.median(_average_nearby(steps**2, rate))) if steps.size else 0.0

@@ -105,7 +105,7 @@ def _parse_number(cell: str, cell_with_point: str, decimal: str) -> float:
 def has_prefixes(rows: Sequence[Sequence[str]]) -> bool:
     """Test whether the numbers in `rows` of cells end in SI prefixes, such as `170.3m`, and not in units.
 
-    An ending in a column is a prefix if it is never a unit, as `k`, or if other numbers have another ending or none.
+    An ending is a prefix if it is never a unit, such as `k`, or if numbers of its column have another ending or none.
     """
     prefixes_by_column: dict[int, set[str]] = {}
     for row in rows:
@@ -135,7 +135,7 @@ def _trailing_unit(cell: str) -> str | None:
 
 
 def find_cell_units(rows: Sequence[Sequence[str]]) -> dict[int, str]:
-    """Find the units after the numbers in over half of a column's `rows` of cells: column -> most frequent unit."""
+    """Find the most frequent unit in the cells of each column, if over half of the `rows` have one: column -> unit."""
     is_known: dict[str, bool] = {}
     counts: dict[int, Counter[str]] = {}
     for row in rows:

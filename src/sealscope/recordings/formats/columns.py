@@ -116,7 +116,7 @@ def _check_channel(channel: str) -> None:
 def check_request(channel_map: ChannelMap, rate: float | None) -> None:
     """Raise InputError for an invalid map from channels to columns, and for a sampling rate that is not positive.
 
-    A map is invalid if it names an unknown channel, or if it is a text other than "auto", or maps `REST` to one.
+    A map is invalid if it names an unknown channel, or if the map or its entry `REST` is a text other than "auto".
     """
     if isinstance(channel_map, str) and channel_map != "auto":
         raise InputError(f"map must be a mapping or the word auto, got {channel_map!r}")
@@ -164,7 +164,8 @@ def _find_column(labels: Sequence[Label], name: str, description: str, mapped: b
     """Find the index, from 0, of the column called `name`, which may be a number such as `#4`, from 1; None without it.
 
     Names are compared by criteria from strict to loose; the first that a column meets decides. With `mapped`, the last
-    words of a column's name are enough, such as `ch2`. Raises InputError if several columns meet it.
+    words of a column's name are enough, such as `ch2`. Raises InputError, which calls the column `description`, if
+    several columns meet the criterion.
     """
     folded = name.casefold()
     for matches_name in (
@@ -318,7 +319,7 @@ def _choose_time_columns(choice: ColumnMap) -> None:
     """Choose the time of a table in several columns, or in a column whose name does not mean a time, for `choice`.
 
     - Columns of hours, minutes and seconds form the time, alone or with a date.
-    - Otherwise, without a time column and a rate, it is a column of dates, or the only column in a unit of time.
+    - Otherwise, without a time column and a rate, the time is a column of dates, or the only column in a unit of time.
     - Columns with parts of a second are added to the time.
     """
     labels, used = choice.labels, choice.channel_of
@@ -374,8 +375,8 @@ def choose_columns(labels: Sequence[Label], request: Request, stated_rate: float
 
     With a requested rate no time is read. Without a time column the rate is the `stated_rate` [Hz] of the file. If the
     map contains "auto", other columns are chosen by their names and units (`proposed_map`). A column in the map takes
-    precedence over a column with the channel's name. Raises InputError for a mapped column that does not exist, without
-    any channel, without time and rate, and for a unit of the wrong dimension.
+    precedence over a column with the channel's name. Raises InputError if a mapped column does not exist, no
+    column is a channel, there is neither a time nor a rate, or a unit has the wrong dimension.
     """
     choice = ColumnMap(labels, stated_rate)
     columns, rate = explicit_columns(request.map), request.rate

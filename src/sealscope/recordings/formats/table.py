@@ -256,7 +256,7 @@ def _convert_channels(
 def _join_time(choice: ColumnMap, columns: Mapping[int, NDArray[Any]], label: Label, notes: list[str]) -> NDArray[Any]:
     """Combine the columns that form the time, such as date and hours, and add a line for the history to `notes`.
 
-    If they are no parts of this time, the time column is returned unchanged; InputError if it contains the hours.
+    If they are no parts of one time, returns the time column unchanged, or raises InputError if it has the hours.
     """
     assert choice.time is not None
     parts = {part: np.asarray(columns[column], dtype=np.float64) for part, column in choice.parts.items()}
@@ -308,8 +308,8 @@ def _assign_clocks(series: Sequence[Series]) -> list[Series]:
 def read_times(time: Series, start: np.datetime64 | None = None) -> tuple[Array, np.datetime64 | None]:
     """Read the series `time`, a column of times; return the times (n,) [s] and the time stamp of 0 s.
 
-    Date stamps count from the first one, which is also the time stamp of 0 s, but None for a column in a group. For
-    numbers or timedelta64 this is `start`, None if it is not known. Raises InputError if no row has a time.
+    Date stamps count from the first one; the time stamp of 0 s is then the first one, or None for a column in a group.
+    For numbers and timedelta64 it is `start`, None if it is not known. Raises InputError if no row has a time.
     """
     values = time.values()
     if values.dtype.kind == "m":
@@ -363,7 +363,7 @@ def _make_names_unique(series: Sequence[Series]) -> tuple[list[Series], list[str
 
 
 def _read_samples(series: Series, *, as_time: bool = False) -> NDArray[Any]:
-    """Read the samples (n,) of a series as doubles, or date stamps as datetime64 with `as_time`; InputError for others.
+    """Read the samples (n,) of a series as doubles or, with `as_time`, as datetime64; raise InputError for others.
 
     Up to the fraction `MAX_WORD_FRACTION` of words in a column of texts becomes NaN.
     """
@@ -389,7 +389,7 @@ def _read_samples(series: Series, *, as_time: bool = False) -> NDArray[Any]:
 def _align_clocks(choice: ColumnMap, used: dict[int, Series]) -> tuple[dict[int, NDArray[Any]], list[str]]:
     """Resample the columns to read, `used`, to common sampling times, those of the chamber pressures.
 
-    Without these they are those of the pressures at the pump, or of the longest series. Returns column -> values (n,),
+    Without these, they are those of the pressures at the pump, or of the longest series. Returns column -> values (n,),
     with the time, and lines for the history. Raises InputError without sampling times, or if counts differ.
     """
     channel_of = choice.channel_of
@@ -464,7 +464,10 @@ def _average(values: Array, times: Array, t: Array, step: float) -> Array:
 
 
 def _find_long_columns(labels: Sequence[Label]) -> dict[str, int] | None:
-    """Find the columns "name", "value" and, if any, "unit" and "valid" of a table with one sample a row, else None."""
+    """Find the columns of a long table, in which each row is one sample of a named channel; None for other tables.
+
+    Returns "name", "value" and, if they exist, "unit" and "valid" -> index of the column.
+    """
     names = [label.name.strip().casefold() for label in labels]
     columns_of_kind = {
         kind: [column for column, name in enumerate(names) if name in words] for kind, words in WORDS["long"].items()

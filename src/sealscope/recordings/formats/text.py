@@ -120,7 +120,10 @@ def read_text_parts(path: Path, request: Request, every: float) -> Iterator[Reco
     log = _Log(path, layout, kinds=choice.columns, date=choice.date)
 
     def make_part(blocks: list[_Block], state: TimeState, more_notes: Sequence[str] = ()) -> RecordingFields:
-        """Convert one part of the log; `state` is that of the time column after the previous part, and is updated."""
+        """Convert one part of the log to fields, with `more_notes` in its history.
+
+        `state`: state of the time column after the previous part, which is updated.
+        """
         columns, notes = log.join_blocks(blocks)
         notes = [*layout.notes, *notes, *more_notes]
         return convert_columns(
@@ -194,7 +197,7 @@ def _find_channel_times(labels: Sequence[Label]) -> list[int]:
 
 
 def _split_blocks(blocks: Iterable[_Block], size: float) -> Iterator[list[_Block]]:
-    """Regroup blocks of rows of a log into lists of `size` rows, or inf for a single list; the last may have fewer."""
+    """Regroup a log's blocks into lists with `size` rows in all, inf for a single list; the last may have fewer."""
     group: list[_Block] = []
     missing_rows = size
     for block in blocks:
@@ -364,7 +367,7 @@ class _Log:
         return result
 
     def _select_samples(self, lines: Sequence[str], first: int) -> list[int]:
-        """List the lines with samples, from index `first` on: no comments, blank lines or repeated headings."""
+        """List the indices of lines with samples, from `first` on: no comments, blank lines or repeated headings."""
         blank = " " if self.layout.delimiter == "\t" else None  # a line of tabs is a row of missing samples
         content = [
             i for i in range(first, len(lines)) if lines[i].strip(blank) and not lines[i].lstrip().startswith(COMMENTS)
@@ -473,7 +476,7 @@ class _Log:
         return bool(self.has_stamps)
 
     def _join_dates(self, rows: Sequence[Sequence[str]], column: int) -> list[str]:
-        """Return the cells of the time column after those of the date column, if any; empty if one is missing."""
+        """Return the cells of the time `column`, after their dates if there is a date column; "" if one is missing."""
         if not self.has_date or self.date is None:
             return [row[column] for row in rows]
         days = [row[self.date].strip() if self.date < len(row) else "" for row in rows]
@@ -572,7 +575,7 @@ class _Log:
         return columns, notes
 
     def describe_text_lines(self) -> list[str]:
-        """Describe which lines of text were left out of the log; raise InputError if they are too many."""
+        """Describe the lines of text left out of the log, for the history; raise InputError if they are too many."""
         if self.n_text_lines > max(MAX_WORD_FRACTION * self.n_rows, _MAX_TEXT_LINES):
             raise InputError(f"a sample must be a number, got {self.first_text_line}")
         lines = format_count(self.n_text_lines, "line")

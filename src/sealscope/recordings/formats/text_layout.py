@@ -128,7 +128,7 @@ def _detect_dialect(body: Sequence[str]) -> tuple[str, str, int]:
     """Detect (delimiter, decimal separator, number of cells in a row) from some lines of a log, else (",", ".", 1).
 
     All pairs of `_DIALECTS` are rated by the fraction of cells, missing ones aside, that are values (numbers or time
-    stamps) in rows of one width. This is the width with most values, at least half of all.
+    stamps) in rows of one width. That width is the one with most values, at least half of all values.
     """
     ranks: dict[tuple[str, str, int], tuple[float, float, bool, int]] = {}
     text = "\n".join(body)
@@ -155,7 +155,8 @@ def _detect_dialect(body: Sequence[str]) -> tuple[str, str, int]:
 def _split_heading(line: str, delimiter: str, width: int = 0) -> list[str]:
     """Split the heading line of a log into the names of columns.
 
-    At blanks, a unit in brackets stays with its name. Wider spaces separate names if only that gives `width` names.
+    At blanks, a unit in brackets stays with its name. If that does not give `width` names but splitting at wider spaces
+    does, the latter counts.
     """
     if delimiter == " ":
         names = _SPACED_LABEL.findall(line)
@@ -391,6 +392,6 @@ def _expand_sample_prefixes(line: str) -> str:
 
 
 def _iter_splits(lines: Sequence[str]) -> Iterator[list[list[str]]]:
-    """Yield the cells of lines at each usual delimiter, if any number has letters after it, such as a unit."""
+    """Yield all lines, split into cells at each usual delimiter in turn; nothing if no number has letters after it."""
     if any(map(_QUANTITY.search, lines)):  # a quick search, which spares most logs the rest
         yield from ([split_cells(line, delimiter) for line in lines] for delimiter in "\t;|,")

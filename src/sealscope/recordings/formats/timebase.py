@@ -288,8 +288,8 @@ def is_falling(times: NDArray[Any]) -> bool:
 def _convert_stamps(values: NDArray[np.datetime64], name: str, state: TimeState) -> _Seconds:
     """Convert date stamps (n,) of the time column `name` to seconds from the first stamp.
 
-    Times of day without a date continue from the last time in `state`; their jumps back at midnight or at the full hour
-    are removed, and of dated stamps a single jump by an hour in the night, as of daylight saving time.
+    Times of day without a date continue from the last time in `state`, and their jumps back at midnight or at the full
+    hour are removed. In dated stamps a single jump by an hour in the night, due to daylight saving time, is removed.
     """
     nanoseconds = values.astype("datetime64[ns]")
     known = ~np.isnat(nanoseconds)
@@ -325,7 +325,7 @@ def _remove_jumps(t: Array, step: float, single: bool) -> Array | None:
     """Remove clock jumps of `step` [s], such as -86400 s at midnight, from times (n,).
 
     An interval is a jump if it differs from `step` plus the median interval by at most `_TOLERANCE` median intervals.
-    None without a jump, with several if only a `single` one may be, or if ordinary intervals could look like jumps.
+    None if there is no jump, if there are several although `single`, or if ordinary intervals could look like jumps.
     """
     steps = np.diff(t)
     positive_steps = steps[np.isfinite(steps) & (steps > 0)]
@@ -343,7 +343,7 @@ def _convert_numbers(values: Array, unit: str | None, name: str, state: TimeStat
     """Convert a time column of numbers (n,) to seconds.
 
     `unit`: may state an origin, as in `days since 1899-12-30`; None if it is to be guessed from the numbers. Only this
-    guess needs `name`, the column in messages, and `state`, that after the previous part of the log, which is updated.
+    guess needs `name`, the column in messages, and `state` after the log's previous part, which it updates.
     """
     finite = values[np.isfinite(values)]
     if not finite.size:
@@ -403,8 +403,8 @@ def _detect_days(values: Array) -> tuple[np.datetime64 | None, str] | None:
     """Find out if the numbers (n,) of a time column without a unit count days: (origin, meaning in words), else None.
 
     They do if the steps between them, taken as seconds, would be shorter than those of any logger, and if the first,
-    counted as spreadsheets or MATLAB count days, is a date from 1982 to 2078, or if all lie between 0 and 1: they are
-    fractions of a day, and the origin is None.
+    counted as spreadsheets or MATLAB count days, is a date from 1982 to 2078. With such steps, numbers between 0 and 1
+    are fractions of a day, and the origin is None.
     """
     steps = np.diff(values)
     steps = steps[steps > 0]
@@ -459,8 +459,9 @@ def time_base(
 def _space_shared_times(t: Array, state: TimeState) -> tuple[float, Array] | None:
     """Spread samples that share a time, because the times of the log have coarse steps, evenly over these steps.
 
-    Returns (step [s], new times (n,)) for the times `t` (n,) [s]; None if a time is missing or steps back, or unless
-    all steps have about equally many samples, at least two. Too short a part of a log has step and rate of `state`.
+    Returns (step [s], new times (n,)) for the times `t` (n,) [s]; None if a time is missing or steps back, or
+    if the steps do not have about equally many samples, at least two. A part of a log that is too short to show this
+    gets step and rate from `state`.
     """
     steps = np.diff(t)
     changes = np.flatnonzero(steps)  # indices of the last samples before the time changes

@@ -49,7 +49,7 @@ def _fold(text: str) -> str:
 
 
 def _column_key(label: Label) -> str:
-    """Return the last word of a column's name, folded, as the words before it may name a group of columns."""
+    """Return the last word of a column's name in lower case; the words before it may name a group of columns."""
     return _fold(label.name.rpartition(" ")[2] or label.name)
 
 

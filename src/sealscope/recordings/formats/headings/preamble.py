@@ -32,9 +32,9 @@ _QUANTITY = re.compile(r"(?P<number>[+-]?\d{1,12}(?:[.,]\d{1,12})?(?:[eE][+-]?\d
 
 
 def stated_rate(remarks: Mapping[str, str]) -> float | None:
-    """Find the sampling rate [Hz], or the interval, first stated in the remarks of a file; None if there is none.
+    """Find the sampling rate [Hz] in the remarks of a file, which may state the interval instead; None without one.
 
-    Its unit may stand after the number, in the remark's name or not at all.
+    The unit may stand after the number, in the remark's name or not at all.
     """
     for name, text in remarks.items():
         label = Label.parse(name)

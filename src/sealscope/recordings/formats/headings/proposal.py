@@ -261,7 +261,7 @@ def is_current_or_fraction(unit: str) -> bool:
 
 
 def _guess_at_valve(label: Label, kind: str) -> _Guess | None:
-    """Guess if a column is a pressure at the side `kind` of a valve, "before" or "behind"; None for other columns."""
+    """Guess the meaning of a column of pressures on a side of a valve, `kind` "before" or "behind"; None for others."""
     name, unit = _find_name_and_unit(label)
     words = _split_words(name)
     if unit is None or not same_dimension(unit, "Pa") or not words & _KIND[kind] or words & _KIND["wanted"]:

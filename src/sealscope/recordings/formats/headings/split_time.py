@@ -24,7 +24,7 @@ _MIN_FRACTION = 0.9
 
 
 def find_time_parts(labels: Sequence[Label], used: Container[int], only_subsecond: bool = False) -> dict[str, int]:
-    """Find the columns that together form the time: part of the time, such as "hour" -> column; `used` are ignored.
+    """Find the columns outside `used` that together form the time: part of the time, such as "hour" -> column.
 
     Hours, minutes and seconds must have one column each. Parts of a second are added, and year, month and day if all
     three exist. With `only_subsecond`, parts of a second beside a time column of whole seconds are found.

@@ -54,7 +54,7 @@ def _is_workbook(path: Path) -> bool:
 def unpack(path: Path, kind: str, max_bytes: int) -> Iterator[Path]:
     """Unpack the single file of a `kind` of archive, such as "zip", yield its path, and remove it at the end.
 
-    Raises UnreadableFile without a single recording, if the archive is damaged, or if it unpacks to more than
+    Raises UnreadableFile if the archive does not hold a single recording, is damaged, or unpacks to more than
     `max_bytes` or half of the free disk space. Raises MissingExtra for .zst without pyarrow.
     """
     with tempfile.TemporaryDirectory(prefix="sealscope-") as folder:
@@ -80,7 +80,7 @@ def _unpack(path: Path, kind: str, folder: Path, max_bytes: int) -> Path:
 
 @contextmanager
 def _open_member(path: Path, kind: str) -> Iterator[tuple[IO[bytes], str, int]]:
-    """Open the single file in a `kind` of archive; yield (stream, name, size [bytes]), "" and 0 if not known."""
+    """Open the single file in a `kind` of archive; yield (stream, name or "", size [bytes] or 0 if not known)."""
     with ExitStack() as stack:
         if kind == "zip":
             zip_archive = stack.enter_context(zipfile.ZipFile(path))

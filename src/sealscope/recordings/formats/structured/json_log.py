@@ -193,7 +193,7 @@ def _parse_records(members: Sequence[Any], place: str) -> list[Series]:
 
 
 def _block_length(member: Mapping[str, Any]) -> int | None:
-    """Find the number of rows in a block of columns, i.e. arrays of equal length and one a time; None for others."""
+    """Find the number of rows in a block of columns, i.e. equally long arrays, one of them a time; None for others."""
     if not all(isinstance(value, list) for value in member.values()):
         return None
     lengths = set(map(len, member.values()))
@@ -218,8 +218,8 @@ def _parse_array(cells: Sequence[Any], name: str) -> NDArray[Any]:
 def _convert_lists(value: Any, place: str, depth: int = 0) -> Any:
     """Convert the lists in a JSON document, at any `depth` of mappings, to arrays or mappings of columns.
 
-    Samples or equally long rows become an array, records a mapping from name to column, other mappings one with the
-    names `(1)`, `(2)`, ..., and any other list None.
+    A list of samples or of equally long rows becomes an array, one of records a mapping from name to column, one of
+    other mappings a mapping with the names `(1)`, `(2)`, ..., and any other list None.
     """
     if isinstance(value, Mapping) and depth < _MAX_TREE_DEPTH:
         return {key: _convert_lists(member, place, depth + 1) for key, member in value.items()}

@@ -87,7 +87,7 @@ def read_lvm(path: Path, request: Request) -> RecordingFields:
 
 
 def _iter_packets(lines: Iterator[tuple[int, str]], delimiter: str, decimal: str, place: str) -> Iterator[_Packet]:
-    """Yield the packets of a LabVIEW measurement file; rows are added to a packet on the way to the next one."""
+    """Yield the packets in numbered `lines` of a LabVIEW file; a packet gets its rows after it is yielded."""
     header: dict[str, list[str]] = {}
     packet: _Packet | None = None
     in_header = True

@@ -66,7 +66,7 @@ def _struct_fields(value: Any) -> Mapping[str, Any] | None:
 def _iter_struct(group: str, name: str, fields: Mapping[str, Any], clock: Clock | None, depth: int) -> Iterator[Series]:
     """Yield the series of samples in a struct: a time series, a signal, or a group of other values.
 
-    A signal has samples and a unit or, in a Simulink log, a name and `values`. Other arguments: as of `_iter_value`.
+    A signal has samples and a unit or, in a Simulink log, a name and `values`. Other arguments as in `_iter_value`.
     """
     by_name = {key.rstrip("_").casefold(): value for key, value in fields.items()}
     unit = _first_text(by_name, _UNIT_FIELDS)
@@ -88,7 +88,7 @@ def _iter_time_series(group: str, name: str, by_name: Mapping[str, Any], clock: 
     """Yield the series of samples in a struct that also contains their times: `by_name` and the `clock`.
 
     The samples are in the structs of `signals`, as in Simulink's structure with time, in an array `data`, as in
-    MATLAB's `timeseries`, or in another value `data`. Other arguments: as of `_iter_value`.
+    MATLAB's `timeseries`, or in another value `data`. Other arguments as in `_iter_value`.
     """
     data = by_name.get("data")
     if "signals" in by_name:
@@ -106,7 +106,7 @@ def _iter_time_series(group: str, name: str, by_name: Mapping[str, Any], clock: 
 def _iter_group(group: str, fields: Mapping[str, Any], clock: Clock | None, depth: int) -> Iterator[Series]:
     """Yield the series of samples in each field of a struct, with names and units from fields such as `units`.
 
-    `group`: names of the struct and of those around it, with slashes between; `depth`, `clock`: as of `_iter_value`.
+    `group`: names of the struct and of those around it, with slashes between; `depth`, `clock`: as in `_iter_value`.
     """
     units, column_names = _find_field_units(fields), _find_column_names(fields)
     for key, value in fields.items():
