@@ -134,12 +134,12 @@ def _size_penalty(
 
 
 def _law_log_prior(name: str) -> float:
-    """Compute the log prior probability of the law by which an observable describes a leak, 0 if it is no leak.
+    """Compute the log prior probability of the law by which an observable describes a leak, over that of laminar flow.
 
-    A law is a power of p_A - p_B (`law_priors`). An external leak is tested as a laminar flow alone.
+    A law is a power of p_A - p_B (`law_priors`). The result is 0 for a laminar leak, and for what is no leak.
     """
-    exponent = 1.0 if name.startswith("external leak") else _LEAK_EXPONENTS.get(name)
-    return 0.0 if exponent is None else float(np.log(law_priors()[EXPONENTS.index(exponent)]))
+    laminar, *_ = priors = law_priors()
+    return float(np.log(priors[EXPONENTS.index(_LEAK_EXPONENTS.get(name, 1.0))] / laminar))
 
 
 def _step_hypotheses(
