@@ -48,7 +48,10 @@ class Unit(NamedTuple):
     offset: Fraction = Fraction(0)
 
     def times(self, other: Unit, power: Fraction) -> Unit:
-        """Multiply by `other` to a power, without offset; raise ValueError for a factor beyond the range of doubles."""
+        """Multiply by `other` raised to a `power`, dropping offsets as that of degC.
+
+        Raises ValueError if the factor of the product is beyond the range of doubles.
+        """
         bits = max(other.factor.numerator, other.factor.denominator).bit_length()
         if abs(power) * bits > _MAX_BITS:  # checked first, as the power itself could take forever
             raise ValueError

@@ -28,7 +28,10 @@ _N_CHANGES = 2**15
 
 
 def remove_spikes(recording: Recording) -> tuple[Recording, list[Finding]]:
-    """Replace spikes by NaN, not in slow channels and the command; return the recording and its findings."""
+    """Replace spikes by NaN in all channels but slow ones and the command u, which may jump.
+
+    Returns the recording, and a finding for each channel with spikes.
+    """
     channels, findings = dict(recording.channels), list[Finding]()
     for name, values in recording.channels.items():
         spikes = find_spikes(values) if name not in SLOW and name != "u" else np.empty(0, dtype=np.intp)

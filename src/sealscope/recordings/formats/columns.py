@@ -223,9 +223,9 @@ def _parse_mapping(labels: Sequence[Label], channel: str, column_text: str) -> F
 def _choose_unit(channel: str, unit: str | None, description: str) -> tuple[str, str | None]:
     """Choose the unit in which a column in `unit` is read as a channel; also return a note for the history, or None.
 
-    This is the same unit, but a column without unit (None) and a command in amperes or per cent are read as raw counts,
-    i.e. numbers of an unknown scale, and a speed in turns per minute in rpm. The note begins with `description`. Raises
-    InputError for a unit of the wrong dimension.
+    The column keeps its unit, with two exceptions. A column without unit (None), or a command in amperes or per cent, is
+    read as raw counts, i.e. numbers of an unknown scale. A speed in turns per minute, however written, is in rpm. The
+    note begins with `description`. Raises InputError for a unit of the wrong dimension.
     """
     if unit is None:
         return COUNTS, f"{description} has no unit: taken as raw counts"
@@ -240,7 +240,10 @@ def _choose_unit(channel: str, unit: str | None, description: str) -> tuple[str,
 
 
 def _apply_map(choice: ColumnMap, columns: Mapping[str, str]) -> None:
-    """Add the channels and the time that a user's map names to `choice`; `columns`: channel -> column or formula."""
+    """Add to `choice` the channels and the time column that a user has mapped.
+
+    `columns`: for each channel, or "t" for the time, the text of a column or of a formula of several columns.
+    """
     for channel, column_text in columns.items():
         formula = _parse_mapping(choice.labels, channel, column_text)
         name = column_text if formula.column is None else choice.labels[formula.column].whole

@@ -90,7 +90,7 @@ class Series:
 
     @property
     def path(self) -> str:
-        """Names of the group and the series, as `group/name`, which a user's map may contain."""
+        """Full name, `group/name` or the name alone without a group, by which a user's column map may refer to it."""
         return f"{self.group}/{self.label.whole}" if self.group else self.label.whole
 
 

@@ -286,7 +286,9 @@ class _Log:
             )  # fmt: skip
             for first_line, content, end, is_cut in line_blocks:
                 block = self._read_by_arrow(first_line, content, end) if self.uses_arrow and not is_cut else None
-                if is_first and block is None:  # later blocks may only have a comment or word that pyarrow cannot read
+                if (
+                    is_first and block is None
+                ):  # of a later block only a comment or a word may be unreadable for pyarrow
                     self.uses_arrow = False
                 is_first = False
                 if block is None:
