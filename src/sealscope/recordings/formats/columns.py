@@ -223,9 +223,9 @@ def _parse_mapping(labels: Sequence[Label], channel: str, column_text: str) -> F
 def _choose_unit(channel: str, unit: str | None, description: str) -> tuple[str, str | None]:
     """Choose the unit in which a column in `unit` is read as a channel; also return a note for the history, or None.
 
-    The column keeps its unit, with two exceptions. A column without unit (None), or a command in amperes or per cent, is
-    read as raw counts, i.e. numbers of an unknown scale. A speed in turns per minute, however written, is in rpm. The
-    note begins with `description`. Raises InputError for a unit of the wrong dimension.
+    The column keeps its unit, with two exceptions. A column without unit (None), or a command in amperes or per cent,
+    is read as raw counts, i.e. numbers of an unknown scale. A speed in turns per minute, however written, is in rpm.
+    The note begins with `description`. Raises InputError for a unit of the wrong dimension.
     """
     if unit is None:
         return COUNTS, f"{description} has no unit: taken as raw counts"
