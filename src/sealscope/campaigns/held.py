@@ -80,7 +80,7 @@ class PlannedHold(NamedTuple):
         }
 
     def text(self, stated_pressure: float) -> str:
-        """Format the planned hold as text, with the flow of its leak at the difference `stated_pressure` [Pa]."""
+        """Format the planned hold as text, with the smallest leak's flow at the difference `stated_pressure` [Pa]."""
         found = f"{self._lpm(stated_pressure):.2g} L/min" if self.finds_a_leak else "no leak, however large"
         high, low = self.pressure_A / 1e6, self.pressure_B / 1e6
         return (
@@ -120,7 +120,7 @@ class _HoldDraws:
     def __init__(
         self, rig: Rig, load: float, flow: float, duration: float, false_alarm: float, detection: float
     ) -> None:
-        """Set chamber B to the charge pressure and A higher by load / A_A, and limit false alarms and missed leaks.
+        """Prepare holds that begin with chamber B at the charge pressure, and chamber A higher by load / A_A.
 
         The arguments are those of `plan_hold`; `duration` [s]: time with shut valves.
         """
@@ -180,7 +180,7 @@ def draw_hold(rig: Rig, hold: PlannedHold, conductance: float, flow: float, seed
     """Simulate a locked hold with a leak past the piston and with sensor noise; measure the leak as in a recording.
 
     `conductance` [m^3/(s Pa)] of the leak; `flow` [m^3/s]: mean flow of the pump under the usual duty. Returns the
-    summary of a recording with this hold, whose Gram matrix, for data from the motion of the piston, is 0.
+    summary of a recording with this hold, whose Gram matrix is 0, because the piston does not move.
     """
     random = np.random.default_rng(seed)
     cylinder, sensors = rig.cylinder, rig.sensors

@@ -97,7 +97,7 @@ def estimate_mean(values: npt.ArrayLike, confidence: float = 0.95) -> IntervalEs
 
 
 def _as_matching(values: npt.ArrayLike | None, n: int, what: str) -> Array:
-    """Convert `values` to an array (n,), all nan for None; raise InputError for values of another shape."""
+    """Convert `values` to an array (n,), all nan for None; raise InputError, naming them `what`, for other shapes."""
     array = np.full(n, math.nan) if values is None else np.asarray(values, dtype=np.float64)
     if array.shape != (n,):
         raise InputError(f"{what} must be as many as the true values, got {array.shape} for {n}")

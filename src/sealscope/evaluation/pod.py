@@ -198,7 +198,7 @@ class HitMiss:
             raise InputError(f"confidence must be from 0.5 to 1, got {confidence}")
         log_odds = _log_odds(detection)
         allowed_drop = 0.5 * float(ndtri(confidence)) ** 2  # largest drop of the log-likelihood
-        if not self.slope > 0.0 or self.log_likelihood - self.null <= allowed_drop:  # a curve of slope 0 is allowed
+        if not self.slope > 0.0 or self.log_likelihood - self.null <= allowed_drop:  # even slope 0 is within the drop
             return math.inf
 
         def excess_drop(log_size: float) -> float:
@@ -241,12 +241,12 @@ class HitMiss:
         design = np.column_stack([np.ones(x.size), x])
 
         def loss(slope: float) -> float:
-            """Compute the negative log-likelihood of the curve with this slope; 1e300, not infinity, for the search."""
+            """Compute the negative log-likelihood of the curve with this slope, 1e300 if it is infinite."""
             eta = log_odds + slope * (x - log_size)
             value = _log_likelihood(design, self.tested, self.hits, eta, firth=self.estimator == "firth")
             return -value if math.isfinite(value) else 1e300
 
-        width = max(float(np.abs(x - log_size).max()), 1e-300)  # never 0, as it divides below
+        width = max(float(np.abs(x - log_size).max()), 1e-300)  # never 0: a divisor below
         return -float(minimize_scalar(loss, bracket=(0.0, 1.0 / width), options={"xtol": 1e-9}).fun)
 
 
@@ -264,7 +264,7 @@ def fit_hit_miss(leaks: npt.ArrayLike, hits: npt.ArrayLike) -> HitMiss:
     """Fit a logistic curve of the probability of detection to hits and misses over the logarithm of the leak's size.
 
     `leaks` (n,): positive sizes in any unit; `hits` (n,): True for the detected leaks. The fit is by maximum likelihood
-    or, if hits and misses are separated by size so that this has no finite maximum, by Firth's penalised likelihood
+    or, if size separates hits from misses so that the likelihood has no finite maximum, by Firth's penalised likelihood
     (`HitMiss.estimator`), also for bounds of a size (`HitMiss.size_bound`). The curve goes to 0 for small leaks, as it
     does not include the false-alarm rate. Raises InputError for a single size, only hits or only misses. Source:
     MIL-HDBK-1823A (2009), appendix G; Firth, Biometrika 80 (1993) 27-38, doi 10.1093/biomet/80.1.27; Heinze and

@@ -130,7 +130,7 @@ def auc(leak_free: npt.ArrayLike, leaky: npt.ArrayLike, confidence: float = 0.95
 
     With scores a (n,) of leak-free and b (m,) of leaky records, high for leaks, the area is ``sum of (b > a) + (b =
     a)/2`` over all pairs, divided by n m. The interval is DeLong's normal approximation, cut off at 0 and 1, or
-    Newcombe's if that has no width, as the scores are completely separated or all equal. Raises InputError for fewer
+    Newcombe's if that has no width (scores completely separated or all equal). Raises InputError for fewer
     than 2 records of either group. Source: DeLong, DeLong and Clarke-Pearson, Biometrics 44 (1988) 837-845, doi
     10.2307/2531595, eq. (5)-(8).
     """

@@ -40,8 +40,8 @@ def karnopp_friction(
 
     While it sticks, friction balances `applied` [N], the sum of all other forces, up to `breakaway` [N]. While it
     slides at the velocity `v` [m/s], friction is F_C (1 + (K_brk - 1) exp(-C_c |v|)) sign(v) + F_v v, eq. (4.21). `F_C`
-    [N]: Coulomb force; `K_brk`: breakaway over Coulomb force; `C_c` [s/m]: transition, `F_v` [N s/m]: viscous
-    coefficient.
+    [N]: Coulomb force; `K_brk`: breakaway over Coulomb force; `C_c` [s/m]: transition coefficient; `F_v`
+    [N s/m]: viscous coefficient.
 
     Source: D. Karnopp, Computer simulation of stick-slip friction in mechanical dynamic systems, ASME Journal of
     Dynamic Systems, Measurement and Control 107 (1985) 100-103.

@@ -97,7 +97,7 @@ def _cast_to_lanes(context: Any, builder: Any, value_type: Any, lanes: Any, valu
 
 
 def _common_lanes_type(arg_types: tuple[Any, ...]) -> Lanes | None:
-    """Find the one type of lanes among the types of a call's arguments, else numbers; None for any other types."""
+    """Find the one type of lanes among a call's argument types, the rest being numbers; None for any other call."""
     lanes = {arg_type for arg_type in arg_types if isinstance(arg_type, Lanes)}
     compatible = len(lanes) == 1 and all(isinstance(arg_type, Lanes | types.Number) for arg_type in arg_types)
     return lanes.pop() if compatible else None
@@ -130,7 +130,7 @@ def _define_on_lanes(function: Any, build: Any, *, is_test: bool = False) -> Non
 
 
 def _lower_division_by_number(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    """Build the LLVM instructions that divide lanes by a number, by its reciprocal, which a loop computes once."""
+    """Build the LLVM instructions that multiply lanes by a number's reciprocal, which a loop computes only once."""
     lanes, number_type = sig.args
     number = context.cast(builder, args[1], number_type, types.float64)
     reciprocal = builder.fdiv(ir.Constant(ir.DoubleType(), 1.0), number)
@@ -183,10 +183,11 @@ for _function, _name in ((operator.and_, "and_"), (operator.or_, "or_")):
 
 
 def register_lowering(function: Any, arity: int, infer_type: Any) -> Any:
-    """Make a Python function of `arity` arguments callable in compiled code, by the LLVM instructions of the decorated.
+    """Make a Python function of `arity` arguments callable in compiled code; the decorated function builds its code.
 
     `infer_type(arg_types)` returns the type of the result, or None if the function does not take arguments of these
-    types. The decorated function takes numba's context, LLVM's builder, and types and values of the arguments.
+    types. The decorated function takes numba's context, LLVM's builder, and types and values of the arguments,
+    and returns the value of the result.
     """
 
     @infer_global(function)
@@ -233,7 +234,7 @@ def _lower_select(context: Any, builder: Any, arg_types: Any, values: Any) -> An
 
 
 def any_lane(condition: Any) -> Any:
-    """Return True if a mask of truth values, or the one truth value of a run without lanes, is true anywhere."""
+    """Return True if any truth value of a mask, or the single one of a run without lanes, is true."""
     return condition
 
 
@@ -254,7 +255,7 @@ def _float_constant(value_type: Any, value: float) -> Any:
 
 
 def nearest_integer(x: Any) -> Any:
-    """Round x, |x| < 2^51 (single precision: 2^22), by adding a constant so large that no fraction is left."""
+    """Round x, |x| < 2^51 (single precision: 2^22), by adding and subtracting a constant too large for fractions."""
     return (x + _ROUNDING_DOUBLE) - _ROUNDING_DOUBLE
 
 
@@ -266,7 +267,7 @@ def _lower_nearest_integer(context: Any, builder: Any, arg_types: Any, values: A
 
 
 def power_of_two(n: Any) -> Any:
-    """Compute 2^n for a float or lanes without fraction in -1022..1023 (single precision: limited to -126..127)."""
+    """Compute 2^n for a whole number n, a float or lanes, in -1022..1023 (single precision: limited to -126..127)."""
     return math.ldexp(1.0, int(n))
 
 
@@ -294,7 +295,7 @@ _LANES_OF_DTYPE = {types.float64: LANES, types.float32: SINGLES}
 
 
 def _row_address(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
-    """Build the LLVM instructions for the address, a pointer to lanes, of a row: arguments (array, row, ...)."""
+    """Build the LLVM instructions for the address of an array's row; the first two `values` are array and row."""
     data = context.make_array(arg_types[0])(context, builder, values[0]).data
     row = context.cast(builder, values[1], arg_types[1], types.intp)
     lanes = _LANES_OF_DTYPE[arg_types[0].dtype]
@@ -305,12 +306,13 @@ def _row_address(context: Any, builder: Any, arg_types: Any, values: Any) -> Any
 def load(array: Any, row: int) -> Any:
     """Load one row of a C-ordered array as lanes, a vector of numbers, in compiled code that `_lower_load` builds.
 
-    Its shape is (..., WIDTH) of doubles, or (..., SINGLE_WIDTH) in single precision; `row` counts through all axes.
+    Its shape is (..., WIDTH) of doubles, or (..., SINGLE_WIDTH) in single precision. Rows are numbered over all axes
+    but the last.
     """
 
 
 def _loaded_type(arg_types: Any) -> Any:
-    """Find the type of the vector (lanes) that `load` reads; None without an array of loadable rows and an integer."""
+    """Find the type of the vector (lanes) that `load` reads; None unless it gets a suitable array and an integer."""
     array, row = arg_types[:2]
     is_loadable = isinstance(array, types.Array) and array.dtype in _LANES_OF_DTYPE and array.layout == "C"
     return _LANES_OF_DTYPE[array.dtype] if is_loadable and isinstance(row, types.Integer) else None

@@ -155,7 +155,10 @@ def throttle_flow_coefficients(v: RigValues, exponent: float, literal: bool) -> 
 
 @law
 def derived_numbers(v: RigValues, exponent: float, literal: bool) -> tuple[float, ...]:
-    """Compute the numbers `DERIVED` of a rig's parameters `v`; `exponent`, `literal`: its `throttle_readings`."""
+    """Compute throttle coefficients, mid-stroke volumes and pump loss coefficients (`DERIVED`) of a rig's parameters.
+
+    `v`: the parameters; `exponent`, `literal`: as in `throttle_flow_coefficients`.
+    """
     c_A_in, c_A_out, c_B_in, c_B_out = throttle_flow_coefficients(v, exponent, literal)
     V_A, V_B = cylinder.mid_stroke_volumes(v)
     c_slip, k_h = pump.loss_coefficients(v.q_b, v.C_st, v.C_h, v.rho)
@@ -168,17 +171,17 @@ def parameter_values(rig: Rig) -> RigValues:
 
 
 def throttle_readings(rig: Rig) -> tuple[float, bool]:
-    """Return the arguments `exponent` and `literal` of `throttle_flow_coefficients` for a rig."""
+    """Return a rig's readings of the thesis: the arguments `exponent` and `literal` of `throttle_flow_coefficients`."""
     return (2.0 if rig.line.closed_means == "diameter" else 1.0), rig.line.metering == "literal"
 
 
 def throttle_coefficients(rig: Rig) -> tuple[float, float, float, float]:
-    """Compute a rig's throttle coefficients by `throttle_flow_coefficients`."""
+    """Compute the flow coefficients (c_A_in, c_A_out, c_B_in, c_B_out) [m^3/(s Pa^0.5)] of a rig's throttles."""
     return throttle_flow_coefficients(parameter_values(rig), *throttle_readings(rig))  # type: ignore[no-any-return]
 
 
 def rig_numbers(rig: Rig) -> RigNumbers:
-    """Convert a rig to the numbers and choices that the laws take; raise InputError if its circuit has no laws."""
+    """Convert a rig to the numbers and choices that the laws take; raise InputError if it cannot be simulated."""
     check_circuit_property("a simulation", rig.name, rig.circuit, "simulated")
     values = parameter_values(rig)
     return RigNumbers(
@@ -199,7 +202,7 @@ def _record_type(lengths: tuple[int, ...]) -> np.dtype[Any]:
 
 
 def pack_numbers(p: RigNumbers) -> Any:
-    """Pack a rig's numbers, unless tables of a load are among them, into one record, to pass it by its address."""
+    """Pack a rig's numbers into one record, to pass it by its address; return `p` itself if it has tables of a load."""
     if len(p.pushed) > 1:
         return p
     lengths = tuple(len(getattr(p, name)) for name in LAWS)
@@ -446,7 +449,7 @@ def make_up_flows(y: State, p: RigNumbers) -> tuple[float, float]:
 
 @contracted
 def external_pressure_rates(y: State, p: RigNumbers) -> tuple[Pressures, float]:
-    """Compute the rates of p_A, p_B, p_1, p_2 [Pa/s] by external leakage and make-up, and its outflow [m^3/s]."""
+    """Compute the rates of p_A, p_B, p_1, p_2 [Pa/s] by external leakage and make-up, and the make-up flow [m^3/s]."""
     V_A, V_B = volumes_at(y[POSITION], p)
     K_A, K_B = bulk_modulus(y[P_A], p), bulk_modulus(y[P_B], p)
     makeup_1, makeup_2 = make_up_flows(y, p)

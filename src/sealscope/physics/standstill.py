@@ -78,7 +78,7 @@ def pressures_behind_valve(force: float, A_A: float, A_B: float, p_1: float, p_2
     `force` [N]: load against +x; `A_A`, `A_B` [m^2]: piston areas; `p_1`, `p_2` [Pa]: pressures of supply and return.
     p_A + p_B = p_1 + p_2, because the edges to supply and return are equal and have equal pressure drops (Merritt,
     Hydraulic Control Systems, 1967, section 5.2). The same sum is assumed for an overlapped valve, which may trap oil
-    at others.
+    at other pressures.
     """
     p_A = (force + A_B * (p_1 + p_2)) / (A_A + A_B)
     return p_A, p_1 + p_2 - p_A
@@ -87,7 +87,8 @@ def pressures_behind_valve(force: float, A_A: float, A_B: float, p_1: float, p_2
 def supply_at_standstill(force: float, x: float, p: RigNumbers) -> tuple[float, float, float]:
     """Compute the supply pressure p_1 and chamber pressures p_A, p_B [Pa] of a rig at rest with a centred servo valve.
 
-    `force` [N]: load against +x; `x` [m]: position. dp_1/dt = 0, which falls with rising p_1, is solved by bisection.
+    `force` [N]: load against +x; `x` [m]: position. p_1 is where dp_1/dt, which falls with rising p_1, is 0; bisection
+    finds it.
     """
     y = np.zeros(len(STATES))
     y[POSITION], y[P_2] = x, p.p_return

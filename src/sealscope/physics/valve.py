@@ -26,7 +26,8 @@ def spool_acceleration(x_s: float, v_s: float, x_d: float, omega_s: float, zeta_
     """Compute the rate dv_s/dt [m/s^2] of the spool's speed, as a second-order lag with a limited speed.
 
     dv_s/dt = omega_s^2 (x_d - x_s) - 2 zeta_s omega_s v_s with position `x_s` and target position `x_d` [m], speed
-    `v_s` [m/s], natural frequency `omega_s` [rad/s] and damping ratio `zeta_s`. It is 0 beyond +-`v_max` [m/s].
+    `v_s` [m/s], natural frequency `omega_s` [rad/s] and damping ratio `zeta_s`. It is 0 where the speed would
+    leave +-`v_max` [m/s].
 
     Source: Merritt, Hydraulic Control Systems, 1967, chapter 7: a servo valve as a second-order lag.
     """

@@ -315,7 +315,7 @@ class ParameterDrift:
             raise InputError(f"a relative drift must stay above -100 %, got {100 * lowest:.4g} % ({self.parameter})")
 
     def effects(self) -> tuple[Effect, ...]:
-        """Build the changes that the drift causes: of an instrument's parameter, or of all that depend on a rig's."""
+        """Build the drift's changes: of an instrument's parameter, or of all model parameters derived from a rig's."""
         breakpoints = self.shape.breakpoints()
 
         def build_effect(name: str, power: float) -> Effect:

@@ -19,9 +19,10 @@ _MAX_OUTPUTS_PER_SAMPLE = 64
 
 
 def outputs_per_sample(rate: float, controller_rate: float, min_outputs: int) -> int:
-    """Find the fewest solver outputs (>= `min_outputs`) per recorded sample that hit every controller sample.
+    """Find the fewest solver outputs per recorded sample such that each controller sample falls on an output.
 
-    `rate`, `controller_rate` [Hz] of the samples. Raises InputError if no number up to 64 suits both.
+    `rate`, `controller_rate` [Hz]: samples of the recording and of the controller; `min_outputs`: lower limit of the
+    result. Raises InputError if no number up to 64 suits both rates.
     """
     for outputs in range(min_outputs, _MAX_OUTPUTS_PER_SAMPLE + 1):
         spacing = rate * outputs / controller_rate  # outputs per controller sample: must be a whole number >= 1

@@ -147,7 +147,7 @@ class Polyline:
         return tuple(map(float, np.unique(self.t))) if self.t.size < _MAX_BREAKPOINTS else ()
 
     def onset(self) -> float:
-        """Find the time [s] of the last point before the first positive value, 0 if none; inf if never positive."""
+        """Find the time [s] of the point before the first positive one; 0 if the first is positive, inf if none is."""
         if not np.any(self.y > 0):
             return math.inf
         first_positive = int(np.argmax(self.y > 0))
@@ -337,7 +337,7 @@ _MAX_CHARACTERS = 1000
 
 
 def normalize_blanks(text: str, what: str) -> str:
-    """Replace blanks in a text by single ones, but not in a path after ``file``; `what` names too long a text."""
+    """Replace blanks in a text by single ones, but not in a path after ``file``; `what`: its name in messages."""
     if len(text) > _MAX_CHARACTERS:
         raise InputError(f"{what} must be of at most {_MAX_CHARACTERS} characters, got {len(text)}")
     if file := re.fullmatch(r"(?:(position)\s+)?(file)\s+(.*)", text.strip(), re.IGNORECASE):

@@ -107,7 +107,8 @@ class FaultRow:
     def _parse_value(self, groups: Groups) -> float:
         """Read the size of a fault from the named groups of its matched text, in SI units.
 
-        "x3" gives the factor 3, "+20 %" 1.2, "1 %" of a gain or of air 0.01, no number 1 for a factor, else 0.
+        "x3" gives 3, "+20 %" gives 1.2, and "1 %" of a gain or of air gives 0.01. Without a number, a factor is 1 and
+        any other size 0.
         """
         if groups.get("size") is not None:
             unit = CHANNEL_UNITS.get(groups["at"] or "", "Pa") if self.is_sensor_fault else self.unit
@@ -194,7 +195,10 @@ class Fault:
         )
 
     def _addend(self, rig: Rig) -> float:
-        """Compute what the fault at full size adds: the rig's `row.adds`, or its value (over the rig's `row.over`)."""
+        """Compute what the fault at full size adds to a parameter.
+
+        It is the rig's parameter `row.adds`, if any, else `value`, divided by the rig's parameter `row.over`, if any.
+        """
         if self.row.adds:
             return float(rig[self.row.adds])
         return self.value / float(rig[self.row.over]) if self.row.over else self.value
@@ -212,7 +216,7 @@ class Fault:
         return ChangedDuty(command, self) if self.name == "duty" else command
 
     def viscosity_ratio(self, rig: Rig) -> Callable[[Array], Array] | None:
-        """Build the function of times [s] for the oil's relative dynamic viscosity, None if it is constant."""
+        """Build a function that computes the oil's relative dynamic viscosity at times t [s]; None if constant."""
         if self.name != "oil":
             return None
         from sealscope.physics.fluid import kinematic_viscosity, thermal_density_ratio
@@ -253,7 +257,10 @@ class ChangedDuty:
     change: Fault
 
     def original_time(self, t: Array) -> Array:
-        """Compute t + (frequency_factor - 1) times the integral of the fault's opening, for a smooth frequency."""
+        """Compute the times [s] at which the original command has the phase of the changed one at times t [s].
+
+        They are t + (frequency_factor - 1) times the integral of the fault's opening.
+        """
         start, stop = self.change.opening.rise or (math.inf, math.inf)  # a fault of the duty always has a rise
         opening_integral = np.maximum(t - start, 0.0)  # for a jump of the opening at `start`
         if stop > start:

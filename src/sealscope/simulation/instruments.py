@@ -159,7 +159,7 @@ def _hum_harmonics(sensor: PressureTransducer, t: Array, random: np.random.Gener
 
 
 def _quantize(values: Array, resolution: float) -> Array:
-    """Round values down to multiples of an encoder's resolution, 0 for none."""
+    """Round values down to multiples of an encoder's resolution; 0 leaves them unchanged."""
     return values if resolution == 0 else np.floor(values / resolution) * resolution
 
 

@@ -134,7 +134,10 @@ def oversampling(experiment: Experiment) -> int:
 
 
 def oversampling_of(rate: float, step: float) -> int:
-    """Compute the solver outputs per sample at `rate` [Hz] for the anti-alias filter: 4, or one each `step` [s]."""
+    """Compute the solver outputs per sample at `rate` [Hz]: 4, which the anti-alias filter needs, or fewer.
+
+    They are fewer if a sample takes fewer than 4 solver steps of at most `step` [s].
+    """
     return min(_OVERSAMPLING, steps_per_output(rate, step))
 
 

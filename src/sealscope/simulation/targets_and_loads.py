@@ -41,7 +41,7 @@ Breakpoints = tuple[tuple[float, float], ...]
 
 @dataclass(frozen=True)
 class Position:
-    """A target for the piston's position: `signal`, a command whose `volts` are metres from mid-stroke; `words`."""
+    """A target for the piston: `signal`, a command whose `volts` are metres from mid-stroke, and its text `words`."""
 
     signal: Command
     words: str
@@ -229,7 +229,7 @@ def parse_force(text: str) -> Force:
 
 
 def _extract_terms(text: str, letter: str) -> tuple[Breakpoints, str]:
-    """Parse the terms over x or v (`letter`) in a load's text as a function; return it and the text without them."""
+    """Parse the terms over x or v (`letter`) in a load's text; return their `Breakpoints` and the text without them."""
     slope_units, start_units = _TERM_UNITS[letter]
     factors = {unit.replace(" ", ""): factor for unit, factor in slope_units.items()}  # the text may lack blanks
     number = rf"({UNSIGNED})\s*\[?({_unit_pattern(slope_units)})\b\]?"

@@ -91,7 +91,7 @@ def shared_inputs(plan: SimulatedPlan) -> dict[str, Any]:
 def _level_digests(plan: SimulatedPlan) -> dict[str, dict[str, str]]:
     """Compute hashes of the machine families and controller files of a plan's factors, by factor and level (value).
 
-    The id of a case depends on those of its own levels only, so its stored row stays valid when another is edited.
+    The id of a case depends on those of its own levels only, so its stored row stays valid if another level is edited.
     """
     digests: dict[str, dict[str, str]] = {FAMILY: {}, CONTROLLER: {}}
     for level in plan.factors.get(FAMILY, ()):

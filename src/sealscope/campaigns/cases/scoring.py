@@ -78,10 +78,10 @@ def score_details(
 
 
 def _score_over_threshold(statement: Statement) -> float | None:
-    """Compute the score of `diagnose` over its threshold, or minus a threshold <= 0, to compare records.
+    """Compute the score of `diagnose` divided by its threshold, or minus it if the threshold is <= 0.
 
-    The detector that decides, and with it the scale of the score, may differ from record to record. Returns None if
-    there is no threshold or no ranking score (`ranking_score`).
+    So records can be compared although different detectors, with scores of other scales, may decide them. Returns None
+    if there is no threshold or no ranking score (`ranking_score`).
     """
     score, threshold = ranking_score(statement), statement.threshold
     if score is None or threshold is None:

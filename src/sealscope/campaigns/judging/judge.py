@@ -40,7 +40,7 @@ class Judgement:
     - `table`, `overall`: fractions of alarms for each size of the leak, and for all sizes together
     - `onsets`, `flows`: errors of the onsets and leak flows that detectors state
     - `causes`: confusion matrices of the causes that detectors name
-    - `pods`: probability of detection over the size of the leak
+    - `pods`, `rocs`: probability of detection over the size of the leak, and ROC curves
     - `cells`, `faults`, `families`: fractions of alarms for each combination of the factors' levels, for each fault
       other than a leak, and for each family of machines
     - `achieved_flows`: by planned size of the leak, mean and standard deviation of the simulated leak flow [L/min]

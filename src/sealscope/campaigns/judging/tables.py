@@ -39,7 +39,7 @@ class PriorKnowledge:
 
 @cache
 def _table_layouts() -> dict[str, dict[str, str]]:
-    """Load the layouts of all tables: by heading, flags and an attribute's dotted path, such as "share alarms"."""
+    """Load the layouts by table: for each heading, flags and an attribute's dotted path, such as "share alarms"."""
     return tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 
 

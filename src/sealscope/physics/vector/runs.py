@@ -35,7 +35,10 @@ FLOW, OPENING, MAX_TRAVEL, MIN_PRESSURE, DIVERGED = range(N_TOTALS)
 
 
 def _compile(text: str, **scope: Any) -> Any:
-    """Compile the function `law` from its source, in which numba needs each element of a tuple written out."""
+    """Compile the function `law` from its source `text`, which may use `load` and the names in `scope`.
+
+    It is generated because numba needs each element of a tuple written out.
+    """
     scope["load"] = load
     exec(text, scope)
     return contracted(scope["law"])

@@ -189,7 +189,7 @@ def simulate_batch(
         set_fraction = len(experiment_set.members) / n
 
         def report(fraction: float, before: float = completed, set_fraction: float = set_fraction) -> None:
-            """Report the batch's progress from the set's; the defaults keep the values of this pass."""
+            """Report the batch's progress from the set's `fraction`; the defaults keep the values of this pass."""
             if progress is not None:
                 progress(min(1.0, before + fraction * set_fraction))
 
@@ -202,7 +202,7 @@ def simulate_batch(
 def _run_set(
     experiment_set: ExperimentSet, batch: Batch, error: float, threads: int, progress: Callable[[float], None]
 ) -> None:
-    """Simulate a set within `error` [Pa rms] of a pressure on `threads` threads, and write its rows of `batch`."""
+    """Simulate a set on `threads` threads, with a pressure error up to `error` [Pa rms]; write its rows of `batch`."""
     members, stated_step = experiment_set.members, experiment_set.experiment.step
     rows = [member.row for member in members]
     coefficients = np.array([member.leak.coefficient or 0.0 for member in members])
@@ -236,7 +236,8 @@ def choose_step(experiment_set: ExperimentSet, coefficients: Array, error: float
 def longest_allowed_step(experiment_set: ExperimentSet, coefficients: Array) -> float:
     """Compute the longest step [s] that resolves the rig and the leak of every run in a set of experiments.
 
-    `coefficients` (runs,): G [m^3/(s Pa)] or C [m^3/(s Pa^0.5)]. No result is shorter than `integrate` tries.
+    `coefficients` (runs,): G [m^3/(s Pa)] or C [m^3/(s Pa^0.5)]. The result is at least the shortest
+    step that `integrate` tries.
     """
     from sealscope.physics.solvers.limits import longest_step
 

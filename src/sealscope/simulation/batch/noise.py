@@ -122,8 +122,8 @@ def half_turn_sine(v: Any) -> Any:
 def normals(key: Any, pair: int) -> tuple[Any, Any]:
     """Draw two independent standard normal random numbers for each of a vector of runs, in compiled code.
 
-    They follow from the uniform numbers at positions 2 `pair` and 2 `pair` + 1 of the sequences that `key` selects by
-    the method of Box and Muller (Annals of Mathematical Statistics 29 (1958) 610-611).
+    They follow from the uniform numbers at positions 2 `pair` and 2 `pair` + 1 of the sequences that `key` selects,
+    by the method of Box and Muller (Annals of Mathematical Statistics 29 (1958) 610-611).
     """
     radius = math.sqrt(-2.0 * logarithm(uniform(key, 2 * pair)))
     s = half_turn_sine(uniform(key, 2 * pair + 1) - 0.5)

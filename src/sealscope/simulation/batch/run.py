@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from sealscope.parameters import Rig
     from sealscope.physics.rig import RigNumbers
 
-#: Slope [1/s] of an abrupt opening.
+#: Slope [1/s] of the opening (0 to 1) of a leak that opens abruptly.
 ABRUPT = 1e15
 
 
@@ -73,7 +73,7 @@ class ExperimentSet:
 
 
 def refuse_unbatchable(experiment: Experiment, row: int) -> None:
-    """Raise InputError, with the first rule broken, for an experiment (number `row`) that cannot be in a batch."""
+    """Raise InputError, which names the first broken rule, if experiment number `row` cannot be in a batch."""
     rig, leaks = experiment.rig, experiment.leaks
     violated_rules = []
     if experiment.active_controller is not None:
@@ -138,7 +138,7 @@ def group_experiments(experiments: Sequence[Experiment]) -> list[ExperimentSet]:
 
 
 def pack_lanes(values: Array, width: int) -> Array:
-    """Rearrange (runs, ...) in groups, (groups, ..., width), for vector registers; copies of the last run fill up."""
+    """Rearrange `values` (runs, ...) as (groups, ..., width) for vector registers; copies of the last run fill up."""
     groups = math.ceil(len(values) / width)
     padded = np.concatenate([values, np.repeat(values[-1:], groups * width - len(values), axis=0)])
     return np.ascontiguousarray(np.moveaxis(padded.reshape(groups, width, *values.shape[1:]), 1, -1))
@@ -173,8 +173,8 @@ def build_leak_rows(members: Sequence[Member], coefficients: Array, flow_coeffic
 class Cells:
     """Model parameters of the runs of a set over time, constant within cells, which are spans of the solver's outputs.
 
-    `bounds` (cells + 1,): outputs at which the cells begin, and the end of the last; `base` (runs, parameters): without
-    changes; `changing`: indices of the parameters that change; `values` (runs, changing, cells): their values.
+    `bounds` (cells + 1,): outputs at which the cells begin, and the end of the last; `base` (runs, parameters): values
+    without changes; `changing`: indices of the parameters that change; `values` (runs, changing, cells): their values.
     """
 
     bounds: np.ndarray
@@ -237,7 +237,10 @@ def build_instrument_rows(members: Sequence[Member], first: int, last: int) -> A
 
 
 def _pressure_instruments(rig: Rig, readings: Readings, ends: Array, samples: int) -> Array:
-    """Build one run's part (2, INSTRUMENT_ROWS) of `build_instrument_rows`; `ends` (2,) [s] of `samples` samples."""
+    """Build one run's part (2, INSTRUMENT_ROWS) of `build_instrument_rows`.
+
+    `readings`: changes of the instruments; `ends` (2,): start and end [s] of the `samples` samples.
+    """
     from sealscope.simulation.batch import signals
 
     rows, daq = np.zeros((len(CHAMBERS), signals.INSTRUMENT_ROWS)), rig.daq
@@ -346,7 +349,10 @@ class SetRun:
         self.taps = pack_lanes(filters, self.width)
 
     def _prepare_statistics(self, bounds: Array) -> None:
-        """Prepare empty sums of squared details between `bounds` [s], without the record's ends, and the noise keys."""
+        """Prepare the sums of squared wavelet details in the segments between `bounds` [s], and the noise keys.
+
+        The segments leave out the record's ends, beyond which the wavelet's filters would reach.
+        """
         from sealscope.signals.filters import reach
         from sealscope.simulation.batch.noise import noise_keys
         from sealscope.simulation.batch.signals import QUANTITIES
@@ -359,7 +365,10 @@ class SetRun:
         self.noise_keys = pack_lanes(noise_keys(seeds), self.width)
 
     def run_all(self, threads: int, progress: Callable[[float], None] | None) -> None:
-        """Simulate all runs on threads, in parallel because compiled code releases Python's lock."""
+        """Simulate all runs on `threads` threads, in parallel because compiled code releases Python's lock.
+
+        `progress`, if any, is called with the completed fraction of the set.
+        """
         # a thread simulates the groups between two successive bounds
         bounds = np.unique(np.linspace(0, self.n_groups, min(threads, self.n_groups) + 1).round().astype(int)).tolist()
         lock, completed = threading.Lock(), 0.0
@@ -461,7 +470,10 @@ class SetRun:
         return np.ascontiguousarray(np.hstack([waveform, np.broadcast_to(load.value_at(times), times.shape)]))
 
     def _sensors(self, groups: tuple[int, int], first: int, last: int) -> Array:
-        """Build the rows of `build_instrument_rows` for some groups of runs, (groups, 2, INSTRUMENT_ROWS, width)."""
+        """Build the instruments' parameters (groups, 2, INSTRUMENT_ROWS, width) by `build_instrument_rows`.
+
+        They are those of the groups groups[0] <= g < groups[1] for the samples first <= sample < last.
+        """
         if self._constant_sensors is not None:
             return self._constant_sensors[groups[0] : groups[1]]
         members = self.experiment_set.members[groups[0] * self.width : groups[1] * self.width]

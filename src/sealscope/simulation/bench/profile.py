@@ -141,7 +141,7 @@ AnyNuisance = Nuisance | NuisanceChoice
 
 
 def _parse_nuisance(table: Any) -> AnyNuisance:
-    """Parse an entry of a profile's file as a difference between machines; InputError names a wrong one."""
+    """Parse an entry of a profile's file as a difference between machines; an InputError names the entry."""
     entry = _NuisanceEntry.model_validate(table)
     try:
         return _convert_to_si(entry)

@@ -136,8 +136,8 @@ def make_row(
 ) -> tuple[Cell, ...]:
     """Build the row of a test in a table with the columns `COLUMNS`.
 
-    `change`: text of what changes in the middle of the test; `ranges_MPa`: range of p_A and of p_B before [MPa]; `rms`:
-    RMS of each wavelet detail in the first and in the second half, by chamber and detail.
+    `change`: text of what changes in the middle of the test; `ranges_MPa`: ranges of p_A and p_B in the first half
+    [MPa]; `rms`: RMS of each wavelet detail in the first and in the second half, by chamber and detail.
     """
     values = (rms[chamber][name][k] for chamber, name, k, _ in _RMS_COLUMNS)
     return (condition.number, condition.command, condition.closed_pct, change, mean_leak_lpm, *ranges_MPa, *values)
@@ -187,6 +187,6 @@ def runs_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
 
 
 def simulated_sheet(context: Context, runs: Runs) -> tuple[ThesisTable, DataSheet]:
-    """Return the simulated tests of Appendix C of a kind (`Runs`), needed by the item, as table and data sheet."""
+    """Return the simulated tests of Appendix C of the kind `runs`, as a table and as a data sheet."""
     table = first_table(context, f"appendix-c-{runs}")
     return table, parse_sheet(table)

@@ -330,7 +330,7 @@ def judge_claims(context: Context, item: Item) -> tuple[Claim, ...]:
 
 
 def _fourier_claims() -> Iterator[Claim]:
-    """Judge claims 3.1 and 3.2: the signal of eq. (3.3) has the spectrum of two cosines of phase 0, else zero."""
+    """Judge claims 3.1 and 3.2: the spectrum of the signal of eq. (3.3) has two lines of phase 0 and is 0 elsewhere."""
     t = np.arange(round(RATE)) / RATE
     frequency, amplitude, phase = amplitude_spectrum(two_tone_signal(t), RATE)
     tones = [nearest_index(frequency, tone) for tone, _ in TONES]

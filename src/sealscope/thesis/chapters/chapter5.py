@@ -151,8 +151,7 @@ class FigureView:
     def draw_leak(self) -> PanelsAndNumbers:
         """Draw the leak flow and both chamber pressures of the test as three panels.
 
-        Numbers: mean leak, simulated and in the thesis, and the 5 to 95 % range of each pressure before and after it
-        opens.
+        Numbers: mean leak, simulated and in the thesis, and the 5 to 95 % range of each pressure without and with it.
         """
         recording = self.recording
         flow = self._curve(recording["q_leak"] / LITRE_PER_MINUTE, "flow meter, A to B positive", "leak")

@@ -84,7 +84,7 @@ def _rig(name: str = RIG) -> Rig:
 
 
 def _amplitude_at(run: Trajectory, mask: NDArray[np.bool_], f: float) -> float:
-    """Compute the amplitude [m] of the piston's motion at the frequency `f` [Hz], from the samples of a mask."""
+    """Compute the amplitude [m] of the piston's motion at the frequency `f` [Hz], from the samples in `mask`."""
     return float(np.abs(sine_fit(run.t[mask], run["x"][mask], 2 * math.pi * f).amplitudes[0]))
 
 

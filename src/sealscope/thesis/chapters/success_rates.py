@@ -56,7 +56,7 @@ CLAIMED_CELLS = CLAIMED[:6]
 
 
 def _format_count(fires: Fires | None) -> tuple[Cell, Cell, Cell, Cell]:
-    """Format a rule's firings, a mask (tests,), as the cells k/n, rate [%], 95 % interval [%]; None is empty."""
+    """Format a rule's firings, a mask (tests,), as four cells: k/n, rate [%], 95 % interval [%]; all empty for None."""
     if fires is None:
         return None, None, None, None
     k, n = int(fires.sum()), fires.size
@@ -65,7 +65,7 @@ def _format_count(fires: Fires | None) -> tuple[Cell, Cell, Cell, Cell]:
 
 
 def _count_heads(source: str, count: str) -> tuple[str, ...]:
-    """Build the heads of a count, a rate [%] and its 95 % interval on the data sheet `source`."""
+    """Build the heads of a count (named `count`), its rate [%] and 95 % interval on the data sheet `source`."""
     return tuple(f"{source}: {part}" for part in (count, "rate [%]", "95 % low [%]", "95 % high [%]"))
 
 

@@ -30,7 +30,7 @@ SENSITIVE = ("d3", "d4", "d3d4")
 
 @dataclass(frozen=True, eq=False)
 class ClaimEvidence:
-    """Hold the data by which the claims on detection are judged.
+    """The data by which the claims on detection are judged.
 
     `measured_sheet`: measured data sheet of Appendix C, None if not given; `leak_sheet`, `no_leak_sheet`,
     `drift_sheet`: the same tests simulated with their leak, without a leak, and without a leak but with drifting

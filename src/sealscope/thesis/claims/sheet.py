@@ -85,7 +85,7 @@ def _rate_claim(rule: Rule, where: str) -> SheetClaim:
         """Test that the rule's success rate is within 1 percentage point of a printed rate, and higher than by chance.
 
         By chance, each of the rule's k details moves as a leak would move it with probability 1/2, which gives a rate
-        of 1/2^k. The one-sided binomial p-value must be below 0.05/10.
+        of 1/2^k. The one-sided binomial p-value must be below 0.05/10. Yields the rate as text, and both results.
         """
         fires = rule.fires(sheet)
         p = upper_tail(int(fires.sum()), fires.size, chance)
@@ -118,7 +118,8 @@ def _rate_claim(rule: Rule, where: str) -> SheetClaim:
 def _test_opposite_moves(sheet: DataSheet) -> Iterator[Finding]:
     """Test claim 5.5.7: d3, d4 and d3d4 of p_A rise with the leak, and those of p_B fall, in most tests.
 
-    All other sentences of section 5.6 state the opposite (`DIRECTION`).
+    All other sentences of section 5.6 state the opposite (`DIRECTION`). Yields for each detail the number of tests as
+    text, and whether it is more than half.
     """
     for chamber in CHAMBERS:
         for name in SENSITIVE:
@@ -128,14 +129,20 @@ def _test_opposite_moves(sheet: DataSheet) -> Iterator[Finding]:
 
 
 def _test_rates_over_80(sheet: DataSheet) -> Iterator[Finding]:
-    """Test claim 5.6.1: each rule of Table 5.1 detects the leak, that is fires, in more than 80 % of the tests."""
+    """Test claim 5.6.1: each rule of Table 5.1 detects the leak, that is fires, in more than 80 % of the tests.
+
+    Yields for each rule its rate as text, and whether it exceeds 80 %.
+    """
     for rule in CLAIMED:
         fires = rule.fires(sheet)
         yield f"{rule.name} {format_rate(fires)}", [bool(fires.mean() > 0.8)]
 
 
 def _test_leak_levels(sheet: DataSheet) -> Iterator[Finding]:
-    """Test claim 5.6.2: at each leak level, the detail d3 of p_A falls beyond noise in 80 % of the tests or more."""
+    """Test claim 5.6.2: at each leak level, the detail d3 of p_A falls beyond noise in 80 % of the tests or more.
+
+    Yields for each level the rate of such tests as text, and whether it is at least 80 %.
+    """
     exceeds = _exceeds_noise(sheet, "p_A", "d3")
     for level in NOMINAL_LPM:
         level_exceeds = exceeds[[row.level == level for row in APPENDIX_C]]
@@ -143,7 +150,10 @@ def _test_leak_levels(sheet: DataSheet) -> Iterator[Finding]:
 
 
 def _test_smallest_leak(sheet: DataSheet, rules: tuple[Rule, ...] = CLAIMED_CELLS) -> Iterator[Finding]:
-    """Test claim 5.6.3: each rule of Table 5.1 detects the leak, that is fires, in the test with the smallest leak."""
+    """Test claim 5.6.3: each rule of Table 5.1 detects the leak, that is fires, in the test with the smallest leak.
+
+    Yields for each of `rules` the changes of its details [%] as text, and whether it fires.
+    """
     row = int(np.argmin(mean_leaks()))
     for rule in rules:
         changes = (log_change_to_percent(sheet.log_change(c, name)[row]) for c, name in rule.details)
@@ -154,7 +164,8 @@ def _test_smallest_leak(sheet: DataSheet, rules: tuple[Rule, ...] = CLAIMED_CELL
 def _test_abstract_rate(sheet: DataSheet) -> Iterator[Finding]:
     """Test claim a.2: even small leaks lower the RMS of d3d4 of p_A.
 
-    It must fall at the smallest leak, and in at least 85 % of the tests with leaks up to 0.0050 L/min.
+    It must fall at the smallest leak, and in at least 85 % of the tests with leaks up to 0.0050 L/min. Yields for both
+    conditions a text, and whether it is met.
     """
     yield from _test_smallest_leak(sheet, (_A_D3D4,))
     fires = _A_D3D4.fires(sheet)
@@ -164,7 +175,10 @@ def _test_abstract_rate(sheet: DataSheet) -> Iterator[Finding]:
 
 
 def _test_both_chambers(sheet: DataSheet) -> Iterator[Finding]:
-    """Test claim 6.1.1: d3d4 falls in p_A and rises in p_B down to 0.0048 L/min, and in over 80 % of the tests."""
+    """Test claim 6.1.1: d3d4 falls in p_A and rises in p_B down to 0.0048 L/min, and in over 80 % of the tests.
+
+    Yields for both conditions a text, and whether it is met.
+    """
     fires, leak = _BOTH_D3D4.fires(sheet), mean_leaks()
     min_leak = float(leak[fires].min()) if fires.any() else math.nan
     yield f"{min_leak:.4f} L/min", [abs(min_leak - 0.0048) < _ROUNDING_LPM]
@@ -175,6 +189,7 @@ def _test_identified_leaks(sheet: DataSheet) -> Iterator[Finding]:
     """Test claim a.1: in each chamber the best wavelet detail reveals the leak in at least 80 % of the tests.
 
     A detail reveals the leak if its RMS falls in p_A, or rises in p_B, beyond the noise; the best does so most often.
+    Yields for each chamber the best detail with its rate as text, and whether the rate is at least 80 %.
     """
     for chamber in CHAMBERS:
         best = max(SENSITIVE, key=lambda name: int(_exceeds_noise(sheet, chamber, name).sum()))
@@ -207,7 +222,8 @@ def _test_trend(chamber: str, sheet: DataSheet) -> Iterator[Finding]:
     """Test claim 5.5.3 (p_A) or 5.5.4 (p_B): each detail's log change is correlated with the mean leak.
 
     The sign must be negative for p_A and positive for p_B, both of the plain correlation and of the partial correlation
-    given the operating condition, at the 5 % level.
+    given the operating condition, at the 5 % level. Yields for each detail both correlations as text, and for each
+    whether it is as claimed.
     """
     leak, conditions, direction = mean_leaks(), condition_design(), DIRECTION[chamber]
     for name in SENSITIVE:
@@ -237,7 +253,8 @@ def _test_sensitive_details(sheet: DataSheet) -> Iterator[Finding]:
     """Test claim 5.5.1: the wavelet details in Table 5.1 change significantly, and the details left out do not.
 
     d3, d4 and d3d4 must move as the thesis states (`moves_beyond_chance`). For d1 and d2, which the table leaves out,
-    the p-value of the sign test, corrected by Holm, must be at least 0.05.
+    the p-value of the sign test, corrected by Holm, must be at least 0.05. Yields for each detail its change and
+    p-value as text, and whether they are as claimed.
     """
     p = holm_p_values(sheet)
     for rule in (*CLAIMED_CELLS, *UNCLAIMED):
@@ -252,7 +269,7 @@ def _test_product_detail(sheet: DataSheet) -> Iterator[Finding]:
     """Test claim 5.5.2: the product d3d4 has a larger effect size than d3 and than d4, for each chamber.
 
     The effect size is the mean of the log changes of the RMS with the leak over their standard deviation, with falls
-    positive for p_A and rises for p_B.
+    positive for p_A and rises for p_B. Yields for each chamber the effect sizes as text, and whether d3d4's is largest.
     """
     for chamber in CHAMBERS:
         changes = {name: sheet.log_change(chamber, name) * DIRECTION[chamber] for name in SENSITIVE}
@@ -262,7 +279,10 @@ def _test_product_detail(sheet: DataSheet) -> Iterator[Finding]:
 
 
 def _test_opposite_chambers(sheet: DataSheet) -> Iterator[Finding]:
-    """Test claim 5.5.6: the log changes of a detail in p_A and in p_B are negatively correlated, at the 5 % level."""
+    """Test claim 5.5.6: the log changes of a detail in p_A and in p_B are negatively correlated, at the 5 % level.
+
+    Yields for each detail the correlation as text, and whether it is significantly negative.
+    """
     for name in SENSITIVE:
         change_A, change_B = (sheet.log_change(chamber, name) for chamber in CHAMBERS)
         r = float(np.corrcoef(change_A, change_B)[0, 1])
@@ -272,7 +292,10 @@ def _test_opposite_chambers(sheet: DataSheet) -> Iterator[Finding]:
 
 
 def _test_p_B_rises(sheet: DataSheet) -> Iterator[Finding]:
-    """Test claim 5.5.5: with the leak, the RMS of d3, d4 and d3d4 of p_B rises significantly."""
+    """Test claim 5.5.5: with the leak, the RMS of d3, d4 and d3d4 of p_B rises significantly.
+
+    Yields for each detail the number of rises and the p-value as text, and whether the rise is significant.
+    """
     p = holm_p_values(sheet)
     for name in SENSITIVE:
         n_up = int(np.sum(sheet.log_change("p_B", name) > 0))
@@ -280,7 +303,10 @@ def _test_p_B_rises(sheet: DataSheet) -> Iterator[Finding]:
 
 
 def _test_printed_rows(sheet: DataSheet) -> Iterator[Finding]:
-    """Test claim 5.3.1: in all tests that chapter 5 shows, the RMS of d3, d4 and d3d4 falls in p_A and rises in p_B."""
+    """Test claim 5.3.1: in all tests that chapter 5 shows, the RMS of d3, d4 and d3d4 falls in p_A and rises in p_B.
+
+    Yields for each detail the number of tests in which it does so as text, and whether these are all.
+    """
     for chamber, verb in (("p_A", "falls"), ("p_B", "rises")):
         for name in SENSITIVE:
             moves = sheet.log_change(chamber, name)[_PRINTED_ROWS] * DIRECTION[chamber] > 0

@@ -92,9 +92,11 @@ def reproduce(
 
     `patterns`: selection (`items.select_items`); `quick`: True to simulate less; `jobs`: number of processes, by
     default one per core, 1 for this process only; `sheet`: folder of the measured data sheet; `items`: the list to
-    select from, by default that of `items.toml`; `publish`: writes the products as files; `progress`: is told which
-    items are finished and in work. Results that an earlier call stored in `folder` from the same inputs are reused. A
-    failed item does not stop the others, and KeyboardInterrupt leaves all finished items stored.
+    select from, by default that of `items.toml`; `publish`: writes the products as files; `progress`: called with the
+    numbers of finished and of all items to make, and the ids of those in work.
+
+    Results that an earlier call stored in `folder` from the same inputs are reused. A failed item does not stop the
+    others, and KeyboardInterrupt leaves all finished items stored.
 
     Raises InputError for an unknown item, a bad sheet, or a folder that is damaged, in use or cannot be written.
     """

@@ -52,7 +52,7 @@ FIGURE_UNITS: dict[str, FigureUnit] = {
 }
 #: Gauge pressure [MPa] of a vacuum.
 _VACUUM = -1e-6 * P_ATM
-#: Curves with an rms difference below this fraction of their range coincide; one is then drawn as so many marks.
+#: Curves with an rms difference below this fraction of their range coincide; one is then drawn as this many marks.
 _COINCIDENCE_FRACTION, _N_MARKS = 0.005, 80
 _CLOSING_ROLES: dict[float, Role] = {25.0: "25 %", 50.0: "50 %", 75.0: "75 %"}
 #: Line volumes V_1 = V_2 [cm^3] that are compared, and those of a quick reproduction.
