@@ -33,9 +33,10 @@ _LEAK = rf"(?:{_MEAN}|(?P<letter>[GC])\s*=\s*(?P<coefficient>{UNSIGNED}))(?:\s+(
 
 
 def opening_from(start: float = 0.0, stop: float = math.inf, ramp: float = 0.0) -> Polyline:
-    """Make the opening of a leak or fault, 0 (shut) to 1 (full), that begins at `start` and ends at `stop` [s].
+    """Make the opening of a leak or fault over time: from 0 (shut) at `start` to 1 (full) at `start` + `ramp` [s].
 
-    It rises and falls within `ramp` [s]; `stop` may be infinite. Raises InputError if the times do not fit together.
+    It falls from 1 at `stop` to 0 at `stop` + `ramp`, unless `stop` is infinite. Raises InputError if `ramp` is
+    negative or infinite, or if `stop` is before `start` + `ramp`.
     """
     if not (math.isfinite(ramp) and ramp >= 0.0):
         raise InputError(f"a ramp must be >= 0 s and finite, got {ramp:g} s")

@@ -47,7 +47,10 @@ class SizeRoc:
 
 
 def iter_pods(verdicts: Verdicts, confidence: float) -> Iterator[DetectorPod]:
-    """Yield each detector's probability of detection over the planned mean flow, if any record has a leak."""
+    """Yield the probability of detection over the planned mean leak flow, for each detector with records of leaks.
+
+    It has a fitted curve, or the reason why none can be fitted.
+    """
     for name, records in verdicts.items():
         leaky = [record for record in records if record.size > 0]
         if not leaky:

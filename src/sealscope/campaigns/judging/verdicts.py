@@ -28,7 +28,7 @@ class JudgedRow(NamedTuple):
 
     @property
     def size(self) -> float:
-        """Planned mean flow of the true leak in the unit of the plan, 0 for none."""
+        """Planned mean flow of the true leak, 0 for none: in L/min, or a grade where the plan grades leaks."""
         return self.row.leak_lpm
 
     @property

@@ -43,8 +43,9 @@ def noise_keys(seeds: list[int]) -> Array:
 
 
 def uniform(key: Any, position: int) -> Any:
-    """Draw uniform random numbers in (0, 1] for a vector of runs, in code that `_lower_uniform` builds.
+    """Draw a uniform random number in (0, 1] for each run of a vector of runs.
 
+    This is only a declaration: `_lower_uniform` generates the compiled code.
     `key`: keys of the runs' noise (`noise_keys`); `position` >= 0: position in the sequences of random numbers.
     """
 

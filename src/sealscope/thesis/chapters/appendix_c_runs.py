@@ -59,9 +59,10 @@ def draw_drifts(number: int, half: float, draw: int = 0) -> tuple[ParameterDrift
 def leak_test(
     condition: Condition, half: float, seed: int, *, leak: bool = True, drifts: tuple[ParameterDrift, ...] = ()
 ) -> Experiment:
-    """Build the experiment of one test of Appendix C, with its leak open in the second half, on the rig fitted to it.
+    """Build the experiment of one test of Appendix C, with its leak open in the second half.
 
-    `half`: half the duration [s]; `seed`: seed of the noise; `leak`: False for no leak; `drifts`: steps of parameters.
+    The rig is the one fitted to the data of Appendix C. `half`: half the duration [s]; `seed`: seed of the noise;
+    `leak`: False for no leak; `drifts`: changes of the rig's parameters within the test.
     """
     return Experiment.of(
         rig=BENCH_RIG,

@@ -117,10 +117,11 @@ def make_experiment(
     duration: float = DURATION,
     overrides: Mapping[str, str | float] = MappingProxyType({}),
 ) -> Experiment:
-    """Build the experiment of a command with throttles closed by `closed_pct` [%], None for no throttles.
+    """Build the experiment of a `command` with throttles closed by `closed_pct` [%], None for no throttles.
 
-    `solver`: "as_published" for the thesis's method and step (RK4, 1e-4 s), "converged" for a step chosen by its error;
-    `overrides`: parameters that replace those of the `reading`.
+    `reading`: interpretation of the thesis's equations, which sets the rig's parameters; `solver`: "as_published" for
+    the thesis's method and step (RK4, 1e-4 s), "converged" for a step chosen by its error; `duration` [s];
+    `overrides`: parameters that replace those of the reading.
     """
     values = {**dict(reading.values(closed_pct)), **overrides}
     experiment = Experiment.of(command=command, duration=duration, set=values)

@@ -149,7 +149,8 @@ def _judge_step_and_gains(context: Context) -> Iterator[Claim]:
 def _judge_equations_and_tables(context: Context) -> Iterator[Claim]:
     """Judge claims 4.13, 4.20 and 4.23 by the thesis's equations and tables; 4.7, 4.17 and 4.22 cannot be tested.
 
-    4.13: a throttle of 3.75 mm in the line's 5 mm is closed by 25 % of the area. 4.20: the friction does not jump at
+    4.13: a throttle of 3.75 mm in the line of 5 mm closes 25 % of its area. 4.7 claims pressure peaks, which depend on
+    the unknown charge pressure; its text states the one that would give them. 4.20: the friction does not jump at
     the threshold velocity, whichever way eq. (4.22) is read. 4.23: the throttles as printed let oil flow to the
     cylinder with less resistance than back, on both sides.
     """
