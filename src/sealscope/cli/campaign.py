@@ -123,7 +123,7 @@ def _campaign_folder(plan: AnyPlan, stated: Path | None) -> Path:
 
 
 def _format_progress(state: CampaignProgress) -> str:
-    """Format the numbers of records done and failed, and the time of one core for each record and for the rest."""
+    """Format the numbers of records done and failed, and the time of one core per record and for those not done."""
     text = f"records: {state.done} of {state.records} done"
     if state.failed:
         text += f", {state.failed} of them failed"
@@ -145,7 +145,8 @@ def _show_progress() -> Iterator[ProgressCallback]:
 def _write_report(plan: AnyPlan, folder: Path, data: Path | None) -> int:
     """Write the tables and the page of a campaign, print its main table, and return the number of failed records.
 
-    The first five failed records are also printed, on standard error. `folder` of the campaign receives the files.
+    The first five failed records are also printed, on standard error. `folder`: of the campaign, to which the files are
+    written; `data`: folder of the recordings, not needed for a simulated plan.
     """
     from sealscope.campaigns.results import write_result
     from sealscope.reporting.campaign.page import PAGE, campaign_text, write_campaign_page

@@ -237,7 +237,8 @@ class StatedMachine:
     def read_all(self, files: Sequence[Path], *, joined: bool = False) -> Iterator[tuple[Path, Recording | None]]:
         """Yield each file with its recording, or with None after a message on standard error if it is unreadable.
 
-        `joined`: yield the first file with the recording of which the files are parts, None if one is unreadable.
+        `joined`: the files are parts of a single recording: yield only the first file, with the joined recording, or
+        with None if a part is unreadable.
         """
         recordings = ((file, attempt(file, partial(self.read, file))) for file in files)
         if not joined:
@@ -252,7 +253,8 @@ class StatedMachine:
     def diagnose(self, recording: Recording, baseline: Sequence[Recording], file: Path, **settings: Any) -> Diagnosis:
         """Diagnose a recording of this machine, compared with the healthy recordings `baseline`, which may be empty.
 
-        A commissioned machine uses those in its own file. `file`: name in the diagnosis; `settings`: of `diagnose`.
+        A commissioned machine uses those in its own file. `file`: name in the diagnosis; `settings`: more arguments of
+        `diagnose`.
         """
         from dataclasses import replace
 
@@ -296,7 +298,7 @@ def with_experiment_options(command: Callable[..., None]) -> Callable[..., None]
 
 
 def _build_experiment(rig: str, set: Sequence[str] | None, **arguments: Any) -> Experiment:
-    """Build the simulated experiment of a call from its options, for `Experiment.of`, with the rig changed by `set`."""
+    """Build the simulated experiment of a call: `set` changes the `rig`, `arguments` are those of `Experiment.of`."""
     from sealscope.simulation.experiment import Experiment
 
     return Experiment.of(rig=load_rig_with(rig, set), **arguments)
@@ -351,7 +353,7 @@ def _build_assumed_rig(name: str | None, area: Sequence[str] | None, displacemen
 
 
 def load_rig_with(name: str, overrides: Sequence[str] | None) -> Rig:
-    """Load a rig by its name or file, with the parameters of the options `--set`, `NAME=VALUE[unit]`."""
+    """Load a rig by its name or file, changed by `overrides`, the options `--set NAME=VALUE[unit]`."""
     from sealscope.parameters import load_rig, parse_overrides
 
     rig = load_rig(name)
@@ -388,7 +390,7 @@ def say(text: str) -> None:
 
 
 def say_wrapped(text: str, head: str = "") -> None:
-    """Print a paragraph on standard output, which begins with `head`, wrapped at 80 columns and indented after it."""
+    """Print `head` and a paragraph on standard output, wrapped at 80 columns and indented by the width of `head`."""
     say(paragraph(text, head, indent=len(head) or 2))
 
 
@@ -440,7 +442,7 @@ def say_jobs(jobs: int | None) -> None:
 def progress(noun: str = "") -> Iterator[Callable[[str, float], None]]:
     """Show progress bars on standard error within the `with` block; yield a function of (task, fraction done).
 
-    Each task, a text, has its own bar, or all the same if `noun`, the name of counted things, is given. If standard
+    Each task, a text, has a bar; if `noun`, the name of counted things, is given, all tasks share one. If standard
     error is not a terminal, there are no bars; with a `noun` a line is printed once a minute instead.
     """
     from rich.console import Console

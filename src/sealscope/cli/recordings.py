@@ -110,10 +110,10 @@ def diagnose(
 def _diagnose_in_parallel(
     work: Callable[[Sequence[Path]], Iterator[DatedDiagnosis | None]], files: Sequence[Path]
 ) -> Iterator[tuple[str, Iterable[DatedDiagnosis | None]]]:
-    """Diagnose files in parallel processes; yield messages and dated diagnoses in the order of the files.
+    """Diagnose files in parallel processes; yield a pair (messages, dated diagnoses) for each file, in their order.
 
-    `work` yields the dated diagnoses of some files, with None for an unreadable file. The list of a file is [None] if
-    its process died. On a single core this process diagnoses all files, and yields one pair for all of them.
+    `work`: function that yields the dated diagnoses of files, None for an unreadable one. If the process of a file
+    dies, its diagnoses are [None]. On a single core, one pair contains all files.
     """
     from sealscope.campaigns.execution.workers import cores, iter_results_in_order
 
@@ -145,7 +145,7 @@ def _format_diagnosis(diagnosis: Diagnosis, form: str, start_s: float | None) ->
 
 
 def _matches_fail_on(reason: str, diagnosis: Diagnosis) -> bool:
-    """Return True if a value of `--fail-on`, a verdict or the least level of severity, applies to a diagnosis."""
+    """Return True if a diagnosis has the verdict `reason`, or at least the level of severity `reason` (`--fail-on`)."""
     level = None if diagnosis.severity is None else diagnosis.severity.level
     if reason in _LEVELS:  # in rising order
         return level in _LEVELS[_LEVELS.index(reason) :]
@@ -153,9 +153,10 @@ def _matches_fail_on(reason: str, diagnosis: Diagnosis) -> bool:
 
 
 def _is_time_series(files: Sequence[Path], starts: Sequence[float | None]) -> bool:
-    """Return True if files are recordings of one machine over time: names differ in numbers, `starts` [s] by an hour.
+    """Return True if files look like recordings of one machine over time.
 
-    All starts must be known, and there must be at least `_MIN_SERIES_FILES` files.
+    At least `_MIN_SERIES_FILES` files are needed. Their names must differ only in numbers, and their `starts` [s] must
+    be known and lie an hour or more apart.
     """
     known = sorted(start for start in starts if start is not None)
     if len(known) < max(_MIN_SERIES_FILES, len(files)):
@@ -204,13 +205,16 @@ def _iter_diagnoses(
 
 
 def _iter_dated_diagnoses(files: Sequence[Path], **options: Any) -> Iterator[DatedDiagnosis | None]:
-    """Yield start [s since 1970], None if unknown, and diagnosis, or None where `_iter_diagnoses` yields None."""
+    """Yield (start, diagnosis) of each recording; None where `_iter_diagnoses`, which gets `options`, yields None.
+
+    The start is in seconds since 1970, or None if unknown.
+    """
     for result in _iter_diagnoses(files, **options):
         yield None if result is None else (_start_seconds(result), result.diagnosis)
 
 
 def _start_seconds(result: DiagnosedRecording) -> float | None:
-    """Find when a recording starts [s since 1970], by itself, its file's name or last change; None if unknown."""
+    """Find the start of a recording [s since 1970]: stated in it, or by its file's name or last change; else None."""
     from sealscope.recordings.joining import file_seconds, start_seconds
 
     path = Path(result.diagnosis.file)
@@ -220,7 +224,7 @@ def _start_seconds(result: DiagnosedRecording) -> float | None:
 def _run_collecting_messages(
     work: Callable[[Sequence[Path]], Iterator[DatedDiagnosis | None]], files: Sequence[Path]
 ) -> tuple[str, list[DatedDiagnosis | None]]:
-    """Diagnose files by the function `work`; return its messages on standard error, and its dated diagnoses."""
+    """Diagnose files by the function `work`; return what it prints on standard error, and its dated diagnoses."""
     with redirect_stderr(StringIO()) as messages:
         dated_diagnoses = list(work(files))
     return messages.getvalue(), dated_diagnoses
@@ -358,7 +362,7 @@ def inspect(
 
 
 def _resolve_map(channel_map: ChannelMap, file: Path, recording: Recording) -> dict[str, str]:
-    """Return the column of each channel of a map, with `auto` replaced by the columns that it found by their names.
+    """Return the column of each channel in `channel_map`; `auto` is replaced by the columns that it found by name.
 
     `recording`: read from `file` by this map. With `auto` the result is empty if the file was converted from another
     one, whose columns the recording states.
@@ -398,7 +402,7 @@ def convert(
 
 
 def _convert_parts(source: Path, folder: Path, stated: opt.StatedMachine, every: str) -> None:
-    """Write a long recording as parts of the length `every`, such as 1h, to files in a new or empty folder."""
+    """Write the long recording `source` as parts of the length `every`, such as 1h, to a new or empty folder."""
     from sealscope.paragraphs import format_count
     from sealscope.recordings import inspect, read_parts, write
     from sealscope.units import parse_quantity

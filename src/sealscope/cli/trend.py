@@ -96,7 +96,7 @@ def trend(
 
 
 def _count_known(readings: Sequence[LeakReading], machine: CommissionedMachine) -> int:
-    """Count the first recordings, in the order of their dates, that the machine's file lists as healthy.
+    """Count the first `readings`, in the order of their dates, whose recordings the machine's file lists as healthy.
 
     The count ends at the first one not listed. Recordings without a date come first, and copies count once.
     """

@@ -57,7 +57,7 @@ class Started:
         self._addresses = law.memory.ctypes.data, self._measured.ctypes.data
 
     def __call__(self, measured: Measured) -> float:
-        """Compute the voltage [V] of the next sample, once a sample; pass on a Python controller's exception."""
+        """Compute the voltage [V] from the next sample; raise the exception with which a Python controller failed."""
         self._measured[:] = measured
         volts = float(self._call(*self._addresses))
         reraise_python_error(self._law)
@@ -111,7 +111,7 @@ def start_law(controller: Controller) -> CompiledLaw:
 
 
 def reraise_python_error(law: CompiledLaw) -> None:
-    """Raise the exception, if any, with which a Python controller failed that `law`, or an inner law, calls."""
+    """Raise the exception, if any, of the Python controller that is called by `law` or by a law inside it."""
     innermost: Any = law
     while isinstance(innermost, CompiledLaw):  # `kept` is the inner law, or the Python controller
         innermost = innermost.kept

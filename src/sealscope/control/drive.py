@@ -41,8 +41,8 @@ def drive_voltage(m: Any, flow: float, dp: float) -> float:
     +-`dead_volts`.
 
     A pump needs u = (omega + shortfall H(omega + droop dp))/omega_per_volt, with omega = flow/displacement and the
-    other parameters of a `Drive`. H is the high-pass filter s/(s + corner), which each call advances by one sample;
-    `m.decay` is exp(-corner/rate).
+    parameters of `Drive`. The second term makes up for the motor's speed falling short of its command after a change.
+    H is the high-pass filter s/(s + corner), which each call advances by one sample; `m.decay` is exp(-corner/rate).
     """
     if m.Q_N > 0.0:  # a servo valve
         valve_drop = max(m.p_s - math.copysign(dp, dp * flow), _MIN_VALVE_FRACTION * m.p_s)  # copysign: sign(flow) dp
@@ -68,7 +68,10 @@ def filter_lag(values: np.ndarray, decay: float, state: float, out: np.ndarray) 
 
 
 def check_numbers(what: str, source: object, positive: Sequence[str], not_negative: Sequence[str] = ()) -> None:
-    """Raise InputError, with `what` for `source`, unless the named attributes are finite and > 0 or >= 0."""
+    """Check that the named attributes of `source` are finite and > 0 (`positive`) or >= 0 (`not_negative`).
+
+    Raises InputError otherwise, with `what` as the name of `source`.
+    """
     for name in (*positive, *not_negative):
         value = getattr(source, name)
         if not (math.isfinite(value) and (value > 0 or (value == 0 and name in not_negative))):
@@ -83,11 +86,12 @@ class _Invertible(ABC):
         """Make the drive's parameters in the form that `drive_voltage` takes, a record (1,) `DRIVE`.
 
         `rate` [Hz]: sampling rate of the controller; `dead_volts` [V]: largest voltage that is added to pass the
-        overlap of a servo valve's edges. A pump's drive ignores the latter, a valve, which has no filter, the former.
+        overlap of a servo valve's edges. A pump's drive ignores `dead_volts`; a valve, which has no filter, ignores
+        `rate`.
         """
 
     def inverse(self, rate: float) -> Callable[[float, float], float]:
-        """Build a function of flow [m^3/s] and p_A - p_B [Pa] for the voltage [V], to call at `rate` [Hz]."""
+        """Build a function that computes the voltage [V] from flow [m^3/s] and p_A - p_B [Pa], at `rate` [Hz]."""
         (coefficients,) = self.coefficients(rate)
         return lambda flow, dp: float(drive_voltage(coefficients, flow, dp))
 
@@ -101,8 +105,9 @@ class Drive(_Invertible):
     current, whose torque balances the pressure difference dp = p_A - p_B. Solved for the commanded speed: omega_d =
     omega + (C_e/k_p) s/(s + K_i/k_p) (omega + R_c D dp/(C_m C_e)).
 
-    `displacement` [m^3/rad]: D; `omega_per_volt` [rad/(s V)]: commanded speed over voltage; `shortfall`: C_e/k_p;
-    `corner` [1/s]: K_i/k_p; `droop` [rad/(s Pa)]: R_c D/(C_m C_e).
+    `displacement` [m^3/rad]: D; `omega_per_volt` [rad/(s V)]: commanded speed over voltage; `shortfall`: C_e/k_p, by
+    which the speed falls short of a quickly changing command, relative to the speed; `corner` [1/s]: K_i/k_p, above
+    which a change is quick; `droop` [rad/(s Pa)]: R_c D/(C_m C_e), speed lost per dp at a constant motor voltage.
     """
 
     displacement: float
@@ -153,7 +158,7 @@ class Drive(_Invertible):
         return np.asarray(self.displacement * omega)
 
     def coefficients(self, rate: float, dead_volts: float = 0.0) -> Any:
-        """Make the parameters of a pump's drive (`_Invertible.coefficients`)."""
+        """Make the parameters of a pump's drive for `drive_voltage`, called at `rate` [Hz]; ignore `dead_volts`."""
         return make_record(DRIVE, self, decay=math.exp(-self.corner / rate))
 
     def steady_voltage(self, flow: float) -> float:
@@ -197,7 +202,10 @@ class ValveDrive(_Invertible):
         return 0.5 * (self.p_s + 2.0 * rig.supply.p_return)  # the supply is at p_s + p_return
 
     def coefficients(self, rate: float, dead_volts: float = 0.0) -> Any:
-        """Make the parameters of a servo valve (`_Invertible.coefficients`)."""
+        """Make the parameters of a servo valve for `drive_voltage`; ignore `rate`.
+
+        `dead_volts` [V]: largest voltage that is added to pass the overlap of the valve's edges.
+        """
         return make_record(DRIVE, self, dead_volts=dead_volts)
 
     def steady_voltage(self, flow: float) -> float:

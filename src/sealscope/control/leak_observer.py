@@ -167,7 +167,7 @@ class Balance:
 
 
 def make_observer(balance: Balance, rate: float) -> Any:
-    """Make the initial memory of a leak observer, a record (1,) `OBSERVER`; `rate` [Hz] of its samples."""
+    """Make the initial memory of a leak observer, a record (1,) `OBSERVER`; `rate` [Hz]: sampling rate."""
     return make_record(
         OBSERVER,
         balance,

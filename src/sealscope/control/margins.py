@@ -173,7 +173,7 @@ def _impulse_responses(controller: Controller, state: Array) -> list[tuple[int, 
     n = round(_RESPONSE_DURATION * controller.rate)
 
     def respond(impulse: Measured) -> Array:
-        """Compute the voltages (n,) [V] from the measurements `impulse` on; all others are at standstill."""
+        """Compute the voltages (n,) [V] from the sample `impulse` on; all other samples are at standstill."""
         voltage = controller.start()
         for _ in range(round(controller.rate)):  # settle for a second
             voltage(standstill)
@@ -193,7 +193,7 @@ def _impulse_responses(controller: Controller, state: Array) -> list[tuple[int, 
 def _frequency_response(response: Array, z: NDArray[np.complex128]) -> NDArray[np.complex128]:
     """Compute the frequency response (m,) of a controller from its impulse response, by the z-transform sum_k a_k z^-k.
 
-    `response` (n,): the first n values a_k, of which the last, as of an integrator, persists; `z` (m,).
+    `response` (n,): the first n values a_k; the last one persists, as that of an integrator does; `z` (m,).
     """
     last_value = response[-1]
     transient = response - last_value

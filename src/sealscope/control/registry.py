@@ -97,7 +97,10 @@ def controller_named(name: str, rig: Rig) -> Controller:
 
 
 def find_controller_source(name: str) -> Path | None:
-    """Find the source file of a controller without importing it, None for a built-in one; InputError without a file."""
+    """Find the source file of a controller without importing it; return None for a built-in one.
+
+    Raises InputError if there is no such file.
+    """
     if name in CONTROLLERS:
         return None
     check_controller_name(name)
@@ -110,7 +113,7 @@ def find_controller_source(name: str) -> Path | None:
 
 
 def _find_module_file(module: str) -> Path | None:
-    """Find the file, if any, of a module, such as "my_package.control", without importing its packages."""
+    """Find the file of a module, such as "my_package.control", without importing its packages; None if not found."""
     parts = module.split(".")
     folders = None  # folders of the package that contains the module, None for a top-level module
     for depth in range(1, len(parts) + 1):
@@ -124,7 +127,7 @@ def _find_module_file(module: str) -> Path | None:
 
 
 def _load_module(module_or_file: str) -> Any:
-    """Import a module by its name, or a Python file once under the hash of its text; InputError without a file."""
+    """Import a module by name, or a Python file by path, again only if its text changes; InputError without a file."""
     if not module_or_file.endswith(".py"):
         return importlib.import_module(module_or_file)
     path = Path(module_or_file)

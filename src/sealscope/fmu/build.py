@@ -48,7 +48,8 @@ system, with clang or `zig cc`: clang -O2 -fPIC -shared -I. -Iheaders -o NAME.so
 class Platform(NamedTuple):
     """An operating system and processor on which an FMU can run.
 
-    `triple`, `target`: its names for LLVM and for the C compiler; `folders`: by FMI version; `suffix` of libraries.
+    `triple`, `target`: its names for LLVM and for the C compiler; `folders`: by FMI version, folder of the library in
+    the FMU's archive; `suffix`: of the library's file.
     """
 
     triple: str
@@ -143,7 +144,7 @@ class MockUp(NamedTuple):
         return hashlib.sha256("".join(texts).encode()).hexdigest()[:32]
 
     def write(self, path: Path, version: Version, platforms: Sequence[str]) -> None:
-        """Write the FMU's archive with a library for each of `platforms`; raise InputError if the compiler fails."""
+        """Write the archive for FMI `version` with a library for each platform; raise InputError if compiling fails."""
         name = re.sub(r"\W", "_", path.stem, flags=re.ASCII)
         identifier = name if re.match(r"[A-Za-z_]", name) else f"_{name}"  # must be valid in C
         with tempfile.TemporaryDirectory(prefix="sealscope-fmu-") as folder, atomic_write(path) as temporary:
@@ -175,7 +176,7 @@ class MockUp(NamedTuple):
         return [folder / name for name in texts]
 
     def _compile_library(self, folder: Path, system: str, version: Version) -> bytes:
-        """Compile the shared library for the platform `system`; return its bytes; raise InputError if it fails."""
+        """Compile the sources in `folder` to a library for `system`; return its bytes, or raise InputError."""
         platform = PLATFORMS[system]
         compiler = find_compiler()
         inputs = [folder / "unit.c", folder / f"fmi{version}.c"]

@@ -154,7 +154,7 @@ def build_functions(choice: RigChoice) -> dict[str, Callable[..., Any]]:
         return stand_still(state, x_0, standstill_force(x_0, p) + input_values[_F], p)  # type: ignore[no-any-return]
 
     def report(values: Any, inputs: Any, y: Any, results: Any) -> int:
-        """Write the rig's outputs, and the electric, hydraulic and mechanical power [W], to `results`; return 0."""
+        """Write the outputs in state `y`, and electric, hydraulic and mechanical power [W], to `results`; return 0."""
         v, input_values, state = carray(values, _N_VALUES), carray(inputs, _N_INPUTS), carray(y, _N_STATES)
         out = carray(results, _N_RESULTS)
         p, z = model_parameters(v, input_values), state_of(state)
@@ -169,7 +169,7 @@ def build_functions(choice: RigChoice) -> dict[str, Callable[..., Any]]:
 
         @law
         def step(z: Any, h: float, t: float, a: Any, b: Any, p: Any) -> Any:
-            """Compute the state at t + h [s] from the state z at t [s], with inputs a + b s at a time s."""
+            """Compute the state at t + h [s] from the state z at t [s], with inputs a + b s and parameters p."""
             u, G = _at_imex_nodes(a[_U], b[_U], t, h), _at_imex_nodes(a[_G], b[_G], t, h)
             C, F = _at_imex_nodes(a[_C], b[_C], t, h), _at_imex_nodes(a[_F], b[_F], t, h)
             return imex_step(z, h, u, G, C, F, p)
@@ -178,7 +178,7 @@ def build_functions(choice: RigChoice) -> dict[str, Callable[..., Any]]:
 
         @law
         def step(z: Any, h: float, t: float, a: Any, b: Any, p: Any) -> Any:
-            """Compute the state at t + h [s] from the state z at t [s], with inputs a + b s at a time s."""
+            """Compute the state at t + h [s] from the state z at t [s], with inputs a + b s and parameters p."""
             u, G = _at_rk4_nodes(a[_U], b[_U], t, h), _at_rk4_nodes(a[_G], b[_G], t, h)
             C, F = _at_rk4_nodes(a[_C], b[_C], t, h), _at_rk4_nodes(a[_F], b[_F], t, h)
             return rk4_step(z, h, u, G, C, F, p, euler)
@@ -224,7 +224,8 @@ def unit_code(functions: Mapping[str, Callable[..., Any]]) -> Mapping[str, str]:
 def object_code(module: str, triple: str | None = None) -> bytes:
     """Compile LLVM code to the bytes of an object file with position-independent machine code for a platform.
 
-    `module`: text of the code; `triple`: LLVM's name of the platform, such as "x86_64-pc-windows-gnu", None for this.
+    `module`: text of the code; `triple`: LLVM's name of the platform, such as "x86_64-pc-windows-gnu", None for the
+    present one.
     """
     llvm.initialize_all_targets()
     llvm.initialize_all_asmprinters()

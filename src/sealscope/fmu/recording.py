@@ -123,7 +123,7 @@ def record_fmu(
 
 
 def _check_experiment(experiment: Experiment) -> None:
-    """Raise InputError for what an FMU cannot run: a target, a machine's fault or drift, a leak stated as a flow."""
+    """Check that an FMU can run an experiment: no target, fault or drift of the machine, or leak stated as a flow."""
     if experiment.target is not None:
         raise InputError(f"an FMU must have a command, not a target, got {experiment.command}")
     if experiment.effects():

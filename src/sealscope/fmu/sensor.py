@@ -210,7 +210,10 @@ def build_functions(choice: SensorChoice) -> dict[str, Callable[..., Any]]:
     quantiles = tuple(float(stdtrit(freedom, quantile_order)) for freedom in range(1, WINDOW))  # Student's t
 
     def start(values: Any, inputs: Any, x_0: float, y: Any) -> int:
-        """Clear the memory `y`; return 0, or a code of `FAILURES` if the displacement in `values` is not > 0."""
+        """Clear the memory `y`; return 0, or a code of `FAILURES` if the displacement in `values` is not > 0.
+
+        `inputs`, `x_0`: ignored.
+        """
         carray(y, n_memory)[:] = 0.0
         return _SUCCESS if carray(values, n_values)[_DISPLACEMENT_INDEX] > 0.0 else _NO_DISPLACEMENT
 
@@ -347,7 +350,7 @@ def _compute_increments(ring: Any, k: int, half: int, rate: float, displacement:
 def _find_angle_sign(m: Any, n_rows: int) -> None:
     """Store in `m.angle_sign` the sign, 1 or -1, with which the pump's flow rises with p_A - p_B.
 
-    It is the sign of their covariance in the first `n_rows` rows of the volume balance in the sensor's memory m.
+    It is the sign of the covariance of both in the first `n_rows` rows of the volume balance in the sensor's memory m.
     """
     mean, covariance = 0.0, 0.0
     for r in range(n_rows):
@@ -499,7 +502,7 @@ def _build_finish_block(choice: SensorChoice) -> Callable[..., Any]:
 
 @large_law
 def _mean(history: Any, newest: int, n: int, column: int) -> float:
-    """Compute the mean of one `column` of `history` (block k in row k modulo WINDOW) over n blocks up to `newest`."""
+    """Compute the mean of a `column` of `history` (block k in row k modulo WINDOW) over the n blocks up to `newest`."""
     total = 0.0
     for k in range(n):
         total += history[(newest - k) % WINDOW, column] / n

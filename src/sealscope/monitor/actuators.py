@@ -60,10 +60,11 @@ class _Actuator:
     """The state of one watched actuator in memory.
 
     `watch`, `judge`: decide on the leak and on the alarm; `pending`, `bytes`: number and size of the blocks of samples
-    since the last checkpoint, `n_stored` of all blocks; `last`: last estimate, with flows averaged over the machine's
-    cycles; `stored_summary`: summary stored last; `oil_celsius`: oil temperature [deg C], None if unknown; `judged_s`
-    [s]: end of the last judged samples; `verdict`: on the last recording, None if whole recordings are not judged;
-    `alarm_samples`: last samples during an alarm, which may become a healthy recording in the machine's file.
+    since the last checkpoint; `n_stored`: number of all stored blocks; `last`: last estimate, with flows averaged over
+    the machine's cycles; `stored_summary`: summary stored last; `oil_celsius`: oil temperature [deg C], None if
+    unknown; `judged_s` [s]: end of the last judged samples; `verdict`: on the last recording, None if whole recordings
+    are not judged; `alarm_samples`: last samples during an alarm, which may become a healthy recording in the machine's
+    file.
     """
 
     settings: ActuatorSettings
@@ -122,7 +123,10 @@ class _Actuator:
         return 0 if self.watch.baseline is None else self.watch.baseline.version
 
     def _update_alarm_samples(self, samples: Recording, *, follows: bool) -> None:
-        """Keep the last `_ALARM_SAMPLES_S` seconds of samples, without gap, of one format, while an alarm is open."""
+        """Keep the last `_ALARM_SAMPLES_S` seconds of samples while an alarm is open.
+
+        The kept samples start anew after a gap (not `follows`), or if the sampling rate or the units change.
+        """
         first = self.alarm_samples[0] if self.alarm_samples else samples
         same_format = (first.units, first.rate) == (samples.units, samples.rate)
         if self.judge.alarm is None or not follows or not same_format:
@@ -138,7 +142,7 @@ class _Actuator:
         return save_attributes(self, ("watch", "judge", "last", "oil_celsius", "judged_s", "verdict"))
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Restore detector and last results from the plain values of a checkpoint; the alarm is not restored."""
+        """Restore detector and last results from `state`, plain values of a checkpoint; the alarm stays as it is."""
         self.watch = Watch.from_state(state["watch"])
         self.last = None if state["last"] is None else restore(BlockEstimate, state["last"], "last")
         self.oil_celsius, self.judged_s = state.get("oil_celsius"), state.get("judged_s")
@@ -212,7 +216,7 @@ class _AlreadyStored(Exception):  # noqa: N818 (says what happened)
 
 
 class WatchedActuators:
-    """The watched actuators of a monitor, restored from its `store`; `keep_days`: days of stored estimates."""
+    """The watched actuators of a monitor, restored from its `store`; `keep_days`: how long estimates are stored [d]."""
 
     def __init__(self, settings: list[ActuatorSettings], store: MonitorStore, keep_days: float = 90.0) -> None:
         self.store, self.settings = store, {setting.name: setting for setting in settings}
@@ -294,7 +298,7 @@ class WatchedActuators:
     def process_blocks(self, blocks: Sequence[SourceBlock]) -> None:
         """Judge blocks of samples, and store them with their estimates and alarms in one transaction.
 
-        Blocks of actuators not in the settings are only counted. After an error of the database, call again.
+        Blocks of actuators not in the settings are only counted. After an error of the database, repeat the call.
         """
         with self._lock:
             known_blocks = [block for block in blocks if block.actuator in self.settings]

@@ -104,7 +104,7 @@ class AlarmJudge:
 
     `alarm`: the open alarm, None if there is none; `raised`: number of alarms so far; `above`, `error`, `below`:
     numbers of successive blocks above the thresholds of a warning and of an error, and below the threshold at which the
-    alarm ends; `over_s` [s]: time of the last change of an alarm that was no longer active (`Alarm.active`).
+    alarm ends; `over_s` [s]: time at which the last alarm ended (`Alarm.active`), or changed after its end.
     """
 
     actuator: str
@@ -184,7 +184,7 @@ class AlarmJudge:
     def _raise_alarm(self, **findings: Any) -> Alarm:
         """Raise an alarm and return it: a new one, or the open alarm again if its leak had ended before.
 
-        An alarm that is raised again keeps its id and shelving; `findings` has the fields but actuator and state.
+        An alarm that is raised again keeps its id and shelving. `findings`: the alarm's other fields, by name.
         """
         self.raised += self.alarm is None
         alarm_id = f"{self.actuator}-{self.raised}"
@@ -241,7 +241,7 @@ class AlarmJudge:
     def _set_alarm(self, alarm: Alarm) -> Alarm:
         """Store a changed alarm as the open alarm, or forget it if it is closed or invalid; return the changed alarm.
 
-        An alarm whose cause has ended stays open until a person has seen it; `over_s` is the time of its last change.
+        An alarm whose cause has ended stays open until a person has seen it.
         """
         if not alarm.active:  # the cause has ended, or the alarm is closed or invalid
             self.over_s = alarm.updated_s

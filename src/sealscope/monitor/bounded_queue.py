@@ -10,7 +10,7 @@ _Item = TypeVar("_Item")
 
 
 class QueueLoad(NamedTuple):
-    """Blocks that wait to be stored, their bytes, and how often a source had to wait because the queue was full."""
+    """Numbers of blocks and bytes that wait to be stored, and of times that a source waited for room in the queue."""
 
     n_blocks: int = 0
     n_bytes: int = 0
@@ -18,7 +18,7 @@ class QueueLoad(NamedTuple):
 
 
 class BoundedQueue(Generic[_Item]):
-    """A queue between threads, limited to `max_items` items and `max_bytes` bytes; one item of any size always fits."""
+    """A queue between threads of at most `max_items` items and `max_bytes` bytes; if empty, it takes any item."""
 
     def __init__(self, max_items: int, max_bytes: int) -> None:
         self._max_items, self._max_bytes = max_items, max_bytes
@@ -32,7 +32,10 @@ class BoundedQueue(Generic[_Item]):
             return len(self._items), self._bytes
 
     def put(self, item: _Item, size: int, timeout: float = 0.0, *, always: bool = False) -> bool:
-        """Append an item of `size` bytes; return False if the queue, unless `always`, stays full for `timeout` [s]."""
+        """Append an item of `size` bytes; return False if the queue stays full for `timeout` [s].
+
+        `always`: True to append the item even if the queue is full.
+        """
 
         def has_room() -> bool:
             fits = len(self._items) < self._max_items and self._bytes + size <= self._max_bytes

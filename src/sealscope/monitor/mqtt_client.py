@@ -29,8 +29,9 @@ def check_mqtt() -> None:
 class MqttLink:
     """A connection to a broker by MQTT 5; the caller must acknowledge the received messages.
 
-    `will`: function, called before each connection, that returns topic and payload of the last will, which the broker
-    publishes when the connection is lost, and `close`, too; `retain`: of this message; `client`: of the library paho.
+    `will`: function, called before each connection, that returns topic and payload of the last will: the broker
+    publishes it when the connection is lost, and `close` before it disconnects; `retain`: True if the broker keeps the
+    will for later subscribers; `client`: object of the library paho.
     """
 
     def __init__(
@@ -65,7 +66,7 @@ class MqttLink:
             client.will_set(*self._last_will, qos=1, retain=self._retain)
 
     def open(self, **options: Any) -> None:
-        """Start a thread that connects to the broker by paho's `connect_async`, and reconnects after a loss."""
+        """Start a thread that connects, with `options` of paho's `connect_async`, and reconnects after a loss."""
         self.client.connect_async(self._broker.host, self._broker.port, KEEP_ALIVE_S, **options)
         self.client.loop_start()
         self.is_open = True

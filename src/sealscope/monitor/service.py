@@ -195,8 +195,9 @@ class Service:
     def _store(self, blocks: list[_Storable], write: Callable[[list[_Storable]], object]) -> None:
         """Store blocks, or refused messages, in one transaction by the function `write`, and acknowledge them.
 
-        The error of an outage of the database is raised. After any other the blocks are stored one by one, and a block
-        that fails alone is counted, dropped and acknowledged: it would fail again, and later blocks must not wait.
+        The error of an outage of the database is raised. After any other error the blocks are stored one by one, and a
+        block that fails alone is counted, dropped and acknowledged: it would fail again, and later blocks must not
+        wait.
         """
         if not blocks:
             return

@@ -26,7 +26,7 @@ _LongText = Annotated[str, Field(min_length=1, max_length=1000)]
 
 
 def _resolve_in_folder(place: _PathLike, info: ValidationInfo) -> _PathLike:
-    """Resolve a path in the settings relative to the folder of their file, which is in the `context` of `info`.
+    """Resolve `place`, a path in the settings, relative to the folder of their file, in the `context` of `info`.
 
     URLs, names of packaged rigs, and all paths of settings that do not come from a file are returned unchanged.
     """
@@ -212,7 +212,8 @@ class MonitorSettings(_Table):
 
     `database`: file of SQLite or URL; `lines`: True to read blocks from standard input; `settle_s` [s]: time without
     change before a file is read; `keep_days`: days of operation whose estimates are stored;
-    `fleet_false_alarms_per_1000_h`: most false alarms of all actuators; `defaults`: settings of each.
+    `fleet_false_alarms_per_1000_h`: most false alarms of all actuators; `defaults`: settings of actuators that state no
+    others.
     """
 
     database: Annotated[str, AfterValidator(_resolve_in_folder)] = Field(default="monitor.db", validate_default=True)
@@ -279,7 +280,10 @@ class MonitorSettings(_Table):
 
 
 def _check_channels(actuator: ActuatorSettings, *, has_opcua: bool) -> None:
-    """Check the OPC UA nodes and the units of an actuator's channels; raise ValueError or InputError if not valid."""
+    """Check the OPC UA nodes and the units of an actuator's channels; raise ValueError or InputError if not valid.
+
+    `has_opcua`: True if the settings have a table [opcua], which nodes need.
+    """
     if actuator.nodes and (not has_opcua or actuator.rate is None):
         raise ValueError(f"an actuator with nodes needs the table [opcua] and its rate, got {actuator.name!r}")
     for table, channels in (("nodes", actuator.nodes), ("units", actuator.units)):

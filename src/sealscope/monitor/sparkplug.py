@@ -89,7 +89,7 @@ class SparkplugPayload:
 def payload_class() -> Any:
     """Build the protobuf class of payloads from `sparkplug.toml`; raise MissingExtra if protobuf is not installed.
 
-    There each field has a number, a name and a type, and maybe roles: ``R`` (repeated), ``V`` (alternative of a value).
+    In this file each field has a number, a name and a type, and maybe roles: ``R`` (repeated), ``V`` (holds the value).
     """
     try:
         from google.protobuf import descriptor_pb2, descriptor_pool, message_factory

@@ -62,7 +62,10 @@ class RecordingVerdict:
 
     @classmethod
     def from_diagnosis(cls, diagnosis: Diagnosis, start_s: float, end_s: float, shift: float) -> RecordingVerdict:
-        """Convert a diagnosis, whose times plus `shift` [s] are in seconds since 1970, to a verdict with such times."""
+        """Convert a diagnosis to a verdict on the recording from `start_s` to `end_s`, in seconds since 1970.
+
+        `shift` [s]: added to times in the diagnosis to give seconds since 1970.
+        """
         plain = diagnosis.as_dict()  # has None for numbers that are not finite
         onset, onset_ends = plain["onset_s"], _parse_interval(plain["onset_interval_s"])
         leaks = diagnosis.verdict == LEAK

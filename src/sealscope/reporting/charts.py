@@ -121,7 +121,10 @@ def display_unit(unit: str, pressure_unit: str, *, detail: bool = False) -> tupl
 
 
 def detail_unit(unit: str, name: str, pressure_unit: str) -> tuple[str, float]:
-    """Choose the display unit of a wavelet detail such as "d3" and its size in `unit`, both squared for d3d4."""
+    """Choose the display unit of the wavelet detail `name`, such as "d3", and its size in `unit`; squares for d3d4.
+
+    `unit`: of the channel; `pressure_unit`: in which pressures are displayed.
+    """
     display, scale = display_unit(unit, pressure_unit, detail=True)
     return (f"{display}²", scale**2) if name == PRODUCT else (display, scale)
 
@@ -225,7 +228,7 @@ def _y_limits(values: Array, low: Array, high: Array) -> tuple[float, float]:
 
 
 def detail_charts(chambers: list[ChamberDetails], pressure_unit: str) -> list[Chart]:
-    """Build a chart for each wavelet detail of each chamber, ordered by detail; `pressure_unit`: for display."""
+    """Build a chart for each wavelet detail of each chamber, ordered by detail; `pressure_unit`: the page's unit."""
     charts = []
     for name in QUANTITIES:
         for chamber in chambers:
@@ -328,7 +331,8 @@ def render_still(
 ) -> Picture:
     """Draw the still picture of a chart, 860 pixels wide and `chart.height` pixels high, shown where no script runs.
 
-    `lines`: values (n,) of each line at the times `t` (n,) [s]; `span` [s]: ends of the time axis; `moments`: to mark.
+    `lines`: values (n,) of each line at the times `t` (n,) [s]; `span` [s]: ends of the time axis; `moments`: to be
+    marked.
     """
     lines = [_clip_values(line) for line in lines]
     all_values = np.concatenate(lines)

@@ -50,7 +50,7 @@ class DetailChange(NamedTuple):
 
 
 def chamber_details(recording: Recording, channel: str) -> tuple[ChamberDetails | None, str]:
-    """Compute the wavelet details of the pressure of one chamber; return them with a note on omitted samples.
+    """Compute the wavelet details of `channel`, a chamber's pressure; return them with a note on omitted samples.
 
     Only parts of the recording that are long enough and without a defect are transformed. If there are none, or the
     transform fails, the details are None, and the note is the reason. It is "" if nothing is missing.

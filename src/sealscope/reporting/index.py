@@ -16,7 +16,7 @@ _ORDER = ("leak", "cannot tell", "no leak")
 
 
 def severity_key(diagnosis: Diagnosis) -> tuple[int, float, float, str]:
-    """Compute a sort key by verdict, ratio of leak to limit, flow (0 if unknown) and file, the most severe first."""
+    """Compute a key that sorts diagnoses by verdict, leak over limit, flow (0: unknown) and file, most severe first."""
     severity = diagnosis.severity
     # `of_limit` is the ratio of leak to limit, and the ends of the ratio's interval
     limit_ratio = 0.0 if severity is None or severity.of_limit is None else severity.of_limit[0]

@@ -76,14 +76,14 @@ def headline(diagnosis: Diagnosis) -> str:
 
 
 def cause(diagnosis: Diagnosis) -> str | None:
-    """Return the named cause of the change in a recording, or None; a leak counts only with the verdict "leak"."""
+    """Return the named cause of the change in a recording, or None; a leak is named only with the verdict "leak"."""
     if diagnosis.cause in LEAKS and diagnosis.verdict != "leak":
         return None
     return diagnosis.cause
 
 
 def shows_reason(diagnosis: Diagnosis) -> bool:
-    """Return True for `cannot tell` or a named cause that is no leak, whose reason the short text must show."""
+    """Return True if the short text must show the reason: for `cannot tell`, or for a named cause other than a leak."""
     return diagnosis.verdict == "cannot tell" or (diagnosis.verdict != "leak" and cause(diagnosis) is not None)
 
 
@@ -171,7 +171,8 @@ def machine_text(machine: AssumedMachine) -> str:
 def how_bad(diagnosis: Diagnosis) -> str | None:
     """Format the severity of the leak as a percentage or multiple of the repair limit, or None if it is not known.
 
-    Without this size, the text says that a stated limit needs the piston area, or gives a fraction of the pump's flow.
+    If the ratio to a stated limit is not known, the text asks for the piston area; without a stated limit, it gives the
+    leak as a fraction of the pump's flow.
     """
     severity, limit = diagnosis.severity, diagnosis.limit
     if severity is None:
@@ -347,7 +348,7 @@ def raw_counts(diagnosis: Diagnosis) -> str | None:
 
 
 def format_unused_columns(diagnosis: Diagnosis) -> str | None:
-    """Format a note on unused columns that could be channels, and options --map for four of them; None without such."""
+    """Format a note on unused columns that could be channels, with options --map for four; None if there are none."""
     if not diagnosis.unused:
         return None
     lines = " ".join(f"--map '{suggest_map_entry(Label.parse(name))}'" for name in diagnosis.unused[:4])
@@ -406,13 +407,13 @@ def _figure_rows(diagnosis: Diagnosis) -> list[tuple[str, str | None]]:
 
 
 def _format_lines(diagnosis: Diagnosis, rows: list[tuple[str, str | None]], width: int) -> str:
-    """Format a line with the file and the verdict, then a paragraph for each row (label, text) that has a text."""
+    """Format a line with file and verdict, and a paragraph of `width` columns for each row (label, text) with text."""
     first = say("terminal.diagnosis", file=printable(diagnosis.file), summary=diagnosis.summary)
     return "\n".join((first, *paragraphs(rows, columns=12, width=width)))
 
 
 def format_leak_flow(diagnosis: Diagnosis) -> str:
-    """Format the leak flow with its interval or, if the verdict is not "leak", its bound, or that none is stated."""
+    """Format the leak flow with its interval or, without the verdict "leak", its bound, or say that none is stated."""
     if diagnosis.verdict == "leak" and diagnosis.leak_lpm is not None:
         low, high = diagnosis.leak_interval_lpm or (diagnosis.leak_lpm, diagnosis.leak_lpm)
         return f"{number(diagnosis.leak_lpm, 2)} L/min ({number(low, 2)} to {number(high, 2)})"

@@ -21,7 +21,7 @@ CURVE_WIDTH = 20
 def draw_curve(values: Array, width: int = CURVE_WIDTH) -> str:
     """Draw values (n,) as a line of at most `width` bar characters, scaled between minimum and maximum.
 
-    Each character shows the middle one of the finite values in its part of the values, or is blank without any.
+    Each character shows the middle one of the finite values in its part of the curve, or is blank if there are none.
     """
     finite = values[np.isfinite(values)]
     if not finite.size:

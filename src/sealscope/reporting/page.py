@@ -98,7 +98,7 @@ def report(
 
 
 def write_page(path: str | os.PathLike[str], recording: Recording, diagnosis: Diagnosis, **options: Any) -> Path:
-    """Write the page of a diagnosis as `report` does; deprecated, and `path` stands before `recording`."""
+    """Write the page of a diagnosis; deprecated: `report` does the same, with `recording` before `path`."""
     return report(recording, path, diagnosis, **options)
 
 
@@ -117,7 +117,7 @@ def _choose_rig(diagnosis: Diagnosis, rig: Rig | str | os.PathLike[str] | None) 
 
 
 def _all_marks(recording: Recording, marks: Sequence[Mark], truth_onset_s: float | None) -> list[Mark]:
-    """Collect the moments to mark on all charts; raise InputError if the recording is empty and has no page."""
+    """Collect the moments to mark on all charts, with the true onset; raise InputError if the recording is empty."""
     if len(recording) == 0:
         raise InputError("recording must have at least 1 sample to be reported, got 0")
     return [*marks, *([] if truth_onset_s is None else [Mark(float(truth_onset_s), "true onset", known=True)])]
@@ -244,7 +244,7 @@ def _summarise_channel(recording: Recording, name: str, pressure_unit: str) -> d
 
 
 def _flatten(value: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
-    """Yield the entries of nested mappings as pairs of dotted name and text, such as ("rig.name", "thesis")."""
+    """Yield the entries of nested mappings as pairs (`prefix` + dotted name, text), such as ("rig.name", "thesis")."""
     for key, inner in value.items():
         if isinstance(inner, Mapping):
             yield from _flatten(inner, f"{prefix}{key}.")

@@ -13,8 +13,8 @@ from sealscope.recordings.recording import Recording
 def collect_particulars(recording: Recording, rig: Rig | None = None) -> dict[str, str]:
     """Collect the facts about a recording for the head of its page, as texts by label, such as "Date" or "Operator".
 
-    They come from remarks in its file, else the machine from `rig`, the date from its start. Labels are in the order of
-    `particulars.toml`.
+    They come from remarks in its file. Without a remark, the machine is that of `rig`, and the date the recording's
+    start. Labels are in the order of `particulars.toml`.
     """
     remarks = recording.remarks
     patterns_by_label = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))

@@ -17,7 +17,7 @@ SYMBOLS = {
     "beyond": "m0-4l5 9h-10z",
     "absent": "m-3-3l6 6m0-6l-6 6",
 }
-#: Smallest side of a box, so that it is visible.
+#: Smallest side of a box in pixels, so that it is visible.
 _MIN_BOX = 2.0
 
 
@@ -109,7 +109,10 @@ class Picture:
             self.draw(style, self._path(*outline) + "z")
 
     def box(self, style: str, begin: float, end: float, low: float | None = None, high: float | None = None) -> None:
-        """Draw a box between x and y values, at least `_MIN_BOX` pixels in size; None is an end of the frame."""
+        """Draw a box from `begin` to `end` on the x axis and from `low` to `high` on the y axis.
+
+        None stands for an end of the frame. Each side is at least `_MIN_BOX` pixels long, so that the box is visible.
+        """
         left, top = float(self.x(begin)), 0.0 if high is None else float(self.y(high))
         bottom = self.height if low is None else float(self.y(low))
         right, bottom = max(float(self.x(end)), left + _MIN_BOX), max(bottom, top + _MIN_BOX)

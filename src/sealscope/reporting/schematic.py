@@ -30,7 +30,7 @@ _BORE, _ROD = 78.0, 18.0
 class Circuit(NamedTuple):
     """The parts of a machine that the schematic shows.
 
-    `cylinder`: name of its type; `rods`: sides of the piston with a rod, "A", "B" or "AB"; `rod`: its drawn height;
+    `cylinder`: name of its type; `rods`: sides of the piston with a rod, "A", "B" or "AB"; `rod`: drawn rod height;
     `throttles`, `make_up`, `bypass`, `valve`: True if there are throttles in the lines, make-up valves, a bypass with a
     flow meter, or a servo valve; `values`: by label, the value with its unit, "" if unknown.
     """
@@ -49,7 +49,7 @@ def build_circuit(rig: Rig | None, recorded: Container[str], machine: AssumedMac
     """Choose the parts of a machine to draw in the schematic.
 
     Without `rig`, only the parts of every pump-controlled actuator are drawn, with areas and displacement that
-    `machine` may state; a bypass is if `q_leak` is among the `recorded` channels.
+    `machine` may state. A bypass is drawn if `q_leak` is among the `recorded` channels.
     """
     bypass = "q_leak" in recorded
     values = dict.fromkeys(_VALUES, "")

@@ -21,8 +21,8 @@ class DrawnTimes:
 
     Samples are divided into buckets, groups of successive samples of which only the minimum and the maximum are drawn.
     `t` (m,) [s]: times of the drawn points, never decreasing; `starts`, `stops` (k,): samples [start, stop) of each
-    bucket; `width`: number of samples in a full one, 1 if all are drawn; `fine`: range of samples that are all drawn;
-    `breaks`: indices of the points, counted without NaN, before which NaN interrupts the line at gaps in time;
+    bucket; `width`: number of samples in a full bucket, 1 if all are drawn; `fine`: range of samples that are all
+    drawn; `breaks`: indices of the points, counted without NaN, before which NaN interrupts the line at gaps in time;
     `by_sample`: True if the time stamps do not increase, and `t` is the number of the sample over the sampling rate.
     """
 
@@ -49,7 +49,7 @@ class DrawnTimes:
 
 
 def _interleave(first: Array, second: Array, sizes: NDArray[np.int64]) -> Array:
-    """Arrange the first and second points (k,) of buckets in order; one with a single sample has no second point."""
+    """Arrange the first and second points (k,) of buckets in order; a bucket of size 1 has no second point."""
     pairs = np.stack([first, second], axis=1)
     is_point = np.stack([np.ones(sizes.size, dtype=bool), sizes > 1], axis=1)
     return np.asarray(pairs[is_point])  # row by row

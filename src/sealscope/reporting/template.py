@@ -50,8 +50,8 @@ def render(
 ) -> str:
     """Render the template called `template` as the text of a page, with the values `context`.
 
-    `package`: of the template; `scripts`: names of its files with scripts that the page runs; `chart_data`: plain JSON
-    values of charts, or None; scripts that draw them are added. Control characters, as in names, are replaced.
+    `package`: package of the template; `scripts`: names of script files in it that the page runs; `chart_data`: plain
+    JSON values of charts, or None; scripts that draw them are added. Control characters, as in names, are replaced.
     """
     names = scripts if chart_data is None else ("vendor/uPlot.iife.min.js", "templates/charts.js", *scripts)
     page = _environment(package).get_template(template)
@@ -83,7 +83,7 @@ def _script_json(value: Any) -> Markup:
 
 
 def parse_page_path(path: str | os.PathLike[str], *, card: bool = True) -> Path:
-    """Convert the path of a page to a Path; raise InputError unless it ends in .html, .htm, .pdf or (`card`) .png."""
+    """Convert the path of a page to a Path; raise InputError unless it ends in .html, .htm, .pdf, or .png if `card`."""
     suffixes = _SUFFIXES if card else _SUFFIXES[:-1]  # the last one is .png
     if Path(path).suffix.lower() not in suffixes:
         raise InputError(f"a page must be a file {', '.join(suffixes)}, got {os.fspath(path)}")

@@ -58,7 +58,7 @@ def record_mark(rig: str, alarm: Alarm, mark: str, samples: Sequence[Recording])
 
 
 def _combine_samples(samples: Sequence[Recording], shift: float) -> Recording:
-    """Join samples to one recording whose times start at 0 s; raise SealscopeError if there are none.
+    """Join the samples of an alarm to one recording whose times start at 0 s; raise SealscopeError if there are none.
 
     `shift` [s]: added to the first time to give the date of the recording, in seconds since 1970.
     """

@@ -21,7 +21,7 @@ _DRIVERS = ("postgresql", "postgresql+psycopg", "postgresql+psycopg2")
 
 
 def engine_options(url: URL) -> dict[str, Any]:
-    """Build SQLAlchemy's options that limit PostgreSQL's waiting times, unless the URL has them; {} for others."""
+    """Build SQLAlchemy's options for PostgreSQL's time limits, unless `url` states them; {} for another database."""
     if url.drivername not in _DRIVERS:
         return {}
     keepalive = {"keepalives_idle": 5, "keepalives_interval": 2, "keepalives_count": 3}

@@ -69,7 +69,7 @@ class StoredRows:
     def add_pending(
         self, actuator: str, number: int, samples: Recording, follows: bool, verdict: RecordingVerdict | None = None
     ) -> None:
-        """Add a block of samples, which a restarted monitor judges again until the next checkpoint.
+        """Add a block of samples, which a monitor that restarts before the next checkpoint judges again.
 
         `number`: running number of the block since the last checkpoint, from 1; `follows`: False if there is a gap
         before these samples; `verdict`: verdict on the samples as a whole recording, None for none.
@@ -89,7 +89,7 @@ class StoredRows:
             self.events.append({**event, "t": t, "alarm_id": alarm.id, "alarm": plain})
 
     def add_checkpoint(self, actuator: str, settings: str, state: dict[str, Any]) -> None:
-        """Add settings (JSON) and state of an actuator; drop its samples, whose effect the state includes."""
+        """Add settings (JSON) and state of an actuator; drop its pending samples, whose effect the state includes."""
         self.pending = [row for row in self.pending if row["actuator"] != actuator]
         plain = json.dumps(state, allow_nan=False)
         self.actuators[actuator] = {"actuator": actuator, "settings": settings, "checkpoint": plain}
@@ -103,7 +103,7 @@ class StoredRows:
 
 
 class StoredSamples(NamedTuple):
-    """The stored samples of a block; `follows`: False after a gap; `verdict`: on them as a whole recording, or None."""
+    """Samples of a stored block; `follows`: False after a gap; `verdict`: on them as a whole recording, or None."""
 
     samples: Recording
     follows: bool
@@ -142,7 +142,7 @@ class MonitorStore:
     def _prepare_tables(self, attempts: int) -> str:
         """Create missing tables, and return the version of the database's schema, which the table `facts` stores.
 
-        An attempt fails if another monitor creates the tables at the same time.
+        `attempts`: number of attempts left; one fails if another monitor creates the tables at the same time.
         """
         facts = tables.facts
         try:
@@ -276,7 +276,8 @@ class MonitorStore:
     def begin_decoding(self, reader: str, digest: str) -> int:
         """Store that a `reader` (MQTT client) begins to decode a message; return the number of earlier attempts.
 
-        These never ended: after a crash of the process the message can thus be refused. `digest`: its hash.
+        Earlier attempts that are still stored have not ended, because the process crashed: the caller can then refuse
+        the message. `digest`: hash of the message.
         """
         table, columns = tables.decodings, tables.decodings.c
         query = select(columns.attempts).where(columns.reader == reader, columns.digest == digest)
@@ -350,8 +351,8 @@ class MonitorStore:
         columns = tables.estimates.c
         is_chosen = columns.actuator == actuator
         if seconds is not None:
-            newest = select(columns.t).where(is_chosen).order_by(columns.number.desc()).limit(1).scalar_subquery()
-            is_chosen &= columns.t.between(newest - seconds, newest)
+            last_t = select(columns.t).where(is_chosen).order_by(columns.number.desc()).limit(1).scalar_subquery()
+            is_chosen &= columns.t.between(last_t - seconds, last_t)
         n_estimates = self._value(select(func.count()).where(is_chosen))
         n_averaged = max(1, -(-n_estimates // max_rows))  # estimates per row, rounded up
         group = columns.number - columns.number % n_averaged  # first running number in the group of an estimate
@@ -375,7 +376,7 @@ class MonitorStore:
             self.upsert(connection, tables.facts, [{"name": name, "value": str(number)}])
 
     def deliver(self, output: str, send: Callable[[dict[str, Any]], bool]) -> None:
-        """Send the events that an output has not sent yet, in order and at most 1000, and store how far it came.
+        """Send the events that an output has not sent yet, in order and at most 1000, and store the number of the last.
 
         `send`: sends an event, and returns False if the next call must try this event again.
         """
@@ -410,7 +411,7 @@ def _pack_samples(samples: Recording, follows: bool, verdict: RecordingVerdict |
 
 @lru_cache(maxsize=64)
 def _format_header(units: tuple[tuple[str, str], ...], rate: float, follows: bool) -> bytes:
-    """Format the first line of packed samples, but for a verdict, as JSON; `units`: pairs (channel, unit)."""
+    """Format the first line of packed samples as JSON; `units`: pairs (channel, unit); `follows`: False after a gap."""
     return json.dumps({"units": dict(units), "rate": rate, "follows": follows}).encode() + b"\n"
 
 
@@ -433,7 +434,7 @@ def _event_from_row(row: Any) -> dict[str, Any]:
 
 
 def _prepare_sqlite(connection: Any, record: object) -> None:
-    """Set the options of a new connection to SQLite, for which SQLAlchemy calls this with its `record`, not used."""
+    """Set the options of a new connection to SQLite; called by SQLAlchemy, whose `record` of it is not used."""
     # a page has room for a second of samples, the cache for all pages of a transaction
     settings = "page_size=16384", "cache_size=-32000", "busy_timeout=5000", "foreign_keys=ON"
     for setting in (*settings, "journal_mode=WAL", "synchronous=FULL"):

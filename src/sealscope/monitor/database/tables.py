@@ -22,7 +22,8 @@ def _table(name: str, columns: str, *indexes: Index) -> Table:
     """Define a table from a text that lists its columns, separated by commas.
 
     Each column is written as its name, its type (``text``, ``int``, ``double``, ``bytes``, or the length of a text),
-    and its roles: ``key`` (primary key), ``counted`` (a running number as the key), ``indexed``, ``null``.
+    and its roles: ``key`` (primary key), ``counted`` (a running number as the key), ``indexed``, ``null`` (may be
+    missing).
     """
     table_columns: list[Column[Any]] = []
     for column, kind, *roles in map(str.split, columns.split(",")):

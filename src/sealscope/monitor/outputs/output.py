@@ -27,7 +27,7 @@ def is_announced(event: Mapping[str, Any]) -> bool:
 
 
 class Output(Protocol):
-    """An output of alarms, whose outages page, log and metrics show under the name `part`.
+    """An output of alarms; `part`: name under which the page, the log and the metrics show its outages.
 
     `deliver` is called again and again; `end` is called once, at the end. Both send the new events by
     `MonitorStore.deliver`, which stores how far the output has come, and raise PartAway if that fails.

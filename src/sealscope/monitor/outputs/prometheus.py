@@ -47,8 +47,8 @@ def format_metrics(
 ) -> str:
     """Format the metrics of all actuators and of the monitor in the text format of Prometheus.
 
-    `summaries`: by actuator; `counters`: numbers of dropped messages and blocks, by reason; `parts`: for each part,
-    such as the database, (True if it works now, number of outages, their total length [s]).
+    `summaries`: summary of each actuator; `counters`: numbers of dropped messages and blocks, by reason; `parts`: for
+    each part, such as the database, (True if it works now, number of outages, their total length [s]).
     """
     families: dict[str, Any] = {}
 

@@ -34,7 +34,7 @@ class SparkplugNode:
     """The Sparkplug B edge node by which a monitor publishes its alarms and values.
 
     `store`: database with the events; `summaries`: function that returns the summary of each actuator; `count`:
-    function called with the reason for each dropped message; `password`: of the `broker`.
+    function called with the reason for each dropped message; `password`: for the `broker`, None for none.
     """
 
     part = "Sparkplug node"
@@ -182,7 +182,7 @@ class SparkplugNode:
         self._sent_values[actuator] = values
 
     def _send(self, kind: str, metrics: list[spb.SparkplugMetric], actuator: str | None = None) -> bool:
-        """Send a message of a `kind` such as "DDATA" of the node, or of a device; return True if it was sent."""
+        """Send `metrics` in a message of a `kind` such as "DDATA", of the node or a device; return True on success."""
         self._seq = (self._seq + 1) % 256
         topic = self._topic(kind, None if actuator is None else topic_level(actuator))
         payload = spb.SparkplugPayload(_milliseconds(None), tuple(metrics), self._seq)
@@ -215,7 +215,7 @@ def _metric_values(table: str, values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _build_metrics(table: str, values: Mapping[str, Any], timestamp: int) -> list[spb.SparkplugMetric]:
-    """Build Sparkplug metrics from values by name, with type and unit by the `table`; `timestamp`: ms since 1970."""
+    """Build metrics from values by name; `table`: has types and units (`_load_table`); `timestamp`: [ms since 1970]."""
     rows = {name: _load_table(table)[name] for name in values}
     return [
         spb.SparkplugMetric(name, values[name], getattr(spb, row["type"]), timestamp=timestamp, unit=row.get("unit"))

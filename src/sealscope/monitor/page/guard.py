@@ -51,9 +51,9 @@ class Admission:
         return max(0.0, last + pause - self._now())
 
     def admits(self, address: str, token: str, *, session: bool = False) -> bool:
-        """Return True if a token is right; count a wrong token for the client's IP `address`, and return False.
+        """Return True if a token is right; count the wrong tokens of a client's IP `address` until a right one.
 
-        `session`: True if `token` is the cookie of a browser that has stated the right token, which clears the count.
+        `session`: True if `token` is the cookie of a browser that has stated the right token before.
         """
         expected, network = self.session if session else self._token, _network(address)
         if hmac.compare_digest(token.encode("utf-8", "replace"), expected.encode()):
@@ -101,7 +101,7 @@ def limit_protocol(max_connections: int, silent_s: float = SILENT_S) -> type[asy
         """A limited connection; `last_activity` [s]: time of its last request, or of reading an answer."""
 
         def connection_made(self, transport: Any) -> None:
-            """Accept the connection; if there are too many, close the surplus one."""
+            """Accept the connection; if there are too many, close the one that has been silent for longest."""
             super().connection_made(transport)
             self.last_activity = self.loop.time()
             if len(self.connections) > max_connections:

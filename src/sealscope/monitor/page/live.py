@@ -75,7 +75,7 @@ class _Window:
 
 
 class LiveSamples:
-    """The last samples of the actuators that somebody views, first the stored ones, which `recall` returns by name."""
+    """The last samples of the viewed actuators; `recall`: returns the stored samples of an actuator, shown first."""
 
     def __init__(self, recall: Callable[[str], Sequence[Recording]] = lambda name: ()) -> None:
         self._recall = recall

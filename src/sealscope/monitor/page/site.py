@@ -174,10 +174,10 @@ class _Pages:
     async def changes(self, request: Request) -> Response:
         """Answer with a stream of server-sent events that keeps the page up to date.
 
-        An event without a name, whose data is the number of changes of results, alarms or outages so far, is sent after
-        each, for the page to load them again, and after `_KEEP_ALIVE_S` [s] without one. An event "live" has the curves
-        of the last samples (`LiveSamples.curves`) of the query's `actuator`. Query, besides: `pressure`, "p_A" or
-        "p_B", whose wavelet details are drawn; `drawn`, "details", or "rms" for their RMS.
+        An event without a name tells the page to load results, alarms and outages again. It has the number of their
+        changes so far, and is sent after each change and after `_KEEP_ALIVE_S` [s] without one. An event "live" has the
+        curves of the last samples of an actuator (`LiveSamples.curves`). Query: `actuator`, the name of this actuator;
+        `pressure`, "p_A" or "p_B", whose wavelet details are drawn; `drawn`, "details", or "rms" for their RMS.
         """
         if self._n_listeners >= self._max_listeners:
             return _make_refusal("too many listeners", 503)
@@ -314,7 +314,7 @@ def _refuse_for_now(wait: float) -> Response:
 
 
 def _format_event(kind: str, values: Mapping[str, Any]) -> str:
-    """Format a server-sent event of this kind, with its values as one line of JSON."""
+    """Format a server-sent event of a `kind` such as "live", with its values as one line of JSON."""
     return f"event: {kind}\ndata: {json.dumps(values, allow_nan=False)}\n\n"
 
 

@@ -144,7 +144,7 @@ class _Connection:
         return self._state_message(online=False)
 
     def _state_message(self, *, online: bool) -> tuple[str, str]:
-        """Build topic and payload of the message that a Sparkplug primary host is `online`, or offline."""
+        """Build topic and payload of the message by which a Sparkplug primary host states whether it is `online`."""
         state = json.dumps({"online": online, "timestamp": self._connected_ms})
         return f"{NAMESPACE}/STATE/{self._settings.host_id}", state
 
@@ -165,8 +165,8 @@ class _Connection:
     def _on_message(self, client: Any, userdata: Any, message: Any) -> None:
         """Queue a received message; called by the library paho, whose connection would time out if this call waited.
 
-        If the queue is full, a message of QoS 0 is dropped. One of QoS 1, and all later ones on this connection, are
-        left unacknowledged; the broker sends them again over the next. All of these are counted.
+        If the queue is full, a message of QoS 0 is dropped. A message of QoS 1, and all later ones on this connection,
+        are left unacknowledged; the broker sends them again on the next connection. All of these messages are counted.
         """
         queue_entry, size = (self._connection, message), len(message.payload)
         if message.qos == 0:

@@ -51,7 +51,7 @@ _GAP_S = 1.0
 
 
 class _FoundFile(NamedTuple):
-    """A file in a watched folder: time of its last change [s since 1970], path, and a text of name, size and time."""
+    """A file in a watched folder; `modified_s` [s since 1970]: last change; `identity`: text of name, size and time."""
 
     modified_s: float
     path: Path
@@ -61,8 +61,8 @@ class _FoundFile(NamedTuple):
 class WatchedFolder:
     """The folder with the recordings of one actuator, read file by file as they arrive.
 
-    `settle_s` [s]: time without a change after which a file is read; `is_stored`: returns True if the block of an
-    actuator with an identity is stored; `newest_s` [s since 1970]: time of the newest stored sample.
+    `settle_s` [s]: time without a change after which a file is read; `is_stored`: function of actuator and identity
+    that returns True if this block is stored; `newest_s` [s since 1970]: time of the newest stored sample.
     """
 
     def __init__(
@@ -125,7 +125,7 @@ class WatchedFolder:
         return max(time.time() - file.modified_s, time.monotonic() - self._first_found[file.identity])
 
     def _is_due(self, file: _FoundFile) -> bool:
-        """Return True if a file has not changed for a while and is not stored; mark a stored file as submitted."""
+        """Return True if a file has not changed for `settle_s` and is not stored; mark a stored file as submitted."""
         is_incomplete = file.identity in self._unreadable and self._may_be_incomplete(file)
         if is_incomplete or self._unchanged_s(file) < self.settle_s:
             return False
@@ -240,7 +240,7 @@ class WatchedFolder:
 
 
 def watch_folders(service: BlockReceiver, *, once: bool) -> None:
-    """Submit new files of the actuators' folders as blocks until the service stops, with `once` those present."""
+    """Submit new files of the actuators' folders as blocks until the service stops; if `once`, only those there now."""
     settle_s = 0.0 if once else service.settings.settle_s
     part, summaries = service.supervisor.part, service.summaries()
     folders: dict[SupervisedPart, WatchedFolder] = {}
@@ -271,6 +271,9 @@ def _printable(name: str) -> str:
     return "".join(letter if letter.isprintable() else letter.encode("unicode_escape").decode() for letter in name)
 
 
-def _is_midnight_before(start: float, newest: float) -> bool:
-    """Return True if `start` [s] is the midnight (UTC) before `newest` [s], as of a recording without a time of day."""
-    return start % DAY == 0.0 and start <= newest < start + DAY
+def _is_midnight_before(start: float, t: float) -> bool:
+    """Return True if `start` is the midnight (UTC) at which the day of `t` begins; both in seconds since 1970.
+
+    A recording without a time of day has such a start.
+    """
+    return start % DAY == 0.0 and start <= t < start + DAY

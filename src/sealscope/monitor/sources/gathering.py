@@ -27,8 +27,8 @@ LATE = "values that came after their block"
 class _Channel:
     """The values of one channel that are not in a block yet.
 
-    `values`: by number of the sample on the time axis; `previous`: the last value before them; `arrival` [s]: time at
-    which the last value arrived; `newest`: number of the newest value so far.
+    `values`: by index of the sample on the time axis; `previous`: the last value before them; `arrival` [s]: time at
+    which the last value arrived; `newest`: largest index of any value so far.
     """
 
     values: dict[int, float] = field(default_factory=dict)
@@ -80,7 +80,7 @@ class ValueGatherer:
         `t` [s]: time of the first sample, rounded to the sampling interval; the others follow at the sampling rate. NaN
         is an unknown value. Values without a finite time, and too many at once, are dropped. If the time jumps forward
         by more than `_AHEAD_S`, the blocks continue after the pause with each channel's last value. If it jumps back by
-        as much, all earlier values are discarded, unless the channel has no valueand is constant since then.
+        as much, all earlier values are discarded, unless the channel has no value yet: it was then constant since `t`.
         """
         # a double resolves the number of a sample up to 2^52
         if not math.isfinite(t) or abs(t * self.rate) > 2**52 or not 0 < len(values) <= MAX_SAMPLES:
@@ -125,7 +125,7 @@ class ValueGatherer:
         self._start = self._newest = None
 
     def _pop_blocks(self) -> list[Recording]:
-        """Remove and return the blocks at whose end each channel has a value or has been silent for `SILENT_S`."""
+        """Remove and return complete blocks: each channel has values up to their end, or is silent for `SILENT_S`."""
         channels = self._channels.values()
         if self._start is None:
             has_new_values = any(channel.values for channel in channels)

@@ -44,7 +44,7 @@ _RULES = (
 
 
 class MessageLimit(ValueError):  # noqa: N818 (names what is exceeded)
-    """Raised if a message has too many, too long or too deep items; `oversized`: True for too many samples."""
+    """Raised if a message breaks a `rule` on number, size or depth of items; `oversized`: True for too many samples."""
 
     def __init__(self, rule: str, *, oversized: bool = False) -> None:
         super().__init__(rule)
@@ -52,7 +52,7 @@ class MessageLimit(ValueError):  # noqa: N818 (names what is exceeded)
 
 
 def check_cbor(payload: bytes) -> int:
-    """Check how many and how deeply nested the items of a CBOR message are; return the number of key-value pairs.
+    """Check number and depth of the items of a CBOR message; return the number of key-value pairs.
 
     Raises MessageLimit also for an item of a type that is not allowed, or an incomplete message.
     """
@@ -78,8 +78,8 @@ def check_json(payload: bytes) -> int:
 def check_json_keys(values: Any, payload: bytes, n_colons: int) -> None:
     """Check that no mapping of a JSON message repeats a key; raise MessageLimit otherwise.
 
-    `values`: the decoded message, whose pairs are fewer than the colons outside texts of its bytes `payload` if a key
-    is repeated; `n_colons`: number of all colons, by `check_json`.
+    A decoder keeps only the last value of a repeated key: the decoded message `values` then has fewer pairs than its
+    bytes `payload` have colons outside texts. `n_colons`: number of all colons, by `check_json`.
     """
     if _count_shallow_pairs(values) != n_colons:  # a quick test, which a colon within a text also fails
         unquoted = payload.replace(b"\\\\", b"").replace(b'\\"', b"").split(b'"')[::2]  # the parts outside texts
@@ -87,7 +87,10 @@ def check_json_keys(values: Any, payload: bytes, n_colons: int) -> None:
 
 
 def check_keys(values: Any, n_pairs: int) -> None:
-    """Check that a decoded message has all `n_pairs` of its bytes; raise MessageLimit if a key is repeated."""
+    """Check that a decoded message has all `n_pairs` key-value pairs of its bytes; raise MessageLimit otherwise.
+
+    A decoder keeps only the last value of a repeated key.
+    """
     if _count_shallow_pairs(values) == n_pairs:  # a quick test
         return
     n_decoded = _count_pairs(values)

@@ -114,7 +114,7 @@ class _OpcUaSession:
                 await asyncio.sleep(_POLL_S)
 
     def datachange_notification(self, node: Any, value: Any, data: Any) -> None:
-        """Add a value of a subscription, and queue the blocks that are then complete; called by the library asyncua.
+        """Add a new value of the variable `node`, and queue the blocks that are then complete; called by asyncua.
 
         `value`: number or array of samples; those not finite or not of good quality count as unknown (NaN), and any
         other value is dropped and counted. `data`: time and quality of the value.

@@ -269,7 +269,7 @@ def _parse_number(values: Mapping[str, Any], name: str) -> float:
 def _parse_channel(values: Any, name: str, units: Mapping[str, Any]) -> np.ndarray[Any, Any]:
     """Convert the list or typed array of a channel to an array (n,) in SI units; raise RefusedMessage if it is neither.
 
-    A slow channel may be a single number; infinite values are refused. `units`: by channel.
+    A slow channel may be a single number; infinite values are refused. `units`: unit by channel.
     """
     if name in SLOW and isinstance(values, (int, float)) and not isinstance(values, bool):
         values = [values]  # a slow channel may be a single number

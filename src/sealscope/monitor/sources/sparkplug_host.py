@@ -81,10 +81,10 @@ class _Birth:
         return birth
 
     def complete_metric(self, metric: spb.SparkplugMetric, *, is_complete: bool) -> spb.SparkplugMetric | None:
-        """Add name, type and unit of the birth to a metric of a data message; return None if it has no such metric.
+        """Add name, type and unit of the birth to a metric of a data message; return None if the birth lacks it.
 
-        `is_complete`: True if no message since the birth is missing. Raises RefusedMessage if one is, and the metric
-        has an alias instead of a name, or if its value does not fit its type.
+        `is_complete`: True if no message since the birth is missing. Raises RefusedMessage if a message is missing and
+        the metric has an alias instead of a name, or if the value does not fit its type.
         """
         if metric.name is None and not is_complete:
             raise RefusedMessage(blocks.OUT_OF_SEQUENCE, "after a missing message an alias must wait for a birth")
@@ -99,7 +99,7 @@ class _Birth:
         return replace(metric, name=name, unit=metric.unit or birth_metric.unit)
 
     def rate(self, actuator: ActuatorSettings) -> float:
-        """Find the sampling rate [Hz] in the settings or else in the metric `rate`; raise RefusedMessage if not > 0."""
+        """Find the sampling rate [Hz] in the settings, else in its metric; raise RefusedMessage if it is not > 0."""
         metric = self.metrics.get(self.names.get(_RATE))
         rate = actuator.rate or (math.nan if metric is None else metric.value)
         if not isinstance(rate, (int, float)) or not 0.0 < rate < math.inf:

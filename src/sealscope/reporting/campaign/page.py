@@ -260,7 +260,7 @@ def _detector_section(pod: DetectorPod, judgement: Judgement, unit: str) -> dict
     """Build the template's values for the section of one detector on a campaign's page.
 
     It has plots, the areas under the ROC curves, and a table of the fractions of alarms by the factors' levels and the
-    leak size, empty without factors or with too many sizes. `pod`: probability of detection over the size.
+    leak size, empty without factors or with too many sizes. `pod`: probability of detection over the size, in `unit`.
     """
     name = pod.detector
     rocs = [roc for roc in judgement.rocs if roc.detector == name]
@@ -287,7 +287,7 @@ def _detector_section(pod: DetectorPod, judgement: Judgement, unit: str) -> dict
 
 
 def _size_text(roc: SizeRoc, unit: str) -> str:
-    """Format the leak size of an ROC curve in the given unit; "any size" for a curve of leaks of all sizes."""
+    """Format the leak size of an ROC curve in `unit`; "any size" for a curve of leaks of all sizes."""
     return "any size" if math.isnan(roc.leak_lpm) else f"{roc.leak_lpm:g} {unit}"
 
 
@@ -312,7 +312,7 @@ class _PlotCurve(NamedTuple):
 
 
 def _pod_plot(pod: DetectorPod, unit: str) -> dict[str, Any] | None:
-    """Draw a detector's fraction of detections over the leak size, logarithmic; None if there are fewer than two sizes.
+    """Draw a detector's fraction of detections over the leak size in `unit`, logarithmic; None for less than two sizes.
 
     The picture has the fractions with their intervals, the fitted curve with its band, and the sizes a90 (detected with
     a probability of 90 %) and a90/95 (upper bound of a90).
@@ -342,7 +342,7 @@ def _pod_plot(pod: DetectorPod, unit: str) -> dict[str, Any] | None:
 
 
 def _roc_plot(rocs: Sequence[SizeRoc], unit: str) -> dict[str, Any] | None:
-    """Draw ROC curves (detections over false alarms), one for each leak size; return None if there are none."""
+    """Draw ROC curves (detections over false alarms), one for each leak size in `unit`; None if there are none."""
     if not rocs:
         return None
     curves = []
@@ -355,7 +355,7 @@ def _roc_plot(rocs: Sequence[SizeRoc], unit: str) -> dict[str, Any] | None:
 
 
 def _draw_detection_curves(picture: Picture, x_label: str, curves: Sequence[_PlotCurve]) -> None:
-    """Draw curves of the detected fraction, each of at most `_MAX_CURVE_POINTS` points, with frame and axes."""
+    """Draw curves of the detected fraction over `x_label`, each of at most `_MAX_CURVE_POINTS` points, with axes."""
     thinned_curves = []
     for label, x, y, band in curves:
         indices = np.unique(np.linspace(0, x.size - 1, min(x.size, _MAX_CURVE_POINTS)).round().astype(np.int64))

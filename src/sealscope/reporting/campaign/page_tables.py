@@ -44,7 +44,10 @@ class PageTable(NamedTuple):
 
 
 def page_tables(judgement: Judgement, unit: str, part: str = "") -> dict[str, PageTable]:
-    """Build the tables of `page_tables.toml` by name, without empty ones, for a campaign's `part` ("development")."""
+    """Build the tables of `page_tables.toml` that are not empty, by name.
+
+    `unit`: of the leak sizes; `part`: purpose of the campaign, such as "development", "" if not stated.
+    """
     tables = {}
     for name, layout in tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8")).items():
         columns = layout["columns"]

@@ -22,7 +22,7 @@ from sealscope.units import DAY
 
 
 class Judged(NamedTuple):
-    """A diagnosed recording: diagnosis, start [s since 1970], None if not known, and a function that reads it."""
+    """A diagnosed recording; `start_s`: its start [s since 1970], None if unknown; `read`: function that reads it."""
 
     diagnosis: Diagnosis
     start_s: float | None
@@ -130,7 +130,7 @@ def _leak_level(diagnosis: Diagnosis) -> _Level | None:
 
 
 def _dates(ordered: Sequence[Judged]) -> list[str]:
-    """Format the start of each recording as a date, with the time of day if all are near each other, or a dash."""
+    """Format the start of each recording as a date, with the time of day if they span less than 3 days; or a dash."""
     starts = [entry.start_s for entry in ordered if entry.start_s is not None]
     span_days = (max(starts) - min(starts)) / DAY if starts else 0.0
     return [messages.ABSENT if entry.start_s is None else stamp(entry.start_s, span_days) for entry in ordered]
@@ -140,8 +140,8 @@ def _draw_comparison(ordered: Sequence[Judged]) -> tuple[list[charts.Chart], cha
     """Draw the channels of the newest and of an earlier recording in the same charts, from a common start.
 
     The earlier is the last one with the verdict `no leak` or else the last but one; `ordered`: by start. Returns the
-    charts, as drawn, too, and the names of the two files, or ([], None, []) without a common channel or increasing
-    clocks.
+    charts, the same charts drawn for the page, and the names of the two files; or ([], None, []) if there is only one
+    recording, no common channel, or a clock that does not increase.
     """
     *earlier, newest = ordered
     healthy = [entry for entry in earlier if entry.diagnosis.verdict == "no leak"]

@@ -54,7 +54,8 @@ def level_pictures(
     """Draw the leakage of a machine over time, as one picture for each of the `SIZES`, "wide" and "narrow".
 
     `days` [d]: times of the first and last recording; `levels`: ends of the leakage axis; `limit`: repair limit, drawn
-    unless it lies above; `format_day`: formats a time [d] for the axis; `draw`: draws the recordings into a picture.
+    unless it lies above the axis; `format_day`: formats a time [d] for the axis; `draw`: draws the recordings into a
+    picture.
     """
     margin = 0.02 * (days[1] - days[0]) or 0.5  # half a day if there is one time only
     first, last = days[0] - margin, days[1] + margin
@@ -116,8 +117,8 @@ def _draw_trend(trend: Trend, picture: Picture) -> None:
 def _y_limits(trend: Trend) -> tuple[float, float]:
     """Compute the limits (low, high) of the leakage axis in a trend's picture, in the trend's unit, with a margin.
 
-    They include the intervals of all recordings, the healthy ranges and, in L/min, zero; the repair limit if below 2.5
-    times the largest.
+    They include the intervals of all recordings, the healthy ranges and, in L/min, zero. They include the repair limit
+    only if it is less than 2.5 times the largest of these: a higher one would flatten the curve.
     """
     ends = [value for point in trend.points for value in (point.low, point.high) if value is not None]
     ends += [end for episode in trend.episodes for end in (episode.wear.healthy.low, episode.wear.healthy.high)]

@@ -32,7 +32,10 @@ def moment(trend: Trend, day: float) -> str:
 
 
 def stamp(seconds: float, span_days: float) -> str:
-    """Format a time [s since 1970] as a date, with the time of day if all shown times span less than three days."""
+    """Format a time [s since 1970] as a date, with the time of day if `span_days` is below 3.
+
+    `span_days` [d]: span of all times that are shown together.
+    """
     text = str(np.datetime64(round(seconds * 1e3), "ms"))  # such as 2026-11-25T09:30:00.000
     return text[:16].replace("T", " ") if span_days < 3.0 else text[:10]
 
@@ -126,7 +129,8 @@ def _format_reach(trend: Trend, limit: float, reach: Interval) -> str:
     """Format the repair limit, and the predicted date at which the leakage reaches it.
 
     `limit`: in the unit of the trend; `reach` [d]: time from the last recording until then. No date is stated if the
-    limit is reached, the date too far away, or the recordings too few; without an alarm only the earliest (95 %).
+    limit is reached, the date too far away, or the recordings too few. Without an alarm only the earliest date is
+    stated (95 % confidence).
     """
     limit_text = f"{number(limit, 2)} {trend.unit} in all"
     first, last = trend.points[0].day, trend.points[-1].day
