@@ -152,8 +152,9 @@ class Case:
     def other_event(self) -> OtherEvent | None:
         """Event other than a leak that explains a rare change with sufficient probability; None if there is none.
 
-        The changes are tried from the smallest p-value up to the allowed probability of naming an event by mistake,
-        first for single causes, then for groups of causes that the data cannot separate (`joint_causes`).
+        The observables are tried in the order of their p-values, as long as these are below the allowed probability of
+        naming an event by mistake. For each, single causes come first, then groups of causes that the data cannot
+        separate (`joint_causes`).
         """
         named_events = [event for event in load_events() if event.cause and event.name not in LEAK_EVENTS]
         candidates_of = {

@@ -144,7 +144,10 @@ def _changed_ringing_text(case: Case, ringing: Ringing) -> str:
 
 
 def _against_text(ringing: Ringing | None) -> str:
-    """State with how many healthy recordings the ringing was compared, and if these have no dates; "" without any."""
+    """State with how many healthy recordings the ringing was compared, and whether they have no dates.
+
+    The text is "" if it was compared with none.
+    """
     if ringing is None or not ringing.healthy:
         return ""
     text = text_of("bound", "against", count=ringing.healthy)

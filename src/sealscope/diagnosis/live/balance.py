@@ -261,7 +261,11 @@ class LiveBalance:
         return float(block.start[0]) - self._half_stride, float(block.end[0]) + self._half_stride
 
     def _relative_motion(self, block: Blocks) -> float:
-        """Compute the mean square of the measured volume in a block, divided by that in earlier blocks."""
+        """Compute how much the machine moves in a block: the mean square of its volume over that of earlier blocks.
+
+        The volume is the left side of the balance, such as what the pump delivers; its mean square in the earlier
+        blocks is part of the first model's `numbers`.
+        """
         return relative_motion(_volume_square(block), float(block.rows[0]), self._models[0].numbers)
 
     def _solve_block(self, block: Blocks, updates_model: bool = True) -> tuple[float, ...]:

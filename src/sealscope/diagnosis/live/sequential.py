@@ -139,10 +139,11 @@ class StepDetector:
         self._level_variance = gain * variance
 
     def _update_walks(self, variance: Array, square: Array) -> None:
-        """Update the scale of the noise, `_squares` / `_count`, and the probability of each random walk after a block.
+        """Update what a block tells of the noise, and of which of the q random walks in `WALKS` the estimates follow.
 
-        `variance` (q, 1) is S, the variance of the innovation e (measured minus predicted estimate) for each of
-        `WALKS`, and `square` (q, 1) is e^2 / S.
+        Updated are the scale of the noise, `_squares` / `_count`, the log probability of each walk, and the sum of the
+        log variances. `variance` (q, 1) is S, the variance of the innovation e (measured minus predicted estimate)
+        under each walk, and `square` (q, 1) is e^2 / S.
         """
         square = np.maximum(square, _MIN_SQUARE)
         if self._count >= _N_WARM:
@@ -282,8 +283,8 @@ class StepDetector:
     def noise(self) -> float:
         """Ratio of the actual to the predicted variance of the innovations (a Kalman filter's prediction errors).
 
-        It is averaged over the blocks with fading memory, and over `step.stated` (`priors.toml`) blocks with the ratio
-        1. The filter is for a random walk whose variance in a block is a tenth of the first estimate's variance.
+        The average forgets old blocks gradually; a prior of `step.stated` (`priors.toml`) blocks draws it to 1. The
+        filter assumes a random walk whose variance grows in each block by a tenth of the first estimate's variance.
         """
         walk = 3  # index of this walk, 0.1, in `WALKS`
         return float((self._squares[walk, 0] + _PRIORS.stated) / (self._count + _PRIORS.stated))

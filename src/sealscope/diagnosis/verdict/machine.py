@@ -74,9 +74,10 @@ class AssumedMachine:
 def assumed_rig(rig: Rig | str | os.PathLike[str] | None, recording: Recording) -> tuple[Rig, AssumedMachine]:
     """Choose the rig that detectors assume for a recording, and tell who stated its areas and displacement.
 
-    A given `rig` counts as stated by the call if it is a whole rig, else by nobody. Without one, the thesis's rig is
-    used. It counts as stated by the recording if that names a rig of the same areas and displacement; else by nobody,
-    with all its values marked as assumptions. Raises InputError if `rig` cannot be read.
+    A given `rig` counts as stated by the caller if it defines a whole machine, else by nobody. Without a rig, the
+    thesis's rig is used. It counts as stated by the recording if the recording names a rig of the same areas and
+    displacement. Otherwise nobody stated it, and all its values are marked as assumptions. Raises InputError if `rig`
+    cannot be read.
     """
     used_rig = load_rig(_DEFAULT if rig is None else rig)
     stated_by: StatedBy

@@ -286,10 +286,8 @@ class _Log:
             )  # fmt: skip
             for first_line, content, end, is_cut in line_blocks:
                 block = self._read_by_arrow(first_line, content, end) if self.uses_arrow and not is_cut else None
-                if (
-                    is_first and block is None
-                ):  # of a later block only a comment or a word may be unreadable for pyarrow
-                    self.uses_arrow = False
+                if is_first and block is None:
+                    self.uses_arrow = False  # of a later block, a comment or a word alone may be unreadable for pyarrow
                 is_first = False
                 if block is None:
                     rows, line_numbers = self._split_rows(first_line, content[:end], is_cut)

@@ -168,7 +168,7 @@ def _say(name: str, **values: Any) -> str:
 
 
 def _prior_knowledge_notes(result: CampaignResult) -> list[str]:
-    """Format a note on each set of channels, and on each rig, that detectors were given, with their names."""
+    """Format a note for each set of channels and for each rig that detectors were given, naming these detectors."""
     by_channels: dict[str, list[str]] = defaultdict(list)
     by_rig: dict[str, list[str]] = defaultdict(list)
     for name, known in result.known.items():
