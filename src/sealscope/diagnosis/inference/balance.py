@@ -315,8 +315,8 @@ class BlockStream:
 def _z_score(products: Array) -> float:
     """Compute the z score of the sum of `products` (r,): sum(products) / sqrt(OVERLAP sum(products^2)).
 
-    A product is that of the flow and a quantity of equal sign if the sensors are wired correctly, in one row of the
-    regression. Overlapping neighbouring rows increase the variance of the sum by the factor `OVERLAP`.
+    Each is the product of the flow and another quantity in one row of the regression, which have equal signs if the
+    sensors are wired correctly. Overlapping rows increase the variance of the sum by the factor `OVERLAP`.
     """
     standard_deviation = float(np.linalg.norm(products) * np.sqrt(OVERLAP))
     return float(products.sum()) / max(standard_deviation, float(np.finfo(float).tiny))
@@ -374,9 +374,9 @@ def max_rest_rate(increments: Array, rate: float, fraction: float = INFERENCE.re
 
 
 def _absolute_offset(pressure: Array) -> float:
-    """Compute absolute - gauge pressure [Pa] of a sensor's samples (n,) [Pa]: at least the atmospheric pressure.
+    """Compute absolute minus gauge pressure [Pa] for a sensor with the readings `pressure` (n,) [Pa].
 
-    It is larger if a sample would otherwise be below `MIN_ABSOLUTE_PRESSURE`.
+    It is the atmospheric pressure, or more if the absolute pressure would otherwise fall below `MIN_ABSOLUTE_PRESSURE`.
     """
     finite = pressure[np.isfinite(pressure)]
     min_reading = float(np.min(finite)) if finite.size else 0.0
@@ -486,7 +486,10 @@ class RecordedBlocks(NamedTuple):
     sign_log_odds: tuple[float, ...]
 
     def with_sign_prior(self, log_odds: Array) -> RecordedBlocks:
-        """Reverse the flows whose sign is wrong after adding `log_odds` (E,) of the right one by other recordings."""
+        """Reverse the flows whose sign is probably wrong if the evidence of other recordings is added.
+
+        `log_odds` (E,): log odds of each balance, from other recordings, that the recorded flow has the right sign.
+        """
         is_right = np.array(self.sign_log_odds) >= 0.0
         is_reversed = ((np.array(self.sign_log_odds) + log_odds >= 0.0) != is_right).tolist()
         if not any(is_reversed):

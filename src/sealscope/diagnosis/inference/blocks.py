@@ -145,13 +145,13 @@ class Blocks:
     def mean_pressure(self, offset: float | None = None) -> Array:
         """Compute the mean of abs(p_A - p_B - offset) [Pa] in each block, shape (K,).
 
-        `offset` [Pa]: sensor offset of p_A - p_B, by default `zero`. A laminar leak's flow is proportional.
+        The flow of a laminar leak is proportional to it. `offset` [Pa]: sensor offset of p_A - p_B, by default `zero`.
         """
         subtracted = self.zero[:, None] if offset is None else offset
         return np.asarray(np.abs(self.pressures - subtracted).mean(axis=1))
 
     def mean_root(self) -> Array:
-        """Compute the mean of sqrt(abs(p_A - p_B - zero)) [Pa^0.5] in each block, (K,): that drives an orifice."""
+        """Compute the mean of sqrt(abs(p_A - p_B - zero)) [Pa^0.5] in each block (K,), which drives an orifice."""
         return np.asarray(np.sqrt(np.abs(self.pressures - self.zero[:, None])).mean(axis=1))
 
     def driving_pressure(self, names: Sequence[str], term: str) -> float:
@@ -262,8 +262,8 @@ class ColumnRoles:
     def leak_deviation(self, column: int, blocks: Blocks) -> float:
         """Compute a healthy machine's prior standard deviation of the leak's coefficient in `column`, in its unit.
 
-        For an orifice it gives the same mean flow as for a laminar leak past a piston, since what a pump leaks is
-        laminar. It is infinite if no pressure drives the column.
+        For an orifice it gives the same mean flow as that of a laminar leak past the piston alone, since the pump's
+        leakage is laminar. It is infinite if no pressure drives the column.
         """
         driver = self.drivers[column] if column < self.left else ""
         pressure, root = float(np.mean(blocks.mean_pressure())), float(np.mean(blocks.mean_root()))

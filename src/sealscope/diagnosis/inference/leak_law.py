@@ -66,7 +66,10 @@ def law_flows(blocks: Blocks) -> dict[float, Array]:
 
 
 def law_priors() -> Array:
-    """Return the prior probability of each exponent of `EXPONENTS`: `size.laminar` (`priors.toml`) and equal others."""
+    """Return the prior probability of each exponent of `EXPONENTS`: `size.laminar` (`priors.toml`) of laminar flow.
+
+    The others are equally probable.
+    """
     laminar: float = INFERENCE.size.laminar
     n_others = len(EXPONENTS) - 1
     return np.array([laminar, *[(1.0 - laminar) / n_others] * n_others])
@@ -77,7 +80,8 @@ def find_leak_step(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Informa
 
     The p-value (`chance`) of the test for each exponent of `EXPONENTS` is divided by the prior probability of the law,
     and the test with the smallest one is returned. The step's size is the change of the conductance, averaged over the
-    blocks by their information. `leak`: likelihood of the leak's coefficient in the blocks. None if too few tell.
+    blocks by their information. `leak`: likelihood of the leak's coefficient in the blocks. Return None if too few
+    blocks have information.
     """
     weights = np.maximum(leak.precision.sum(axis=0), 0.0)  # information of each block
     shapes = apparent_conductances(blocks, columns)
@@ -99,7 +103,10 @@ def growth_priors() -> list[tuple[float, float]]:
 
 
 def _onset_positions(leak: Information, test: StepTest) -> Array:
-    """Return the onsets (o,) of `test`, counted in blocks of the recording, without one for a prior on the level."""
+    """Return the onsets (o,) of `test`, counted in blocks from the start of the recording.
+
+    `test` counts a prior on the level as one more block before the first (`StepTest.positions`).
+    """
     return test.positions - float(np.isfinite(leak.level))
 
 
@@ -109,7 +116,7 @@ def estimate_step_flow(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Inf
     It is the mean over combinations of a law (exponent of |p_A - p_B|, `EXPONENTS`), a growth (fraction by which the
     leak increases from the onset to the end) and an onset, weighted by their likelihood and the prior probability of
     the growth; its standard error is the standard deviation of their mixture. `leak`: likelihood of the leak's
-    coefficient in the blocks; `test`: step test of this coefficient, whose more probable onsets are used.
+    coefficient in the blocks; `test`: step test of this coefficient, whose onsets are used except improbable ones.
     """
     onsets = np.flatnonzero(test.weights > NEGLIGIBLE * test.weights.max())
     positions = _onset_positions(leak, test)[onsets]
@@ -185,7 +192,10 @@ def _weigh_rise_onsets(leak: Information, test: StepTest | None, value: float) -
 
 
 def mixture_flow(weights: Array, flows: Array, deviations: Array) -> Flow:
-    """Compute mean and standard deviation of a mixture of k estimates (k,) of a flow [m^3/s] or another quantity."""
+    """Compute mean and standard deviation of a mixture of k estimates of a flow [m^3/s] or another quantity.
+
+    `weights` (k,): weights of the estimates, of any sum; `flows`, `deviations` (k,): their values and standard errors.
+    """
     probabilities = weights / weights.sum()
     value = float(probabilities @ flows)
     return Flow(value, float(np.sqrt(probabilities @ (deviations**2 + (flows - value) ** 2))))

@@ -56,7 +56,7 @@ class Observable:
 
     @property
     def surprisal(self) -> float:
-        """Minus the natural logarithm of `chance`: exponentially distributed in a healthy machine if that is right."""
+        """Minus the natural logarithm of `chance`; in a healthy machine it is exponentially distributed."""
         return float(-np.log(max(self.chance, np.finfo(float).tiny)))
 
     @classmethod
@@ -66,7 +66,8 @@ class Observable:
         """Make the observable of a step, a sudden lasting change, within the recording.
 
         `test`: the best of `n_tests` tests, whose chance is therefore multiplied by their number (Bonferroni); `sign`:
-        1 for a step up, -1 for a step down, whose size the test states as positive.
+        1 for a step up, -1 for a step down, whose size the test states as positive. The other arguments are fields of
+        the observable.
         """
         return cls(
             name=name,
@@ -99,8 +100,8 @@ class Remark(NamedTuple):
 class LeakRise(NamedTuple):
     """Leakage of a recording above that of healthy recordings (`rise`), and its agreement with a step.
 
-    `step_log_ratio`: log likelihood ratio of two explanations of the estimated rise, a step of the leakage that was
-    found within the recording to no rise. It is positive if the rise agrees with the step.
+    `step_log_ratio`: log likelihood ratio, for the estimated rise, of a step of the leakage that was found within the
+    recording to no rise. It is positive if the rise agrees with the step.
     """
 
     rise: Rise
@@ -176,7 +177,7 @@ class LeakMeasure(Protocol):
 
     @property
     def excess(self) -> float | None:
-        """Total leakage minus the limit in the rig's file (`pump.G_healthy`) in standard deviations, or None."""
+        """Total leakage minus the limit in the rig's file (`pump.G_healthy`) [standard deviations]; None if unknown."""
 
     @property
     def bound_flow(self) -> float:

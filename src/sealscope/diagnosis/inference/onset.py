@@ -155,7 +155,7 @@ class StepTest:
 
     @cached_property
     def weights(self) -> Array:
-        """Probability of each tried onset, shape (o,), given that there is a step; before, all are equally probable."""
+        """Probability of each tried onset (o,), given that there is a step; a priori all are equally probable."""
         weights = np.exp(self.likelihood - self.likelihood.max())
         return np.asarray(weights / weights.sum())
 
@@ -293,6 +293,7 @@ class NullLaw(NamedTuple):
     def chance(self, score: float) -> float:
         """Compute the probability P that a coefficient without a step has a higher score (formula: see the module).
 
+        P is the probability that a random direction lies as close to the curve of all steps as the measured one does.
         If several tests share a false-alarm probability, P is divided by the share of this test (Bonferroni).
         """
         from scipy.special import betainc

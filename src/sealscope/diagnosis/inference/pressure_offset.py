@@ -68,8 +68,9 @@ def remove_pressure_offset(blocks: Blocks, columns: Sequence[ColumnRoles]) -> Bl
 def _find_relative_offset(leak_steps: Array, flow_offset_steps: Array, residuals: Array) -> float:
     """Find the most probable sensor offset of p_A - p_B, in units of its usual standard deviation.
 
-    `residuals` (n,): whitened residuals. Column k of `leak_steps` (n, K) is the change of the residuals by a unit step
-    of the leak's coefficient from block k on; `flow_offset_steps` (n, K): the same for a step of the constant flow.
+    `residuals` (n,): whitened residuals of leak and constant flow in K blocks. Column k of `leak_steps` (n, K) is their
+    change by a unit step of the leak's coefficient from block k on. Such a step also lowers the constant flow, in
+    proportion to the offset: column k of `flow_offset_steps` (n, K) is the effect of this change for an offset of -1.
     With S = leak_steps - offset flow_offset_steps, and a leak that steps up by `size` in block k,
 
         residuals = size S[:, k] + noise,    cov noise = kappa (I + q S S'),
@@ -78,7 +79,7 @@ def _find_relative_offset(leak_steps: Array, flow_offset_steps: Array, residuals
     q; `offset_cost` states the prior on the offset. The search is over asinh of the offset.
     """
     usual, far = INFERENCE.zero.pressure, INFERENCE.zero.far  # standard deviations of the prior [Pa]
-    # only walks up to the best one without an offset: else offset and walk describe changes that no leak explains
+    # only walks up to the best one without an offset: with a larger walk an offset could fit changes that are no leak's
     walks = WALKS[: int(_walk_likelihoods(leak_steps, residuals, WALKS).argmax()) + 1]
 
     # the residual of the balance repeats from cycle to cycle, so not all residuals are independent

@@ -47,9 +47,9 @@ def apply_regime(blocks: Blocks, roles: ColumnRoles, shut: bool, *, has_holds: b
     - Open valves: these columns are dropped from the Gram matrices.
     - Shut valves: the flow offset in motion replaces the flow offset of all times (`terms.shut_at_rest`). The column
       `HOLDING`, of a pump that holds the load, remains only if some hold lasts for seconds (`has_holds`) and the pump
-      is off at other times. Else it is set to zero. Before that, if no hold lasts for seconds but the pump is off at
-      times, and it is certain that valves are shut at rest (`is_certain`), this column is added to `TURNING`, of a pump
-      that moves the piston: a press that builds up its pressure is connected to its pump.
+      is off at other times; otherwise it becomes zero. If all holds are short, the pump is off at times, and valves
+      certainly are shut at rest (`is_certain`), it is first added to the column `TURNING`, of a pump that moves the
+      piston: a press that builds up its pressure is connected to its pump.
     """
     names = (*roles.names, "left")
     if not shut:
@@ -84,7 +84,7 @@ def add_pump_columns(gram: Array, names: Sequence[str]) -> Array:
 
 
 def has_rests(blocks: Blocks, roles: ColumnRoles) -> bool:
-    """Return True if pump or piston rest in any block, beyond rounding; `roles` include those of `terms.with_rests`."""
+    """Return True if pump or piston rest for more than rounding errors; `roles` include those of `terms.with_rests`."""
     return _rest_share(blocks, roles, TURNING) > NEGLIGIBLE
 
 
@@ -181,5 +181,5 @@ def fit_with_robust_covariance(gram: Array, columns: list[int], left: int) -> tu
 
 
 def _normal_log_density(value: float, variance: float) -> float:
-    """Compute the log density of a normal distribution with mean zero at `value`, up to a constant."""
+    """Compute the log density at `value` of a normal distribution with mean 0 and a `variance`, up to a constant."""
     return -0.5 * value * value / variance - 0.5 * float(np.log(variance))

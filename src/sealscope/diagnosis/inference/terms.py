@@ -128,21 +128,23 @@ class Signals:
     def directed_step(self, outward: bool, by_A: bool) -> Array:
         """Compute the increments (n - 1,) of x [m] in one direction of motion under one loaded side, else 0.
 
-        `outward`: motion towards B or standstill, else towards A; `by_A`: p_A exceeds p_B, without the sensor offset.
-        If either changes within an interval, half of its increment counts.
+        `outward`: true for motion towards B or standstill, false for motion towards A; `by_A`: true if A carries the
+        load (`carried_by_A`), false if B does. If direction or loaded side change within an interval, half of its
+        increment counts.
         """
         is_counted = ((self.speed >= 0.0) == outward) & (self.carried_by_A == by_A)
         return _interval_means(is_counted.astype(float)) * self.step("x")
 
     def moving(self, pump_volume: Callable[[Signals], Array]) -> Array:
-        """Flag the sampling intervals (n - 1,) in which pump and piston move by 1, the others by 0.
+        """Return 1 for each sampling interval (n - 1,) in which pump and piston move, else 0.
 
-        `pump_volume` computes the volume [m^3] that the pump delivers in each interval. Without `rest_limits` all move.
+        `pump_volume` computes the volume [m^3] that the pump delivers in each interval. Without `rest_limits` all
+        intervals count as motion.
         """
         return self._find_states(pump_volume)[0]
 
     def holding(self, pump_volume: Callable[[Signals], Array]) -> Array:
-        """Flag the intervals (n - 1,) in which the pump turns to hold a resting piston by 1, else 0, as in `moving`."""
+        """Return 1 for each interval (n - 1,) in which the pump turns and the piston rests, else 0, as in `moving`."""
         return self._find_states(pump_volume)[1]
 
     def _find_states(self, pump_volume: Callable[[Signals], Array]) -> tuple[Array, Array]:
@@ -567,7 +569,7 @@ def pump_volume(rig: Rig, channels: frozenset[str]) -> Callable[[Signals], Array
 
     The volume follows from the best recorded channel (`flow_source`): the pump's angle, its speed, a flow meter, or the
     command, from which the speed is derived. Return None if none of them is recorded, or only the command of a pump
-    that does not feed the chambers. A flow meter's scale errors show as piston areas.
+    that does not feed the chambers. An error of a flow meter's scale shows as an error of the piston areas.
     """
     displacement, source = rig.pump.q_b / (2.0 * np.pi), flow_source(channels)
     if source == "theta":

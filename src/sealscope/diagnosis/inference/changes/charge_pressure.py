@@ -167,7 +167,8 @@ def _regressors(recording: Recording, flow_channel: str) -> Array:
     """Compute the quantities (n, 2 or 3) that change the charge pressure besides a drift: pump flow and position.
 
     The columns are the positive and the negative part of the flow, relative to its largest magnitude, and, if recorded,
-    the position [m] minus its mean, all averaged over `charge.seconds` of `priors.toml`.
+    the position [m] minus its mean, all averaged over `charge.seconds` of `priors.toml`. `flow_channel`: channel of the
+    pump's angle or speed.
     """
     drive = average_over(CHANGES.charge.seconds, recording[flow_channel], recording.rate)
     flow = np.gradient(drive) if flow_channel == "theta" else drive

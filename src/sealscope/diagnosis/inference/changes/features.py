@@ -62,7 +62,10 @@ def time_in_motion(speeds: Array, max_speed: float, rate: float) -> Array:
 
 
 def is_in_motion(fractions: Array) -> NDArray[np.bool_]:
-    """Flag the blocks (K,) with at least `features.busy` (`priors.toml`) times the largest of all `time_in_motion`."""
+    """Flag the blocks (K,) in motion: for at least `features.busy` (`priors.toml`) times the time of the busiest block.
+
+    `fractions` (K,): fraction of each block's samples in which the piston moves (`time_in_motion`).
+    """
     return np.asarray(fractions >= _PRIORS.busy * fractions.max(initial=0.0))
 
 

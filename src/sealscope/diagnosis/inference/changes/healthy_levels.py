@@ -48,7 +48,7 @@ TINY = 1e-300
 FRICTION, DRIFTS = "friction", ("drift of p_A", "drift of p_B", "drift of both")
 #: Keys of the drifts of p_A and p_B in motion, and of their standard errors.
 DRIFT_KEYS = ("drift_A", "drift_A_error", "drift_B", "drift_B_error")
-#: Probability of the quantile of the healthy recordings' errors of sign.
+#: Quantile of the healthy frictions' excess in the wrong direction, over their errors, by which the errors are raised.
 UPPER_QUARTILE = 0.75
 #: Keys of two estimates of the friction in a recording's summary, each with the key of its standard error. The second
 #: one is made without loads that change slowly.

@@ -68,8 +68,8 @@ class LevelChange(NamedTuple):
 
     `name`: cause that changes these levels, such as "friction"; `rank`: the score minus log(number of blocks) for each
     coefficient of the pattern after the first, by which patterns are compared; `score`: twice the log likelihood ratio
-    of a step to no step; `chance`: probability of it in a healthy recording; `onset`: time of the step [s]; `block`:
-    length of a block [s].
+    of a step to no step; `chance`: probability that a healthy recording scores as high; `onset`: time of the step [s];
+    `block`: length of a block [s].
     """
 
     name: str
@@ -159,7 +159,8 @@ def fit_pressure_levels(gram: Array, length: float, means: Array) -> Array | Non
     """Fit each pressure's mean over both directions of motion, and half its change with the direction, in K blocks.
 
     The result (K, 4) contains `PressureLevels.values`. It is None if a block has too few samples of one direction.
-    `gram` (K, m, m): Gram matrices of `pressure_level_rows`; `length`: samples in a block; `means` (2,) [Pa]: as there.
+    `gram` (K, m, m): Gram matrices of `pressure_level_rows`; `length`: samples in a block; `means` (2,): means of the
+    pressures that were subtracted in these rows [Pa].
     """
     # free in each block: the constant and, if a motion is recorded, sign(v); the last two columns are p_A and p_B
     n_free = min(2, gram.shape[1] - 2)
@@ -190,7 +191,8 @@ def pattern_tests(time: Array, values: Array) -> tuple[LevelChange, ...]:
     """Test pressure levels for a step in each of several patterns, the highest rank, i.e. the most likely one, first.
 
     A pattern (`PATTERNS`) is the combination of levels that one cause changes, such as friction or a sensor's offset.
-    `time` (K,): times of K blocks [s]; `values` (K, 4): their levels, as in `PressureLevels`. Others are left out.
+    `time` (K,): times of K blocks [s]; `values` (K, 4): their levels, as in `PressureLevels`. Patterns that cannot be
+    tested are left out.
     """
     whitening = _whitening_matrix(values)
     mean = values.mean(axis=0)
@@ -215,7 +217,7 @@ def _whitening_matrix(values: Array) -> Array:
     """Compute the matrix (c, 4) that transforms pressure levels to c numbers with independent errors of equal variance.
 
     The matrix W is a root of the inverse of S, W' W = S^-1, where S is the covariance of the differences between
-    neighbouring blocks. `values` (K, 4): `PressureLevels.values`, of whose four columns c vary at all.
+    neighbouring blocks. `values` (K, 4): `PressureLevels.values`, of whose four columns c are not constant.
     """
     varying = np.flatnonzero(np.ptp(values, axis=0) > 0.0)  # half differences are constant without a motion
     differences = np.diff(values[:, varying], axis=0)
@@ -231,7 +233,7 @@ def _test_pattern(name: str, rows: Array, whitened: Array, time: Array) -> Level
     """Test the pressure levels for a step in one pattern, i.e. within a subspace of their possible changes.
 
     `rows` (m, c): vectors that span the subspace; `whitened` (K, c): levels in K blocks, both multiplied by the
-    `_whitening_matrix`; `time` (K,): times of the blocks [s]. Return None if none can be tested.
+    `_whitening_matrix`; `time` (K,): times of the blocks [s]. Return None if no direction can be tested.
     """
     basis, triangle = np.linalg.qr(rows.T)
     # orthonormal directions, without those of vectors that depend on earlier ones
@@ -241,7 +243,8 @@ def _test_pattern(name: str, rows: Array, whitened: Array, time: Array) -> Level
     if not tests:
         return None
     n_blocks, n_directions = len(time), len(tests)
-    # log likelihood ratio of a step in each direction at each onset, then log(1 + sum_j F_j) at each onset (see module)
+    # log likelihood ratio of a step in each direction at each onset; then log(1 + sum_j F_j) at each onset, where F_j
+    # is the residual sum of squares without a step over that with a step in direction j, minus 1
     log_ratios = np.array([test.likelihood - test.likelihood.max() + 0.5 * test.score for test in tests])
     gains = np.log1p(np.expm1(np.maximum(log_ratios, 0.0) / (0.5 * n_blocks)).sum(axis=0))
     best = int(np.argmax(gains))

@@ -219,7 +219,7 @@ def jackknife_errors(design: Array, values: Array, columns: Sequence[int], group
 def remove_slow_changes(motion: Motion, design: Array, values: Array, t: Array) -> tuple[Array, Array]:
     """Remove changes slower than a time tau from the columns of a design matrix and from the values.
 
-    With the times t_k of the samples in `motion`, each column y of `design`, and likewise `values`, becomes
+    With the times t_k of the samples in `motion`, each column y of `design`, and y = `values`, becomes
 
         (y_k - r_k y_(k-1)) / sqrt(1 - r_k^2),    r_k = exp(-(t_k - t_(k-1)) / tau),
 
@@ -246,7 +246,10 @@ def fit_difference(recording: Recording, *, without_slow_changes: bool = False) 
 
 @np.errstate(all="ignore")
 def _fit_difference(recording: Recording, without_slow_changes: bool) -> Resistance | None:
-    """Compute what `fit_difference` returns, with standard errors that allow for correlation in `equal_parts`."""
+    """Fit p_A - p_B in motion by friction and a viscous drop (`fit_difference`); None without enough motion.
+
+    The standard errors allow for residuals that are correlated within `equal_parts` of the rows.
+    """
     motion = select_motion(recording)
     if motion is None:
         return None

@@ -54,7 +54,7 @@ MIN_OCTAVES = 3
 GLITCH = 3
 #: Minimum power that is divided by, of pressures [Pa^2], the position [m^2] and the pump's speed [rad^2/s^2].
 MIN_POWER = {"p_A": 1e-6, "p_B": 1e-6, "x": 1e-24, "omega": 1e-18}
-#: Minimum coherence.
+#: Minimum coherence, since its square is a divisor.
 MIN_COHERENCE = 1e-3
 #: Number of cut-off frequencies, between the limits of the prior.
 CUTOFFS = 15

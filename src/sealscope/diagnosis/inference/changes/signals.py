@@ -29,7 +29,7 @@ def observe_signals(recording: Recording) -> Observed:
 
 @np.errstate(all="ignore")
 def _test_signals(recording: Recording) -> Observed:
-    """Compute what `observe_signals` returns; only the reason if the recording is too short."""
+    """Test a recording's signals for changes (`observe_signals`); report only a reason if it is too short."""
     shortest = CHANGES.features.shortest  # length of a block [s]
     if len(recording) < BLOCKS * max(ORDER + 2, shortest * recording.rate):  # differences of `ORDER` need samples
         return Observed(SIGNALS, lack="too short for changes of its signals")

@@ -136,7 +136,8 @@ def _size_penalty(
 def _law_log_prior(name: str) -> float:
     """Compute the log prior probability of the law by which an observable describes a leak, over that of laminar flow.
 
-    A law is a power of p_A - p_B (`law_priors`). The result is 0 for a laminar leak, and for what is no leak.
+    A law is a power of p_A - p_B (`law_priors`). `name`: name of the observable. The result is 0 for a laminar leak,
+    and if the observable is no leak.
     """
     laminar, *_ = priors = law_priors()
     return float(np.log(priors[EXPONENTS.index(_LEAK_EXPONENTS.get(name, 1.0))] / laminar))
@@ -149,8 +150,8 @@ def _step_hypotheses(
 
     `centred`, `recorded`: blocks of the recording without the sensor offset of p_A - p_B, for the tests of laminar
     leaks, and with the pressures as recorded; `has_accumulator`: true if the accumulator's volume shows external leaks.
-    A step has the name of its observable, the signs of a step to test (1 up, -1 down), the likelihood of the
-    coefficient in K blocks, and its change in each block by a unit step (K,), None for 1.
+    Yields for each step the name of its observable, the signs to test (1 up, -1 down), the likelihood of the
+    coefficient in K blocks, and the change of the coefficient in each block by a unit step (K,), None for 1.
     """
     first = columns[0]
     for term in terms:

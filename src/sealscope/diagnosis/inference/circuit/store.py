@@ -65,7 +65,8 @@ def oil_loss_tests(signals: Signals, rig: Rig, cycle: float | None, begin: float
     The accumulator is connected to the unloaded side. The oil that it has delivered follows from the pressure of this
     side by the polytropic law of the gas, less the oil that the rod displaces if the position is recorded. The leak's
     conductance is tested for a step between blocks (`step_test`). Blocks are whole multiples of the machine's `cycle`
-    [s], so that motion within a cycle averages out, or of any length if it is None. `begin`: first time [s].
+    [s], so that motion within a cycle averages out, or of any length if it is None. `begin`: time of the first sample
+    [s].
 
     The result maps "external leak A" and "external leak B" to their tests, without a side that cannot be tested. It is
     empty without an accumulator (`makeup.check_valves` = "absent") or for fewer than `MIN_BLOCKS` blocks.

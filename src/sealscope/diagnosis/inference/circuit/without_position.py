@@ -160,10 +160,10 @@ def _build_blocks(
 def _integrate_rows(increments: list[Array], is_used: NDArray[np.bool_], half_width: float, rate: float) -> Rows:
     """Compute rows of a regression: mean rates of c columns over overlapping triangular windows.
 
-    `increments`: those of each column in n sampling intervals; `is_used` (n,): flags of the intervals that may be part
-    of a row, which is flagged as not whole if it has others; `half_width`: half the width of a window, and twice the
-    distance of windows [s]; `rate`: sampling rate [Hz]. The integral over a triangle is the second difference of the
-    twice integrated increments.
+    `increments`: each column's increments in n sampling intervals; `is_used` (n,): flags of the intervals that may be
+    part of a row (a row with any other interval is flagged as not whole); `half_width`: half the width of a window, and
+    twice the distance of windows [s]; `rate`: sampling rate [Hz]. The integral over a triangle is the second difference
+    of the twice integrated increments.
     """
     half_length, n_samples = half_width * rate, len(is_used)
     centres = np.arange(half_length, n_samples - half_length, 0.5 * half_length)
@@ -190,7 +190,7 @@ def _shrink_offset(values: Array, names: list[str]) -> None:
 
     `values` (r, c): rows of the volume balance, each a mean over one window of time; `names`: names of the columns. The
     mean pressure difference d of a row, in the column of a laminar leak, becomes d - z^2/d, or 0 if |d| is smaller than
-    the largest usual offset z (Breiman's garrote). That of an orifice is scaled alike.
+    the largest usual offset z (Breiman's garrote). The column of an orifice is multiplied by the same factor.
     """
     max_offset = WITHIN_95 * INFERENCE.zero.pressure
     mean_pressure = values[:, names.index(LEAK)]

@@ -37,11 +37,11 @@ def coefficient_level(gram: Array, columns: Sequence[ColumnRoles]) -> tuple[floa
 def reduce_to_tested(
     gram: Array, products: Array, tested: int, nuisance: list[int], prior: Array | None = None
 ) -> tuple[float, float]:
-    """Eliminate the `nuisance` coefficients of an equation by the Schur complement: precision x coefficient = moment.
+    """Compute precision and moment of a tested coefficient, with the others eliminated (Schur complement).
 
-    `gram` (m, m): Gram matrix of the columns; `products` (m,): their products with the left side, or with a residual;
-    `tested`: column of the coefficient; `prior`: precisions of the priors on the nuisance coefficients. Returns
-    precision and moment of the tested coefficient.
+    The estimate of the coefficient is moment / precision. `gram` (m, m): Gram matrix of the columns; `products` (m,):
+    their products with the left side, or with a residual; `tested`, `nuisance`: columns of the tested and of the other
+    coefficients; `prior`: precisions of the priors on the latter.
     """
     cross = gram[nuisance, tested]
     matrix = gram[np.ix_(nuisance, nuisance)]

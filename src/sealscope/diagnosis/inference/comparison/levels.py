@@ -66,7 +66,7 @@ def rise(judged: RecordingSums, baseline: Sequence[RecordingSums], columns: Sequ
 
     `columns`: roles of the columns of each equation, the same for all recordings. The rise and its standard deviation
     are in the unit of the leak's coefficient, for the laminar leak m^3/(s Pa). The other coefficients may differ
-    between recordings within a prior. The result is an average over widths of it (`_compare_levels`).
+    between recordings within a prior. The result is an average over widths of this prior (`_compare_levels`).
     """
     healthy_sums = np.sum([recording.sums for recording in baseline], axis=0)
     count, prior = len(baseline), INFERENCE.scatter

@@ -80,11 +80,11 @@ class Rise(NamedTuple):
     share: float = 1.0
 
     def share_alarms(self, share: float) -> Rise:
-        """Return this rise with its p-value divided by `share`, for use beside another one of which the best counts."""
+        """Return this rise with its p-value divided by `share`, its fraction of the false alarms of several tests."""
         return self._replace(share=share)
 
     def widen(self, variance: float) -> Rise:
-        """Return the rise, if it has a mixture, with an additional independent error of the `variance`, if positive."""
+        """Add an independent error of the `variance`, if positive, to the rise; unchanged if it has no mixture."""
         if self.mixture is None or not variance > 0.0:
             return self
         mixture = self.mixture._replace(deviations=np.sqrt(self.mixture.deviations**2 + variance))
@@ -120,8 +120,8 @@ class Rise(NamedTuple):
         """Compute the log likelihood ratio of a true rise of the leak's coefficient by `rise` to no rise.
 
         `rise` is in the unit of `value`, with which both hypotheses are compared. `log_deviation`: standard deviation
-        of the logarithm of the true rise about log(`rise`); 0 if the true rise is known to be `rise`. Then, if
-        `may_be_partial`, `value` may contain any fraction of it, over which the likelihood is averaged.
+        of the logarithm of the true rise about log(`rise`); 0 if the true rise is known to be `rise`. If it is known
+        and `may_be_partial`, `value` may contain any fraction of it, over which the likelihood is averaged.
         """
         if log_deviation > 0.0 and rise > 0.0:
             return self._log_ratio_lognormal(rise, log_deviation)

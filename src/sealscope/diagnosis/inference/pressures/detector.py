@@ -41,7 +41,7 @@ class PressureResponse:
         return response.measure_leak(recording, self.rig)
 
     def learn(self, recording: Recording) -> Summary | None:
-        """Summarise a healthy recording by its mean conductance past the piston [m^3/(s Pa)], or return None."""
+        """Summarise a healthy recording by its mean conductance past the piston [m^3/(s Pa)]; None if that fails."""
         leak = self.reading(recording)
         return None if leak is None else {"level": leak.level[0]}
 

@@ -97,8 +97,8 @@ class Block(NamedTuple):
     """Sums over a block of samples, from the linearisation about the block's parameters `theta` (p,).
 
     `gram` (1 + p, 1 + p): products of the residual and of the derivatives by each parameter with each other; `samples`:
-    number of known samples; `scores` (s, 1 + p): products of the same with the derivative by the tested parameter, in
-    each of s pieces of the block, whose scatter shows the autocorrelation of the residual.
+    number of known samples; `scores` (s, 1 + p): products of residual and derivatives with the derivative by the tested
+    parameter, summed over each of s pieces of the block; their scatter shows the autocorrelation of the residual.
     """
 
     theta: Array
@@ -149,7 +149,8 @@ class Joint:
         """Compute the likelihood of one parameter in K blocks, with all other parameters eliminated, as `Information`.
 
         It follows from the fitted posterior by subtracting the prior of the fit. The result then has another prior: on
-        a linear change and on a random walk, both with the scale `wander` over all blocks. `time` (K,): [s].
+        a linear change and on a random walk, both with the scale `wander` over all blocks, in the unit of the
+        parameter. `parameter`: index of the parameter; `time` (K,): middles of the blocks [s].
         """
         indices = slice(parameter, None, self.theta.shape[1])  # the parameter in all blocks
         unit = self.priors.unit[parameter]
@@ -179,17 +180,18 @@ def _prior_precision(n_blocks: int, priors: Priors, block_s: float) -> Array:
 
 
 def _estimate_noise(blocks: Sequence[Block], deviations: Array, parameter: int) -> tuple[float, float]:
-    """Compute the variance of the residual [Pa^2], and its inflation in estimates by the correlation of the noise.
+    """Compute the variance of the residual [Pa^2], and the factor by which its correlation raises the variance of fits.
 
-    The inflation is the variance of the scores (`Block`) over their variance under white noise, at least 1.
-    `deviations` (K p,): deviations of the parameters from `theta` of each block, in `Priors.unit`; `parameter`: the
-    tested one.
+    The factor is the variance of the scores (`Block`) over their variance under white noise, at least 1. `deviations`
+    (K p,): deviations of the parameters from `theta` of each block, in `Priors.unit`; `parameter`: index of the tested
+    parameter.
     """
     # residual at these deviations: (1, -deviations) times the rows of residual and Jacobian
     directions = [np.append(1.0, -deviation) for deviation in deviations.reshape(len(blocks), -1)]
     pairs = list(zip(blocks, directions, strict=True))
     squares = sum(float(direction @ block.gram @ direction) for block, direction in pairs)
-    variance = max(squares, 1.0) / sum(block.samples for block in blocks)  # never zero, as it is a divisor
+    # a sum of squares of at least 1 Pa^2, since the variance is a divisor
+    variance = max(squares, 1.0) / sum(block.samples for block in blocks)
     scores = np.concatenate([block.scores @ direction for block, direction in pairs])
     white_variance = variance * sum(float(block.gram[1 + parameter, 1 + parameter]) for block in blocks)
     return variance, max(1.0, float(scores @ scores) / max(white_variance, np.finfo(float).tiny))

@@ -94,8 +94,9 @@ def _advance_friction(
 ) -> tuple[float, float]:
     """Advance the friction force by LuGre's law over a time step h [s].
 
-    Returns the friction force after the step and the friction of steady sliding at the speed v, both [N]. `friction_0`,
-    `steady_0`: the same two forces before the step; `theta`: fitted parameters; `m`: sizes of the rig.
+    Returns the friction force after the step and the friction of steady sliding at the speed `v` [m/s] after it, both
+    [N]. `friction_0`, `steady_0`: the same two forces before the step; `theta`: fitted parameters; `m`: sizes of the
+    rig.
 
     The law, without the damping of the contact, is c dF/dt = v - |v| F/F_m for the friction force F, with the contact's
     compliance c and the magnitude F_m of the steady friction (`_steady_friction`). The step is L-stable and of order 2:

@@ -114,7 +114,7 @@ class Segment:
         return rows, products, products @ self._wave_gram_inverse
 
     def residual_squares(self, sets: Array) -> Array:
-        """Compute the residual sum of squares of p_A - p_B [Pa^2] for each of up to 16 parameter sets (m, p), (m,).
+        """Compute the residual sums of squares (m,) of p_A - p_B [Pa^2] for each of up to 16 parameter sets (m, p).
 
         Its mean and the mains hum do not count. The result is infinite for a set whose simulation diverges.
         """
@@ -474,13 +474,15 @@ def measure_leak(recording: Recording, rig: Rig) -> ResponseLeak | None:
 
 
 def parameter_information(joint: Joint, time: Array, seconds: float) -> dict[str, Information]:
-    """Compute the likelihood of each parameter's values in K blocks, by its name, from the joint fit of all blocks.
+    """Compute the likelihood of each parameter in K blocks, by the parameter's name, from the joint fit of all blocks.
 
-    All other parameters are eliminated. The priors on a linear change and on a random walk of the parameter grow with
-    the root of the recording's length; those of the leakage conductance G are those of a healthy machine. `time` (K,):
-    middles of the blocks [s]; `seconds`: length of the recording [s].
+    All other parameters are eliminated. Each likelihood comes with the scale of the priors on a linear change and on a
+    random walk of the parameter: the standard deviation that a walk reaches over the recording (for the leakage
+    conductance G that of a healthy machine). `time` (K,): middles of the blocks [s]; `seconds`: length of the recording
+    [s].
     """
-    growth = math.sqrt(seconds / PRESSURE.blocks.wander)  # random walk in the recording over that in `blocks.wander`
-    wander = growth * joint.priors.wander
-    wander[G] = growth * PRESSURE.conductance.wander
-    return {name: joint.information(k, time, float(wander[k])) for k, name in enumerate(PARAMETERS)}
+    # `Priors.wander` is reached within the time `blocks.wander`; a random walk grows with the root of the time
+    growth = math.sqrt(seconds / PRESSURE.blocks.wander)
+    deviations = growth * joint.priors.wander
+    deviations[G] = growth * PRESSURE.conductance.wander
+    return {name: joint.information(k, time, float(deviations[k])) for k, name in enumerate(PARAMETERS)}

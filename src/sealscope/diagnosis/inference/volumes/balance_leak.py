@@ -36,12 +36,12 @@ class _HoldLaws(NamedTuple):
     """Leak past the piston, fitted to the times in which shut valves hold the load, under k laws of flow.
 
     A law is an exponent of `EXPONENTS` (1 laminar, 0.5 orifice) with a growth of the leak; the first law is laminar
-    without growth. `weights` (k,): probability of each law, with the sum 1; `units`: mean flow [m^3/s] for a
+    without growth. `weights` (k,): probability of each law, with the sum 1; `unit_flows`: mean flow [m^3/s] for a
     coefficient of 1; `flows`, `deviations`: fitted mean flows and their standard deviations [m^3/s].
     """
 
     weights: Array
-    units: Array
+    unit_flows: Array
     flows: Array
     deviations: Array
 
@@ -148,7 +148,7 @@ class BalanceLeak:
     def _hold_rise(self) -> Rise | None:
         """Rise of the leakage over healthy recordings [m^3/(s Pa)], from the times in which shut valves hold the load.
 
-        None without such times (holds), or if it shows no leak and is less precise than that of the whole recording.
+        None if it cannot be estimated, or if it shows no leak and is less precise than the rise in the whole recording.
         """
         motion_rise = self._motion_rise
         if not self.balance.locked or motion_rise is None:
@@ -210,13 +210,13 @@ class BalanceLeak:
         """
         laws = self._hold_laws
         low, high = hold_rise.interval()
-        laminar_unit = laws.units[0]  # the rise is that of a laminar leak
-        rise_flow_deviation = (high - low) / (2.0 * WITHIN_95) * laminar_unit
+        laminar_unit_flow = laws.unit_flows[0]  # the rise is that of a laminar leak
+        rise_flow_deviation = (high - low) / (2.0 * WITHIN_95) * laminar_unit_flow
         return mixture_flow(laws.weights, laws.flows, np.hypot(rise_flow_deviation, laws.deviations))
 
     @cached_property
     def _hold_laws(self) -> _HoldLaws:
-        """Fit a leak past the piston to the times in which shut valves hold the load, for each law and piston area.
+        """Leak past the piston, fitted to the times in which shut valves hold the load, for each law and piston area.
 
         A law is an exponent of `EXPONENTS` and a relative growth of the coefficient between onset and end
         (`growth_priors`); the flow is the coefficient times abs(p_A - p_B)^exponent. Each is fitted with each area of
@@ -231,21 +231,25 @@ class BalanceLeak:
         return _HoldLaws(*(np.concatenate(values) for values in zip(*parts, strict=True)))
 
     def _fit_hold_laws(self, chambers: HeldChambers) -> _HoldLaws:
-        """Fit a piston leak for each exponent and growth, with the areas of `chambers`; the weights sum to 1."""
-        recording, units = self.balance.recording, list[float]()
+        """Convert the fits of a piston leak under each law (`chambers.law_fits`) to mean flows and weights of the laws.
+
+        The flows are means over the recording after the onset. Their deviations include the uncertain starts of the
+        holds (`HeldChambers.start_error`).
+        """
+        recording, unit_flows = self.balance.recording, list[float]()
         for law, conditions, _, _ in chambers.law_fits:
             after_onset = recording.t >= conditions.onset
             t = recording.t[after_onset]
             difference = (recording["p_A"] - recording["p_B"])[after_onset]
             pressure = np.abs(chambers.pressure_difference(t, difference, conditions.offset))
             # mean flow after the onset for a coefficient of 1
-            units.append(float(np.nanmean(pressure**law.exponent * law.growth_factor(t, chambers.end))))
+            unit_flows.append(float(np.nanmean(pressure**law.exponent * law.growth_factor(t, chambers.end))))
         values, noise_deviations, oil_deviations, _ = np.array([law_fit.fit for law_fit in chambers.law_fits]).T
         log_weights = np.array([law_fit.log_weight for law_fit in chambers.law_fits])
         weights = np.exp(log_weights - log_weights.max())
         start_errors = np.array([chambers.start_error(conditions, law) for law, conditions, _, _ in chambers.law_fits])
         deviations = np.sqrt(noise_deviations**2 + oil_deviations**2 + (start_errors * values) ** 2)
-        return _HoldLaws(weights / weights.sum(), np.array(units), values * units, deviations * units)
+        return _HoldLaws(weights / weights.sum(), np.array(unit_flows), values * unit_flows, deviations * unit_flows)
 
     def _rise_laws(self) -> list[tuple[float, float]]:
         """Weigh the laws of a leak's flow, such as laminar, by their fit to the rise over healthy recordings.
@@ -276,8 +280,8 @@ class BalanceLeak:
     def excess(self) -> float | None:
         """Total leakage minus the limit in the rig's file, over the standard deviation of the leakage (no unit).
 
-        None without a limit in the file, if no flow can be stated in L/min (`Size.stated`), behind a servo valve, if no
-        channel measures the flow, or if healthy recordings are compared instead.
+        None if the file states no limit, if no flow can be stated in L/min (`Size.stated`), if a servo valve drives the
+        cylinder, if no channel measures the flow, or if healthy recordings are compared instead.
         """
         balance = self.balance
         limit, size = healthy_leakage(balance.rig), balance.size
@@ -294,8 +298,8 @@ class BalanceLeak:
     def bound_flow(self) -> float:
         """95 % upper bound of the leak's mean flow over the recording [m^3/s]; infinite if nothing was tested.
 
-        With healthy recordings it is that of the leakage above theirs (by `_hold_bound` if holds measure it); without
-        them, of a leak that begins within the recording. The uncertainties of scale and law widen it.
+        With healthy recordings the bound is on the leakage above theirs (`_hold_bound` if holds measure it), otherwise
+        on a leak that begins within the recording. The uncertain scale of flows and law of the leak raise it.
         """
         test = self.step if self._motion_rise is None else self._motion_rise
         if test is None:
@@ -475,7 +479,7 @@ class BalanceLeak:
 def _flow_mixture(rise: Rise, value: float, *, unit: float, weight: float, oil_deviation: float = 0.0) -> Mixture:
     """Compute the distribution of a leak's mean flow [m^3/s] from the rise of its coefficient.
 
-    It is a part, with the sum of weights `weight`, of a larger mixture. `rise`: rise over healthy recordings, of which
+    Its weights sum to `weight`, as it is a part of a larger mixture. `rise`: rise over healthy recordings, of which
     only the distribution of the error is used; `value`: estimate of the rise, a negative one counting as 0; `unit`:
     mean flow [m^3/s] for a coefficient of 1; `oil_deviation`: additional standard deviation of the coefficient due to
     the uncertain properties of the oil.
@@ -486,7 +490,7 @@ def _flow_mixture(rise: Rise, value: float, *, unit: float, weight: float, oil_d
 
 
 def _divide_interval(interval: tuple[float, float], divisor: float | None) -> tuple[float, float] | None:
-    """Divide both ends of an interval, at least 0, by `divisor`; None unless the divisor is positive."""
+    """Divide both ends of an interval, the lower one at least 0, by `divisor`; None unless the divisor is positive."""
     if divisor is None or not divisor > 0.0:
         return None
     return max(interval[0], 0.0) / divisor, interval[1] / divisor

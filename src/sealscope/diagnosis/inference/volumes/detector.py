@@ -131,7 +131,8 @@ class VolumeBalance:
     def _balance_without_position(self, recording: Recording) -> RecordedBalance | None:
         """Choose the volume balance with the smallest upper bound of a leak, among those that need no position.
 
-        It must be that of a load behind shut valves, or of a pump that `compensates_leakage`. Return None if none is.
+        It must be that of a load behind shut valves, or of a pump that `compensates_leakage`; None without such a
+        balance.
         """
         balances = compute_once(
             recording, (self.name, self.rig), lambda samples: cycle_balances(samples, self.rig), READ
@@ -245,7 +246,8 @@ class VolumeBalance:
         """Report on a recording: tests of each term of the volume balance for a step, and the leakage.
 
         The leakage is compared with that of the healthy recordings in `baseline` that have the same terms. Without a
-        recorded flow of the pump, the creep of a load that valves hold shows the leakage. Else it says what is missing.
+        recorded flow of the pump, the creep of a load that valves hold shows the leakage. If nothing shows it, the
+        report says what is missing.
         """
         summaries = healthy_summaries(self, baseline)
         is_locked = _are_valves_shut(summaries)

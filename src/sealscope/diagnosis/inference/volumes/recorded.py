@@ -145,7 +145,10 @@ class RecordedBalance:
 
     @cached_property
     def compared_leak(self) -> Information:
-        """Likelihood as `leak`, for comparison of recordings: without a separate leakage in holds of the pump."""
+        """Likelihood of the leak's conductance in each of `running_blocks`, for a comparison with other recordings.
+
+        Unlike `leak`, it has no separate coefficient for the leakage while the pump holds a load.
+        """
         roles = self.columns[0]
         return information(self.running_blocks, self.columns, roles.leak, left_out=roles.hold_leak)
 
@@ -188,7 +191,8 @@ class RecordedBalance:
     def chambers(self) -> HeldChambers | None:
         """Estimator of the chambers' leaks from holds: times in which the pump rests and shut valves hold the load.
 
-        None without `locked`, a long and loaded hold, a unit of the pressures, or known areas of the piston.
+        None if valves are not known to hold the load (`locked`), if no hold is long and loaded, if the pressures have
+        no unit, or if the areas of the piston are unknown.
         """
         sides = self._cylinder_sides() if self.locked and self.recording.units["p_A"] != COUNTS else None
         if sides is None:
@@ -226,8 +230,8 @@ class RecordedBalance:
     def _lost_flow(self, sides: CylinderSides) -> Array:
         """Compute the magnitude of the pump's flow [m^3/s] that does not move the piston, averaged, shape (n - 1,).
 
-        It is positive while the pump holds a load or compresses oil. The area is that of the side with the higher
-        pressure.
+        It is positive while the pump holds a load or compresses oil. The flow that moves the piston is its speed times
+        the area of the side with the higher pressure.
         """
         recording = self.recording
         is_A_higher = recording["p_A"][1:] > recording["p_B"][1:]
@@ -239,7 +243,10 @@ class RecordedBalance:
         return np.asarray(np.maximum(flow - displaced, 0.0))
 
     def _is_pump_off(self, hold: LockedHold) -> bool:
-        """Return True if the pump probably rests in a hold: the mean flow is rather zero than that of holding it."""
+        """Return True if the pump probably rests in a hold, as its mean flow is too small for a pump that holds a load.
+
+        Such a pump is assumed to deliver the fraction `rest.holding` (`priors.toml`) of its flow in motion.
+        """
         recording = self.recording
         # time in which the pump's flow may still fall: the first interval, and the longest extension by `extend_rests`
         falling = hold.t[hold.edges[1]] - hold.t[0] + INFERENCE.rest.averaged
@@ -269,7 +276,10 @@ class RecordedBalance:
         return float(self._load_log_odds(np.array([pressure]))[0]) > oil.loaded
 
     def _load_log_odds(self, pressure: Array) -> Array:
-        """Compute the log odds that values abs(p_A - p_B) (n,) [Pa] are loads (all equally probable), not an offset."""
+        """Compute the log odds (n,) that values of abs(p_A - p_B) (n,) [Pa] are loads and not an offset of the sensors.
+
+        All loads up to the largest of the recording are equally probable; the offset is normal about 0.
+        """
         # minus the log density of an offset is this constant plus half of its cost
         log_offset_norm = float(np.log(INFERENCE.zero.pressure * np.sqrt(2.0 * np.pi)))
         difference = np.abs(self.recording["p_A"] - self.recording["p_B"])
@@ -296,7 +306,7 @@ class RecordedBalance:
         return rest_log_odds(hold_leak.value, total, rest_variance=variance, difference_variance=difference_variance)
 
     def _cylinder_sides(self) -> CylinderSides | None:
-        """Estimate piston areas and ends of the stroke; None at rest, or if the ratio of the areas is implausible.
+        """Estimate piston areas and ends of the stroke; None without motion, or if the areas' ratio is implausible.
 
         The stroke is that of all known recordings (`known_stroke`).
         """
@@ -360,10 +370,10 @@ class RecordedBalance:
         return area_A, area_B, deviation_A, deviation_B
 
     def _loaded_shares(self) -> tuple[float, float]:
-        """Compute, for A and for B, the fraction of the motion with this side loaded in which it surely carries a load.
+        """Compute, for A and for B, the fraction of the motion with this side loaded in which the load is certain.
 
-        A side counts as loaded while its pressure is higher. It surely carries a load if p_A - p_B almost certainly is
-        not an offset of the sensors (`_load_log_odds`). The motion is measured by the sum of squared speeds over the
+        A side counts as loaded while its pressure is higher. The load is certain if p_A - p_B almost certainly is not
+        an offset of the sensors (`_load_log_odds`). The motion is measured by the sum of squared speeds over the
         samples. A side that is never loaded has the fraction 0.
         """
         recording = self.recording
@@ -400,7 +410,10 @@ class RecordedBalance:
         return self.mean_of_blocks(self.blocks.mean_pressure(self.pressure_offset), since)
 
     def outside_unit_flows(self) -> dict[str, float]:
-        """Compute the flow [m^3/s] of each external leak of 1 m^3/(s Pa) at the rms of its pressure, by its name."""
+        """Compute the flow [m^3/s] of each external leak with a conductance of 1 m^3/(s Pa), by the name of its term.
+
+        The leak is driven by the root mean square of its pressure (`Blocks.driving_pressure`).
+        """
         names, recorded = self.columns[0].names, self.blocks if self.plain is None else self.plain
         return {
             name: recorded.driving_pressure(names, name) * self.size.scale
@@ -410,7 +423,7 @@ class RecordedBalance:
 
     @cached_property
     def mean_flow(self) -> float:
-        """Mean magnitude of the pump's flow [m^3/s]; with `is_creep`, that of the flow which the piston displaces."""
+        """Mean magnitude of the pump's flow [m^3/s]; with `is_creep`, of the flow that the piston displaces."""
         if not self.is_creep:
             return self.mean_of_blocks(self.blocks.flow)
         area = max(self.rig.cylinder.A_A, self.rig.cylinder.A_B)

@@ -47,8 +47,8 @@ def rival_rises(
     each that can be compared. External leaks are compared only while shut valves hold the load, if `held_rivals` can.
 
     `volume_ratio`: measured over assumed ratio of the piston's area to the pump's displacement, by which volumes of air
-    scale; `unit_flows`: flow [m^3/s] of an external leak with a conductance of 1 m^3/(s Pa), by the name of its term,
-    by default the mean of abs(p_A - p_B) in the judged recording.
+    scale; `unit_flows`: flow [m^3/s] of an external leak with a conductance of 1 m^3/(s Pa), by the name of its term. A
+    leak without an entry is assumed to be driven by the mean of abs(p_A - p_B) in the judged recording.
     """
     names = columns[0].names
     hold_rivals = held_rivals(judged, healthy, unit_flows)
@@ -116,7 +116,8 @@ def rival_rises(
 def _without_oil(coefficients: Array, thinning: Array) -> Array:
     """Remove the effect of the oil's viscosity from leakage coefficients (n + 1,), if they then scatter less.
 
-    `thinning` (n + 1,): logarithm by which thinner oil raises each. The last one is judged, the others are healthy.
+    `thinning` (n + 1,): logarithm of the factor by which thinner oil raises each coefficient. The last coefficient is
+    that of the judged recording, the others are those of healthy ones.
     """
     corrected = coefficients * np.exp(-thinning)
     scatters = [
@@ -150,10 +151,11 @@ def held_rivals(
 
 
 def _penalise_size(observable: Observable, judged: RecordingSums, unit_flows: Mapping[str, float] | None) -> Observable:
-    """Return the observable of an external leak with the `advantage` that the prior on the size of such leaks gives it.
+    """Return the observable of an external leak with the penalty for its size as `advantage`, which is at most 0.
 
-    A large external leak is improbable, since oil outside is seen: the advantage is 2 log(prior density / largest prior
-    density) of the flow, and 0 for flows below the centre of the prior (`outside` in `priors.toml`).
+    A large external leak is improbable, since someone would have noticed the oil outside. The penalty is 2 log(prior
+    density / largest prior density) of the leak's flow, and 0 for flows below the centre of the prior (`outside` in
+    `priors.toml`). `unit_flows`: as in `rival_rises`.
     """
     flow = observable.size * (unit_flows or {}).get(observable.name, judged.pressure)
     return replace(observable, advantage=-size_penalty(INFERENCE.outside, flow, above=True))

@@ -152,9 +152,10 @@ class HeldChambers:
         return [np.array([self._is_closed(hold, p) for p in (hold.p_A, hold.p_B)]) for hold in self.holds]
 
     def _closed_flags(self, refilled: tuple[bool, bool]) -> list[NDArray[np.bool_]]:
-        """Flag the samples (2, n), for each hold of n samples, in which no check valve refills A, and B.
+        """Flag the samples in which no check valve refills A (row 0) or B (row 1), (2, n) for each hold of n samples.
 
-        `refilled`: true for A, and for B, if a check valve refills that side once it is at the charge pressure.
+        `refilled`: for A and for B, true if a check valve refills that side whenever its pressure is not above the
+        charge pressure. A side that is never refilled has only true flags.
         """
         return [flags | ~np.array(refilled)[:, None] for flags in self._above_charge]
 
@@ -172,8 +173,9 @@ class HeldChambers:
     ) -> UnitLeak:
         """Compute the flow past the piston in each hold for a leak with a coefficient of 1, in Pa^e.
 
-        The flow is sign(dp) |dp|^e, times the growth of the leak since its onset, with dp = p_A - p_B - z. The sensor
-        offset z in a hold may differ from the recording's `offset` [Pa] (`LockedHold.driving_pressure`).
+        The flow is sign(dp) |dp|^e, with the exponent e of the `law` and dp = p_A - p_B - z, times the growth of the
+        leak since its onset. The sensor offset z in a hold may differ from the recording's `offset` [Pa]
+        (`LockedHold.driving_pressure`). The flow of a side counts as 0 while a check valve refills it (`refilled`).
         """
         flows = []
         for hold in self.holds:
@@ -197,7 +199,7 @@ class HeldChambers:
         return np.asarray(difference - offsets)
 
     def _unit_outside_leak(self, is_A: bool) -> UnitLeak:
-        """Compute the flow [Pa] of a laminar leak with a conductance of 1 from chamber A, or B, to the outside.
+        """Compute the flow [Pa] of a laminar leak with a conductance of 1 from A (or B, if not `is_A`) to the outside.
 
         It is the chamber's gauge pressure, or 0 while a check valve refills the chamber.
         """
@@ -206,7 +208,7 @@ class HeldChambers:
         return UnitLeak([flow_of_side(flow, is_A) for flow in flows], refilled=BOTH)
 
     def _unit_pump_leak(self, is_A: bool) -> UnitLeak:
-        """Compute the flow from A, or from B, through open valves and the pump, for a conductance of 1.
+        """Compute the flow [Pa] from A (or B, if not `is_A`) through open valves and the pump, for a conductance of 1.
 
         No flow counts for the other chamber, since check valves or a shuttle valve keep it at the charge pressure.
         """
@@ -229,13 +231,16 @@ class HeldChambers:
         }
 
     def fit_piston_leak(self, conditions: PistonFit, law: LeakLaw = LAMINAR) -> LeakFit:
-        """Fit the coefficient of a leak past the piston; the likelihood includes the prior on the sensor offset."""
+        """Fit the coefficient of a leak past the piston, given onset, sensor offset and refilled sides (`conditions`).
+
+        The likelihood includes the prior on the sensor offset.
+        """
         unit_leak = self._unit_piston_leak(conditions.offset, conditions.refilled, law)
         fit = self._fit_leak(unit_leak, conditions.onset)
         return fit._replace(log_likelihood=fit.log_likelihood - 0.5 * self._offset_cost(conditions.offset))
 
     def start_error(self, conditions: PistonFit, law: LeakLaw) -> float:
-        """Estimate the relative standard error of a piston leak's coefficient by the uncertain start of each hold.
+        """Estimate the relative standard error of a piston leak's coefficient due to the uncertain start of each hold.
 
         The coefficient is the volume that has left a chamber, divided by the time integral of the flow u of a leak with
         a coefficient of 1. A hold starts when its valves are shut. This time is known to within s = `held_oil.settles`
@@ -244,7 +249,8 @@ class HeldChambers:
 
             s sqrt(sum of u_0^2) / (sum of the integrals of u), summed over the holds.
 
-        Only the time after the onset counts, so that a leak which begins within a hold has no such error there.
+        Only the time after the onset (`conditions`) counts, so that a leak which begins within a hold has no such error
+        there.
         """
         start_flows, integrals = [0.0], [0.0]
         for hold in self.holds:
@@ -301,7 +307,8 @@ class HeldChambers:
     def onsets(self) -> Array:
         """Possible onsets of a leak [s] in order of time: the beginning of the recording, between holds, within them.
 
-        As a large leak equalises the pressures at once, one of those in a hold is the time of its largest change.
+        One onset within each hold is the time at which p_A - p_B changes most, since a large leak equalises the
+        pressures at once.
         """
         onsets = [self.begin]
         for k, hold in enumerate(self.holds):
@@ -363,19 +370,19 @@ class HeldChambers:
 
     @cached_property
     def piston_fits(self) -> dict[float, PistonFit]:
-        """Most probable onset of a leak past the piston, sensor offset, and effect of check valves, by exponent."""
+        """Most probable onset and sensor offset for a leak past the piston, by the exponent of the leak's law."""
         return {exponent: self._find_piston_fit(exponent) for exponent in EXPONENTS}
 
     @property
     def piston_fit(self) -> PistonFit:
-        """Most probable onset of a laminar leak past the piston, sensor offset, and effect of check valves."""
+        """Most probable onset and sensor offset for a laminar leak past the piston."""
         return self.piston_fits[1.0]
 
     def _find_piston_fit(self, exponent: float) -> PistonFit:
-        """Find the most probable onset of a leak past the piston, sensor offset, and effect of check valves.
+        """Find the most probable onset, sensor offset and refilled sides for a leak past the piston.
 
         They have the highest joint posterior probability, on a grid of onsets and a grid of offsets that is refined
-        once, with and without check valves that replace displaced oil (equally probable). `exponent`: as in `LeakLaw`.
+        once, with and without check valves that refill a side (equally probable). `exponent`: as in `LeakLaw`.
         """
         grid, fits = self._offset_grid, list[tuple[float, PistonFit]]()
         is_never_refilled = self._closed_share(self._refillable_sides) == 1.0
@@ -429,7 +436,8 @@ class HeldChambers:
     def _find_onset(self, offset: float, refilled: tuple[bool, bool], exponent: float) -> tuple[float, PistonFit]:
         """Find the most probable onset of a leak past the piston, given the sensor offset of p_A - p_B [Pa].
 
-        `refilled`, `exponent`: as in `PistonFit` and `LeakLaw`. Return its log posterior and the fit with it.
+        `refilled`, `exponent`: as in `PistonFit` and `LeakLaw`. Return the log posterior of this onset, and the onset
+        together with `offset` and `refilled`.
         """
         posteriors = self._onset_posteriors(self._unit_piston_leak(offset, refilled, LeakLaw(exponent)))
         index = int(posteriors.argmax())
@@ -491,7 +499,8 @@ class HeldChambers:
     def leaks(self) -> HeldLeaks:
         """Mean leaks over the recording, from the times in which shut valves hold the load.
 
-        Each leak is its estimate times its probability. Its deviation is not, and excludes that of the oil.
+        Each leak is its estimate times its probability. Its standard deviation is not multiplied by the probability,
+        and excludes the uncertainty of the oil's properties.
         """
         values_and_deviations = []
         for leak in self._leak_hypotheses:

@@ -88,11 +88,12 @@ class LockedHold:
         pressure, difference = max(last_A, last_B), last_A - last_B
         deviation = INFERENCE.held_oil.gain * pressure
         cost = ((difference - offset) / deviation) ** 2
+        # log densities of `difference` in the two cases
         is_equalised = -0.5 * cost - math.log(deviation * math.sqrt(2.0 * math.pi)) > -math.log(pressure)
         return (difference, cost) if is_equalised else (offset, 0.0)
 
     def driving_pressure(self, offset: float) -> Array:
-        """Compute p_A - p_B [Pa] at each sample (n,), without the offset of the hold, given that of the recording.
+        """Compute p_A - p_B [Pa] at each sample (n,) minus the hold's offset, given the recording's `offset` [Pa].
 
         Once a leak has equalised the pressures, small differences d are errors of the sensors. Their integral over the
         hold may exceed the integral of the large but short-lived difference before. In such holds d is therefore
@@ -105,9 +106,9 @@ class LockedHold:
         return difference
 
     def steepest_time(self) -> float:
-        """Find the time [s] from which p_A - p_B changes most over `held_oil.equalises` (`priors.toml`).
+        """Find the time [s] after which p_A - p_B changes most within the time `held_oil.equalises` (`priors.toml`).
 
-        In this time a large leak equalises the pressures.
+        Within such a time a large leak equalises the pressures.
         """
         n_equalising = int(np.searchsorted(self.t, self.t[0] + INFERENCE.held_oil.equalises))  # [samples]
         difference = self.difference
@@ -182,7 +183,7 @@ def find_locked_holds(channels: Sequence[Array], rests: NDArray[np.bool_], rate:
 
 
 def _reading_edges(n_samples: int, width: float) -> NDArray[np.intp]:
-    """Divide the samples of a hold into k intervals that lengthen geometrically; return their bounds, shape (k + 1,).
+    """Divide `n_samples` of a hold into k intervals that lengthen geometrically; return their bounds, shape (k + 1,).
 
     The first interval has `width` samples, each later one `GROWTH` times as many; the last one takes the rest.
     """

@@ -42,8 +42,8 @@ class UnitLeak(NamedTuple):
     """Flow of a leak with a coefficient of 1 while shut valves hold the load.
 
     `flows`: for each hold of n samples the flow out of A (first row) and out of B, (2, n), in Pa^e for the exponent e
-    of the law (laminar: 1); `refilled`: true for A, and for B, if a check valve refills that side while it is at the
-    charge pressure. The flow of the side does not count then.
+    of the law (laminar: 1); `refilled`: for A and for B, true if a check valve refills that side while it is at the
+    charge pressure, in which time its flow does not count.
     """
 
     flows: Sequence[Array]
@@ -67,7 +67,7 @@ class HeldLeaks(NamedTuple):
 class PistonFit(NamedTuple):
     """Most probable `onset` of a leak past the piston [s], and sensor `offset` of p_A - p_B [Pa].
 
-    `refilled`: true for A, and for B, if a check valve probably refills that side while it is at the charge pressure.
+    `refilled`: for A and for B, true if a check valve probably refills that side while it is at the charge pressure.
     """
 
     onset: float
@@ -96,8 +96,8 @@ class LeakFit(NamedTuple):
 class LawFit(NamedTuple):
     """Fit of a leak past the piston under one `law`.
 
-    `conditions`: onset, sensor offset, and effect of check valves; `fit`: fitted coefficient; `log_weight`: log
-    likelihood of the fit plus the log prior probability of the law.
+    `conditions`: onset, sensor offset and refilled sides; `fit`: fitted coefficient; `log_weight`: log likelihood of
+    the fit plus the log prior probability of the law.
     """
 
     law: LeakLaw

@@ -119,8 +119,8 @@ def build_regression(
     """Build the regression of displaced volumes on the oil's properties from all holds (`OilRegression`).
 
     The rows are the readings (sample means) of each hold, side A before side B, relative to their mean over the hold.
-    `flags`: for each hold of n samples, flags (2, n) of the samples in which no check valve refills A, and B, so that
-    the displacement of this side counts; `n_readings`: effective number of independent readings.
+    `flags` (2, n), for each hold of n samples: true in samples in which no check valve refills A (row 0) or B (row 1),
+    so that the displacement of that side counts; `n_readings`: effective number of independent readings.
     """
     prior, stroke = INFERENCE.held_oil, sides.high - sides.low
     displaced, strained, aired = list[Array](), list[Array](), list[Array]()
@@ -153,16 +153,18 @@ def build_regression(
 def fit_leaks(regression: OilRegression, columns: Array, n_readings: float) -> LeakRegression:
     """Fit the coefficients of c leaks together with the properties of the oil.
 
-    `columns` (r, c): volumes leaked with coefficients of 1 by each reading (mean of samples); `n_readings`: effective
-    number of independent readings. The properties are found by iteration, and so is the variance of a reading, which
-    weights their priors against the readings. A dead volume that reaches its lower limit stays there.
+    `columns` (r, c): volume [m^3] that has left the chamber by each of r readings (means of samples), for each leak
+    with a coefficient of 1; `n_readings`: effective number of independent readings. The properties are found by
+    iteration, and so is the variance of a reading, which weights their priors against the readings. A dead volume that
+    reaches its lower limit stays there. The covariance is split into two parts (`LeakRegression`).
     """
     n_leaks = columns.shape[1]
     changes = np.zeros(4)  # changes of the oil's properties, at first none
     leaked, misfit_variance = regression.leaked(changes), regression.misfit_variance
     degrees_of_freedom = max(n_readings - n_leaks, 1.0)
     variance = max(float(leaked @ leaked) / len(leaked), misfit_variance)
-    # precisions of the priors (0 for leaks, which have none), and lower limits of the properties
+    # precisions of the priors (0 for leaks, which have none). The fit counts all r readings as independent, so that the
+    # covariance is multiplied by `inflation` below; the precisions are too, lest the priors become weaker
     precisions = np.append(np.zeros(n_leaks), regression.inflation / _oil_deviations() ** 2)
     lowest = _lowest_changes()
     is_lowest = np.zeros(4, dtype=bool)  # properties that stay at their lower limit
