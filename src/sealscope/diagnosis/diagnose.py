@@ -64,7 +64,7 @@ class Examination:
     refusal : str or None
         Reason why none of the given healthy recordings can be compared; None if one can, or if none was given.
     share, judged_until : float
-        Fractions of the original samples that `recording` contains, and up to its last time.
+        Fraction of the original samples that `recording` contains, and fraction of them up to its last time.
     """
 
     recording: Recording
@@ -104,7 +104,8 @@ class Examination:
     def null(self) -> HealthyNull:
         """Distribution of the detectors' test results in the healthy recordings (`baseline`).
 
-        If valves cut the pump off at rest by the volume balance, this is assumed for the healthy recordings, too.
+        If the judged recording's volume balance shows that valves cut the pump off at rest, this is assumed for the
+        healthy recordings, too.
         """
         leak = self.report(VOLUME_BALANCE).leak if VOLUME_BALANCE in detectors() else None
         # `shut`: the valves cut the pump off at rest; `locked`: they also hold the load then
@@ -138,7 +139,7 @@ class Examination:
     def _decide_by(self, name: str, reports: Sequence[Observed], *, weigh_rivals: bool = True) -> Evidence:
         """Decide from the observations of the detector called `name` if the machine leaks.
 
-        `reports` of other detectors may show another cause of an alarm, which competes with a leak (`weigh_rivals`).
+        `reports` of other detectors may show another cause of an alarm, which competes with a leak if `weigh_rivals`.
         """
         probability = self.false_alarm_probability
         with np.errstate(all="ignore"):

@@ -24,7 +24,8 @@ class SummarisedRecording:
     start_s: float | None  # time of its first sample [s since 1970], None if unknown
     summaries: Mapping[str, Summary]  # summary by each detector, by the detector's name
     about: Mapping[str, Any] = field(default_factory=dict)  # pressure, oil, noise and problems, for display
-    statistics: Mapping[str, float | Array] = field(default_factory=dict)  # surprisals (`healthy_surprisals`)
+    # surprisal, -log(p-value), of each change within it, by the key of the change (`healthy_surprisals`)
+    statistics: Mapping[str, float | Array] = field(default_factory=dict)
 
 
 #: A healthy recording, as samples or as summaries.
@@ -32,7 +33,10 @@ Healthy = Recording | SummarisedRecording
 
 
 def healthy_summaries(detector: Any, baseline: Sequence[Healthy]) -> list[Summary]:
-    """Collect summaries of healthy recordings, stored ones or by the `detector`'s method `learn`; None is skipped."""
+    """Collect the `detector`'s summaries of healthy recordings: stored ones, and those that `detector.learn` computes.
+
+    Recordings without a summary are skipped.
+    """
     summaries = (
         recording.summaries.get(detector.name)
         if isinstance(recording, SummarisedRecording)

@@ -65,9 +65,9 @@ class Line(NamedTuple):
 
 
 def table_type(extra: Literal["allow", "ignore"] = "ignore", **value_types: Any) -> Any:
-    """Make a pydantic type for a table with these keys and value types; (type, None) marks a value that may be absent.
+    """Make a pydantic type for a table from the type of each key's value, or (type, None) if it may be absent.
 
-    Unknown keys are kept or dropped, depending on `extra`.
+    Unknown keys are kept if `extra` is "allow", and dropped if it is "ignore".
     """
     config = ConfigDict(strict=True, allow_inf_nan=False, extra=extra)
     # pydantic's `...` marks a value that must be present
@@ -76,7 +76,7 @@ def table_type(extra: Literal["allow", "ignore"] = "ignore", **value_types: Any)
 
 
 def uniform_table_type(value_type: Any) -> Any:
-    """Make a pydantic type for a table of any keys and one type of values; the error names the first other value."""
+    """Make a pydantic type for a table of any keys and one type of values; the error names the first wrong one."""
 
     def check_values(table: Any) -> Any:
         if not isinstance(table, dict):
@@ -92,7 +92,7 @@ def uniform_table_type(value_type: Any) -> Any:
 
 
 def list_type(value_type: Any, min_length: int = 0) -> Any:
-    """Make a pydantic type for a list of values of one type; validation stops at the first other value and names it."""
+    """Make a pydantic type for a list of values of one type; validation stops at the first wrong one and names it."""
     return Annotated[list[value_type], FailFast(), Field(min_length=min_length)]
 
 
@@ -248,7 +248,10 @@ _ABOUT = {
 
 
 def _restore_arrays(value: Any, name: str) -> Any:
-    """Convert packed arrays (tables of "shape" and "f8") at any depth of a JSON value; ValueError names a wrong one."""
+    """Convert packed arrays (tables of "shape" and "f8") at any depth of a JSON value to arrays.
+
+    `name` is the key of the value. Raises ValueError with the key of an array that is not valid.
+    """
     if isinstance(value, dict):
         if value.keys() == {"shape", "f8"}:
             try:
@@ -295,14 +298,14 @@ def _pack_arrays(value: Any) -> Any:
 
 
 def _format_json(value: Any) -> bytes:
-    """Convert a value to JSON with packed arrays; raise ValueError if not finite, TypeError if not for JSON."""
+    """Convert a value to JSON with packed arrays; raise ValueError for infinity or nan, TypeError for other types."""
     return json.dumps(_pack_arrays(value), allow_nan=False, sort_keys=True, separators=(",", ":")).encode("ascii")
 
 
 def check_summary(method: str, summary: Summary) -> None:
-    """Raise ArithmeticError unless a detector's summary can be stored and read back, e.g. for infinite numbers.
+    """Check that the summary by the detector `method` can be stored and read back, e.g. is finite.
 
-    This error tells that the recording is the cause, not a defect of the detector called `method` (`log_failure`).
+    Raises ArithmeticError otherwise, which blames the recording and not a defect of the detector (`log_failure`).
     """
     try:
         convert_type(_BY_METHOD, parse_json(_format_json({method: summary})))

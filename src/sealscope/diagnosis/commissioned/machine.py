@@ -196,7 +196,8 @@ class CommissionedMachine:
         """Find a confirmed leak that was open between `start_s` and `end_s` [s since 1970]; None if there was none.
 
         An alarm judged "valid" or "repaired" is a confirmed leak, open from its onset until the next repair. A later
-        judgement "invalid" of its name revokes it, unless the onset is after the confirmation: then it is another one.
+        judgement "invalid" of an alarm of the same name revokes it, unless the onset stated there is after the
+        confirmation, as that is another alarm.
         """
         for k, leak in enumerate(self.alarms):
             is_revoked = any(

@@ -372,7 +372,8 @@ def _format_table(tree: Mapping[str, Any], path: str = "", heading: str = "") ->
     """Format a table as lines of TOML: first plain values, then inner tables.
 
     An inner table of plain values only is a value on one line, except in the outermost table. `path` is the table's
-    dotted name, "" for the file, in which a list becomes an array of tables; `heading` is the line before its values.
+    dotted name, "" for the file itself, in which a list becomes an array of tables; `heading` is the line to write
+    before the table's values.
     """
     lines, inner_lines = list[str](), list[str]()
     for name, value in tree.items():
@@ -461,7 +462,8 @@ def read_machine(path: str | os.PathLike[str]) -> CommissionedMachine:
 def _convert_tree(tree: dict[str, Any], place: str) -> dict[str, Any]:
     """Check the tables of a machine's file, raising InputError with the path `place`, and convert their values.
 
-    Returns the tables `machine`, `map` (if any), `healthy` and `alarms`, with times in seconds, not the rig's.
+    Returns the tables `machine`, `map` (if any), `healthy` and `alarms`, with times in seconds, but not the rig's
+    tables, which are not checked.
     """
     try:
         tables: dict[str, Any] = convert_type(_FILE, tree).model_dump(exclude_unset=True)

@@ -100,7 +100,10 @@ class MachineSummary:
         return "\n".join(paragraphs(rows, columns=16))
 
     def _smallest_leak_rows(self, n_healthy: int, are_dated: bool) -> list[tuple[str, str]]:
-        """Build the rows (heading, text) on the smallest leak and what halves it; `are_dated`: dates are known."""
+        """Build the rows (heading, text) on the smallest detectable leak and on what would halve it.
+
+        `n_healthy` is the number of healthy recordings; `are_dated` is True if their dates are known.
+        """
         if self.smallest is None:
             needs = "speed or angle of the pump, flow or command, and two recordings"
             return [("smallest leak", f"not known, that needs {needs}; the ringing alone judges")]
@@ -305,7 +308,7 @@ def _estimate_noise(values: Array) -> float:
 
 
 def _describe_vacuum(part: Recording, name: str) -> str:
-    """Describe a gauge pressure, in Pa, that is below vacuum in about 1 % of the samples or more; else return ""."""
+    """Describe the zero error of a gauge pressure [Pa] of which 1 % of the samples are below vacuum; else return ""."""
     if part.units[name] != "Pa" or not (low_pressure := float(np.quantile(part[name], 0.01))) < -P_ATM:
         return ""
     offset = (-P_ATM - low_pressure) / BAR
@@ -313,7 +316,7 @@ def _describe_vacuum(part: Recording, name: str) -> str:
 
 
 def _describe_glitches(part: Recording, name: str) -> str:
-    """Describe a channel whose single samples stand out by over its range (1 to 99 % quantile); else return ""."""
+    """Describe a channel with single samples that jump by more than its range (1 to 99 % quantile); else return ""."""
     values = part[name]
     if len(values) < 3:
         return ""

@@ -86,7 +86,10 @@ def is_remeasured(rig: Rig, rig_before: Rig) -> bool:
 
 
 def _with_measured_displacement(rig: Rig, healthy: tuple[SummarisedRecording, ...]) -> Rig:
-    """Give a rig that states only the piston areas the pump displacement measured by the healthy recordings, if any."""
+    """Set the pump displacement of a rig that states only piston areas to that measured by the healthy recordings.
+
+    Any other rig, and a rig without such a measurement, is returned unchanged.
+    """
     if rig.states(_DISPLACEMENT) or not rig.states(*_AREAS):
         return rig
     summaries = (recording.summaries.get(VOLUME_BALANCE, {}) for recording in healthy)

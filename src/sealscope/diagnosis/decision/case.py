@@ -34,9 +34,9 @@ class LeakTest(NamedTuple):
 
     name: str  # WITHIN the recording, AGAINST healthy recordings, or LEVEL: against the limit in the rig's file
     score: float  # statistic of the test, which grows with the evidence of a leak
-    threshold: float  # score that is exceeded without a leak with the `probability` allowed for a false alarm
+    threshold: float  # score that is exceeded with the `probability` if there is no leak
     chance: float  # p-value, i.e. probability of at least this score without a leak
-    probability: float
+    probability: float  # part of the allowed probability of a false alarm that the test gets
 
 
 class OtherEvent(NamedTuple):
@@ -89,7 +89,7 @@ class Case:
         return probability_of(self.explanations, *LEAK_EVENTS, data_kind=self._data_kind(alarm))
 
     def external_probability(self, alarm: LeakTest) -> float:
-        """Compute the probability that oil leaks out of the circuit, given the data of an `alarm`; 0 if not weighed."""
+        """Compute the probability that oil leaks out of the circuit, given an `alarm`; 0 if rivals are not weighed."""
         if not self.weigh_rivals:
             return 0.0
         return probability_of(self.explanations, causes=["external leak"], data_kind=self._data_kind(alarm))
@@ -181,8 +181,9 @@ class Case:
     def _probability_of_causes(self, causes: Sequence[str], data_kind: str) -> float | None:
         """Compute the probability that one of the causes changed a kind of data, against other causes and chance.
 
-        The result is None, as the causes must not be named, unless it is above `happened` (`priors.toml`), that against
-        other causes alone is above `named`, and for each cause alone it is above 1 - `sure`.
+        The result is None, as the causes must then not be named, unless three limits of `priors.toml` are exceeded:
+        `happened` by this probability, `named` by that against other causes only, and 1 - `sure` by that of each
+        single cause.
         """
         limits = DECISION.explanation
         by_cause = [probability_of(self.explanations, causes=[cause], data_kind=data_kind) for cause in causes]

@@ -27,7 +27,7 @@ ORDER = (VOLUME_BALANCE, PRESSURE_RESPONSE)
 
 
 def rank(detector: str) -> int:
-    """Return the rank of the `detector` with this name; the first by rank that decides gives the verdict.
+    """Return the rank of a detector by its name; of the detectors that decide, the lowest rank gives the verdict.
 
     Detectors in `ORDER` come first, then plug-ins, which share a rank, and last the change of RMS.
     """
@@ -37,7 +37,7 @@ def rank(detector: str) -> int:
 
 
 def is_decided(evidence: Evidence) -> bool:
-    """Return True if a detector could use the recording, and states a verdict, the cause of a change, or an alarm."""
+    """Return True if a detector could use the recording and states leak, no leak, a change's cause, or an alarm."""
     return evidence.usable and not evidence.abstains
 
 
@@ -74,8 +74,9 @@ def combine(decisions: Sequence[Evidence], refusal: str | None) -> Evidence:
 def _explain_undecided(ranked: Sequence[Evidence], usable: Sequence[Evidence]) -> Evidence:
     """Make the verdict `cannot tell` with a reason, as no detector decides.
 
-    It is that of the first of the `usable` detectors; that of the volume balance comes before one of the change of RMS.
-    If none is usable, it is the reason of the last built-in one in `ranked`, which needs the fewest channels.
+    The reason is that of the first `usable` detector; if this is the change of RMS, it follows the reason why the
+    volume balance cannot be used. If none is usable, it is that of the last built-in detector in `ranked`, which needs
+    the fewest channels.
     """
     if usable:
         undecided = usable[0]

@@ -77,10 +77,10 @@ def decide(
 
 
 def _decide_without_leak(case: Case) -> Evidence:
-    """Decide, where no test found a leak, on `no leak` if its bound is small enough, else on `cannot tell`.
+    """Decide between `no leak` and `cannot tell`, given that no test has found a leak.
 
-    The evidence states the cause of another event that explains a rare change and, if leakage is measured, the bound of
-    an undetected leak.
+    The verdict is `no leak` if an undetected leak can only be small. The evidence states the cause of another event
+    that explains a rare change and, if leakage is measured, the bound of an undetected leak.
     """
     alarm = next(iter(case.alarms), None)  # an alarm that has a better explanation than a leak
     leak, other = case.leak, case.other_event
@@ -157,7 +157,7 @@ def _size_fields(leak: LeakMeasure, flow: Flow | None) -> dict[str, Any]:
 def _leak_bound(case: Case, alarm: LeakTest | None) -> float:
     """Compute the 95 % upper bound of a leak's mean flow [m^3/s].
 
-    If a leak may have caused the first `alarm`, it is at least the upper end of this leak's 95 % interval. The result
+    If a leak may have caused the `alarm`, the bound is at least the upper end of this leak's 95 % interval. The result
     is infinite if leakage was not measured, or if the bound is not below the mean flow of a pump that moves.
     """
     leak = case.leak
@@ -190,7 +190,7 @@ def _bound_and_limit(case: Case, bound: float) -> tuple[float, float]:
 
 
 def _findable_step(case: Case) -> float | None:
-    """Compute the mean flow [m^3/s] of the smallest step of a leak that would be detected; None if not tested."""
+    """Compute the mean flow [m^3/s] of the smallest step of a leak that would be detected; None without a test."""
     test = next((test for test in case.tests if test.name == WITHIN), None)
     if test is None or case.leak is None or case.leak.step is None:
         return None
@@ -200,9 +200,10 @@ def _findable_step(case: Case) -> float | None:
 
 
 def _add_tests(case: Case, evidence: Evidence, judging: LeakTest | None) -> Evidence:
-    """Add what the judging detector reports, and the results of its tests, in `parts` if there are several.
+    """Add to `evidence` figures of the judging detector's report, and the results of its tests.
 
-    The test `judging` gives score, threshold and p-value; None adds no results of tests.
+    Score, threshold and p-value are those of the test `judging`; if it is None, no results are added. Several tests are
+    also listed in `parts`.
     """
     judge = case.judge
     evidence = replace(evidence, detector=judge.provider, share=judge.share, judged_until=judge.judged_until)

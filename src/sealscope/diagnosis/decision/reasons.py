@@ -43,7 +43,7 @@ def reason_of(case: Case, evidence: Evidence, alarm: LeakTest | None, bound: flo
 
     For a `leak`, it describes the leak that the test `alarm` detected. Otherwise it states the 95 % upper `bound` of an
     undetected leak [m^3/s], and the cause of a change: the event `other` or, if there is an alarm, the most probable
-    explanation other than a leak. Remarks follow.
+    explanation other than a leak. Remarks on the measured leakage follow.
     """
     if evidence.verdict == LEAK:
         return _leak_text(case, evidence, alarm) + _remarks(case)
@@ -88,9 +88,10 @@ def _leak_text(case: Case, evidence: Evidence, alarm: LeakTest | None) -> str:
 def _bound_text(case: Case, evidence: Evidence, bound: float) -> str:
     """State in words how large a leak can be that was not detected.
 
-    If leakage is measured, the text states its upper `bound` in L/min, else as a percentage of the pump's flow, else as
-    "any size", and after `cannot tell` how to record better. Otherwise it describes the pressures' ringing: its change
-    after an alarm, else the limit of its fall. `bound`: mean flow [m^3/s], infinite if unknown.
+    `bound` is the upper bound of the mean flow [m^3/s], infinite if unknown. If leakage is measured, the text states it
+    in L/min, as a percentage of the pump's flow, or as "any size", in this order of preference; with `cannot tell`, it
+    also says how to record better. Otherwise it describes the pressures' ringing: its change if there is an alarm, else
+    the limit of an undetected fall.
     """
     leak, ringing = case.leak, case.judge.ringing
     if leak is None:
@@ -115,9 +116,9 @@ def _bound_text(case: Case, evidence: Evidence, bound: float) -> str:
 def _ringing_text(evidence: Evidence, ringing: Ringing | None, provider: str) -> str:
     """State in words the 95 % upper limit [%] of an undetected fall of the ringing (RMS of the pressures' details).
 
-    The fall is relative to healthy recordings or, without these, to the start of the same recording. After `cannot
-    tell`, the text says that such a fall would not show. If the sampling rate is too low, it says so or names unused
-    columns instead. If the ringing was not measured (None), it says that the detector `provider` sees no change.
+    The fall is relative to healthy recordings or, without these, to the start of the same recording. With the verdict
+    `cannot tell`, the text says that such a fall would not show. If the sampling rate is too low, it says so or names
+    unused columns instead. If the ringing was not measured (None), it says that the detector `provider` sees no change.
     """
     if ringing is None:
         return text_of("bound", "unseen", provider=provider)

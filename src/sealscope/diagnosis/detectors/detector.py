@@ -52,7 +52,10 @@ Factory = Callable[["Rig"], Detector]
 
 
 def unusable_reason(detector: Detector, recording: Recording) -> str | None:
-    """Return the reason, one line, that a detector cannot use a recording, or None; raise TypeError for others."""
+    """Return the reason, in one line, why a detector cannot use a recording; None if it can.
+
+    Raises TypeError if the detector's `usable` returns neither a text nor None.
+    """
     reason: Any = detector.usable(recording)
     if reason is None:
         return None
@@ -71,7 +74,8 @@ def make_observable(
     name : str
         Name of the change, in plain words.
     chance : float
-        Probability that a healthy recording changes as much; of several changes, the smallest times their number.
+        Probability that a healthy recording changes as much. If several changes are tested, the smallest of their
+        probabilities times their number.
     size : float
         The change, in the detector's own unit; negative for a fall.
     onset : tuple of float, optional
@@ -84,10 +88,11 @@ def make_observable(
 
 
 def validate_report(report: Any, name: str) -> Observed:
-    """Return a detector's report, or single observable, with the detector's `name` as provider, if it is valid.
+    """Check what the detector called `name` has returned, and return it as a report by this detector.
 
-    Raises TypeError for wrong types, ArithmeticError for a score that is not finite, and ValueError for a chance
-    outside 0 to 1, or if `Observed.lack`, the reason why nothing could be observed, has several lines.
+    `report` may also be a single observable. Raises TypeError for wrong types, ArithmeticError for a score that is not
+    finite, and ValueError for a chance outside 0 to 1, or if `Observed.lack`, the reason why nothing could be observed,
+    has several lines.
     """
     if isinstance(report, Observable):
         report = Observed(name, (report,))

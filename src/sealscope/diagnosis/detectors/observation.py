@@ -53,7 +53,10 @@ def limit_threads() -> AbstractContextManager[object]:
 
 @lru_cache(maxsize=1)
 def _thread_pools(n_modules: int) -> Any:
-    """Find the thread pools of the loaded linear-algebra libraries, again if `n_modules`, the imported ones, change."""
+    """Find the thread pools of the loaded linear-algebra libraries.
+
+    The result is cached until `n_modules`, the number of imported modules, changes, as a new one may load a library.
+    """
     from threadpoolctl import ThreadpoolController
 
     return ThreadpoolController()
@@ -62,7 +65,8 @@ def _thread_pools(n_modules: int) -> Any:
 def observe_rivals(recording: Recording, baseline: Sequence[Healthy], distrust: str | None = None) -> Observed:
     """Test a recording for changes of duty, noise, mains hum and mean pressures, which may be mistaken for a leak.
 
-    They are tested within it and against `baseline`. A reason for `distrust` of the pressures is reported instead.
+    Changes within the recording, and against `baseline`, are tested. A reason to `distrust` the pressures is reported
+    instead.
     """
     if distrust:
         return Observed(SIGNALS, lack=distrust)
@@ -95,8 +99,8 @@ def run_detector(
 def _observe(detector: Detector, recording: Recording, baseline: Sequence[Healthy], distrust: str | None) -> Observed:
     """Run a detector on a recording, compared with the baseline recordings that the detector can use.
 
-    The report is empty and states the reason if there is one not to trust the pressures (`distrust`), or if the
-    detector cannot use the recording or any of the given baseline recordings. Without a baseline, the reason may also
+    The report is empty and states the reason if the pressures cannot be trusted (`distrust`), if the detector cannot
+    use the recording, or if it can use none of the given baseline recordings. Without a baseline, the reason may also
     be a pressure that does not move for some time, except for the volume balance, which needs no motion.
     """
     lack = unusable_reason(detector, recording) or distrust

@@ -46,7 +46,7 @@ class PlugIn:
 
     @property
     def fingerprint(self) -> str:
-        """First 16 digits of the SHA-256 of the source file, to tell versions apart; "unknown" if it cannot be read."""
+        """First 16 digits of the SHA-256 of the file that defines `make`, to tell versions apart; else "unknown"."""
         source = getattr(sys.modules.get(getattr(self.make, "__module__", "")), "__file__", None)
         try:
             return sha256(Path(source).read_bytes()).hexdigest()[:16] if source else "unknown"

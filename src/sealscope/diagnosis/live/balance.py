@@ -312,7 +312,8 @@ class LiveBalance:
     def observables(self, since: float, end: float, onset: float) -> tuple[Observable, ...] | None:
         """Test terms of the volume balance and signals of the last blocks, from `since` to `end` [s], for changes.
 
-        The result is None if the stored blocks do not reach from `onset` to `end`, and empty if there are too few.
+        The result is None if the stored blocks do not reach from the onset of the leakage's increase, `onset` [s], to
+        `end`, and empty if there are too few.
         """
         stored = self._stored
         if stored is None:
@@ -378,7 +379,7 @@ def size_error(rig: Rig) -> float:
 def live_equations(rig: Rig, names: Sequence[str], with_tested_terms: bool = False) -> list[Equation]:
     """Build the volume balances of a running machine that the channels `names` allow.
 
-    Balances whose flow is computed from the command are left out, and the term of the pump's leakage, which cannot be
+    Balances whose flow is computed from the command are left out. So is the term of the pump's leakage, which cannot be
     distinguished from the piston's. `with_tested_terms` includes terms that are only tested for a change, not fitted.
     """
     balances = []

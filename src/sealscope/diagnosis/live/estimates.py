@@ -164,13 +164,13 @@ def find_level_rise(
 ) -> LiveRise | None:
     """Test whether a mean conductance exceeds that of the healthy machine, and estimate by how much.
 
-    `g` and `deviation` are the mean conductance and its standard error [m^3/(s Pa)], and `onset` is that to state in
-    the result. Two tests must both be significant at the false-alarm `probability`:
+    `g` and `deviation` are the mean conductance and its standard error [m^3/(s Pa)], and `onset` is the time of the
+    rise, which the result repeats. Two tests must both be significant at the false-alarm `probability`:
 
     - g against the lowest healthy mean, increased for the warmest oil (normal distribution),
     - g against the average of the healthy means, given their scatter (Student's t with Welch's degrees of freedom).
 
-    The result is None if one is not, or if there are fewer than two healthy means.
+    The result is None if one of them is not, or if there are fewer than two healthy means.
     """
     from scipy.special import ndtr, ndtri
 
@@ -208,7 +208,7 @@ def level_before_leak(leak: WatchedLeak, t: float) -> HealthyLevel:
 def mean_flow(flows: Array, errors: Array) -> Flow:
     """Average the flows of n blocks (n,) [L/min] with standard `errors` (n,); return the mean and its standard error.
 
-    The latter is sqrt(sum(errors^2)/n^2 + s^2/n) with the standard deviation s, 0 for a single block.
+    The latter is sqrt(sum(errors^2)/n^2 + s^2/n) with the standard deviation s of the flows, 0 for a single block.
     """
     count = len(flows)
     scatter = float(flows.std(ddof=1)) / math.sqrt(count) if count > 1 else 0.0
@@ -216,10 +216,10 @@ def mean_flow(flows: Array, errors: Array) -> Flow:
 
 
 def is_known_duty(duty: Duty, low: Duty, high: Duty) -> bool:
-    """Test whether the pressure difference and the pump flow of a block are in a known range, extended by a margin.
+    """Test whether the duty of a block is in the range from `low` to `high`, extended by a margin.
 
-    A duty is the logarithms of the mean |p_A - p_B| [Pa] and of the mean pump flow [m^3/s]. The margin towards low
-    pressures is larger, because a leak lowers the pressure difference.
+    A duty consists of the logarithms of the mean |p_A - p_B| [Pa] and of the mean pump flow [m^3/s]. The margin towards
+    low pressures is larger, because a leak lowers the pressure difference.
     """
     margin = LIVE.watch.margin
     min_pressure, min_flow = low
@@ -247,7 +247,7 @@ class BaselineLearning:
     high: float | None = None
 
     def add(self, g: float, flow: float, duty: Duty) -> None:
-        """Add a block: its conductance `g`, factor to a flow (`BlockConductance.lpm`) and duty."""
+        """Add a block: its conductance `g` [m^3/(s Pa)], `flow` at a conductance of 1 [L/min] and `duty`."""
         self.blocks += 1
         self.total += g
         self.flow += flow
@@ -269,9 +269,10 @@ class BaselineLearning:
             self.squares += difference * (mean - self.mean)
 
     def freeze(self, version: int, end: float, hours: float, *, states_lpm: bool) -> WatchBaseline:
-        """Compute the baseline from at least `GROUP` blocks; it states `version`, the last `end` [s] and `hours`.
+        """Compute the baseline from the sums over at least `GROUP` blocks.
 
-        With `states_lpm`, it also states its level as a flow [L/min].
+        It states its `version`, the `end` of its last block [s], the operating time `hours` of learning and, with
+        `states_lpm`, its level as a flow [L/min].
         """
         assert self.duty_low and self.duty_high and self.low is not None and self.high is not None
         level = self.total / self.blocks

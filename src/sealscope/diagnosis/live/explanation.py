@@ -44,7 +44,7 @@ def explain_rise(observables: Sequence[Observable], data: str, onset: Interval, 
     """Find the cause of an increase of the leakage among the changes observed in the blocks around it.
 
     `observables` are results of tests for changes, and `onset` is the interval in which the increase began [s]. Changes
-    of the kind `data` from which the leakage is estimated ("volumes" or "response") count only if they began in it.
+    of the kind `data` from which the leakage is estimated ("volumes" or "response") count only if they began then.
     `is_settled` is True if enough blocks have followed to distinguish a leak to the outside from a sensor fault; until
     then, only a leak past piston or pump counts as a leak.
 

@@ -67,7 +67,7 @@ class SampleJoiner:
     """Divide the samples of an actuator into runs without a gap."""
 
     ways: tuple[tuple[str, ...], ...]  # sets of channels from which the actuator can be watched (`ways_to_watch`)
-    late_s: float = 60.0  # greatest age of a dropped late or repeated sample [s]; an older one: the clock was set back
+    late_s: float = 60.0  # greatest age of a late or repeated sample [s]; an older one means a clock set back
     is_final: bool = False  # True if the set of channels must not be replaced any more
     names: tuple[str, ...] = ()  # set of channels in use, empty before the first samples
     rate: float = 0.0  # sampling rate [Hz]
@@ -108,7 +108,10 @@ class SampleJoiner:
             self.changed = False
 
     def _choose_names(self, samples: Recording) -> tuple[str, ...]:
-        """Choose the first of `ways` that is recorded, or (); only one with x replaces it, and not if `is_final`."""
+        """Choose the channels by which to watch: the first of `ways` that is recorded, or () if none is.
+
+        Channels in use are replaced only by a set that adds the position x, and not if `is_final`.
+        """
         recorded = next((way for way in self.ways if samples.channels.keys() >= {*way}), ())
         has_new_position = "x" in recorded and "x" not in self.names and not self.is_final
         return recorded if not self.names or has_new_position else self.names

@@ -213,7 +213,8 @@ class PressureEstimator:
     def observables(self, since: float, end: float, onset: float) -> tuple[Observable, ...] | None:
         """Test the model's parameters and the signals of the last blocks, from `since` to `end` [s], for changes.
 
-        The result is None if the stored blocks do not reach from `onset` to `end`, and empty if there are too few.
+        The result is None if the stored blocks do not reach from the onset of the leakage's increase, `onset` [s], to
+        `end`, and empty if there are too few.
         """
         rows, seconds = self._rows, self.block_seconds
         # no blocks, a last block that is not the one at `end`, or a first block that begins after the onset
@@ -235,7 +236,7 @@ class PressureEstimator:
         return (*response, *self._signals.observables(since))
 
     def relearn(self, since: float = math.inf) -> None:
-        """Make the learned parameters uncertain again, e.g. after a repair; only `LiveBalance` uses `since`."""
+        """Make the learned parameters uncertain again, e.g. after a repair; `since`, for `LiveBalance`, is ignored."""
         if self._follower is not None:
             self._follower.interrupt(math.inf)
 

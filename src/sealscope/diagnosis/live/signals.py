@@ -65,7 +65,10 @@ class SignalWindow:
 
     @np.errstate(all="ignore")
     def take(self, begin: float, channels: Mapping[str, Array], rate: float) -> None:
-        """Store the features of the block of `channels` that begins at `begin` [s], unless samples are missing."""
+        """Store the features of a block, unless samples are missing.
+
+        `channels` are its samples by name, which begin at the time `begin` [s], and `rate` is the sampling rate [Hz].
+        """
         if not all(np.isfinite(values).all() for values in channels.values()):
             return
         if not self._means.size:
@@ -85,7 +88,10 @@ class SignalWindow:
 
     @np.errstate(all="ignore")
     def observables(self, since: float) -> tuple[Observable, ...]:
-        """Test each feature for a step in the blocks that begin at `since` [s] or later, if these are `MIN_BLOCKS`."""
+        """Test each feature for a step in the blocks that begin at `since` [s] or later.
+
+        The result is empty for fewer than `MIN_BLOCKS` blocks.
+        """
         rows = self._rows[self._rows[:, _BEGIN] >= since] if self._rows.size else self._rows
         if len(rows) < MIN_BLOCKS:
             return ()

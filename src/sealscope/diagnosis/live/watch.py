@@ -70,7 +70,7 @@ class Watch:
     rig, false_alarms_per_1000_h, learn_hours : Rig, float, float
         Arguments of `watch`.
     litres : mapping of str to bool, optional
-        Whether L/min can be stated by each way of watching, "volumes" and "pressures"; by default by the rig.
+        Whether L/min can be stated, for each way of watching, "volumes" and "pressures"; by default found from the rig.
     healthy : HealthyLevel, optional
         Argument of `watch`.
 
@@ -142,7 +142,7 @@ class Watch:
 
     @property
     def learned_with(self) -> tuple[Rig, Mapping[str, bool], float]:
-        """Rig, whether L/min are stated (for each method), and time to learn [h], as the baseline is learned with."""
+        """Settings with which the baseline is learned: rig, whether each method states L/min, and time to learn [h]."""
         return self._rig, self._litres, self.learn_hours
 
     @property
@@ -254,7 +254,7 @@ class Watch:
         return LiveBalance(self._rig, self._samples.names, litres)
 
     def continue_from(self, blocks: int, baseline_version: int) -> None:
-        """Continue the numbers of blocks and baselines of an earlier watch of the machine, which had other settings."""
+        """Continue to count from the `blocks` and the `baseline_version` of an earlier watch with other settings."""
         self.blocks, self.baseline_version = blocks, baseline_version + 1
 
     def relearn(self) -> None:
@@ -278,7 +278,8 @@ class Watch:
     def judge(self, result: BlockResult) -> BlockEstimate:
         """Test the conductances of a block for a leak, and return the estimate of the block.
 
-        Of the blocks to which the volume balance is first fitted, which are one result, it is that of the last one.
+        The first blocks, to which the volume balance is fitted together, come as a single result; the estimate is then
+        that of the last of them.
         """
         self.blocks += 1
         if isinstance(result, NotJudged):
@@ -376,9 +377,9 @@ class Watch:
     def _explain(self, estimator: Estimator, rise: LiveRise, block: BlockConductance) -> RiseExplanation:
         """Find the cause of the increase `rise` of the conductance, from changes of other quantities up to `block`.
 
-        The cause is unknown if too few blocks have followed the onset, or if the machine started shortly before it;
-        then the tests restart. It is a leak if the blocks around the onset are no longer stored, else that of
-        `explain_rise`. Once enough blocks have followed, tests and `estimator` restart for another event than a leak.
+        The cause is unknown if too few blocks have followed the onset, or if the machine had started shortly before; in
+        the latter case the tests restart. It is a leak if the blocks around the onset are no longer stored, else that
+        of `explain_rise`. If that is not a leak and enough blocks have followed, tests and `estimator` restart.
         """
         n_since = int(np.count_nonzero(self._compared["end"] > rise.interval.high))  # blocks since the onset
         if n_since < _EXPLANATION.shows:
@@ -446,9 +447,9 @@ class Watch:
     ) -> None:
         """Set the leak alarm, `self.leak`, from a significant increase `rise` of the conductance up to `block`.
 
-        `reason` is the text of the alarm. `before` is the conductance before the onset, by default the mean of up to
-        `GROUP` blocks; `cause` is by default the estimator's. An earlier alarm keeps its time and its conductance
-        before the onset.
+        `reason` is the text of the alarm, and `threshold` that of the test. `before` is the conductance before the
+        onset, by default the mean of up to `GROUP` blocks; `cause` is by default the estimator's. An earlier alarm
+        keeps its time and its conductance before the onset.
         """
         raised_s = block.end
         if self.leak is not None:

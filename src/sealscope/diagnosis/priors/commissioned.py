@@ -7,7 +7,7 @@ class SmallestLeakPriors(PriorTable):
     """Definition of the smallest detectable leak of a machine."""
 
     power: float  # probability with which the next recording shows this leak
-    repeats: tuple[int, ...]  # tried factors of more healthy recordings, to find how many would halve this leak
+    repeats: tuple[int, ...]  # factors on the number of healthy recordings, tried to find the one that halves this leak
 
 
 class CommissionedPriors(PriorTable):

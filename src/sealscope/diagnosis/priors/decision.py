@@ -26,7 +26,7 @@ class NullPriors(PriorTable):
 class QuestionPriors(PriorTable):
     """Division of the false-alarm probability of a diagnosis among its tests."""
 
-    # fraction for the test for a change within the recording; without healthy ones, for the rig's limit
+    # fraction for the test within the recording; without healthy recordings, for that by the limit in the rig's file
     within: float
 
 

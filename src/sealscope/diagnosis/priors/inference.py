@@ -140,7 +140,7 @@ class HeldOilPriors(PriorTable):
     # relative compression per pressure, and the standard deviation of its logarithm
     compressibility: float
     deviation: float
-    # dead volume over the recorded stroke's volume, the smallest one, and its relative standard deviation
+    # dead volume over the recorded stroke's volume: usual value, smallest value, relative standard deviation
     dead: float
     least_dead: float
     dead_deviation: float

@@ -42,7 +42,7 @@ class StepPriors(PriorTable):
     memory: float  # factor per block by which earlier blocks lose weight in the estimates of noise and random walk
     recent: int  # [blocks] age up to which all possible onsets are kept; of older ones only some are
     horizon: int  # [blocks] largest age of an onset
-    stated: float  # [blocks] the variance that an estimate states weighs as much as that observed in so many blocks
+    stated: float  # [blocks] number whose observed variance weighs as much as the variance that an estimate states
 
 
 class WatchPriors(PriorTable):

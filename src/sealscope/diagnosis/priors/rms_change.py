@@ -4,19 +4,19 @@ from sealscope.storage.toml_file import PriorTable, read_priors
 
 
 class WalkPriors(PriorTable):
-    """Random walk of the logarithm of the RMS over time [s], with scales stated as 1 in 90 s."""
+    """Random walk of the logarithm of the RMS, with the scale of its change in 90 s (unit "1 in 90 s")."""
 
     # half-Cauchy scales of its change in `time`: of the machine, of noise, of a duty that does not repeat
     machine: float
     noise: float
     duty: float
     tried: int  # number of rates of the walk between recordings that are tried
-    time: float  # time for which the scales are stated
+    time: float  # [s] time for which the scales are stated
     least: float  # smallest fraction of a wavelet detail's energy that is due to the machine
 
 
 class DutyExponents(PriorTable):
-    """Prior standard deviations of exponents of power laws for the RMS of a wavelet detail over motion and load."""
+    """Prior standard deviations of the exponents with which the RMS of a wavelet detail grows with motion and load."""
 
     command: float  # RMS of the command
     rate: float  # RMS of the command's rate of change

@@ -4,7 +4,7 @@ from sealscope.storage.toml_file import PriorTable, read_priors
 
 
 class LevelDeviation(PriorTable):
-    """Scatter between recordings of one machine of its leakage level, a conductance or the log RMS of details."""
+    """Scatter of a machine's leakage level (conductance or log RMS of wavelet details) between its recordings."""
 
     volume_balance: float  # standard deviation over the usual level, for the volume balance
     ringing: float  # standard deviation of the logarithm of the RMS of the pressures' wavelet details (their ringing)
@@ -18,13 +18,13 @@ class LevelError(PriorTable):
     """Errors of the leakage level (conductance or log RMS of wavelet details) of a single recording."""
 
     ringing: float  # standard error of the logarithm of the RMS of the pressures' wavelet details (their ringing)
-    scale: float  # largest difference of displacement over area between compared recordings
+    scale: float  # largest relative difference of displacement over area between compared recordings
 
 
 class ChangeScales(PriorTable):
     """Scales of the half-normal priors on a change of the leakage level.
 
-    A step is stated in deviations between recordings, the time of a growth in intervals between recordings.
+    A step is stated in standard deviations between recordings, the time of a growth in intervals between recordings.
     """
 
     steps: tuple[float, ...]  # sizes of a step of the leakage level
@@ -33,9 +33,9 @@ class ChangeScales(PriorTable):
 
 
 class HistoryPriors(PriorTable):
-    """Limits of a machine's history, for an outlier in deviations between recordings."""
+    """Limits of the distance of a recording, in standard deviations between recordings, and of predictions."""
 
-    outlier: float  # distance beyond which a single recording is an outlier
+    outlier: float  # distance of the level from those before, beyond which the recording is an outlier
     furthest: float  # [d] longest time that is predicted
 
 

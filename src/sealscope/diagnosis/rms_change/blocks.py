@@ -63,9 +63,9 @@ class RmsBlocks:
         return float(np.diff(self.edges).min()) if len(self.log_rms) else 0.0
 
     def without_start(self) -> RmsBlocks:
-        """Return the blocks after the start, in which pressures and speed settle.
+        """Return a copy without the first blocks, in which pressures and speed settle.
 
-        It lasts 10 s or three cycles, whichever is longer, but at most an eighth of the blocks.
+        These span 10 s or three cycles, whichever is longer, but are at most an eighth of the blocks.
         """
         n_blocks, prior = len(self.log_rms), RMS_PRIORS.blocks
         start_s = max(prior.settling, prior.settling_cycles * (self.cycle or 0.0))
@@ -99,7 +99,8 @@ def _measure_blocks(recording: Recording, transformed: list[Details], bounds: In
     """Compute the log RMS of wavelet details (n, 5 per chamber) and features of the duty (n, 4) of n blocks.
 
     Both are described for `RmsBlocks`. `transformed` holds the wavelet details of each chamber, and `bounds` (n + 1,)
-    the sample indices of the blocks' ends. The pressure of a single chamber, minus its mean, replaces the difference.
+    the sample indices of the blocks' ends. The load is p_A - p_B or, if only one chamber is recorded, its pressure
+    minus the mean.
     """
     chambers = chambers_of(recording)
     if len(chambers) == len(CHAMBERS):
@@ -155,8 +156,8 @@ def _block_bounds(inside: slice, rate: float, cycle: float | None) -> tuple[IntA
 
     `inside` are the samples at which the wavelet details do not depend on padding, `rate` is the sampling rate [Hz],
     and `cycle` the period of the command [s], or None. A block is the fraction 1, 1/2, 1/3, ... of the cycle that is
-    closest to the shortest allowed length, several cycles if they are shorter than this, and of this length without a
-    cycle. If there would be too many blocks, they become longer and span whole cycles.
+    closest to the shortest allowed length, or several cycles if a cycle is shorter than that. Without a cycle, it has
+    the shortest allowed length. If there would be too many blocks, they become longer and span whole cycles.
     """
     prior, n_samples = RMS_PRIORS.blocks, inside.stop - inside.start
     block_s = min_block_s = max(prior.seconds, prior.samples / rate)

@@ -95,7 +95,8 @@ def observe_within(blocks: RmsBlocks, rate: float, unused: tuple[str, ...] = ())
 
     The more significant of a step up and a step down is reported for each detail. Their common onset is estimated from
     the sum of the log likelihoods of the judged details (d2 to d4) whose step has a p-value below 0.5. `rate` is the
-    sampling rate [Hz], and `unused` are columns of no channel. Without enough information, it reports only that.
+    sampling rate [Hz], and `unused` are columns of the log that are no channel. If most blocks say nothing about a
+    detail, the report only says so.
     """
     changes = dict[str, tuple[StepTest, float]]()  # by detail: the more significant test, and the change of the log RMS
     judged_steps, bounds = list[StepTest](), list[float]()
@@ -131,7 +132,8 @@ def observe_within(blocks: RmsBlocks, rate: float, unused: tuple[str, ...] = ())
 def observe_against(recording: Recording, baseline: Sequence[Healthy]) -> Observed:
     """Test the RMS of a recording's wavelet details for changes against leak-free recordings.
 
-    Only those of `baseline` with the same chamber pressures and sampling rate are used. Without any, it says so.
+    Only recordings in `baseline` with the same chamber pressures and sampling rate are used. If there are none, the
+    report only says so.
     """
     chambers, recorded = judged_chambers(recording), list(chambers_of(recording))
     # the duty is computed from all recorded chambers, which must therefore be the same
@@ -189,7 +191,7 @@ def _make_observable(
     """Make the observable for the change of one wavelet detail, named by its `column`, such as "d3 of p_A".
 
     `size` is the change of the log RMS, `score` twice its log likelihood ratio, and `onset` its time [s], None for a
-    comparison. The p-value `chance` is multiplied by the number of tests: of each judged detail, for rise and fall.
+    comparison. The p-value `chance` is multiplied by the number of tests: for rise and fall of each judged detail.
     """
     return Observable(
         name=f"{'rise' if size > 0.0 else 'fall'} of {column}",
@@ -202,6 +204,6 @@ def _make_observable(
 
 
 def _summary_levels(summary: Summary, chambers: Sequence[str]) -> Array:
-    """Select the log RMS of the chambers' wavelet details, five for one after the other, from a recording's summary."""
+    """Select the log RMS of the wavelet details (5 per chamber,) of the given chambers from a recording's summary."""
     levels = np.asarray(summary["levels"], dtype=float).reshape(len(summary["chambers"]), -1)
     return np.concatenate([levels[summary["chambers"].index(chamber)] for chamber in chambers])

@@ -267,7 +267,10 @@ def build_timeline(
 
 
 def _sort_by_time(readings: Sequence[LeakReading], every: float | None) -> list[LeakReading]:
-    """Sort readings by time, dated by `every` [s] as in `build_timeline`; raise InputError if a time is unknown."""
+    """Sort readings by time; raise InputError if a time is unknown.
+
+    With `every`, the time between readings [s], they are dated in the order of their file names.
+    """
     ordered = sorted(readings, key=lambda reading: numeric_sort_key(reading.file))
     if every is not None:
         ordered = [replace(reading, start=k * every) for k, reading in enumerate(ordered)]

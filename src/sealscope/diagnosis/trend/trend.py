@@ -129,7 +129,7 @@ class Trend:
 
     @property
     def leak(self) -> Interval | None:
-        """Increase of the flow past pump and piston over the healthy machine, with interval; None if not stated."""
+        """Increase of the flow past pump and piston over that of the healthy machine; None if it is not stated."""
         value, interval = self.decision.leak_lpm, self.decision.leak_interval_lpm
         if value is not None and interval is not None:
             return Interval(value, *interval)
@@ -321,9 +321,10 @@ def trend(
 
 
 def _add_episodes(trend: Trend) -> Trend:
-    """Complete a trend of one or more comparable recordings by leakages, episodes between repairs, and the decision.
+    """Add to a trend the leakage in each comparable recording, the episodes between repairs, and the decision.
 
-    Of very many recordings, averages of neighbours are compared; `rows` are then the recordings nearest to these.
+    If there are very many recordings, averages of neighbours are compared instead, and `rows` become the recordings
+    nearest to these averages.
     """
     levels, trend_units_per_level = _convert_levels(trend)
     points, findings = _add_values(trend, levels)
@@ -345,9 +346,9 @@ def _add_episodes(trend: Trend) -> Trend:
 
 
 def _add_values(trend: Trend, levels: Levels) -> tuple[tuple[TrendPoint, ...], tuple[Finding, ...]]:
-    """Return a trend's points with the converted `levels` of the compared ones, and its findings with any outliers."""
+    """Return a trend's points, with values from the `levels` of the compared ones, and its findings, with outliers."""
     points, findings = [*trend.points], [*trend.findings]
-    _, excess = outlier_excess(levels)  # beyond the limit of outliers, judged in the whole series
+    _, excess = outlier_excess(levels)  # part of each level beyond the limit of outliers
     outliers = np.flatnonzero(excess)
     remark = "apart from the recordings before and after: it counts as if it were near"
     for k, row in enumerate(trend.rows):
@@ -362,7 +363,7 @@ def _add_values(trend: Trend, levels: Levels) -> tuple[tuple[TrendPoint, ...], t
 
 
 def _count_healthy(trend: Trend) -> int:
-    """Count the compared recordings among the first `trend.healthy`, at least 1; copies count as one recording."""
+    """Count how many of the first `trend.healthy` different recordings are compared; return at least 1."""
     digests = dict.fromkeys(point.digest for point in trend.points)  # in the order of time, copies once
     healthy_digests = list(digests)[: trend.healthy]
     return max(1, sum(trend.points[row].digest in healthy_digests for row in trend.rows))

@@ -91,8 +91,9 @@ def decide_trend(
 
     `points` are in the order of time, and `episode` is the period with its test. `trend_units_per_level` is the factor
     from `LeakReading.level` to the unit of the trend, `pressure` the pressure difference at which L/min are stated
-    [Pa], None for the unit %, and `interval` the median time between two recordings [days]. Over the mean time `years`
-    between false alarms, it is the allowed probability of a false alarm. Fewer than three recordings cannot tell.
+    [Pa], None for the unit %, and `interval` the median time between two recordings [days]. The allowed probability of
+    a false alarm is `interval` divided by `years`, the mean time between false alarms. With fewer than three recordings
+    the verdict is `cannot tell`.
     """
     wear = episode.wear
     # `interval` over the mean time until a healthy machine scores as high, exp(log_days); > 0 even if that underflows
@@ -125,7 +126,7 @@ def _measure_leak(
     # the flow at `pressure` is the level times `pressure` for a laminar leak, k = 1; other laws have a further factor
     flow_factors = pressure_ratio ** (1.0 - np.array(EXPONENTS))
     leak_sd = (wear.leak.high - wear.leak.low) / (2.0 * WITHIN_95)
-    # converted as a leak: a flow over the pressure is a level
+    # mean flow of the pump in the trend's unit, converted like a level, which is a flow over a pressure
     pump_flow = float(np.median([point.pump / point.pressure for point in points])) * trend_units_per_level
     pump_flow = pump_flow if np.isfinite(pump_flow) else 0.0
     size_deviation = max(point.size_error for point in points)
@@ -196,8 +197,9 @@ def _split_at_onset(points: Sequence[TrendPoint], wear: Wear) -> tuple[list[Tren
 def _rival_changes(points: Sequence[TrendPoint], wear: Wear) -> tuple[Observable, ...]:
     """Test the other terms of the volume balance for a change at the onset of the leak, which may explain the increase.
 
-    The recordings since the onset are compared with those before, if their balance has the terms of the last one's. The
-    result is empty if there are none before the onset, or if the last recording has no or several balances.
+    The recordings since the onset are compared with those before. Only recordings whose balance has the same terms as
+    that of the last one are used. The result is empty if none of these is from before the onset, or if the last
+    recording has no balance or several.
     """
     names = [roles.names for roles in points[-1].terms]  # names of the terms of each balance
     sums_before, sums_since = (

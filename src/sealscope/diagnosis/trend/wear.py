@@ -108,7 +108,7 @@ class Levels:
     def average_neighbours(self, max_count: int = 240) -> Levels:
         """Average levels of successive recordings of a group, so that about `max_count` levels remain, to save time.
 
-        The standard error of an average is sqrt(sum of error^2) / number. Few levels are returned unchanged.
+        The standard error of an average is sqrt(sum of error^2) / number. Up to `max_count` levels are not averaged.
         """
         size = math.ceil(len(self) / max_count)
         if size <= 1:
@@ -362,7 +362,10 @@ class _Draws(NamedTuple):
         return cls(tau, change, amplitude, level - slope * amplitude + error)
 
     def last_rises(self, changes: _Changes) -> Array:
-        """Compute the rise (d,) of the last recording's level over the mean before it, for draws from `changes`."""
+        """Compute for each draw the rise (d,) of the last recording's level over the mean before the change.
+
+        `changes` are the hypotheses from which the draws were made.
+        """
         return np.asarray(self.amplitude * changes.profiles[-1, changes.profile_index[self.change]])
 
 
@@ -376,7 +379,8 @@ class Wear(NamedTuple):
     total : Interval
         Present level, without the scatter of the last recording.
     leak, bound, growth : Interval, float, Interval
-        Rise of the level since the change, or that the levels allow; its 95 % upper bound; rise per month.
+        Rise of the level since the change or, if the test found none, the rise that the levels allow; its 95 % upper
+        bound; rise per month.
     step : Interval or None
         Size of the step; None if a growth is more probable or nothing changed.
     onset : Interval or None
@@ -413,8 +417,8 @@ def estimate_wear(levels: Levels, allowed_rise: float | None, change_begin: int 
 
     `allowed_rise` is the rise above the healthy level at which a repair is due, None if there is no limit.
     `change_begin` is the index of the first recording after the change that the test has found. If it is None, an even
-    growth or decrease over all recordings is estimated, with a wide prior. Over less than a day, growth and time are
-    NaN.
+    growth or decrease over all recordings is estimated, with a wide prior. If the recordings span less than a day,
+    growth and time are NaN.
     """
     is_changed = change_begin is not None
     is_long = levels.t[-1] - levels.t[0] >= 1.0  # [days]
@@ -477,7 +481,7 @@ class Episode(NamedTuple):
 
     begin: int  # first of the compared recordings in the period
     end: int  # index after the last one
-    alarm: int | None  # index at which the test raised an alarm
+    alarm: int | None  # index at which the test raised an alarm, None if it did not
     log_days: float  # logarithm of the largest mean time to a false alarm [days] with which the test raises an alarm
     wear: Wear  # state after the last recording
     fell: bool  # True if the period began with a repair, i.e. a fall of the level
@@ -488,7 +492,7 @@ def find_episodes(
 ) -> list[Episode]:
     """Divide a series of recordings at repairs, and test and estimate the leakage in each period between them.
 
-    `years` is the smallest mean time between false alarms. The first `n_healthy` recordings are known to be healthy.
+    `years` is the mean time to a false alarm. The first `n_healthy` recordings are known to be healthy.
     `allowed_rise` is the rise at which a repair is due, None if there is no limit. After a repair, a fall of the level
     (`_find_repair`), the level is estimated anew, with the scatter before the repair as prior.
     """

@@ -181,7 +181,7 @@ class Diagnosis(Evidence):
 
     @property
     def named_cause(self) -> str | None:
-        """Cause that the verdict names, or None: one of `LEAKS` with `leak`, any other cause with other verdicts."""
+        """The `cause` if it fits the verdict: one of `LEAKS` fits `leak`, any other the other verdicts. Else None."""
         return self.cause if (self.verdict == LEAK) == (self.cause in LEAKS) else None
 
     @property
@@ -223,7 +223,7 @@ class Diagnosis(Evidence):
 
     @property
     def rises_within(self) -> bool:
-        """True if fewer than 1 in 20 healthy recordings seem to rise as much within, and no onset is stated."""
+        """True if the leakage seems to rise within the recording (p-value below 0.05), but no onset is stated."""
         step_test = self._find_test(WITHIN)
         return self.onset_s is None and step_test is not None and not _is_usual(step_test)
 
@@ -233,7 +233,7 @@ class Diagnosis(Evidence):
         return next((test for test in tests if test.detector == name), None)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the diagnosis as plain values for JSON, in the order of the output contract; None if not finite."""
+        """Return the diagnosis as plain values for JSON, in the order of the output contract; None for nan or inf."""
         ratio, ratio_interval = self.measured_ratio or (None, None)
         total = None if self.total_leakage is None else dict(vars(self.total_leakage))
         if total is not None:
@@ -268,7 +268,10 @@ class Diagnosis(Evidence):
         )
 
     def to_frame(self) -> pandas.DataFrame:
-        """Return a table of one row for `pandas.concat`, two columns for an interval; MissingExtra without pandas."""
+        """Return the diagnosis as a table of one row, for `pandas.concat`, with two columns for each interval.
+
+        Raises MissingExtra if pandas is not installed.
+        """
         try:
             import pandas
         except ImportError:

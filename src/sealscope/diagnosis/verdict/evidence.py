@@ -86,7 +86,7 @@ class TotalLeakage:
 
     @property
     def healthy(self) -> bool:
-        """True if the 95 % interval is known to be at most the largest flow of a healthy machine."""
+        """True if the 95 % interval of the flow ends at `healthy_lpm` or below; False if one of them is unknown."""
         is_known = self.healthy_lpm is not None and self.interval_lpm is not None
         return is_known and self.interval_lpm[1] <= self.healthy_lpm  # type: ignore[index,operator]
 

@@ -115,8 +115,8 @@ def measures_flow(units: Mapping[str, str]) -> bool:
 def healthy_leakage(rig: Rig) -> float:
     """Return the largest leakage conductance of a healthy pump [m^3/(s Pa)] by the rig (`pump.G_healthy`).
 
-    An assumed one is used if the same file states the displacement; else it may belong to another pump, such as that of
-    the default rig, and the result is 0.
+    A value marked as an assumption is used only if the same file states the displacement. Otherwise it may belong to
+    another pump, such as that of the default rig, and the result is 0.
     """
     is_from_same_file = rig.entry("pump.G_healthy").place == rig.entry("pump.q_b").place
     is_of_this_pump = states_rig(rig) and rig.states("pump.q_b") and is_from_same_file

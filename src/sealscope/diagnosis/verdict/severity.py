@@ -46,7 +46,10 @@ class RepairLimit:
 
     @classmethod
     def parse(cls, text: str | None) -> RepairLimit:
-        """Parse a repair limit such as "5 mL/min" or "8 mm/min", by default that of `priors.toml`; else InputError."""
+        """Parse a repair limit such as "5 mL/min" or "8 mm/min"; None gives the default of `priors.toml`.
+
+        Raises InputError for a text that is no flow or speed above 0 with a unit.
+        """
         if text is None:
             return cls(VERDICT.repair.creep * MM_PER_MINUTE, "creep", stated=False)
         without_exponent = _EXPONENT.sub("", text) if isinstance(text, str) else ""  # its e is no unit
@@ -117,7 +120,7 @@ class Severity:
         return "monitor" if high < VERDICT.repair.watch else "plan"
 
     def as_dict(self) -> dict[str, Any]:
-        """Return `level`, figures and their intervals (`creep_mm_per_min_interval`) for JSON; None if not known."""
+        """Return level, figures and their intervals (such as `of_limit_interval`) for JSON; unknown ones are None."""
         plain: dict[str, Any] = {"level": self.level}
         for name in ("mL_per_min", "pump_share", "creep_mm_per_min", "of_limit"):
             figure = getattr(self, name)
