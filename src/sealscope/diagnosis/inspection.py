@@ -101,8 +101,8 @@ def select_comparable(judged: Inspection, baseline: Sequence[Healthy]) -> Baseli
     """Inspect the baselines of a judged recording and choose those that can be compared with it.
 
     A baseline is left out if it cannot be trusted, if it lacks a chamber pressure of the judged recording or has it in
-    another unit, or if it has the samples of the judged recording, or of a baseline with at least as many channels.
-    Differences of speed, load and temperature are accepted, as the detectors allow for them.
+    another unit, or if its samples are those of the judged recording. Of baselines with the same samples, the one with
+    the most channels is kept. Differences of speed, load and temperature are accepted, as the detectors allow for them.
     """
     healthy = [entry if isinstance(entry, SummarisedRecording) else inspect_recording(entry) for entry in baseline]
     index_of_digest: dict[str, int] = {}  # index of each comparable recording, by its digest

@@ -18,9 +18,10 @@ _COPY_TOLERANCE = 1e-6
 def find_implausibility(recording: Recording) -> str | None:
     """Find a reason, in words, why the channels cannot come from one hydraulic machine; None if there is none.
 
-    p_B may be a copy of p_A; the motor speed may differ from the rate of the motor angle by a constant factor; p_A -
-    p_B, or the only chamber pressure that varies, may be nothing but noise. Unit, offset and range of the pressures do
-    not matter. Constant and absent channels are ignored, as one chamber may rest at the charge pressure.
+    They cannot if p_B is a copy of p_A, if the motor speed differs from the rate of the motor angle by a constant
+    factor, or if p_A - p_B (or the only chamber pressure that varies) is nothing but noise. Unit, offset and range of
+    the pressures do not matter. Constant and absent channels are ignored, as one chamber may rest at the charge
+    pressure.
     """
     # the third difference of `_is_noise` needs four samples
     names = [name for name in chambers_of(recording) if len(recording) > 3 and not is_constant(recording[name])]

@@ -61,8 +61,8 @@ class Condition:
 def experiment_values(condition: Condition) -> dict[str, str | float]:
     """Return the rig's parameters in a test of Appendix C by name, as `Experiment.of` takes them in `set`.
 
-    For open throttles `line.orifices` is not set, so that the rig's value holds: absent in the thesis's model (section
-    4.2.1), present in a rig that includes the open valves.
+    Each line has an orifice that can be closed. If both are open, `line.orifices` is not set, and the rig decides
+    whether they count: not in the thesis's model (section 4.2.1), but in a rig that includes the drop of open valves.
     """
     closed = condition.closed_pct / 100.0
     values: dict[str, str | float] = {"line.closed_A": closed, "line.closed_B": closed}

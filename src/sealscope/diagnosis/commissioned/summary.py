@@ -278,7 +278,7 @@ def _smallest_leak(balance: VolumeBalance, summaries: Sequence[Summary], channel
 
 
 def _collect_problems(healthy: Sequence[SummarisedRecording]) -> list[str]:
-    """List the problems of all healthy recordings, one line for each kind: those of equal text before the first colon.
+    """List the problems of all healthy recordings, one line for each kind, i.e. equal text before the first colon.
 
     A line shows the alphabetically last text of its kind, and the recording's name or the number of recordings.
     """

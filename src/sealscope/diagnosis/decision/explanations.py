@@ -237,7 +237,7 @@ def probability_of(
 ) -> float:
     """Compute the probability of an event with one of the `names` or `causes`; 0 without `explanations`.
 
-    With `data_kind`, only explanations of this kind of data (`Observable.data`) count, and their sum becomes 1.
+    With `data_kind`, only explanations of this kind of data (`Observable.data`) count, scaled to a sum of 1.
     """
     relevant = [explanation for explanation in explanations if data_kind is None or data_kind in explanation.data]
     total = sum(explanation.probability for explanation in relevant)

@@ -169,7 +169,8 @@ class BlockStream:
     def state(self) -> dict[str, Any]:
         """Return the state of the stream as plain values for JSON, from which `load_state` continues.
 
-        It has the samples that later blocks need, constants of the first samples, and sums over all blocks.
+        It has the samples that later blocks need, what the first samples fixed (offsets of the pressures, signs of the
+        flows), and sums over all blocks.
         """
         return {
             "samples": {name: plain_array(values) for name, values in self._join_pieces().items()},
@@ -486,9 +487,10 @@ class RecordedBlocks(NamedTuple):
     sign_log_odds: tuple[float, ...]
 
     def with_sign_prior(self, log_odds: Array) -> RecordedBlocks:
-        """Reverse the flows whose sign is probably wrong if the evidence of other recordings is added.
+        """Reverse the flows whose sign this recording alone gets wrong, by the evidence of other recordings.
 
-        `log_odds` (E,): log odds of each balance, from other recordings, that the recorded flow has the right sign.
+        `log_odds` (E,): for each of the E balances, log odds from other recordings that its recorded flow has the right
+        sign. They are added to those of this recording.
         """
         is_right = np.array(self.sign_log_odds) >= 0.0
         is_reversed = ((np.array(self.sign_log_odds) + log_odds >= 0.0) != is_right).tolist()

@@ -283,9 +283,9 @@ class LiveBalance:
     def _estimate_block(self, block: Blocks, updates_model: bool = True) -> BlockConductance | NotJudged:
         """Estimate the leakage conductance in a block from the volume balance.
 
-        `sd` is the part of the standard error that is due to this block alone. Returns a `NotJudged` if the machine
-        stands still and the estimate is therefore too uncertain. With `updates_model`, the block also updates the other
-        coefficients.
+        `sd` of the result is the part of the standard error that is due to this block alone. Returns a `NotJudged` if
+        the machine stands still and the estimate is therefore too uncertain. With `updates_model`, the block also
+        updates the other coefficients.
         """
         begin, end = self._sample_times(block)
         at_standstill = self._relative_motion(block) < STANDSTILL

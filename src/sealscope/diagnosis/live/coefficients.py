@@ -165,7 +165,8 @@ def _sum_residual_squares(sums: Any, solution: Any) -> float:
 def fit_coefficients(model: Any) -> None:
     """Compute a volume balance's coefficients other than the leak's, and the variance of its equations, into `model`.
 
-    They are the least-squares estimate from the sums over blocks in `model`, a `Coefficients`, and its mean square.
+    The coefficients are the least-squares estimate from the sums over blocks in `model`, a `Coefficients`, and the
+    variance is the mean square of the residuals.
     """
     n = len(model.matrix)
     solution = model.matrix[:, n:]
@@ -184,9 +185,9 @@ def _learn_block(model: Any, rows: float, g: float) -> float:
 
     `model` is a `Coefficients`, `rows` the number of equations in the block, and `g` its leak coefficient. Column n of
     `model.matrix` holds the n other coefficients (`_solve`). The usual noise is the variance of an equation's residual,
-    with fading memory; `MISFIT` is that of this block over it. The weight is 1, or `JUMP`^2 / MISFIT if this is less.
-    If g differs from its earlier estimate by more than `JUMP` standard deviations, the leak has stepped, and earlier
-    blocks do not constrain it any more.
+    with fading memory; `MISFIT` is the variance in this block divided by it. The weight is 1, or `JUMP`^2 / MISFIT if
+    this is less. If g differs from its earlier estimate by more than `JUMP` standard deviations, the leak has stepped,
+    and earlier blocks do not constrain it any more.
     """
     sums, numbers, n = model.sums, model.numbers, len(model.matrix)
     variance = max(_sum_residual_squares(model.block, model.matrix[:, n:]), 0.0) / rows

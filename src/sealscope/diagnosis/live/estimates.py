@@ -111,7 +111,7 @@ class WatchedLeak:
 
     @property
     def rarity(self) -> float:
-        """Probability that a healthy machine scores as high, over the `allowed` one, limited to 1e-9 to 1."""
+        """Probability that a healthy machine scores as high, divided by the `allowed` one, but within 1e-9 to 1."""
         log_ratio = self.estimate.log_chance - LiveRise(self.test, self.threshold).log_chance
         return math.exp(min(0.0, max(log_ratio, math.log(1e-9))))
 

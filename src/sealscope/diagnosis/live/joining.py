@@ -85,7 +85,7 @@ class SampleJoiner:
         self.newest = -math.inf
 
     def runs(self, samples: Recording) -> Iterator[SampleRun]:
-        """Divide samples into runs without a gap; count what is dropped, gaps, and changes of rate or channels."""
+        """Yield the runs of samples without a gap; count dropped samples, gaps, and changes of rate or channels."""
         names = self._choose_names(samples)
         if reason := _find_lack(samples, names):
             self.count(reason if names else f"samples without {format_ways(self.ways)}", len(samples))

@@ -45,7 +45,7 @@ class LiveRise(NamedTuple):
         return math.exp(self.log_chance)
 
     def threshold(self, chance: float) -> float:
-        """Return the score that a healthy machine exceeds with the probability `chance`, the inverse of `chance`."""
+        """Return the score that a healthy machine exceeds with the probability `chance`."""
         from scipy.special import ndtri
 
         return -2.0 * math.log(chance) if self.test == STEP else -float(ndtri(chance))

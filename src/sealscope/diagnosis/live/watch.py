@@ -125,7 +125,8 @@ class Watch:
     def _false_alarm_probability(self, test: str, seconds: float) -> float:
         """Compute the false-alarm probability of a test, `STEP` or `LEVEL`, that is made once in `seconds`.
 
-        It is the test's part of the stated rate times `seconds`. Raises InputError unless it is 1e-12 to 0.05.
+        It is `seconds` times the part of the stated rate of false alarms that the test gets. Raises InputError unless
+        it is 1e-12 to 0.05.
         """
         rate: float = self.false_alarms_per_1000_h
         fraction_of_alarms = getattr(_PRIORS, test)

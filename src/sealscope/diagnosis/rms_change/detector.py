@@ -181,7 +181,7 @@ def compare_summaries(
 
 
 def _is_judged(column: str) -> bool:
-    """Return True if an alarm may rest on the wavelet detail in a column name, such as "d3 of p_A" (`JUDGED`)."""
+    """Return True if a column, such as "d3 of p_A", may raise an alarm: if its wavelet detail is one of `JUDGED`."""
     return column.split(maxsplit=1)[0] in JUDGED
 
 

@@ -192,7 +192,7 @@ def _balance_fields(solution: RecordedBalance, machine: AssumedMachine) -> dict[
 
 
 def scatter_prior(basis: Basis, usual: float) -> ScatterPrior:
-    """Make the prior on the standard deviation of `LeakReading.level` between recordings, estimated by `basis`.
+    """Make the prior on the standard deviation between recordings of `LeakReading.level`, for the method `basis`.
 
     It is proportional to the typical level `usual` for the volume balance, and constant for other methods.
     """

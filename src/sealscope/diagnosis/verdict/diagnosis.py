@@ -181,7 +181,7 @@ class Diagnosis(Evidence):
 
     @property
     def named_cause(self) -> str | None:
-        """The `cause` if it fits the verdict: one of `LEAKS` fits `leak`, any other the other verdicts. Else None."""
+        """The `cause`; None if it does not fit the verdict, as `leak` needs one of `LEAKS`, and others need another."""
         return self.cause if (self.verdict == LEAK) == (self.cause in LEAKS) else None
 
     @property

@@ -65,13 +65,14 @@ def verdict_sentence(trend: Trend) -> str:
     """Format the verdict of a trend as a sentence for the heading of its page."""
     if trend.decision.summary != trend.verdict:  # the summary names another cause than a leak
         return trend.decision.summary.capitalize()
-    key = "ringing"  # an alarm by pressure oscillations, whose leak has no size
     if trend.verdict == "no leak":
         key = "fell" if trend.repairs else "no leak"
     elif trend.alarm is None or trend.wear is None:
         key = "cannot tell"
     elif trend.verdict == "leak":
         key = "grows" if trend.wear.step is None else "stepped"
+    else:
+        key = "ringing"  # an alarm by pressure oscillations, which show no size of a leak
     last_repair = moment(trend, trend.repairs[-1].day) if trend.repairs else ""
     return say(f"trend_headline.{key}", since=last_repair)
 

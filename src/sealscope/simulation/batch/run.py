@@ -349,9 +349,9 @@ class SetRun:
         self.taps = pack_lanes(filters, self.width)
 
     def _prepare_statistics(self, bounds: Array) -> None:
-        """Prepare the sums of squared wavelet details in the segments between `bounds` [s], and the noise keys.
+        """Set the sums of squared wavelet details between `bounds` [s] to zero, and make the keys of the noise.
 
-        The segments leave out the record's ends, beyond which the wavelet's filters would reach.
+        Samples at the ends of the record for which the wavelet's filters would need samples beyond it are left out.
         """
         from sealscope.signals.filters import reach
         from sealscope.simulation.batch.noise import noise_keys

@@ -66,7 +66,10 @@ def scope_start(remarks: Mapping[str, str]) -> np.datetime64 | None:
 
 
 def collect_remarks(pairs: Iterable[tuple[object, object]]) -> dict[str, str]:
-    """Collect up to `_MAX_REMARKS` pairs of name and text, made printable and shortened, the first of equal names."""
+    """Collect up to `_MAX_REMARKS` pairs of name and text, both made printable and shortened.
+
+    Of several pairs with one name the first is kept; pairs with an empty name or text are skipped.
+    """
     remarks: dict[str, str] = {}
     for name, value in pairs:
         key, text = _clean_text(str(name), _MAX_NAME), _clean_text(str(value), _MAX_TEXT)

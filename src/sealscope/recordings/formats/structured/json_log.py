@@ -81,7 +81,10 @@ def read_json(path: Path, request: Request) -> RecordingFields:
 
 
 def _read_members(text: str, place: str) -> tuple[list[Any], bool]:
-    """Read the values of a JSON text, and whether the last is truncated; raise InputError for other damage."""
+    """Read the whole values of a JSON text; also return whether it breaks off within a further one, which is dropped.
+
+    Raises InputError for other damage.
+    """
     members, is_cut = list[Any](), False
     try:
         for member in _iter_members(text):

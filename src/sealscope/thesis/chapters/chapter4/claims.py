@@ -258,7 +258,7 @@ def _judge_opening(context: Context) -> Iterator[Claim]:
 
     - 4.8: no pressure's peak or range changes visibly, i.e. by more than a transducer's noise (`visible_pressure`).
     - 4.9: the flows Q_A and Q_B differ by less than 5 %.
-    - 4.10: the peak of each pressure changes visibly.
+    - 4.10: the peak of each pressure changes visibly. The thesis states both 4.8 and 4.10; at most one can hold.
     - 4.11: the mean of p_1 is visibly below the mean of p_A.
     - 4.12: the mean of p_2 is visibly above the mean of p_B.
     """
