@@ -91,7 +91,10 @@ class _Invertible(ABC):
         """
 
     def inverse(self, rate: float) -> Callable[[float, float], float]:
-        """Build a function that computes the voltage [V] from flow [m^3/s] and p_A - p_B [Pa], at `rate` [Hz]."""
+        """Build a function that computes the voltage [V] for a flow [m^3/s] at p_A - p_B [Pa].
+
+        It must be called at the `rate` [Hz], as a filter in it advances by a sample with each call.
+        """
         (coefficients,) = self.coefficients(rate)
         return lambda flow, dp: float(drive_voltage(coefficients, flow, dp))
 

@@ -234,8 +234,9 @@ class ColumnRoles:
 
         `indices` (c,): their columns; `coefficients` (c,): their values in the other recordings; `leak_coefficient`:
         the leak's value there [m^3/(s Pa)]. The prior deviations are relative to the coefficients: `between_deviation`,
-        for the leak `between.pump` of `priors.toml`. Only a flow offset that repeats differs by the leak's flow at the
-        pressure `zero.pressure`, the standard deviation of a sensor offset of p_A - p_B. Precisions may be infinite.
+        for the leak `between.pump` of `priors.toml`. A flow offset that repeats in all recordings (deviation 0) is an
+        exception: it differs by the leak's flow at the pressure `zero.pressure`, the standard deviation of a sensor
+        offset of p_A - p_B. Precisions may be infinite.
         """
         is_leak = np.array(indices) == self.names.index(LEAK)
         deviations = np.abs(coefficients) * np.where(is_leak, INFERENCE.between.pump, self.between_deviation[indices])

@@ -143,12 +143,12 @@ class Watch:
 
     @property
     def learned_with(self) -> tuple[Rig, Mapping[str, bool], float]:
-        """Settings with which the baseline is learned: rig, whether each method states L/min, and time to learn [h]."""
+        """Rig, whether each method states L/min, and time to learn [h], with which the baseline is learned."""
         return self._rig, self._litres, self.learn_hours
 
     @property
     def method(self) -> str:
-        """Way of watching: "pressures" if samples have arrived without a position, otherwise "volumes"."""
+        """Way in which the machine is watched, "pressures" if samples have come without a position, else "volumes"."""
         return "volumes" if "x" in self._samples.names or not self._samples.names else "pressures"
 
     @property
@@ -170,7 +170,10 @@ class Watch:
 
     @property
     def evidence(self) -> Evidence:
-        """Present verdict, with the detected leak or a 95 % bound of one; "cannot tell" before enough blocks."""
+        """Present verdict, with the detected leak or the 95 % upper bound of an undetected one.
+
+        It is "cannot tell" until enough blocks have arrived.
+        """
         leak = self.leak
         if leak is not None:
             estimator = self._estimator or self._make_estimator()

@@ -83,8 +83,8 @@ def rise(judged: RecordingSums, baseline: Sequence[RecordingSums], columns: Sequ
         )
     values, error = estimate_leak_excess(judged.sums, healthy_sums, columns, widths)
     level, level_error = coefficient_level(healthy_sums, columns)
-    # error of a rise for each width: a fraction of the typical standard error, at least the fraction `prior.finest` of
-    # the pump's mean flow, as a conductance, and never 0 (1 / MAX_READING)
+    # smallest scatter of the rises for each width: a fraction of their typical standard error, at least the fraction
+    # `prior.finest` of the pump's mean flow, as a conductance, and never 0 (1 / MAX_READING)
     errors = prior.estimate * np.median(np.column_stack([error, rise_errors]), axis=1)
     errors = np.maximum(errors, max(prior.finest * judged.conductance_of_flow, 1.0 / MAX_READING))
     return _compare_levels(judged, baseline, _Estimates(values, rises, errors, level, level_error))

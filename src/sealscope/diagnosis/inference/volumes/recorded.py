@@ -439,13 +439,14 @@ class RecordedBalance:
 
     @cached_property
     def size(self) -> Size:
-        """Factor from computed to true flows and its uncertainty, from the sizes in the rig's file.
+        """Factor by which computed flows are multiplied to give the true ones, from the sizes in the rig's file.
 
         - Behind a servo valve, and for a load that shut valves hold, the areas give the flow, and the factor is 1.
           While a held load creeps, its oil also expands, which adds to the uncertainty.
         - The factor is also 1 for a flow meter.
         - A stated displacement gives the factor 1. If a stated area disagrees, the difference is the uncertainty.
-        - If only the area is stated, the factor follows from the measured ratio of displacement to area.
+        - If only the area is stated, the factor follows from the measured ratio of displacement to area. If neither is
+          stated, it is 1, with the uncertainty of both.
         """
         rig, is_meter = self.rig, measures_flow(self.recording.units)
         prior, source = INFERENCE.size, flow_source(self.recording.channels)

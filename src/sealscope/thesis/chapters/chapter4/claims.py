@@ -200,7 +200,7 @@ def _judge_runs(
     test: Callable[[_T], Iterable[bool]],
     format_numbers: Callable[[list[_T]], str],
 ) -> Claim:
-    """Judge claim 4.`number` of the thesis by converged runs under both interpretations of the throttles' equations.
+    """Judge claim 4.`number` by the runs with the converged solver, under both readings of the throttles' equations.
 
     `numbers`: results of the runs by solver and interpretation; `test`: yields True or False for each test on the
     results under one interpretation; `format_numbers`: formats the results under all interpretations. The claim's text
