@@ -167,8 +167,8 @@ class DetailStream:
     def state_dict(self) -> dict[str, Any]:
         """Return the state of the stream as plain values and arrays, from which `from_state` continues.
 
-        `history` has the last inputs of each level's filters: (rows, levels, samples, columns), where the signals form a
-        table of these rows and columns.
+        `history` has the last inputs of each level's filters, of the shape (rows, levels, samples, columns), where the
+        signals form a table of these rows and columns.
         """
         # the columns of the table are in groups (first axis) of WIDTH (last axis): bring both axes together
         history = np.moveaxis(self.buffers[:, :, :, self._fill - self._history : self._fill], 0, -2)

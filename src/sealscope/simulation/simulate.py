@@ -218,7 +218,7 @@ def _collect_truth(experiment: Experiment, leaks: tuple[Leak, ...], run: Traject
     at_samples, times = _sample_outputs(experiment), experiment.sample_times()
     outputs = {name: run[name][at_samples] for name in TRUE_OUTPUTS}
     if experiment.rig.line.k_clog_A > 0 or experiment.rig.line.k_clog_B > 0:
-        # a rig with clogging filters has no servo valve: the spool's two states serve for the oil that passed the filters
+        # a rig with clogging filters has no servo valve: its two states stand for the oil that passed the filters
         outputs |= {"passed_A": run["x_s"][at_samples], "passed_B": run["v_s"][at_samples], "x_s": np.zeros(times.size)}
     outputs |= powers(outputs, experiment.rig)
     dp, dp_0 = run["p_A"] - run["p_B"], experiment.rig.line.dp_0
