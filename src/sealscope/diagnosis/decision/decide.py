@@ -13,12 +13,13 @@ The verdict is `leak` if both conditions hold for one test of the leakage:
 
 A detector that measures no leakage has a single test, with the whole probability of a false alarm.
 
-These three numbers are `[false_alarm] probability`, `[questions] within` and `[explanation] leak` of `priors.toml`.
+The numbers 0.01, a quarter and 0.5 are `[false_alarm] probability`, `[questions] within` and `[explanation] leak` of
+`priors.toml`.
 
 Otherwise the verdict is `no leak` if the 95 % upper bound of a leak is small enough, i.e. at most the fraction `[worth]
-share` of the pump's flow (`_bound_and_limit`). It is `cannot tell` if the bound is larger, and the reason
-states the bound and the most probable other explanation. No other module states a verdict; `combination.combine`
-chooses among the decisions of several detectors.
+share` of the pump's flow (`_bound_and_limit`). It is `cannot tell` if the bound is larger, and the reason states the
+bound and the most probable other explanation. No other module states a verdict; `combination.combine` chooses among the
+decisions of several detectors.
 """
 
 from __future__ import annotations
