@@ -248,3 +248,14 @@ def test_a_rod_seal_of_either_side_is_no_piston_leak_where_check_valves_make_up(
     recording = ss.simulate(rig="thesis-closed-loop", command="3 sin(4t)", duration="40 s", seed=1, fault=fault)
     result = ss.diagnose(recording)
     assert (result.verdict, result.cause) == ("no leak", "external leak")
+
+
+def test_a_scale_of_the_position_shows_behind_a_servo_valve() -> None:
+    """Its column bore the prior of a piston's leak, so that no step of it was ever tested."""
+    recording = ss.simulate(rig="servo-valve", command="2 sin(4t)", duration="60 s", seed=1)
+    position = recording["x"] * np.where(recording.t < 30.0, 1.0, 1.03)
+    wrong = replace(recording, channels={**recording.channels, "x": position})
+    balance = VolumeBalance(load_rig("servo-valve")).balance(wrong)
+    assert balance is not None
+    scores = {observable.name: observable.score for observable in balance.observables}
+    assert scores["scale"] > scores["leak"] + 10.0

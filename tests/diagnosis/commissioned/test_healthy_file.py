@@ -235,6 +235,7 @@ HOSTILE = {
     "summaries/volume balance/sums   ": (sums_of(np.nan), "finite numbers"),
     "summaries/volume balance/scale": (1e300, "scale"),
     "summaries/volume balance/flow": (-1.0, "flow"),
+    "summaries/volume balance/stroke": (packed([0.2, 0.1]), "stroke must hold the lower and the upper end"),
     "summaries/volume balance/start_s": (1e18, "start_s"),
     "summaries/rms change/duty": (packed([1.0, 2.0]), "levels and duty must be of the shapes (10,) and (4,)"),
     "summaries/rms change/duty ": (packed([1.0, 2.0, 3.0, 1e9]), "must be logarithms"),

@@ -104,11 +104,11 @@ class Case:
           neither of the two is excluded, i.e. both have a probability above 1 - `sure`.
         """
         limits, leak = DECISION.explanation, self.leak_probability(alarm)
-        if leak > limits.leak or not self.weigh_rivals:
-            return leak > limits.leak
+        if leak > limits.leak:
+            return True
         external, data_kind = self.external_probability(alarm), self._data_kind(alarm)
-        either = probability_of(self.explanations, *LEAK_EVENTS, causes=["external leak"], data_kind=data_kind)
-        return either > limits.named >= external and min(leak, external) > 1.0 - limits.sure
+        joint = probability_of(self.explanations, *LEAK_EVENTS, causes=["external leak"], data_kind=data_kind)
+        return joint > limits.named >= external and min(leak, external) > 1.0 - limits.sure
 
     def _data_kind(self, alarm: LeakTest) -> str:
         """Return the kind of data (`Observable.data`) by which the test `alarm` raised its alarm.

@@ -269,9 +269,9 @@ class ColumnRoles:
         driver = self.drivers[column] if column < self.left else ""
         pressure, root = float(np.mean(blocks.mean_pressure())), float(np.mean(blocks.mean_root()))
         per_conductance = {"": float("inf"), "pressure": 1.0, "root": pressure / root if root > 0.0 else 1.0}
-        conductance = (
-            min(self.healthy_conductance, INFERENCE.healthy.piston) if driver == "root" else self.healthy_conductance
-        )
+        conductance = self.healthy_conductance
+        if driver == "root":
+            conductance = min(conductance, INFERENCE.healthy.piston)
         return conductance * per_conductance[driver]
 
     def offset_deviation(self, column: int, blocks: Blocks) -> float:

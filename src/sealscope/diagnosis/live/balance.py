@@ -326,7 +326,7 @@ class LiveBalance:
             return ()
         centred = remove_pressure_offset(blocks, self._roles)
         volumes = volume_observables(  # oil: not tested
-            centred, blocks, self._balances, self._roles, oil_loss={}, has_varied_duty=False
+            centred, blocks, self._balances, self._roles, oil_loss={}, with_orifice=False
         )
         # the samples of a block begin less than a block before the time range of its equations
         return (*volumes, *self._signals.observables(since - BLOCK_SECONDS))

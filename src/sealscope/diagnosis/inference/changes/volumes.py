@@ -63,7 +63,7 @@ def volume_observables(
     volume_ratio: float = 1.0,
     charge: ChargeTrend | None = None,
     flow_scale: float = 1.0,
-    has_varied_duty: bool = True,
+    with_orifice: bool = True,
 ) -> tuple[Observable, ...]:
     """Test the coefficients of a volume balance for a step up or down, or only up for leaks; highest score first.
 
@@ -78,14 +78,14 @@ def volume_observables(
     - `volume_ratio`: measured over assumed ratio of piston area to pump displacement.
     - `charge`: trend of the charge pressure, None if it is unknown.
     - `flow_scale`: true flow over the flow of the balance.
-    - `has_varied_duty`: false for a few blocks of one duty. There the flow of an orifice looks like a change of the
-      motion's scale, and is not tested.
+    - `with_orifice`: false to leave out the test of an orifice's own flow, which in a few blocks looks like a change of
+      the motion's scale.
     """
     centred, recorded = (series.merge(max_blocks=INFERENCE.blocks.coarse) for series in (blocks, plain))
     # a laminar leak is tested without the sensor offset, so an improbable offset counts against the leak
     leak_disadvantage = float(offset_cost(estimate_offset(blocks, columns)))
     observables = []
-    terms = [term for term in balances[0].terms if has_varied_duty or term.name != ORIFICE]
+    terms = [term for term in balances[0].terms if with_orifice or term.name != ORIFICE]
     for name, signs, coefficient, shape in _step_hypotheses(centred, recorded, terms, columns, bool(oil_loss)):
         steps = step_tests(coefficient, signs, shape)
         if not steps:
