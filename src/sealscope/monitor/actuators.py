@@ -86,8 +86,9 @@ class _Actuator:
         """Judge new samples; return the leakage estimates of blocks of some seconds, and the changes of the alarm.
 
         `follows`: False after a gap; `settings`: thresholds of the alarm; `verdict`: verdict on the samples as a whole
-        recording, None for none. A verdict that decides (`RecordingVerdict.decides`) alone updates the alarm, and the
-        estimates state its leak; otherwise each estimate updates it. The result depends only on arguments and state.
+        recording, None for none. If this verdict decides (`RecordingVerdict.decides`), only it updates the alarm, and
+        the estimates state its leak; otherwise each estimate updates the alarm. The result depends only on arguments
+        and state.
         """
         estimates: list[BlockEstimate] = []
         events: list[_AlarmEvent] = []
@@ -96,7 +97,7 @@ class _Actuator:
         self.bytes += count_bytes(samples)
         if (oil_celsius := measured_oil_temperature(samples)) is not None:
             self.oil_celsius = oil_celsius
-        for estimate, leak in self.watch.each(samples, follows=follows):  # leak: the one found by then, or None
+        for estimate, leak in self.watch.each(samples, follows=follows):  # leak: found so far, or None
             self.last = self.watch.with_cycle_means(estimate)
             if estimate.judged or self.judged_s is None or self.judged_s > estimate.t:  # the clock may be set back
                 self.judged_s = estimate.t
@@ -172,11 +173,12 @@ class _Actuator:
     def summary(self) -> dict[str, Any]:
         """Build the summary of the actuator for the page, the metrics and messages, as plain values by name.
 
-        Status and time come from the last verdict on a whole recording, if there is one, and the flows if this verdict
-        decides (`RecordingVerdict.decides`); otherwise from the detector's last block. Unknown values are None.
+        Status and time are those of the last verdict on a whole recording, or of the detector's last block if there is
+        none. The flows are those of this verdict only if it decides (`RecordingVerdict.decides`). Unknown values are
+        None.
 
-        - `blocks`, `counters`: number of the detector's blocks so far, some seconds each, and its counters; `by`: what
-          it watches, "volumes" or "pressures"; `why_no_litres`: reason why no L/min are stated, else "";
+        - `blocks`: number of blocks of some seconds that the detector has processed; `counters`: its counters; `by`:
+          quantity that it watches, "volumes" or "pressures"; `why_no_litres`: reason why no L/min are stated, else "";
         - `t`: end of the last block or recording [s since 1970]; `status`: its result; `state`: state by NAMUR NE 107;
         - `total_lpm`, `leak_lpm`, `bound_lpm` [L/min]: total leakage, leak, and upper bound of a leak that is not
           found; `total_interval_lpm`, `leak_interval_lpm`: 95 % intervals; `recording`: texts of the last verdict;
@@ -251,9 +253,9 @@ class WatchedActuators:
     def _load_checkpoint(self, actuator: _Actuator, stored: StoredCheckpoint) -> bool:
         """Restore an actuator from its checkpoint `stored` in the database, and judge the samples since then again.
 
-        The detector (`watch`) starts anew if another version saved its state, or if it learned with another rig or
-        learning time; pump displacements of rigs may differ by up to 5 %, as two measurements do. Returns True if the
-        detector starts anew or the settings changed: a new checkpoint must then be saved.
+        The detector (`watch`) starts anew if another version of Sealscope saved its state, or if its rig or learning
+        time has changed. A pump displacement within 5 % of the stored one counts as the same, measured again. Returns
+        True if a new checkpoint must be saved, because the detector starts anew or the settings have changed.
         """
         settings, name = actuator.settings, actuator.settings.name
         fresh, state = actuator.watch, stored.state
@@ -448,7 +450,8 @@ class WatchedActuators:
     def summaries(self) -> dict[str, dict[str, Any]]:
         """Read the last stored summary of each actuator in the settings, by name.
 
-        The state is "no data" if unknown or, unless it reports a leak, if no block has come for `no_data_s` seconds.
+        An unknown state is replaced by "no data", and so is one that reports no leak if no block has come for
+        `no_data_s` seconds.
         """
         stored_summaries, now = self.store.summaries(), time.monotonic()
         summaries = {}

@@ -86,7 +86,10 @@ class Alarm:
 
     @property
     def status_word(self) -> int:
-        """Status as a sum of bits: 1 for an active warning, 2 for an active error, 4 for a new alarm, not shelved."""
+        """Sum of the status bits of the alarm.
+
+        Bit 1 states an active warning, 2 an active error, and 4 a new alarm that is not shelved.
+        """
         level_bit = ERROR_BIT if self.level == "error" else WARNING_BIT
         new_bit = NEW_BIT if self.state == "new" and not self.shelved else 0
         return (level_bit if self.active else 0) | new_bit
@@ -182,11 +185,12 @@ class AlarmJudge:
         return self._set_alarm(updated), event
 
     def _raise_alarm(self, **findings: Any) -> Alarm:
-        """Raise an alarm and return it: a new one, or the open alarm again if its leak had ended before.
+        """Raise a new alarm, or raise the open alarm again if there is one; return the raised alarm.
 
-        An alarm that is raised again keeps its id and shelving. `findings`: the alarm's other fields, by name.
+        The open alarm, whose leak has ended, keeps its id and shelving. `findings`: the alarm's other fields, by name.
         """
-        self.raised += self.alarm is None
+        if self.alarm is None:  # not the open alarm, raised again
+            self.raised += 1
         alarm_id = f"{self.actuator}-{self.raised}"
         shelved_until_s = 0.0 if self.alarm is None else self.alarm.shelved_until_s
         self.alarm = Alarm(alarm_id, self.actuator, state="new", shelved_until_s=shelved_until_s, **findings)
@@ -284,11 +288,11 @@ class AlarmJudge:
 
 
 def rank_actuators(summaries: Mapping[str, Mapping[str, Any]], alarms: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Sort actuators by urgency, and return their summaries as rows, each with the `name` and the open `alarm` or None.
+    """Sort the summaries of actuators by urgency; add to each the `name` and the open `alarm`, None if there is none.
 
-    More urgent is, in this order: the more severe state; a new alarm; the stronger evidence (fewer such alarms of a
-    healthy actuator by chance); the larger lower end of the leak's interval; the larger leak; then the name decides.
-    `summaries`: by name; `alarms`: the open alarms, for each actuator with the latest first.
+    The criteria are, in this order: severity of the state; whether the alarm is new; evidence, which is stronger if a
+    healthy actuator raises fewer such alarms by chance; lower end of the leak's interval; leak; and name. `summaries`:
+    by name of the actuator; `alarms`: the open alarms, for each actuator the latest first.
     """
 
     def rank(row: Mapping[str, Any]) -> tuple[Any, ...]:

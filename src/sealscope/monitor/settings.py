@@ -26,9 +26,10 @@ _LongText = Annotated[str, Field(min_length=1, max_length=1000)]
 
 
 def _resolve_in_folder(place: _PathLike, info: ValidationInfo) -> _PathLike:
-    """Resolve `place`, a path in the settings, relative to the folder of their file, in the `context` of `info`.
+    """Resolve `place`, a path in the settings, relative to the folder of the settings file.
 
-    URLs, names of packaged rigs, and all paths of settings that do not come from a file are returned unchanged.
+    The `context` of `info` states this folder. URLs, names of packaged rigs, and all paths of settings that do not come
+    from a file are returned unchanged.
     """
     is_name = isinstance(place, str) and ("://" in place or (info.field_name == "rig" and not place.endswith(".toml")))
     return place if is_name or not info.context else type(place)(Path(info.context["folder"]) / place)
@@ -280,7 +281,7 @@ class MonitorSettings(_Table):
 
 
 def _check_channels(actuator: ActuatorSettings, *, has_opcua: bool) -> None:
-    """Check the OPC UA nodes and the units of an actuator's channels; raise ValueError or InputError if not valid.
+    """Check the OPC UA nodes and units of an actuator's channels; raise ValueError or InputError for a wrong entry.
 
     `has_opcua`: True if the settings have a table [opcua], which nodes need.
     """
@@ -309,7 +310,7 @@ def _column_unit(channel: str, column: str) -> str | None:
 
 
 def topic_level(name: str) -> str:
-    """Convert a name to one level of an MQTT topic by replacing +, #, / and NUL by underscores."""
+    """Convert a name to one level of an MQTT topic by replacing +, #, / and NUL with underscores."""
     return "".join("_" if letter in "+#/\0" else letter for letter in name)
 
 

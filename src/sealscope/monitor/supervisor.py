@@ -49,7 +49,7 @@ class SupervisedPart:
         self.name, self._supervisor = name, supervisor
         self.since: float | None = None
         self.reason, self.count, self.seconds, self._began = "", 0, 0.0, 0.0
-        self._pause = self._due = 0.0  # after the last error [s], and the monotonic time at which it ends
+        self._pause = self._due = 0.0  # length of the last pause [s], and the monotonic time at which it ends
         self._lock = threading.Lock()
 
     def begin_outage(self, reason: object) -> None:
@@ -86,8 +86,9 @@ class SupervisedPart:
     def attempt(self, work: _Work, *, at_once: bool = False) -> bool:
         """Run the function `work` unless the part pauses after an error; return True if it ran without an error.
 
-        An error begins an outage, of the database if it comes from there, and a pause, twice as long as the last one up
-        to a limit. Success ends the outage of the part. `at_once`: True to run `work` even during a pause.
+        An error begins a pause, twice as long as the last one up to a limit. It also begins an outage of the database
+        if the error comes from there, otherwise of this part. Success ends the outage of this part. `at_once`: True to
+        run `work` even during a pause.
         """
         if self.pause_s and not at_once:
             return False
@@ -127,7 +128,7 @@ class Supervisor:
         self._lock = threading.Lock()
 
     def part(self, name: str) -> SupervisedPart:
-        """Return the part called `name`; create it, without an outage, if it does not exist."""
+        """Return the part of the monitor called `name`, such as "database"; create it if it does not exist."""
         with self._lock:
             if name not in self._parts:
                 self._parts[name] = SupervisedPart(name, self)
@@ -144,7 +145,10 @@ class Supervisor:
         return {part.name: (part.since is None, part.count, part.seconds + part.outage_s) for part in parts}
 
     def start(self, name: str, work: _Work, *, restart: bool = True, on_end: _Work = lambda: None) -> threading.Thread:
-        """Start a thread that runs `work` as the part `name`, again after errors if `restart`, and then `on_end`."""
+        """Start a thread that runs `work` as the part `name`, and calls `on_end` when it has ended.
+
+        `restart`: True to run `work` again after an error, until it ends without an error or the monitor stops.
+        """
         part = self.part(name)
 
         def work_with_timer() -> None:
@@ -182,12 +186,13 @@ class LimitedLines(logging.Filter):
 
     def __init__(self) -> None:
         super().__init__()
+        # by place (logger, file, line): start of the minute [s], and number of records since then
         self._places: dict[tuple[str, str, int], tuple[float, int]] = {}
 
     def filter(self, record: logging.LogRecord) -> bool:
         """Return True if a log record is within the limit for its place in the code; make it one printable line.
 
-        The first record after a minute also states how many lines were left out before.
+        The first record after a minute also states how many lines were left out during that minute.
         """
         place = (record.name, record.pathname, record.lineno)
         max_lines = _PACKAGE_LINES if record.name.startswith("sealscope") else _LIBRARY_LINES

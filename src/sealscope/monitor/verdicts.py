@@ -114,8 +114,8 @@ class RecordingVerdict:
     def is_rare(self, false_alarms_per_1000_h: float) -> bool:
         """Return True if leak-free recordings get such a verdict so rarely that it may raise an alarm by itself.
 
-        `chance`, unless it is None, must not exceed `false_alarms_per_1000_h` times the length of the recording in
-        units of 1000 h, or `rarest` of `priors.toml`, the smallest probability that can be known, if that is larger.
+        The probability `chance` must be unknown or at most `false_alarms_per_1000_h` times the length of the recording
+        in units of 1000 h. The smallest probability that can be known, `rarest` of `priors.toml`, is always permitted.
         """
         allowed_chance = false_alarms_per_1000_h * (self.end_s - self.start_s) / 3.6e6  # [s] in 1000 h
         return self.chance is None or self.chance <= max(_FALSE_ALARM.rarest, allowed_chance)
@@ -135,7 +135,8 @@ class RecordingVerdict:
     def restate_block(self, block: BlockEstimate) -> BlockEstimate:
         """Replace the leak in the estimate of a block by the leak of the whole recording.
 
-        Before the onset, or without a leak, the block gets no leak, and the interval from 0 to `bound_lpm` if known.
+        If the block lies before the onset, or the recording has no leak, the block's leak becomes None, and its
+        interval becomes 0 to `bound_lpm`, or None if that is unknown.
         """
         is_before_onset = self.onset_s is not None and block.t < self.onset_s
         if self.leaks and not is_before_onset:

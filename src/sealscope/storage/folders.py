@@ -34,7 +34,10 @@ def make_inner_folder(folder: Path, *names: str) -> Path:
 
 
 def iter_inner_files(folder: Path, paths: Iterable[Path]) -> Iterator[Path]:
-    """Yield the files of `folder`, which may be a link, among `paths`; skip and log links that lead out of it."""
+    """Yield those of the `paths` that are files within `folder`; skip and log links that lead out of it.
+
+    The folder itself may be a link.
+    """
     root = folder.resolve()
     for path in paths:
         try:

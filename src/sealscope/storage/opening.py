@@ -42,7 +42,7 @@ def open_regular(path: str | os.PathLike[str], what: str) -> BinaryIO:
 
 
 def open_inner(path: str | os.PathLike[str], what: str, mode: Literal["rb", "ab+"] = "rb") -> BinaryIO:
-    """Open a file in a folder of results that may come from others, in binary mode.
+    """Open a file, in binary mode, in a folder of results that other people may have prepared.
 
     `mode`: `rb` to read, `ab+` to append or create; `what`: name in messages. Raises InputError for a link and any
     other file that is not regular, and in mode `ab+` for a file with several hard links; OSError if opening fails.

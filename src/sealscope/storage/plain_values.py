@@ -70,10 +70,10 @@ _PLAIN_RULES = {
 
 
 def format_error(error: ValidationError, entry_name: Callable[[str], str] = str, unit: str = "") -> str:
-    """Format the first of pydantic's errors, or the first about an unknown entry, as "ENTRY must be ..., got ...".
+    """Format the first of pydantic's errors as "ENTRY must be ..., got ...", preferably one about an unknown entry.
 
-    ENTRY is the path to the wrong entry, such as `line.V_1`; `entry_name` converts its first name ("" if the whole
-    value is wrong). `unit`: text that is appended to the broken rule.
+    ENTRY is the path to the wrong entry, such as `line.V_1`. `entry_name` converts the first name of this path, "" if
+    the whole value is wrong; `unit`: text that is appended to the broken rule.
     """
     errors = error.errors(include_url=False)
     chosen = next((detail for detail in errors if _PLAIN_RULES.get(detail["type"]) == "is not known"), errors[0])

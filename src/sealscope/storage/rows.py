@@ -37,11 +37,11 @@ Row = TypeVar("Row", bound=StoredRow)
 def read_rows(
     folder: Path, row_of: Callable[[Any], Row | None], what: str, parse: Callable[[bytes], Any] = parse_json
 ) -> dict[str, Row]:
-    """Read the results of jobs that `store_rows` stored in a folder; return the last row of each job by its id.
+    """Read the results of jobs that `store_rows` stored in a folder; return the last result of each job by its id.
 
-    `parse` parses a line; `row_of` makes a row of the result, or None to ignore it; `what` names the folder in errors.
-    A last line that was cut off is ignored, and a missing file has no rows. Raises UnreadableFile if the file cannot
-    be read or a line is not a row, and InputError if the file is a link.
+    `parse`: parses a line to plain values; `row_of`: converts these to a result, or to None to ignore the line; `what`:
+    name of the folder in errors. An incomplete last line is ignored, and a missing file holds no results. Raises
+    UnreadableFile if the file cannot be read or a line does not fit, and InputError if the file is a link.
     """
     path = folder / ROWS
     rows: dict[str, Row] = {}
@@ -91,7 +91,7 @@ def store_rows(folder: Path, rows: Generator[Row, None, None], what: str, allow_
 
 @contextmanager
 def lock_rows(folder: Path, what: str) -> Iterator[None]:
-    """Lock the rows of a folder against other processes while the block runs; remove old temporary files.
+    """Lock the results stored in a folder against other processes while the block runs; remove old temporary files.
 
     Raises InputError if another process holds the lock; `what` names the folder in the error.
     """

@@ -101,7 +101,7 @@ def read_priors(package: str, kind: type[_T]) -> _T:
 
     The fields of `kind` are the tables of the file. Each is a `PriorTable` or a mapping, with numbers and tuples of
     numbers as values. In the file each key must have value, unit and source; the value is returned in that unit. Raises
-    InputError that names file, table, key and rule.
+    InputError, which names file, table and key, if a rule is broken.
     """
     place = f"{package.replace('.', '/')}/priors.toml"
     tables = tomllib.loads((files(package) / "priors.toml").read_text("utf-8"))
@@ -127,7 +127,7 @@ def _parse_table(rows: Mapping[str, Any], kind: Any, place: str) -> Any:
 
 
 def _parse_value(row: Any, kind: Any, place: str) -> Any:
-    """Return the value of a prior, the entry {value, unit, source}, as `kind`: int, tuple of numbers, or else float."""
+    """Convert the value of a prior, given as {value, unit, source}, to `kind`: int, a tuple of numbers, or float."""
     if not isinstance(row, dict) or set(row) != {"value", "unit", "source"} or not (row["unit"] and row["source"]):
         raise InputError(f"{place} must have value, unit and source, got {row!r}")
     if get_origin(kind) is tuple:
@@ -146,13 +146,16 @@ def _parse_number(value: Any, kind: type, place: str) -> Any:
     return kind(value)
 
 
-def _check_keys(rows: Collection[str], names: Collection[str], optional: Collection[str], place: str) -> None:
-    """Raise InputError unless the keys `rows` of a table are those in `names`; the `optional` ones may be absent."""
-    for name in rows:
+def _check_keys(keys: Collection[str], names: Collection[str], optional: Collection[str], place: str) -> None:
+    """Check that a table has the keys `names` and no others; raise InputError otherwise. `optional` keys may be absent.
+
+    `keys`: those of the table; `place`: their description in the error.
+    """
+    for name in keys:
         if name not in names:
             raise InputError(f"{place} must be {', '.join(names)}, got {name!r}")
     for name in names:
-        if name not in rows and name not in optional:
+        if name not in keys and name not in optional:
             raise InputError(f"{place} must be {', '.join(names)}, got none called {name!r}")
 
 

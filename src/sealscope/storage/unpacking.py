@@ -16,7 +16,7 @@ def max_unpacked_size(path: Path) -> int:
     """Compute the largest size [bytes] that the packed file at `path` may unpack to.
 
     The limit is 200 times the size on the disk, but at least 64 MiB and at most 8 GiB. Packing usually reduces a log to
-    a tenth of its size, and a log of constant channels to a hundredth. Holes of a sparse file take no size.
+    a tenth of its size, and a log of constant channels to a hundredth. Holes of a sparse file do not count.
     """
     status = path.stat()
     disk_bytes = 512 * getattr(status, "st_blocks", 0)  # 512 bytes a block; 0 where the file system does not say
@@ -24,7 +24,7 @@ def max_unpacked_size(path: Path) -> int:
 
 
 def check_unpacked(size: int, max_bytes: int, place: str | Path) -> None:
-    """Check that an unpacked `size` of the file `place` is at most `max_bytes`; raise UnreadableFile otherwise."""
+    """Check that the unpacked `size` of the file `place` is at most `max_bytes`; raise UnreadableFile otherwise."""
     if size > max_bytes:
         raise UnreadableFile(
             f"a packed file must unpack to at most {max_bytes} bytes, got {size} or more: unpack it, or export it as "

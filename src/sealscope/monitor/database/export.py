@@ -31,7 +31,7 @@ def export_labels(store: MonitorStore, folder: Path) -> tuple[int, int]:
     rows = []
     # by actuator: start and stop [s] of an interval, and the columns `label` and `alarm` of the estimates in it
     intervals = defaultdict[str, list[tuple[float, float, dict[str, str]]]](list)
-    # in order of time, at equal times in order of number: the label of the latest alarm is the last
+    # `alarms` lists the latest first: reversed and sorted by time, the labels of the latest alarm come last
     for alarm in sorted(reversed(store.alarms()), key=lambda alarm: float(alarm["raised_s"])):
         history = events[alarm["id"]]
         last_mark: dict[str, Any] = next((event for event in reversed(history) if event["event"] in _LABELS), {})

@@ -40,7 +40,10 @@ def record_mark(rig: str, alarm: Alarm, mark: str, samples: Sequence[Recording])
         outcome = "written down"
 
         def add_mark(machine: CommissionedMachine) -> CommissionedMachine:
-            """Add the marked alarm to a machine, and if it is invalid, its samples as a healthy recording."""
+            """Add the marked alarm to a machine, with its samples as a healthy recording if the alarm is invalid.
+
+            Sets `outcome`, the text that states whether the machine has accepted these samples.
+            """
             nonlocal outcome
             machine = replace(machine, alarms=(*machine.alarms, judgement))
             if mark == "invalid":

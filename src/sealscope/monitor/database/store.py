@@ -78,9 +78,10 @@ class StoredRows:
         self.pending.append({"actuator": actuator, "number": number, "samples": packed_samples})
 
     def add_alarm(self, alarm: Alarm, kind: str, t: float, by_whom: str = "", text: str = "") -> None:
-        """Add an alarm in its present state, and the event `kind`, "" for none, that changed it at the time `t` [s].
+        """Add the row of an alarm in its present state, and that of the event that changed it at the time `t` [s].
 
-        `by_whom`, `text`: person who caused the event, and their comment, or "".
+        `kind`: kind of the event, "" if no event is to be stored; `by_whom`, `text`: person who caused the event, and
+        their comment, or "".
         """
         plain = json.dumps(alarm.as_dict())
         self.alarms[alarm.id] = {"actuator": alarm.actuator, "id": alarm.id, "state": alarm.state, "alarm": plain}
@@ -193,7 +194,7 @@ class MonitorStore:
             return int(connection.execute(query).scalar() or 0)
 
     def select_stored(self, blocks: Iterable[tuple[str, str]]) -> set[tuple[str, str]]:
-        """Select the blocks that are stored already among `blocks`, given as pairs (actuator, identity)."""
+        """Select from `blocks`, pairs (actuator, identity), those that are stored already."""
         # one query per block: SQLite scans the whole table for a list of pairs
         columns = tables.blocks.c
         is_block = (columns.actuator == bindparam("name")) & (columns.identity == bindparam("identity"))
@@ -210,7 +211,7 @@ class MonitorStore:
         return bool(self.select_stored([(actuator, identity)]))
 
     def insert_blocks(self, connection: sa.Connection, blocks: Iterable[tuple[str, str, int]]) -> None:
-        """Store the identities of blocks, each given as (actuator, identity, running number in the actuator's blocks).
+        """Store the identities of blocks, each given as (actuator, identity, running number for this actuator).
 
         Raises IntegrityError, which ends the open transaction of `connection`, if one of the blocks is stored already.
         """
@@ -287,7 +288,7 @@ class MonitorStore:
         return n_before
 
     def end_decoding(self, reader: str, digest: str) -> None:
-        """Delete the record that `reader` is decoding the message with the hash `digest` (`begin_decoding`)."""
+        """Delete the record that the MQTT client `reader` is decoding the message with the hash `digest`."""
         columns = tables.decodings.c
         with self._begin_relaxed_transaction() as connection:
             connection.execute(tables.decodings.delete().where(columns.reader == reader, columns.digest == digest))
@@ -367,16 +368,16 @@ class MonitorStore:
                 yield dict(row._mapping)
 
     def position(self, name: str) -> int:
-        """Read the number that `write_position` stored under a name, such as an output's last event, 0 for none."""
+        """Read the number that `write_position` stored under `name`; return 0 if there is none."""
         return self._value(select(tables.facts.c.value).where(tables.facts.c.name == name))
 
     def write_position(self, name: str, number: int) -> None:
-        """Store the number of the last alarm event that the output `name` has delivered."""
+        """Store a number under `name`, such as that of the last alarm event that an output has delivered."""
         with self.writing() as connection:
             self.upsert(connection, tables.facts, [{"name": name, "value": str(number)}])
 
     def deliver(self, output: str, send: Callable[[dict[str, Any]], bool]) -> None:
-        """Send the events that an output has not sent yet, in order and at most 1000, and store the number of the last.
+        """Send up to 1000 events that an output has not sent yet, in order, and store the number of the last one sent.
 
         `send`: sends an event, and returns False if the next call must try this event again.
         """
@@ -387,7 +388,7 @@ class MonitorStore:
 
 
 def outage_reason(error: BaseException) -> str | None:
-    """Describe the database outage that an error reports in one line; return None for an error of another kind.
+    """Describe in one line the database outage that an error reports; return None for an error of another kind.
 
     A value that the database cannot store (DataError) is not an outage: waiting would not help.
     """
@@ -428,13 +429,13 @@ def _unpack_samples(data: bytes) -> StoredSamples:
 
 
 def _event_from_row(row: Any) -> dict[str, Any]:
-    """Convert a row of `events` to the plain values that outputs send: the event, and the alarm after it."""
+    """Convert a row of `events` to the plain values that outputs send: the event, and the alarm after this event."""
     values = {"number": row.number, "event": row.kind, "t": row._mapping["t"], "by": row.by_whom, "text": row.text}
     return {**values, "alarm": json.loads(row.alarm)}
 
 
 def _prepare_sqlite(connection: Any, record: object) -> None:
-    """Set the options of a new connection to SQLite; called by SQLAlchemy, whose `record` of it is not used."""
+    """Set the options of a new connection to SQLite; called by SQLAlchemy, whose second argument is not used."""
     # a page has room for a second of samples, the cache for all pages of a transaction
     settings = "page_size=16384", "cache_size=-32000", "busy_timeout=5000", "foreign_keys=ON"
     for setting in (*settings, "journal_mode=WAL", "synchronous=FULL"):

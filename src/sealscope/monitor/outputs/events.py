@@ -89,7 +89,10 @@ class Webhook:
     end = deliver
 
     def _send_post(self, event: dict[str, Any]) -> bool:
-        """Post an event if it is to be announced (`is_announced`); return True, or raise PartAway if not confirmed."""
+        """Post an event if it is to be announced (`is_announced`), and return True.
+
+        Raises PartAway if the server does not confirm the event.
+        """
         if not is_announced(event):
             return True
         try:

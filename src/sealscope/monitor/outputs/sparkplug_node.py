@@ -121,14 +121,17 @@ class SparkplugNode:
     def _death_message(self) -> tuple[str, bytes]:
         """Build topic and payload of the death message, which the broker publishes when the next connection is lost.
 
-        Death and birth of a connection have the same number bdSeq (0 to 255), one more than the last birth's.
+        Death and birth of a connection have the same number bdSeq (0 to 255), one more than that of the last birth.
         """
         self._connection_birth_number = (self._sent_birth_number + 1) % 256
         payload = spb.SparkplugPayload(_milliseconds(None), (self._birth_number_metric(),))
         return self._topic("NDEATH"), spb.encode_payload(payload)
 
     def _on_connect(self, client: Any, userdata: Any, flags: Any, reason: Any, properties: Any) -> None:
-        """Subscribe to commands, and let the birth messages become due; paho calls this after an attempt to connect."""
+        """Subscribe to commands, and send birth messages soon; called by the library paho.
+
+        Only logs an error if the broker refuses the connection.
+        """
         if reason.is_failure:
             _log.error("the broker %s refuses the Sparkplug node: %s", self._broker.host, reason)
             return
@@ -136,7 +139,7 @@ class SparkplugNode:
         self._birth_due.set()
 
     def _on_message(self, client: Any, userdata: Any, message: Any) -> None:
-        """Acknowledge a command, and let the birth messages become due if it requests them; paho calls this.
+        """Acknowledge a command, and send birth messages soon if it requests them; called by the library paho.
 
         A message that is not a valid Sparkplug payload is counted and logged.
         """
@@ -215,7 +218,10 @@ def _metric_values(table: str, values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _build_metrics(table: str, values: Mapping[str, Any], timestamp: int) -> list[spb.SparkplugMetric]:
-    """Build metrics from values by name; `table`: has types and units (`_load_table`); `timestamp`: [ms since 1970]."""
+    """Build metrics from values by name, with the `timestamp` [ms since 1970].
+
+    `table`: name of the table of the metrics' types and units (`_load_table`).
+    """
     rows = {name: _load_table(table)[name] for name in values}
     return [
         spb.SparkplugMetric(name, values[name], getattr(spb, row["type"]), timestamp=timestamp, unit=row.get("unit"))

@@ -51,9 +51,10 @@ class Admission:
         return max(0.0, last + pause - self._now())
 
     def admits(self, address: str, token: str, *, session: bool = False) -> bool:
-        """Return True if a token is right; count the wrong tokens of a client's IP `address` until a right one.
+        """Return True if a token is right; count wrong tokens, for each network, until it sends a right one.
 
-        `session`: True if `token` is the cookie of a browser that has stated the right token before.
+        `address`: IP address of the client; `session`: True if `token` is the cookie of a browser, given to it after a
+        right token.
         """
         expected, network = self.session if session else self._token, _network(address)
         if hmac.compare_digest(token.encode("utf-8", "replace"), expected.encode()):
@@ -77,7 +78,7 @@ def _network(address: str) -> str:
 
 
 def connection_limit() -> int:
-    """Compute the largest number of connections: `_MAX_CONNECTIONS`, or fewer if file descriptors are few."""
+    """Compute the largest number of connections: `_MAX_CONNECTIONS`, or fewer if the system permits few open files."""
     with suppress(ImportError, OSError, ValueError):
         import resource
 

@@ -115,7 +115,7 @@ class _Pages:
         return Response(read_package_file(name, _PACKAGE), media_type=media_type)
 
     def _counters_and_outages(self) -> dict[str, Any]:
-        """Collect the counters, the number of queued blocks and the outages, which are known without the database."""
+        """Collect the counters, the number of queued blocks and the outages, without access to the database."""
         counters, outages = self._actuators.counters, self._supervisor.outages()
         return {"counters": counters, "waiting": self._queue_load().n_blocks, "outages": outages}
 
@@ -191,7 +191,7 @@ class _Pages:
         return _EventStream(self._events(request, name, pressure, detail_form), self._remove_listener)
 
     def _remove_listener(self) -> None:
-        """Count one listener less; called at the end of an event stream."""
+        """Decrease the number of listeners by 1; called at the end of an event stream."""
         self._n_listeners -= 1
 
     async def _events(self, request: Request, name: str, pressure: str, detail_form: str) -> AsyncIterator[str]:

@@ -136,10 +136,13 @@ class _Connection:
             client.publish(*self._state_message(online=True), qos=1, retain=True)
         for topic in (*self._names, *(self._host.topics if self._host is not None else ())):
             client.subscribe(topic, qos=1)
-        self._received.put((self._connection, None), size=0, always=True)  # no message: a new connection
+        self._received.put((self._connection, None), size=0, always=True)  # None tells the decoder of a new connection
 
     def _offline_message(self) -> tuple[str, str]:
-        """Build the last will, by which a Sparkplug primary host states that it is offline, with the present time."""
+        """Build topic and text of the last will, by which a Sparkplug primary host states that it is offline.
+
+        It has the time of the connection, which begins now.
+        """
         self._connected_ms = round(1000.0 * time.time())
         return self._state_message(online=False)
 

@@ -92,8 +92,9 @@ class WatchedFolder:
         """Yield the blocks of all files that are complete and not stored yet, in the order of their recording.
 
         A file is complete when it has not changed for `settle_s`. An unreadable one is tried again when it has not
-        changed for `_PATIENCE_FACTOR` times as long, and then refused: a block without samples is stored. A recording
-        older than the watched samples is refused, too. Raises PartAway if the folder cannot be read.
+        changed for `_PATIENCE_FACTOR` times as long, and then refused. A recording older than the watched samples is
+        refused, too. For a refused file, the reason and a block without samples are yielded. Raises PartAway if the
+        folder cannot be read.
         """
         files = sorted(self._files())  # by the time of their last change
         self._first_found = {file.identity: self._first_found.get(file.identity, time.monotonic()) for file in files}
@@ -141,7 +142,7 @@ class WatchedFolder:
     def _start_time(self, file: _FoundFile) -> float:
         """Find the time of a file's first sample [s since 1970], or the time of its last change if it is unreadable.
 
-        The recording that is read for this is kept for `blocks` if there is room in `_READ_AHEAD_BYTES`.
+        The file is read for this; `blocks` need not read it again if all such recordings fit in `_READ_AHEAD_BYTES`.
         """
         modified_s, path, identity = file
         if identity not in self._starts:
@@ -166,8 +167,8 @@ class WatchedFolder:
     def _find_refusal_reason(self, samples: Recording | None, file: _FoundFile) -> str:
         """Return the reason to refuse a recording that starts before the newest recording so far, or "" to accept it.
 
-        After a restart the last stored sample stands for the start of the newest recording. A recording of the same day
-        without a time of day is accepted, and so are all if the newest is dated in the future.
+        After a restart, the time of the last stored sample replaces the start of the newest recording. An earlier
+        recording is accepted if it states only the day of the newest one, or if the newest is dated in the future.
         """
         if samples is None:
             return ""
@@ -240,7 +241,10 @@ class WatchedFolder:
 
 
 def watch_folders(service: BlockReceiver, *, once: bool) -> None:
-    """Submit new files of the actuators' folders as blocks until the service stops; if `once`, only those there now."""
+    """Submit new files of the actuators' folders as blocks until the service stops.
+
+    `once`: True to end after the files that are there now.
+    """
     settle_s = 0.0 if once else service.settings.settle_s
     part, summaries = service.supervisor.part, service.summaries()
     folders: dict[SupervisedPart, WatchedFolder] = {}
@@ -260,7 +264,7 @@ def watch_folders(service: BlockReceiver, *, once: bool) -> None:
 
     while not service.stopping.is_set():
         succeeded = [folder_part.attempt(partial(submit_blocks, folder)) for folder_part, folder in folders.items()]
-        # in an outage of the database the folders are tried again
+        # with `once`, folders are read again only if they failed in an outage of the database
         if once and (all(succeeded) or part(DATABASE).since is None):
             return
         service.stopping.wait(_LOOK_S)

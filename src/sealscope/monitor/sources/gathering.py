@@ -80,9 +80,10 @@ class ValueGatherer:
         `t` [s]: time of the first sample, rounded to the sampling interval; the others follow at the sampling rate. NaN
         is an unknown value. Values without a finite time, and too many at once, are dropped. If the time jumps forward
         by more than `_AHEAD_S`, the blocks continue after the pause with each channel's last value. If it jumps back by
-        as much, all earlier values are discarded, unless the channel has no value yet: it was then constant since `t`.
+        as much, all earlier values are discarded. Only the first value of a channel may be as old: the channel has then
+        been constant since `t`.
         """
-        # a double resolves the number of a sample up to 2^52
+        # beyond 2^52 a double cannot tell the numbers of successive samples apart reliably
         if not math.isfinite(t) or abs(t * self.rate) > 2**52 or not 0 < len(values) <= MAX_SAMPLES:
             self._count("values without a clock, or too many")
             return []
@@ -125,7 +126,10 @@ class ValueGatherer:
         self._start = self._newest = None
 
     def _pop_blocks(self) -> list[Recording]:
-        """Remove and return complete blocks: each channel has values up to their end, or is silent for `SILENT_S`."""
+        """Remove and return the complete blocks, up to whose end each channel has sent values.
+
+        A channel without values for `SILENT_S` seconds is not waited for, unless all are silent.
+        """
         channels = self._channels.values()
         if self._start is None:
             has_new_values = any(channel.values for channel in channels)
@@ -137,7 +141,7 @@ class ValueGatherer:
                 first_indices = [min(min(channel.values) for channel in channels if channel.values)]
             self._start = max(first_indices)
         newest_indices = [channel.newest for channel in channels if channel.arrival >= self._now() - SILENT_S]
-        if not newest_indices or None in newest_indices:  # all are silent, or one has no value on the time axis
+        if not newest_indices or None in newest_indices:  # all are silent, or one has sent nothing since the axis began
             return []
         blocks: list[Recording] = []
         known_stop = min(index for index in newest_indices if index is not None) + 1

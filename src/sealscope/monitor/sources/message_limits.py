@@ -65,7 +65,7 @@ def check_cbor(payload: bytes) -> int:
 def check_json(payload: bytes) -> int:
     """Check that a JSON message does not have too many quotation marks or brackets; return the number of colons.
 
-    The number, with colons within texts, is for `check_json_keys`. Raises MessageLimit above a limit.
+    The number includes colons within texts; `check_json_keys` needs it. Raises MessageLimit above a limit.
     """
     n_quotes, n_brackets, n_colons = _count_marks(np.frombuffer(payload, dtype=np.uint8))
     if n_quotes > _MAX_QUOTES:
@@ -78,8 +78,8 @@ def check_json(payload: bytes) -> int:
 def check_json_keys(values: Any, payload: bytes, n_colons: int) -> None:
     """Check that no mapping of a JSON message repeats a key; raise MessageLimit otherwise.
 
-    A decoder keeps only the last value of a repeated key: the decoded message `values` then has fewer pairs than its
-    bytes `payload` have colons outside texts. `n_colons`: number of all colons, by `check_json`.
+    `values`: the decoded message; `payload`: its bytes; `n_colons`: number of colons in them (`check_json`). A decoder
+    keeps only the last value of a repeated key: there are then fewer pairs than colons outside texts.
     """
     if _count_shallow_pairs(values) != n_colons:  # a quick test, which a colon within a text also fails
         unquoted = payload.replace(b"\\\\", b"").replace(b'\\"', b"").split(b'"')[::2]  # the parts outside texts
@@ -125,7 +125,7 @@ def _count_marks(data: Any) -> tuple[int, int, int]:
 
 @law
 def _read_argument(data: Any, position: int, info: int) -> tuple[int, int]:
-    """Read the argument of a CBOR item, a number, and return it with the position after it, -1 if the data end.
+    """Read the argument of a CBOR item, a number; return it and the position after it, or -1 if the data end before.
 
     `data` (n,): bytes of the message; `position`: index after the item's initial byte; `info`: low 5 bits of that byte,
     the argument itself if below 24; 24 to 27 mean that the next 1, 2, 4 or 8 bytes contain it.
@@ -166,13 +166,13 @@ def _skip_pieces(data: Any, start: int, position: int, major: int, n_texts: int)
 
 @kernel
 def _scan_items(data: Any) -> tuple[int, int, int]:
-    """Check number, depth and types of the items of a CBOR message, given as bytes (n,), in one pass.
+    """Check the number, depth and types of the items of a CBOR message, given as bytes (n,), in one pass.
 
-    Returns the index in `_RULES` of the broken rule (0 for none), position of fault or end, and number of pairs.
+    Returns the index in `_RULES` of the broken rule (0 for none), the index of the byte at which the fault or the end
+    of the message lies, and the number of key-value pairs before it.
     """
-    # arrays by depth: `n_left` is the number of items that a container still needs, negative if its length is
-    # unknown; `role` is 0 in a list, in a mapping 1 before a key and 2 before a value; `n_items` counts the items so
-    # far
+    # for the container at each depth: `n_left` is the number of items still to come, negative if unknown; `role` is 0
+    # in a list, 1 before a key and 2 before a value of a mapping; `n_items` is the number of items so far
     size, position, depth = len(data), 0, 0
     n_left, role = np.zeros(MAX_DEPTH + 1, dtype=np.int64), np.zeros(MAX_DEPTH + 1, dtype=np.int64)
     n_items = np.zeros(MAX_DEPTH + 1, dtype=np.int64)

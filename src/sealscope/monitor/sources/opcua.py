@@ -116,8 +116,8 @@ class _OpcUaSession:
     def datachange_notification(self, node: Any, value: Any, data: Any) -> None:
         """Add a new value of the variable `node`, and queue the blocks that are then complete; called by asyncua.
 
-        `value`: number or array of samples; those not finite or not of good quality count as unknown (NaN), and any
-        other value is dropped and counted. `data`: time and quality of the value.
+        `value`: number or array of samples; numbers that are not finite or not of good quality become NaN, and values
+        of other types are dropped and counted. `data`: time and quality of the value.
         """
         name, channel = self._channels[node.nodeid]
         data_value = data.monitored_item.Value

@@ -289,7 +289,10 @@ def _parse_channel(values: Any, name: str, units: Mapping[str, Any]) -> np.ndarr
 
 
 def convert_to_si(values: Any, unit: object, channel: str) -> Any:
-    """Convert values of a channel from `unit`, None for SI; raise RefusedMessage if it has another dimension."""
+    """Convert values of a channel from `unit` to SI; leave them unchanged if it is None.
+
+    Raises RefusedMessage if the unit has another dimension than the channel.
+    """
     try:
         return values if unit is None else to_si(values, _abbreviate(unit), CHANNEL_UNITS[channel], name=channel)
     except InputError as error:

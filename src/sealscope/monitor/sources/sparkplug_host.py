@@ -99,7 +99,7 @@ class _Birth:
         return replace(metric, name=name, unit=metric.unit or birth_metric.unit)
 
     def rate(self, actuator: ActuatorSettings) -> float:
-        """Find the sampling rate [Hz] in the settings, else in its metric; raise RefusedMessage if it is not > 0."""
+        """Find the sampling rate [Hz] in the settings, else in the birth; raise RefusedMessage if it is not > 0."""
         metric = self.metrics.get(self.names.get(_RATE))
         rate = actuator.rate or (math.nan if metric is None else metric.value)
         if not isinstance(rate, (int, float)) or not 0.0 < rate < math.inf:
@@ -286,8 +286,9 @@ class SparkplugHost:
         shifted towards `t`, by at most `_MAX_SHIFT` samples.
         """
         start, expected_start = t, self._next_starts.get(actuator, math.nan)
-        if abs(expected_start - t) < 3.0 * _LATE_S:  # else samples are missing, or the clock was set
-            # the true time nearest to the expected start that rounding or truncation may turn into `t`
+        # rounding explains up to `_LATE_S`; three times as much means missing samples, or that the clock was set
+        if abs(expected_start - t) < 3.0 * _LATE_S:
+            # the true start lies within [t - _EARLY_S, t + _LATE_S]: take the time nearest to the expected start
             possible_start = min(max(expected_start, t - _EARLY_S), t + _LATE_S)
             shift, max_shift = possible_start - expected_start, _MAX_SHIFT / rate
             start = expected_start + min(max(shift, -max_shift), max_shift)
@@ -300,10 +301,10 @@ def _simultaneous_samples(
 ) -> dict[str, Array]:
     """Collect the samples (n,) of the metrics that have the same timestamp, by channel.
 
-    If a value of the `group` (metrics by channel) is an array, only channels with a value are returned, all of one
-    length n. Otherwise n is 1, and a fast channel that is left out repeats its last value in `birth`, which is updated,
-    unless that is an array; None becomes NaN. `channel_of`: channel by name of its metric. Raises RefusedMessage if the
-    values are not numbers, or arrays of different lengths.
+    `group`: these metrics by channel; `channel_of`: channel by name of its metric. If a value is an array, all must be
+    arrays of the same length n, and channels without a value are left out. Otherwise n is 1: `birth` stores the values,
+    and a fast channel that is not in the group repeats the last single value stored there; None becomes NaN. Raises
+    RefusedMessage if the values are not numbers, or arrays of different lengths.
     """
     if any(isinstance(metric.value, np.ndarray) for metric in group.values()):
         piece = {channel: np.atleast_1d(metric.value) for channel, metric in group.items() if metric.value is not None}
