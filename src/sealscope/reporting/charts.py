@@ -95,7 +95,7 @@ class Chart(NamedTuple):
 def display_values(recording: Recording, name: str, pressure_unit: str) -> tuple[str, Array]:
     """Convert a channel of a recording to its display unit; return the unit and the values (n,).
 
-    Pressures are in `pressure_unit`, raw counts in counts, others as in the log, by default degC, mm, rpm, L/min or SI.
+    Pressures are in `pressure_unit`, raw counts in counts, others in the log's unit, else degC, mm, rpm, L/min or SI.
     """
     si_unit = recording.units[name]
     unit = None if si_unit in ("Pa", COUNTS) else recording.unit_in_log(name)
@@ -121,9 +121,9 @@ def display_unit(unit: str, pressure_unit: str, *, detail: bool = False) -> tupl
 
 
 def detail_unit(unit: str, name: str, pressure_unit: str) -> tuple[str, float]:
-    """Choose the display unit of the wavelet detail `name`, such as "d3", and its size in `unit`; squares for d3d4.
+    """Choose the display unit of the wavelet detail `name`, such as "d3"; return this unit and its size in SI units.
 
-    `unit`: of the channel; `pressure_unit`: in which pressures are displayed.
+    For the product d3d4 both are squared. `unit`: SI unit of the channel; `pressure_unit`: the page's unit of pressure.
     """
     display, scale = display_unit(unit, pressure_unit, detail=True)
     return (f"{display}²", scale**2) if name == PRODUCT else (display, scale)
@@ -266,10 +266,10 @@ def draw(
     diagnosis: Diagnosis,
     marks: Sequence[Mark],
 ) -> DrawnCharts:
-    """Reduce and encode the lines of all charts for the script of the page, and draw a still picture of each chart.
+    """Encode the lines of all charts for the script of the page, and draw a still picture of each chart.
 
     Long channels are divided into groups of successive samples, of which only minimum and maximum are drawn, so that
-    peaks are preserved. `chambers`: give the time axes of the RMS windows; `marks`: moments besides the onset.
+    peaks are preserved. `chambers`: wavelet details with the times of their RMS windows; `marks`: further moments.
     """
     middle = float(recording.t[len(recording) // 2])
     near = diagnosis.onset_s if diagnosis.onset_s is not None and isfinite(diagnosis.onset_s) else middle
@@ -331,21 +331,21 @@ def render_still(
 ) -> Picture:
     """Draw the still picture of a chart, 860 pixels wide and `chart.height` pixels high, shown where no script runs.
 
-    `lines`: values (n,) of each line at the times `t` (n,) [s]; `span` [s]: ends of the time axis; `moments`: to be
-    marked.
+    `lines`: values (n,) of each line at the times `t` (n,) [s]; `span` [s]: ends of the time axis; `moments`:
+    moments and intervals to be marked.
     """
     lines = [_clip_values(line) for line in lines]
     all_values = np.concatenate(lines)
     finite = all_values[np.isfinite(all_values)]
     low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
     max_magnitude = max(abs(low), abs(high))
-    if high - low <= max(_MIN_EXTENT, _MIN_RELATIVE_EXTENT * max_magnitude):  # constant
+    if high - low <= max(_MIN_EXTENT, _MIN_RELATIVE_EXTENT * max_magnitude):  # all values are equal
         pad = max(0.5, 1e-6 * max_magnitude)
         low, high = low - pad, high + pad
     margin = 0.04 * (high - low)
     low, high = chart.limits or (low - margin, high + margin)
     lines = [np.clip(line, low, high) for line in lines]
-    ends = (span[0], span[1] if span[1] > span[0] else span[0] + 1)  # [s], an axis of at least some length
+    ends = (span[0], span[1] if span[1] > span[0] else span[0] + 1)  # [s], 1 s if the axis has no length
     # the margin below has room for the labels of the time axis
     picture = Picture(860.0, float(chart.height), ends, (low, high), margins=(0.0, 0.0, 0.0, 20.0))
     picture.frame(count=4)

@@ -75,7 +75,8 @@ def chamber_details(recording: Recording, channel: str) -> tuple[ChamberDetails 
             ends, window_rows = windowed_rms(rows[:, inside], first=inside.start)
         except InputError as error:  # such as pressures of 1e300, whose squares overflow
             return None, f"No details of {channel}: {error}."
-        for name, row, level in zip(QUANTITIES, rows, (1, 2, 3, 4, 4), strict=True):  # d3d4 is affected where d4 is
+        # padding at the ends affects d3d4 as far as d4
+        for name, row, level in zip(QUANTITIES, rows, (1, 2, 3, 4, 4), strict=True):
             unaffected_samples = transform.inside(level)
             values[name][part][unaffected_samples] = row[unaffected_samples]
         if ends.size:
@@ -109,7 +110,7 @@ class Parts(NamedTuple):
 
 
 def parts_to_compare(diagnosis: Diagnosis, recording: Recording) -> Parts:
-    """Choose the parts of a recording to compare: before and after the interval of the onset or, without it, halves.
+    """Choose two parts of a recording to compare: before and after the onset's interval, or halves without an onset.
 
     If the halves are too short for `HALF_WINDOWS` RMS windows each, the first part is the whole recording and the
     second is empty: a difference would reflect the motion of the piston and not the seal.
@@ -123,7 +124,7 @@ def parts_to_compare(diagnosis: Diagnosis, recording: Recording) -> Parts:
         return Parts(low, high, ("Before", "After"), text)
     if len(recording) < 2 * (WINDOW_SIZE + (HALF_WINDOWS - 1) * WINDOW_STEP):
         text = "No onset was found, and the recording is too short to be parted."
-        # all times lie before the end inf of the first part
+        # the first part ends at infinity, so that it has all samples
         return Parts(end=np.inf, start=np.inf, heads=("Whole", "Later"), text=text)
     middle = float(t[0] + t[-1]) / 2
     text = f"No onset was found: the first half is set against the second, parted at {middle:.1f} s."

@@ -198,7 +198,7 @@ def other_sizes(diagnosis: Diagnosis) -> str | None:
     if severity is None:
         return None
     creep = severity.creep_mm_per_min
-    # each quantity has a value, which is stated, and an interval
+    # [0]: each quantity is (value, low, high), of which only the value is stated
     parts = [
         None if severity.mL_per_min is None else f"{number(severity.mL_per_min[0], 2)} mL/min",
         None if diagnosis.leak_lpm is None else _pump_fraction(diagnosis),
@@ -208,7 +208,7 @@ def other_sizes(diagnosis: Diagnosis) -> str | None:
 
 
 def total_leakage(diagnosis: Diagnosis, *, basis: bool = True) -> str | None:
-    """Format the total leakage past pump and piston, if known, and its smallest change that could be detected.
+    """Format the total leakage past pump and piston, and its smallest change that could be detected; None if unknown.
 
     `basis`: True to add the piston area and pump displacement of the flows, unless the verdict is "leak".
     """
@@ -268,7 +268,7 @@ def _format_percent(fraction: float | None) -> str:
 
 
 def how_sure(diagnosis: Diagnosis) -> str:
-    """Format the evidence: odds that a healthy recording looks so, score, threshold, and false-alarm probability."""
+    """Format the evidence: odds that a healthy recording looks like this one, score, threshold, false-alarm rate."""
     if diagnosis.score is None or diagnosis.threshold is None:
         return say("how_sure.no_score")
     odds, found_cause = diagnosis.odds, cause(diagnosis)
@@ -348,7 +348,7 @@ def raw_counts(diagnosis: Diagnosis) -> str | None:
 
 
 def format_unused_columns(diagnosis: Diagnosis) -> str | None:
-    """Format a note on unused columns that could be channels, with options --map for four; None if there are none."""
+    """Format a note on unused columns, with options --map to use the first four as channels; None if there are none."""
     if not diagnosis.unused:
         return None
     lines = " ".join(f"--map '{suggest_map_entry(Label.parse(name))}'" for name in diagnosis.unused[:4])
@@ -399,7 +399,7 @@ def diagnosis_text(diagnosis: Diagnosis, *, width: int = WIDTH) -> str:
 
 
 def _figure_rows(diagnosis: Diagnosis) -> list[tuple[str, str | None]]:
-    """Build the rows (label, text or None) on the onset, the size and the severity of the leak."""
+    """Build the rows (label, text) on the onset, the size and the severity of the leak; a text is None if unknown."""
     size, basis = how_much(diagnosis), flow_basis(diagnosis)
     if size is not None and basis is not None and diagnosis.leak_lpm is not None:
         size = f"{size}; {basis}"
@@ -413,7 +413,7 @@ def _format_lines(diagnosis: Diagnosis, rows: list[tuple[str, str | None]], widt
 
 
 def format_leak_flow(diagnosis: Diagnosis) -> str:
-    """Format the leak flow with its interval or, without the verdict "leak", its bound, or say that none is stated."""
+    """Format the leak flow [L/min] with its interval for the verdict "leak", and its upper bound for other verdicts."""
     if diagnosis.verdict == "leak" and diagnosis.leak_lpm is not None:
         low, high = diagnosis.leak_interval_lpm or (diagnosis.leak_lpm, diagnosis.leak_lpm)
         return f"{number(diagnosis.leak_lpm, 2)} L/min ({number(low, 2)} to {number(high, 2)})"

@@ -13,8 +13,8 @@ from sealscope.recordings.recording import Recording
 def collect_particulars(recording: Recording, rig: Rig | None = None) -> dict[str, str]:
     """Collect the facts about a recording for the head of its page, as texts by label, such as "Date" or "Operator".
 
-    They come from remarks in its file. Without a remark, the machine is that of `rig`, and the date the recording's
-    start. Labels are in the order of `particulars.toml`.
+    The facts come from remarks in the recording's file. If none states the machine or the date, these are the name of
+    `rig` and the start of the recording. Labels are in the order of `particulars.toml`.
     """
     remarks = recording.remarks
     patterns_by_label = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
@@ -28,5 +28,5 @@ def collect_particulars(recording: Recording, rig: Rig | None = None) -> dict[st
         matches = (name for pattern in patterns for name in remarks if re.fullmatch(pattern, name, re.IGNORECASE))
         name = next(matches, None)
         if name is not None:
-            facts[label] = remarks.pop(name)  # no remark is used for two facts
+            facts[label] = remarks.pop(name)  # pop: no remark is used for two facts
     return {label: facts[label] for label in patterns_by_label if label in facts}

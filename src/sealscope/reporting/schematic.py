@@ -48,8 +48,8 @@ class Circuit(NamedTuple):
 def build_circuit(rig: Rig | None, recorded: Container[str], machine: AssumedMachine | None = None) -> Circuit:
     """Choose the parts of a machine to draw in the schematic.
 
-    Without `rig`, only the parts of every pump-controlled actuator are drawn, with areas and displacement that
-    `machine` may state. A bypass is drawn if `q_leak` is among the `recorded` channels.
+    Without `rig`, only the parts that every pump-controlled actuator has are drawn, labelled with the areas and the
+    displacement if `machine` states them. A bypass is drawn if `q_leak` is among the `recorded` channels.
     """
     bypass = "q_leak" in recorded
     values = dict.fromkeys(_VALUES, "")
@@ -74,7 +74,7 @@ def build_circuit(rig: Rig | None, recorded: Container[str], machine: AssumedMac
 def _cylinder_parts(areas: tuple[float, float]) -> tuple[str, str, float]:
     """Determine the type of a cylinder, its sides with a rod ("A", "B" or "AB"), and the drawn height of the rod.
 
-    `areas`: of the piston's sides A and B. A single rod's height over the bore's is sqrt(1 - smaller / larger area).
+    `areas`: areas of the sides A and B. A single rod is drawn sqrt(1 - smaller/larger area) times as high as the bore.
     """
     ratio = min(areas) / max(areas)
     if ratio > _MIN_DOUBLE_ROD_RATIO:
@@ -84,7 +84,7 @@ def _cylinder_parts(areas: tuple[float, float]) -> tuple[str, str, float]:
 
 
 def _value_text(value: float, unit: str, scale: float) -> str:
-    """Format a value in SI as a number with four significant digits and `unit`, whose size in SI is `scale`."""
+    """Format a value in SI units as a number of `unit` with four significant digits; `scale`: `unit` in SI units."""
     return f"{messages.number(value / scale, 4)} {unit}"
 
 

@@ -38,7 +38,7 @@ class DrawnTimes:
         """Reduce the values (n,) of a channel to the points (m,) that are drawn at the times `t`.
 
         Each bucket, a group of successive samples, gives its minimum and maximum, the minimum first if the last value
-        is not below the first. A bucket of one sample gives one point. A NaN at each gap in time is inserted.
+        is not below the first. A bucket of one sample gives one point. A NaN is inserted at each gap in time.
         """
         values = np.where(np.isfinite(values), values, np.nan)
         low = np.fmin.reduceat(values, self.starts)
@@ -56,9 +56,9 @@ def _interleave(first: Array, second: Array, sizes: NDArray[np.int64]) -> Array:
 
 
 def ordered_time(t: Array, rate: float) -> tuple[Array, bool]:
-    """Choose an increasing time axis (n,) [s] for a recording with the time stamps `t` (n,) [s].
+    """Choose an increasing time axis (n,) [s] for a recording, and tell whether it was computed from sample numbers.
 
-    It is `t` and False or, if `t` does not increase, the number of the sample over the `rate` [Hz] and True.
+    The axis is the time stamps `t` (n,) [s]. If they do not increase, it is the sample number divided by `rate` [Hz].
     """
     by_sample = not (np.all(np.isfinite(t)) and np.all(np.diff(t) > 0))
     return (np.arange(t.size) / rate, True) if by_sample else (t, False)
@@ -69,11 +69,11 @@ def choose_drawn_times(
 ) -> DrawnTimes:
     """Choose the times at which a chart draws a recording: about `points`, and all samples around the time `near`.
 
-    There are two times for each bucket, a group of successive samples of which only minimum and maximum are drawn. Full
-    buckets have equal numbers of samples, so a drawn peak is at most one bucket away from its true time. At a gap in
-    time, or only at the longest if they exceed a twentieth of `points`, a new bucket starts, and an additional point
-    interrupts the line. `t` (n,) [s]: time stamps; `rate` [Hz]: nominal sampling rate; `near` [s]: time around which
-    `near_samples` samples are all drawn, None for the start of the recording.
+    The samples are divided into buckets, groups of successive samples of which only minimum and maximum are drawn. A
+    bucket has two times. Full buckets have equal numbers of samples, so a drawn peak is at most one bucket away from
+    its true time. At each gap in time a new bucket starts, and an additional point interrupts the line; of many gaps,
+    only the longest count, a twentieth of `points`. `t` (n,) [s]: time stamps; `rate` [Hz]: nominal sampling rate;
+    `near` [s]: time around which `near_samples` samples are all drawn, None for the start of the recording.
     """
     n = t.size
     t, by_sample = ordered_time(t, rate)

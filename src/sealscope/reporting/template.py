@@ -83,7 +83,7 @@ def _script_json(value: Any) -> Markup:
 
 
 def parse_page_path(path: str | os.PathLike[str], *, card: bool = True) -> Path:
-    """Convert the path of a page to a Path; raise InputError unless it ends in .html, .htm, .pdf, or .png if `card`."""
+    """Check that a path ends in .html, .htm or .pdf, or in .png if `card`; return it as a Path, or raise InputError."""
     suffixes = _SUFFIXES if card else _SUFFIXES[:-1]  # the last one is .png
     if Path(path).suffix.lower() not in suffixes:
         raise InputError(f"a page must be a file {', '.join(suffixes)}, got {os.fspath(path)}")

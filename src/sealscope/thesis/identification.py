@@ -46,9 +46,9 @@ def noise_free_mean_squares(
 ) -> Array:
     """Simulate a test of Appendix C without noise, and compute the mean squares of its wavelet details.
 
-    Returns the mean squares of d1..d4 [psi^2] and of the product d3d4 [psi^4] as (chambers, 5), sampled at the rig's
-    rate behind its anti-alias filter, from 7.2 s on (`SETTLING`) for 4 pi s (`ANALYSED`). `leak`: text of the leak,
-    None for no leak; `x_0` [m]: start of the piston; `values`: parameters that override the test's.
+    Returns (chambers, 5): the mean squares of d1..d4 [psi^2] and of the product d3d4 [psi^4]. The pressures are sampled
+    at the rig's rate after its anti-alias filter; the means are over 4 pi s (`ANALYSED`) from 7.2 s on (`SETTLING`).
+    `leak`: text of the leak, None for no leak; `x_0` [m]: first position; `values`: parameters that replace the test's.
     """
     duration = ANALYSED + SETTLING + 128.0 / rig.daq.sample_rate  # 128: more than the 120 later samples of d4
     values = {**experiment_values(condition), **(values or {})}
@@ -78,8 +78,7 @@ def log_rms(squares: Array, sigma: float) -> Array:
 def pressure_noise(rig: Rig, chamber: str) -> float:
     """Compute the standard deviation [psi] of the noise in one sample of a chamber's pressure.
 
-    It is ``sqrt(sensor^2 + common^2 + step^2/12)``, from the noise of the sensor, the common noise, and the step of the
-    quantisation.
+    It is ``sqrt(sensor^2 + common^2 + step^2/12)``: noise of the sensor, common noise, and step of the quantisation.
     """
     sensor, daq = getattr(rig.sensors, chamber), rig.daq
     step = daq.step * (sensor.range_hi - sensor.range_lo) / (daq.sensor_volts_hi - daq.sensor_volts_lo)
@@ -158,7 +157,7 @@ def predicted_sheet(
 
 
 def _scale_parameters(rig: Rig, factors: Mapping[str, float]) -> Rig:
-    """Multiply parameters of a rig by the `factors` on them, by name of the parameter; return the new rig."""
+    """Return a copy of a rig with some parameters multiplied by `factors`, which are given by parameter name."""
     return rig.with_overrides({name: float(rig[name]) * factor for name, factor in factors.items()}) if factors else rig
 
 

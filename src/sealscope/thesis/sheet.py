@@ -54,7 +54,7 @@ class Condition:
 
     @property
     def group(self) -> tuple[str, float]:
-        """Command and closing of both throttles [%], equal for all tests of a group, which differ in the leak."""
+        """Command and closing of both throttles [%]; tests with the same group differ only in the leak."""
         return self.command, self.closed_pct
 
 
@@ -62,7 +62,7 @@ def experiment_values(condition: Condition) -> dict[str, str | float]:
     """Return the rig's parameters in a test of Appendix C by name, as `Experiment.of` takes them in `set`.
 
     Each line has an orifice that can be closed. If both are open, `line.orifices` is not set, and the rig decides
-    whether they count: not in the thesis's model (section 4.2.1), but in a rig that includes the drop of open valves.
+    whether they cause a pressure drop. They cause none in the thesis's model (section 4.2.1).
     """
     closed = condition.closed_pct / 100.0
     values: dict[str, str | float] = {"line.closed_A": closed, "line.closed_B": closed}

@@ -44,7 +44,7 @@ def _format_area(area: Area) -> str:
 
 
 def column_sizes(judgement: Judgement) -> list[float]:
-    """List the leak sizes with a column in the main table; [nan] (all sizes together) if they are none or too many."""
+    """List the leak sizes that get columns in the main table; [nan], for any size, if there are none or too many."""
     sizes = sorted({row.leak_lpm for row in judgement.table if row.leak_lpm > 0})
     return sizes if 0 < len(sizes) <= _MAX_SIZES else [math.nan]
 
@@ -90,7 +90,8 @@ def _format_knowledge(known: PriorKnowledge | None) -> str:
 def _format_a90(pod: DetectorPod | None) -> tuple[str, str]:
     """Format the leak size a90 of a detector, detected with a probability of 90 %, and its upper 95 % bound a90/95.
 
-    `pod`: probability of detection (POD) over the size. A size above all tested ones is written "> LARGEST".
+    `pod`: probability of detection (POD) over the size. A size above all tested sizes is written "> LARGEST", an
+    unknown size as a dash.
     """
     if pod is None or pod.curve is None:
         return "–", "–"
@@ -106,7 +107,7 @@ def result_text(result: CampaignResult) -> str:
     """Summarise in a few sentences the leaks that the best detectors of a campaign find, and their false alarms.
 
     At most `_MAX_NAMED` detectors are described, in the order of a90, the leak size that is detected with a probability
-    of 90 %. Those without an a90 within the tested sizes follow by the fraction of the largest leaks found.
+    of 90 %. Those without an a90 within the tested sizes follow, ordered by the fraction of the largest leaks found.
     """
     judgement, unit = result.judgement, result.plan.unit
     ranked_findings: list[tuple[float, float, str]] = []
@@ -135,7 +136,7 @@ def campaign_text(result: CampaignResult) -> str:
     heads, rows = main_table(result)
     widths = [max(map(len, column)) for column in zip(heads, *rows, strict=True)]
     lines = []
-    for name, *cells in (heads, *rows):  # the name of the detector stands left, the other cells right
+    for name, *cells in (heads, *rows):  # the detector's name is aligned left, the other cells right
         right = (text.rjust(width) for text, width in zip(cells, widths[1:], strict=True))
         lines.append("  ".join([name.ljust(widths[0]), *right]).rstrip())
     return "\n".join([result.plan.title, *lines, *(paragraph(note) for note in _notes(result))])
@@ -220,8 +221,8 @@ def render_campaign_page(result: CampaignResult, files: Sequence[str] = ()) -> s
 def _facts(result: CampaignResult) -> list[tuple[str, str]]:
     """List the conditions of a campaign for its page, as pairs of label and text.
 
-    For recordings of machines there is a pair for each set. For simulated records they are rig, records, factors, seed,
-    mode, the channels of each view that detectors are given, any assumed rig, and the simulated leak flows.
+    For recordings of machines there is a pair for each set of files. For simulated records the pairs are: rig, records,
+    factors, seed, mode, the channels in each view (the channels a detector is given), any assumed rig, and leak flows.
     """
     plan, judgement = result.plan, result.judgement
     if isinstance(plan, RecordedPlan):
@@ -245,7 +246,7 @@ def _facts(result: CampaignResult) -> list[tuple[str, str]]:
 
 
 def _describe_assumed_machine(plan: SimulatedPlan) -> str:
-    """Describe the rig that the detectors assume, with the first parameters that differ from the simulated rig's."""
+    """Describe the rig that the detectors assume, with a few parameters that differ from those of the simulated rig."""
     if plan.assumed == plan.rig:
         return f"the rig {plan.rig.name} as it stands, not the machine that was drawn"
     simulated_values = {row.name: row.value for row in plan.rig.table()}
@@ -259,8 +260,9 @@ def _describe_assumed_machine(plan: SimulatedPlan) -> str:
 def _detector_section(pod: DetectorPod, judgement: Judgement, unit: str) -> dict[str, Any]:
     """Build the template's values for the section of one detector on a campaign's page.
 
-    It has plots, the areas under the ROC curves, and a table of the fractions of alarms by the factors' levels and the
-    leak size, empty without factors or with too many sizes. `pod`: probability of detection over the size, in `unit`.
+    The section has plots, the areas under the ROC curves, and a table: the fractions of alarms by leak size and by the
+    levels of the campaign's factors. The table is empty if there are no factors or too many sizes. `pod`: the
+    detector's probability of detection over the leak size, in `unit`.
     """
     name = pod.detector
     rocs = [roc for roc in judgement.rocs if roc.detector == name]
@@ -294,12 +296,12 @@ def _size_text(roc: SizeRoc, unit: str) -> str:
 def _describe_score(name: str) -> str:
     """Describe the score from which the ROC curve of a detector is computed; "" if the detector is not installed."""
     detector = parse_detector_name(name)
-    through = f", given the channels of {detector.view} alone" if detector.view else ""
+    view_text = f", given the channels of {detector.view} alone" if detector.view else ""
     if detector.scorer is not None:
-        return detector.scorer.description + through
+        return detector.scorer.description + view_text
     if detector.base == DIAGNOSE:
-        return f"score over threshold of the detector that judged{through}"
-    return f"the score of the detector {detector.base!r}{through}" if detector.base in detectors() else ""
+        return f"score over threshold of the detector that judged{view_text}"
+    return f"the score of the detector {detector.base!r}{view_text}" if detector.base in detectors() else ""
 
 
 class _PlotCurve(NamedTuple):

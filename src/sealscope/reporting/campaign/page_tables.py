@@ -46,7 +46,7 @@ class PageTable(NamedTuple):
 def page_tables(judgement: Judgement, unit: str, part: str = "") -> dict[str, PageTable]:
     """Build the tables of `page_tables.toml` that are not empty, by name.
 
-    `unit`: of the leak sizes; `part`: purpose of the campaign, such as "development", "" if not stated.
+    `unit`: unit of the leak sizes; `part`: purpose of the campaign, such as "development", "" if not stated.
     """
     tables = {}
     for name, layout in tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8")).items():
@@ -60,9 +60,10 @@ def page_tables(judgement: Judgement, unit: str, part: str = "") -> dict[str, Pa
 
 
 def _format_cell(row: Any, content: str) -> str:
-    """Format one cell: `content` is a format, a space, and the dotted path of the value in the attributes of `row`.
+    """Format the value of one cell, which is an attribute of `row`.
 
-    The format is an entry of `_FORMATS`, such as "percent", or a format specification of Python, or missing.
+    `content`: format, a space, and the dotted path of the attribute. The format is the name of an entry of `_FORMATS`,
+    such as "percent", or a format specification of Python, or missing.
     """
     format_name, _, path = content.rpartition(" ")
     value = resolve_attribute(row, path)
@@ -85,7 +86,7 @@ class CauseTable(NamedTuple):
 
 
 def cause_tables(judgement: Judgement) -> list[CauseTable]:
-    """Build the table of named causes by true cause for each detector."""
+    """Build a table for each detector that counts the causes it named (columns) by the true cause (rows)."""
     tables = []
     for causes in judgement.causes:
         confusion = causes.confusion

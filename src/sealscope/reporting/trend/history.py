@@ -76,8 +76,8 @@ def render_history_page(judged: Sequence[Judged], title: str, left_out: int = 0)
 def history_pictures(ordered: Sequence[Judged]) -> dict[str, Picture] | None:
     """Draw each recording's leak flow [L/min] over time, as a picture for each of the `SIZES`, "wide" and "narrow".
 
-    `ordered`: by start; if one has no date, all are drawn over their numbers, from 1. A diagnosis without the verdict
-    `leak` is drawn with the upper bound of a leak. Returns None without any flow or bound.
+    `ordered`: recordings in the order of their start; if a date is missing, the axis counts the recordings from 1. For
+    verdicts other than `leak`, the upper bound of a leak is drawn. Returns None if no flow and no bound is known.
     """
     levels = [_leak_level(entry.diagnosis) for entry in ordered]
     known_levels = [level for level in levels if level is not None]
@@ -119,7 +119,10 @@ def history_pictures(ordered: Sequence[Judged]) -> dict[str, Picture] | None:
 
 
 def _leak_level(diagnosis: Diagnosis) -> _Level | None:
-    """Return the leak of a diagnosis as (estimate, low, high), its bound as (bound, None, bound), or None [L/min]."""
+    """Return the leak flow [L/min] of a diagnosis as (estimate, low, high); None if it is not known.
+
+    For verdicts other than `leak`, the result is the upper bound of a leak, as (bound, None, bound).
+    """
     leak, bound = diagnosis.leak_lpm, diagnosis.bound_lpm
     if diagnosis.verdict != "leak":
         return None if bound is None or not math.isfinite(bound) else (bound, None, bound)
@@ -130,7 +133,7 @@ def _leak_level(diagnosis: Diagnosis) -> _Level | None:
 
 
 def _dates(ordered: Sequence[Judged]) -> list[str]:
-    """Format the start of each recording as a date, with the time of day if they span less than 3 days; or a dash."""
+    """Format the start of each recording as a date, with the time of day if all are within 3 days; "–" if unknown."""
     starts = [entry.start_s for entry in ordered if entry.start_s is not None]
     span_days = (max(starts) - min(starts)) / DAY if starts else 0.0
     return [messages.ABSENT if entry.start_s is None else stamp(entry.start_s, span_days) for entry in ordered]
@@ -139,9 +142,9 @@ def _dates(ordered: Sequence[Judged]) -> list[str]:
 def _draw_comparison(ordered: Sequence[Judged]) -> tuple[list[charts.Chart], charts.DrawnCharts | None, list[str]]:
     """Draw the channels of the newest and of an earlier recording in the same charts, from a common start.
 
-    The earlier is the last one with the verdict `no leak` or else the last but one; `ordered`: by start. Returns the
-    charts, the same charts drawn for the page, and the names of the two files; or ([], None, []) if there is only one
-    recording, no common channel, or a clock that does not increase.
+    The earlier recording is the last one with the verdict `no leak` or, if there is none, the last before the newest.
+    `ordered`: recordings in the order of their start. Returns the charts, their drawn lines, and the names of the two
+    files; or ([], None, []) if there is only one recording, no common channel, or a time that does not increase.
     """
     *earlier, newest = ordered
     healthy = [entry for entry in earlier if entry.diagnosis.verdict == "no leak"]

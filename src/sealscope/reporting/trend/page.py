@@ -88,8 +88,9 @@ def trend_pictures(trend: Trend) -> dict[str, Picture] | None:
 def _draw_trend(trend: Trend, picture: Picture) -> None:
     """Draw a trend into a picture, in the trend's unit of leakage over days since the first recording.
 
-    Each episode (recordings from one repair to the next) has the range of healthy recordings and the fitted line; each
-    recording a point with its interval, or a symbol at the bottom; each alarm and repair a vertical line.
+    An episode (recordings from one repair to the next) is drawn as the range of healthy recordings and the fitted line,
+    a recording as a point with its interval or, if the leakage is unknown, as a symbol at the bottom, and an alarm or a
+    repair as a vertical line.
     """
     days = [trend.points[row].day for row in trend.rows]
     for episode in trend.episodes:

@@ -19,7 +19,7 @@ from sealscope.units import BAR, DAY, DAYS_PER_YEAR
 
 
 def level_name(trend: Trend) -> str:
-    """Return the label of a trend's present level: "total" leakage or, if it follows the pressures' ringing, "now"."""
+    """Return the label of the present leakage: "now" if the trend is based on the pressures' ringing, else "total"."""
     return "now" if trend.basis == "ringing" else "total"
 
 
@@ -32,10 +32,7 @@ def moment(trend: Trend, day: float) -> str:
 
 
 def stamp(seconds: float, span_days: float) -> str:
-    """Format a time [s since 1970] as a date, with the time of day if `span_days` is below 3.
-
-    `span_days` [d]: span of all times that are shown together.
-    """
+    """Format a time [s since 1970] as a date, with the time of day if the span of all shown times is below 3 days."""
     text = str(np.datetime64(round(seconds * 1e3), "ms"))  # such as 2026-11-25T09:30:00.000
     return text[:16].replace("T", " ") if span_days < 3.0 else text[:10]
 
@@ -113,7 +110,7 @@ def figures(trend: Trend) -> dict[str, str]:
 
 
 def healthy_end(wear: Wear) -> float:
-    """Compute the upper end of the healthy range for display, cut off at the repair limit but not below its mean."""
+    """Compute the upper end of the healthy range, cut at the repair limit but not below the healthy mean."""
     high = wear.healthy.high
     return high if wear.limit is None else min(high, max(wear.limit, wear.healthy.value))
 

@@ -72,7 +72,7 @@ def compare_sheets(sheet: DataSheet, measured: DataSheet | None) -> list[tuple[C
 
 
 def agreement_tables(context: Context, item: Item) -> tuple[ThesisTable, ...]:
-    """Tabulate how well the simulated data sheet agrees with the measured one (`compare_sheets`), and both sheets."""
+    """Tabulate how well the simulated data sheet agrees with the measured one, and for each chamber both sheets."""
     table, sheet = simulated_sheet(context, "leak")
     notes = f"{table.notes} Means are geometric." + ("" if context.sheet else " No measured sheet was given.")
     summary = item.table(compare_sheets(sheet, context.sheet), notes, resolved=table.resolved)

@@ -78,8 +78,8 @@ def leak_test(
 def build_experiments(kind: Runs, half: float, quick: bool) -> list[tuple[Condition, Experiment]]:
     """Build the experiments of all tests of Appendix C, as pairs (inputs of the test, experiment).
 
-    `kind`: what changes in the middle of each test; `half`: half the duration [s]. With drift each test occurs twice,
-    with two random draws of the steps, or once if `quick`.
+    `kind`: what changes in the middle of each test, at the time `half` [s]. With drift, parameters step by random
+    amounts, and each test occurs twice with different amounts, or once if `quick`.
     """
     runs = []
     for draw, condition in product(range(2 if kind == "drift" and not quick else 1), APPENDIX_C):
@@ -99,10 +99,10 @@ def _describe_change(experiment: Experiment) -> str:
 
 
 def part_detail_rms(recording: Recording, parts: Sequence[tuple[float, float]]) -> RmsPairs:
-    """Compute the RMS of the wavelet details of both chamber pressures in each part (from, to) [s] of a recording.
+    """Compute the RMS of the wavelet details of both chamber pressures in each part of a recording.
 
-    Returns, by chamber and detail, the RMS of each part: of d1..d4 [psi], and of the product d3d4 [psi^2]. Each part is
-    shortened by the reach of the wavelet's filters, so that no detail depends on samples outside of it.
+    `parts`: begin and end [s] of each part. Returns the RMS in each part, by chamber and detail: d1..d4 [psi] and the
+    product d3d4 [psi^2]. Parts are shortened by the reach of the wavelet's filters, which would use samples outside.
     """
     before, after = reach("db8", 4)[-1]  # numbers of earlier and later samples on which d4 depends
     bounds = np.round(np.array(parts) * recording.rate).astype(int) + np.array([before, -after])
@@ -151,8 +151,8 @@ def column(table: ThesisTable, head: str) -> Array:
 
 
 def parse_sheet(table: ThesisTable) -> DataSheet:
-    """Build the data sheet from a table of simulated tests, one a row, with the columns `COLUMNS`."""
-    # (chambers, details, halves, tests)
+    """Build the data sheet from a table of simulated tests, with one test per row and the columns `COLUMNS`."""
+    # shape: (chambers, details, halves of the test, tests)
     values = np.array([column(table, head) for *_, head in _RMS_COLUMNS]).reshape(len(CHAMBERS), len(QUANTITIES), 2, -1)
     return DataSheet({c: {q: values[k, j].T for j, q in enumerate(QUANTITIES)} for k, c in enumerate(CHAMBERS)})
 

@@ -110,7 +110,7 @@ class FigureView:
     def _curve(self, y: Array, label: str, role: Role, t: Array | None = None, start: float = 0.0) -> FigureCurve:
         """Build the curve of `y` over `t` [s], by default the recording's times, within the figure's interval.
 
-        `role`: meaning of the curve, which determines the line style; `start` [s]: the curve begins there or later.
+        `role`: meaning of the curve, which determines the line style; `start` [s]: earliest time of the curve.
         """
         t = self.recording.t if t is None else t
         is_drawn = (t >= max(start, self.span[0])) & (t <= self.span[1])
@@ -208,7 +208,7 @@ _VIEWS: dict[str, tuple[str, Callable[[FigureView], PanelsAndNumbers]]] = {
 
 
 def iter_views() -> Iterator[tuple[str, str, dict[str, object]]]:
-    """Yield (id, title, inputs) of Figs. 5.1 to 5.89: views of each test as a whole, or close to the opening."""
+    """Yield (id, title, inputs) of Figs. 5.1 to 5.89, which show a whole test or the time around the leak's opening."""
     for test in TESTS.values():
         input_views = [("input", "", False), ("input", "", True)]  # (view, chamber, is_closeup)
         test_views = [*input_views[: test.n_input_figures], ("leak", "", False), ("leak", "", True)]
@@ -282,7 +282,10 @@ def fit_step_time(t: Array, y: Array, min_points: int = 5) -> float:
 
 
 def measure_test(context: Context, test: PrintedTest, *, leak: bool = True) -> LeakTestMeasures:
-    """Simulate one of the ten tests of chapter 5, with or without its `leak`, and compute measures of both parts."""
+    """Simulate one of the ten tests of chapter 5, and compute measures of its parts before and after the leak opens.
+
+    `leak`: False to simulate the test without the leak.
+    """
     experiment = make_test_experiment(test)
     run = context.run(experiment) if leak else context.run(replace(experiment, leaks=()), prove=False)
     recording = run.recorded

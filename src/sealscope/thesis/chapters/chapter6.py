@@ -130,7 +130,10 @@ class ControlledRig:
         return integrate_run(experiment, experiment.leaks)
 
     def run_duty(self, load: str = "0 N") -> tuple[Trajectory, Array]:
-        """Simulate five cycles of `DUTY` under `LOAD` plus `load`; return the run and a mask of its last two cycles."""
+        """Simulate five cycles of the position sine `DUTY`; return the run and the mask of its last two cycles.
+
+        `load`: text of a force that is added to `LOAD`.
+        """
         run = self.run(DUTY, 5.0 * CYCLE, load)
         return run, np.asarray((run.t >= 3.0 * CYCLE) & (run.t < 5.0 * CYCLE))
 
@@ -203,7 +206,7 @@ def tracking(run: Trajectory, mask: Array) -> Tracking:
 
 
 def controllers_table(context: Context, item: Item) -> tuple[ThesisTable | Figure, ...]:
-    """Tabulate, and partly draw, tracking, bandwidth, energy, stiffness and leakage, by controller and leak."""
+    """Tabulate tracking, bandwidth, energy, stiffness and leakage by controller and leak; plot error and stiffness."""
     rows: list[tuple[Cell, ...]] = []
     for name, lpm in itertools.product(CONTROLLERS, _leak_flows(context)):
         loop = ControlledRig(name, lpm)
@@ -224,7 +227,7 @@ def _figure_over_leak(
 ) -> Figure:
     """Draw some columns of a table over the leak, one panel each.
 
-    `roles`: line style of each curve, by the first cells of its rows; `columns`: heads of the columns to draw.
+    `roles`: line style of each curve, by the first cells of its rows in `table`; `columns`: columns to draw.
     """
     panels = []
     for head in columns:
@@ -292,11 +295,11 @@ def external_leak_table(context: Context, item: Item) -> tuple[ThesisTable, ...]
     """Tabulate tracking and stiffness of each controller with a leak past the rod seal of either side.
 
     The last column is the change [kPa] of the mean of min(p_A, p_B) over a cycle, from the third to the fifth cycle,
-    due to the loss of oil. The flow of a leak is stated for the mean pressure of the leaking side without leaks.
+    due to the loss of oil. The flow of a leak is stated for the mean pressure on its side in a run without leaks.
     """
     healthy, mask = ControlledRig("pi", 0.0).run_duty()
     pressure = {side: float(np.mean(healthy[f"p_{side}"][mask])) for side in ("A", "B")}
-    # "ideal" is left out, as it knows only internal leaks
+    # the controller "ideal" is left out, as only internal leaks are made known to it
     names, leaks = (("pi",), (0.5,)) if context.quick else (CONTROLLERS[:-1], LEAKS[1:])
     rows: list[tuple[Cell, ...]] = []
     for side, name, lpm in itertools.product(pressure, names, leaks):
@@ -311,7 +314,7 @@ def external_leak_table(context: Context, item: Item) -> tuple[ThesisTable, ...]
 
 
 def valve_table(context: Context, item: Item) -> tuple[ThesisTable | Figure, ...]:
-    """Compare the pump-controlled with the valve-controlled rig in a table over controllers and leaks, and a figure."""
+    """Compare a pump- and a valve-controlled rig by controller and leak in a table; plot their energy and stiffness."""
     rigs = {"pump": RIG, "valve": VALVE_RIG}
     rows: list[tuple[Cell, ...]] = []
     for (source, rig), name, lpm in itertools.product(rigs.items(), VALVE_CONTROLLERS, _leak_flows(context)):

@@ -65,7 +65,7 @@ def _format_count(fires: Fires | None) -> tuple[Cell, Cell, Cell, Cell]:
 
 
 def _count_heads(source: str, count: str) -> tuple[str, ...]:
-    """Build the heads of a count (named `count`), its rate [%] and 95 % interval on the data sheet `source`."""
+    """Build column heads for a count (named `count`), its rate and both ends of its interval on the sheet `source`."""
     return tuple(f"{source}: {part}" for part in (count, "rate [%]", "95 % low [%]", "95 % high [%]"))
 
 
@@ -123,9 +123,9 @@ def column_tests(sheet: DataSheet) -> list[_Row]:
 def d1_threshold(sheet: DataSheet, chamber: str, either_side: bool = False) -> float:
     """Compute the change of log RMS that noise alone exceeds in 5 % of the tests (`FALSE_ALARMS`).
 
-    It is 1.645 times the rms log change of d1 over the tests of the sheet if changes of one sign count, and 1.960 times
-    if `either_side`. The finest wavelet detail d1 of the pressure `chamber` is noise and does not depend on the leak.
-    The other details scatter at least as much.
+    The finest wavelet detail d1 of the pressure `chamber` is noise and does not depend on the leak; the other details
+    scatter at least as much. The threshold is 1.645 times the rms log change of d1 over the tests of the sheet, or
+    1.960 times if changes of `either_side` count, rises as well as falls.
     """
     change = sheet.log_change(chamber, "d1")
     return float((WITHIN_95 if either_side else UPPER_95) * np.sqrt(np.mean(change**2)))
@@ -134,19 +134,18 @@ def d1_threshold(sheet: DataSheet, chamber: str, either_side: bool = False) -> f
 def drift_threshold(drift: DataSheet, chamber: str, detail: str) -> float:
     """Compute the change of log RMS that drifting parameters alone exceed in 5 % of the tests (`FALSE_ALARMS`).
 
-    It is the 95 % quantile over `drift`, the sheet simulated with drifting parameters and no leak, for changes of the
-    detail in the direction in which a leak should move it: down for p_A, up for p_B (`DIRECTION`).
+    It is the 95 % quantile of the detail's changes in `drift`, the sheet simulated with drifting parameters and no
+    leak. A change is positive if it has the direction that a leak should cause: down for p_A, up for p_B (`DIRECTION`).
     """
     return float(np.quantile(drift.log_change(chamber, detail) * DIRECTION[chamber], 1.0 - FALSE_ALARMS))
 
 
 def count_with_thresholds(measured: DataSheet | None, leak: DataSheet, drift: DataSheet) -> list[_Row]:
-    """Count the leaks that each rule on a single wavelet detail finds if a change must exceed a threshold.
+    """Count the leaks that each rule on a single wavelet detail finds if its RMS must change by more than a threshold.
 
-    The log RMS of the detail must change with the leak by more than the threshold, which 5 % of the tests without a
-    leak exceed, in the direction in which a leak should move it. The threshold is that of `d1_threshold` for the
-    `measured` tests, None if not given, and that of `drift_threshold` for the tests simulated with a `leak`. Returns
-    rows with the columns `THRESHOLDS`.
+    The change of the log RMS counts in the direction in which a leak should move it (`DIRECTION`). 5 % of the tests
+    without a leak would exceed the threshold: `d1_threshold` for the `measured` sheet, None if not given, and
+    `drift_threshold` over `drift` for the sheet simulated with a `leak`. Returns rows with the columns `THRESHOLDS`.
     """
     rows: list[_Row] = []
     for rule in (*CLAIMED_CELLS, *UNCLAIMED):

@@ -81,8 +81,8 @@ class SheetClaim:
     def judge(self, evidence: ClaimEvidence, id: str, kind: str = "") -> Claim:
         """Judge the claim by the measured data sheet, and state the findings on the measured and the simulated sheet.
 
-        `kind`: key of the texts in `claims.toml` if claims share them, by default `id`. Without a measured sheet it
-        `cannot be tested`.
+        `kind`: key of the texts in `claims.toml` if claims share them, by default `id`. Without a measured sheet the
+        claim `cannot be tested`.
         """
 
         def state_findings(sheet: DataSheet) -> tuple[str, list[bool]]:

@@ -15,7 +15,7 @@ from sealscope.thesis.chapters.appendix_c_runs import column
 from sealscope.thesis.chapters.success_rates import CLAIMED, FALSE_ALARMS
 from sealscope.thesis.claims.evidence import NO_SHEET, ClaimEvidence, format_rate
 from sealscope.thesis.engine.products import Claim
-from sealscope.thesis.engine.texts import format_range, judge_claim
+from sealscope.thesis.engine.texts import NOT_TESTED, format_range, judge_claim
 from sealscope.thesis.sheet import APPENDIX_C, BENCH_RIG
 
 #: Changes [%] below which a quantity counts as unchanged, and above which a change counts as severe.
@@ -38,7 +38,7 @@ _COMPARED_CLOSING = 75.0
 def claims(evidence: ClaimEvidence) -> tuple[Claim, ...]:
     """Judge the claims of the abstract and of chapters 1, 5 and 6 that the data sheet alone cannot decide."""
     return (
-        judge_claim("1.3.1", [None]),
+        judge_claim("1.3.1", NOT_TESTED),
         *_wavelet_claims(),
         *_printed_test_claims(evidence),
         _d3_sign_claim(evidence),
@@ -124,7 +124,7 @@ def _printed_test_claims(evidence: ClaimEvidence) -> Iterator[Claim]:
 def _d3_sign_claim(evidence: ClaimEvidence) -> Claim:
     """Judge claim 5.7.6: a fall of the RMS of the wavelet detail d3 of p_A indicates a leak.
 
-    It must fall in fewer than 5 % of the tests simulated without a leak, with constant and with drifting parameters.
+    The RMS must fall in fewer than 5 % of the tests simulated without a leak, with constant or drifting parameters.
     """
     d3_rule = CLAIMED[0]  # d3 of p_A falls
     sheets = {"leak": evidence.leak_sheet, "no_leak": evidence.no_leak_sheet, "drift": evidence.drift_sheet}
@@ -162,7 +162,7 @@ def _agreement_claim(evidence: ClaimEvidence) -> Claim:
     """Judge claim 6.1.4: simulation and measurement agree.
 
     For d1 to d4 of each chamber, the geometric mean of simulated over measured leak-free RMS must be from 1/1.25 to
-    1.25. The RMS of d3 of p_A must change with the leak in the same direction in at least 39 of the 41 tests.
+    1.25. In at least 39 of the 41 tests, both RMS of d3 of p_A must change with the leak in the same direction.
     """
     measured, leak = evidence.measured_sheet, evidence.leak_sheet
     if measured is None:

@@ -76,7 +76,7 @@ def _format_controls(evidence: ClaimEvidence, rule: Rule) -> str:
 
 
 def _rate_claim(rule: Rule, where: str) -> SheetClaim:
-    """Build the claim that a rule of Table 5.1 has its printed success rate; `where`: its place in the thesis."""
+    """Build the claim that a rule of Table 5.1 has its printed success rate; `where`: its section or figure."""
     # without an effect each of the rule's details moves in its direction with probability 1/2
     chance = 0.5 ** len(rule.details)
     printed = [int(rate) for rate in re.findall(r"\d+", rule.printed)]  # [%]
@@ -214,7 +214,7 @@ def _baseline_texts(evidence: ClaimEvidence, sheet: DataSheet) -> dict[str, Any]
 
 
 def _noise_limit_texts(evidence: ClaimEvidence, sheet: DataSheet) -> dict[str, Any]:
-    """Format false alarms ("controls") and detections beyond the noise ("finds") of the rule that d3 of p_A falls."""
+    """Format rates of the rule that d3 of p_A falls: false alarms ("controls") and falls beyond the noise ("finds")."""
     return {"controls": _format_controls(evidence, _A_D3), "finds": format_rate(_exceeds_noise(sheet, "p_A", "d3"))}
 
 
@@ -400,11 +400,11 @@ def _test_rows(
 
 
 def curve_claims(evidence: ClaimEvidence) -> Iterator[Claim]:
-    """Judge the claims of chapter 5 that a leak lowers, or changes, the RMS of wavelet details of a chamber's pressure.
+    """Judge the claims of chapter 5 that a leak changes the RMS of some wavelet details of a chamber's pressure.
 
-    In the measured data sheet the RMS of each detail must do so by more than the noise (`_test_rows`); without this
-    sheet the claim cannot be tested. For comparison, the texts state the simulated changes, and the changes that
-    drifting parameters alone exceed in 5 % of the simulated tests.
+    Some claims state a fall, others any change. It must exceed the noise in the measured data sheet (`_test_rows`);
+    without this sheet the claim cannot be tested. The texts also state the simulated changes and, for each detail, the
+    threshold that changes due to drifting parameters alone exceed in 5 % of the simulated tests.
     """
     curves = load_texts("cases.toml")["curves"]
     for number, (section, chamber, names, statement) in enumerate(curves, start=1):

@@ -92,8 +92,8 @@ def reproduce(
 
     `patterns`: selection (`items.select_items`); `quick`: True to simulate less; `jobs`: number of processes, by
     default one per core, 1 for this process only; `sheet`: folder of the measured data sheet; `items`: the list to
-    select from, by default that of `items.toml`; `publish`: writes the products as files; `progress`: called with the
-    numbers of finished and of all items to make, and the ids of those in work.
+    select from, by default that of `items.toml`; `publish`: writes the products as files, None to write none;
+    `progress`: called with the numbers of finished and of all items to make, and the ids of those in work.
 
     Results that an earlier call stored in `folder` from the same inputs are reused. A failed item does not stop the
     others, and KeyboardInterrupt leaves all finished items stored.
@@ -179,7 +179,10 @@ def _item_keys(items: Sequence[Item], sheet_key: str, quick: bool, is_published:
 
 
 def _parse_row(keys: Mapping[str, str], tree: Any) -> ItemRow | None:
-    """Build the stored result of an item; None if `keys` has another digest of its inputs, ValueError if malformed."""
+    """Convert plain values (`tree`) to the stored result of an item, or None if its inputs have changed since.
+
+    `keys`: present digest of each item's inputs, by id. Raises ValueError if `tree` has another form.
+    """
     if not isinstance(tree, dict):
         raise ValueError("no row")
     return convert_type(ItemRow, tree) if keys.get(str(tree.get("id"))) == tree.get("key") else None
@@ -188,7 +191,7 @@ def _parse_row(keys: Mapping[str, str], tree: Any) -> ItemRow | None:
 def _item_status(item: Item, sheet: DataSheet | None, row: ItemRow | None, folder: Path) -> ItemStatus:
     """Determine the status of an item before anything is made: "kept", "left out" or "not made".
 
-    It is kept if its stored `row`, None if there is none, is no error and all its files exist in `folder`.
+    `row`: stored result or None. The item is "kept" if this is no error and all its files exist in `folder`.
     """
     if item.needs_sheet and sheet is None:
         return ItemStatus(item, "left out", MISSING)

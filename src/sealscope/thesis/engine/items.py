@@ -133,7 +133,7 @@ def select_items(items: Sequence[Item], patterns: Sequence[str]) -> tuple[Item, 
 
 
 def add_needed_items(items: Sequence[Item], selected: Iterable[Item]) -> tuple[Item, ...]:
-    """Add to the selected items all whose products they need, directly or indirectly, in the order of `items`."""
+    """Add to the selected items all items whose products they need, directly or indirectly, in the order of `items`."""
     by_id, ids = {item.id: item for item in items}, {item.id for item in selected}
     while missing := {needed for name in ids for needed in by_id[name].needs} - ids:
         ids |= missing

@@ -141,9 +141,9 @@ def claim_verdict(tests: Iterable[bool | None]) -> Verdict:
 
 
 def thin_curve(x: Array, y: Array, max_points: int = 4000) -> tuple[Array, Array]:
-    """Thin a curve (x, y) to about `max_points` points that preserve its peaks, the extremes of successive blocks.
+    """Thin a curve (x, y) to about `max_points` points: the minimum and maximum of each block of successive points.
 
-    Points after the last whole block are left out. A shorter curve is returned unchanged.
+    Points after the last whole block are left out. A curve of at most `max_points` points is returned unchanged.
     """
     if x.size <= max_points:
         return x, y

@@ -35,8 +35,8 @@ def judge_claim(id: str, tests: Iterable[bool | None], kind: str = "", /, **valu
     """Judge the claim `id` by the tests of its parts (`claim_verdict`), and fill `values` into its texts.
 
     The texts are in `claims.toml` under `id`, or under `kind` for claims that share texts. The values `sheet` (what the
-    thesis's data show), `simulation` (what a simulation shows) and `why` (reason for the verdict) replace a whole text,
-    the others the placeholders of the same name.
+    thesis's data show), `simulation` (what a simulation shows) and `why` (reason for the verdict) replace a whole text;
+    the others fill the placeholders of the same names.
     """
     claims = load_texts("claims.toml")
     templates = dict(claims[kind or id])

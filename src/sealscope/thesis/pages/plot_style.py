@@ -34,8 +34,8 @@ SETTINGS = Path(__file__).with_name("thesis.mplstyle")
 def caption(figure_id: str, title: str) -> str:
     """Format a caption from the id and the title of a product, such as "Fig. 4.22. Pressures in the chambers".
 
-    A letter or word after the number, as in "fig-4.2-a", follows as "a)" or in brackets. An id without the number of a
-    figure, table or equation gives the title alone.
+    A letter at the end of the id, as in "fig-4.2-a", is written "a)", and a word in brackets. The caption is the title
+    alone if the id does not begin with the number of a figure, table or equation.
     """
     kind, _, number_and_part = figure_id.partition("-")
     prefix = {"fig": "Fig.", "table": "Table", "eq": "Eq."}.get(kind)

@@ -80,7 +80,7 @@ def _render_svg(mpl_figure: MplFigure, figure: Figure) -> bytes:
     from matplotlib.backends.backend_svg import FigureCanvasSVG
 
     out = io.StringIO()
-    mpl_figure.set_dpi(DPI)  # of rasterised lines; an earlier rendering may have changed it
+    mpl_figure.set_dpi(DPI)  # resolution of rasterised lines, which an earlier rendering may have changed
     metadata = {"Title": caption(figure.id, figure.title), "Date": None, "Creator": None}
     FigureCanvasSVG(mpl_figure).print_svg(out, metadata=metadata)
     return out.getvalue().encode()
@@ -225,8 +225,8 @@ def drawn_points(curve: FigureCurve, x_range: _Range | None) -> tuple[np.ndarray
 def _draw_curve(ax: Axes, curve: FigureCurve, n_before: int, x_range: _Range | None, *, is_only: bool) -> None:
     """Draw a curve into `ax` in the line style of its role.
 
-    `n_before`: number of earlier curves with this role in the panel, by which other dashes are chosen; `is_only`: True
-    for the only curve of a panel, whose role "reference" is drawn as "other".
+    `n_before`: number of earlier curves with this role in the panel, which determines the dashes; `is_only`: True for
+    the only curve of a panel, which is drawn in the style "other" if its role is "reference".
     """
     style = STYLES["other" if is_only and curve.role == "reference" else curve.role]
     x, y = drawn_points(curve, x_range)

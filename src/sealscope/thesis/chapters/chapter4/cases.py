@@ -131,7 +131,10 @@ def make_experiment(
 def make_drift_experiment(
     reading: Reading, closed_pct: float | None, solver: Solver, **overrides: str | float
 ) -> Experiment:
-    """Build the long experiment in which the drift is measured, with `overrides` of the reading's parameters."""
+    """Build the experiment of 60 s in which the drift of the piston is measured.
+
+    The arguments are those of `make_experiment`; `overrides` replace parameters of the reading.
+    """
     overrides = {"daq.sample_rate": _DRIFT_RATE, **overrides}
     return make_experiment(COMMAND, closed_pct, reading, solver, duration=_DRIFT_DURATION, overrides=overrides)
 

@@ -150,8 +150,8 @@ def _judge_equations_and_tables(context: Context) -> Iterator[Claim]:
     """Judge claims 4.13, 4.20 and 4.23 by the thesis's equations and tables; 4.7, 4.17 and 4.22 cannot be tested.
 
     4.13: a throttle of 3.75 mm in the line of 5 mm closes 25 % of its area. 4.7 claims pressure peaks, which depend on
-    the unknown charge pressure; its text states the one that would give them. 4.20: the friction does not jump at
-    the threshold velocity, whichever way eq. (4.22) is read. 4.23: the throttles as printed let oil flow to the
+    the unknown charge pressure; its text states the charge pressure that would give them. 4.20: the friction does not
+    jump at the threshold velocity, whichever way eq. (4.22) is read. 4.23: the throttles as printed let oil flow to the
     cylinder with less resistance than back, on both sides.
     """
     rig = thesis_rig()
@@ -220,14 +220,14 @@ def _judge_runs(
 def _range_text(head: str, values: Callable[[Rows], Iterable[float]]) -> Callable[[list[Rows]], str]:
     """Build a function that formats the smallest and the largest of some numbers [kPa] over several runs.
 
-    `values`: computes the numbers [Pa] from the summaries of the runs (`summarise_run`) under one interpretation of the
-    throttles' equations; the built function takes a list of these. `head`: text before the numbers.
+    The built function takes a list with the summaries of the runs (`summarise_run`) under each interpretation of the
+    throttles' equations. `values`: computes numbers [Pa] from the summaries under one; `head`: text before the numbers.
     """
-    return lambda readings: f"{head} {format_range((v for rows in readings for v in values(rows)), 'kPa', 1e-3)}"
+    return lambda all_rows: f"{head} {format_range((v for rows in all_rows for v in values(rows)), 'kPa', 1e-3)}"
 
 
 def _changes(rows: Rows, statistic: str, names: Iterable[str] = PRESSURES) -> list[float]:
-    """Compute by how much a statistic of each pressure changes [Pa] from the first run to each later one, run by run.
+    """Compute the change [Pa] of a statistic of each pressure from the first run to every later run.
 
     `rows`: summaries of the runs (`summarise_run`); `statistic`: "peak" (maximum) or "range" (maximum minus minimum).
     """

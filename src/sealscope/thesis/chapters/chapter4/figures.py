@@ -65,7 +65,7 @@ def item_reading(item: Item) -> Reading:
 
 
 def _run_case(context: Context, item: Item) -> tuple[Runs, str]:
-    """Simulate the case of Table 4.2 or 4.3 that `item.inputs` names by both solvers; return runs and notes."""
+    """Simulate by both solvers the case of Table 4.2 or 4.3 in `item.inputs`; return the runs and notes on them."""
     (command, closed_pct), reading = CASES[item.inputs["case"]], item_reading(item)
     runs = run_both_solvers(context, command, closed_pct, reading)
     return runs, _run_notes(runs, reading if closed_pct is not None else None)
@@ -108,7 +108,7 @@ def _mark_points(curve: FigureCurve) -> FigureCurve:
 def _solver_curves(runs: Runs, name: str) -> tuple[FigureCurve, ...]:
     """Build the curves of an output over time, one for each solver whose run did not diverge.
 
-    If both coincide, i.e. differ by less than 0.5 % of the output's range (rms), the thesis's curve is a few marks.
+    If both coincide (rms difference below 0.5 % of the output's range), the thesis's solver is drawn as a few marks.
     """
     max_difference = _COINCIDENCE_FRACTION * steady_range(runs["converged"], name) * FIGURE_UNITS[name].scale
     curves = {solver: _line_curve(run, name, label, solver) for solver, label, run in completed_runs(runs)}
@@ -118,19 +118,19 @@ def _solver_curves(runs: Runs, name: str) -> tuple[FigureCurve, ...]:
 
 
 def _rms_difference(runs: Runs, name: str) -> float:
-    """Compute the rms difference of an output between both solvers' steady runs, in the figures' unit, or nan."""
+    """Compute the rms difference of an output between the two solvers, in the figures' unit; nan if a run diverged."""
     difference = steady_output(runs["as_published"], name) - steady_output(runs["converged"], name)
     return float(np.sqrt(np.mean(difference**2)) * FIGURE_UNITS[name].scale)
 
 
 def case_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
-    """Tabulate minimum, maximum and standard deviation of each quantity in a case of Table 4.2 or 4.3, by solver.
+    """Tabulate minimum, maximum and standard deviation of each output in a case of Table 4.2 or 4.3, by solver.
 
-    The last column is the rms difference between both runs. All numbers are from pi to 2 pi seconds of the runs.
+    The last column is the rms difference between the two solvers. All numbers are from pi to 2 pi seconds of the runs.
     """
     runs, notes = _run_case(context, item)
     rows: list[tuple[Cell, ...]] = []
-    for name in list(FIGURE_UNITS)[1:]:  # without the command
+    for name in list(FIGURE_UNITS)[1:]:  # the first output is the command
         row: list[Cell] = [_axis_label(name)]
         for run in runs.values():
             values = steady_output(run, name) * FIGURE_UNITS[name].scale

@@ -40,7 +40,7 @@ def stribeck_force(v: Array, F_C: float, *, literal_bracket: bool = False) -> Ar
 def friction_at_threshold(F_C: float) -> dict[str, tuple[float, float]]:
     """Compute the friction [N] at the threshold velocity v_th and just above it, for both forms of eq. (4.22).
 
-    The keys are "continuous", and "literal" with the bracket as printed. `F_C`: Coulomb force [N].
+    The keys are "continuous", and "literal" for the unbalanced bracket closed at its end. `F_C`: Coulomb force [N].
     """
     v_th = thesis_rig().friction.v_th
     velocities = np.array([v_th, math.nextafter(v_th, 1.0)])
@@ -54,8 +54,8 @@ def friction_at_threshold(F_C: float) -> dict[str, tuple[float, float]]:
 def falling_friction_limit(F_C: float) -> float:
     """Compute the velocity [m/s] up to which friction falls with speed, 0 if never; `F_C` > 0: Coulomb force [N].
 
-    It solves F_v = F_C (K_brk - 1) C_c exp(-C_c v), with the parameters of the thesis's rig: F_v [N s/m] viscous
-    coefficient, K_brk breakaway force over Coulomb force, C_c [s/m] decay of the Stribeck effect.
+    The limit v solves F_v = F_C (K_brk - 1) C_c exp(-C_c v), with the parameters of the thesis's rig: F_v [N s/m]
+    viscous coefficient, K_brk breakaway force over Coulomb force, C_c [s/m] decay of the Stribeck effect.
     """
     f = thesis_rig().friction
     # slope of the Stribeck friction at standstill over that of the viscous friction
