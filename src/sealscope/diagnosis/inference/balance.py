@@ -121,7 +121,7 @@ class BlockStream:
         self.restart(start)
 
     def restart(self, begin: float) -> None:
-        """Drop the samples of an incomplete block; the next sample is at the time `begin` [s], after a gap."""
+        """Restart the stream after a gap, at the time `begin` [s] of the next sample, without an incomplete block."""
         self._begin = begin
         self._pieces: list[Mapping[str, Array]] = []  # joined only when they complete a block
         self._first = 0  # index of the first stored sample, counted from `begin`
@@ -169,8 +169,8 @@ class BlockStream:
     def state(self) -> dict[str, Any]:
         """Return the state of the stream as plain values for JSON, from which `load_state` continues.
 
-        It has the samples that later blocks need, what the first samples fixed (offsets of the pressures, signs of the
-        flows), and sums over all blocks.
+        It has the samples that later blocks need, the values that the first samples determined (offsets of the
+        pressures, signs of the flows), and sums over all blocks.
         """
         return {
             "samples": {name: plain_array(values) for name, values in self._join_pieces().items()},
@@ -416,8 +416,8 @@ def derive_drive_signals(
 
     `rate`: sampling rate [Hz]. The entry `START` is exp(-t/lag) at the time t since the first sample: the effect of the
     drive's unknown initial state decays with the time constant lag. If only the command u shows the pump's flow, its
-    speed "omega" [rad/s] is added: the drive's response to u, NaN where u is missing. With `loaded` the drive responds
-    to the load p_A - p_B as well. Otherwise the droop of the real speed under load counts as leakage.
+    speed "omega" [rad/s] is added: the drive's response to u, NaN where u is missing. If `loaded` is true, the drive
+    responds to the load p_A - p_B as well. Otherwise the droop of the real speed under load counts as leakage.
     """
     drive = Drive.from_rig(rig)
     derived = {START: np.exp(-np.arange(len(samples["p_A"])) / (rate * drive.lag))}
@@ -500,7 +500,7 @@ class RecordedBlocks(NamedTuple):
         return self._replace(open=self.open.reverse_flow(is_reversed), shut=shut)
 
     def regime(self, odds: float) -> RegimeBlocks:
-        """Return the blocks for the more probable valves at rest: shut ones, if possible, for positive log `odds`."""
+        """Return the blocks for shut valves if these are possible and their log `odds` positive, else for open ones."""
         return self.shut if self.shut is not None and odds > 0.0 else self.open
 
 
@@ -591,6 +591,7 @@ def _build_regime(balances: tuple[Equation, ...], compute_blocks: Callable[[floa
     plain = compute_blocks(0.0)  # as recorded
     blocks = remove_pressure_offset(plain, columns)
     offset = float(blocks.zero[0])
-    if abs(offset) >= NEGLIGIBLE_OFFSET * INFERENCE.zero.pressure:  # else the terms are linear enough in the offset
+    # removal from the Gram matrices assumes terms that are linear in the offset, as they nearly are for a small one
+    if abs(offset) >= NEGLIGIBLE_OFFSET * INFERENCE.zero.pressure:
         blocks = remove_pressure_offset(compute_blocks(offset), columns)
     return RegimeBlocks(blocks.merge(), plain.merge(), balances, columns)

@@ -93,7 +93,7 @@ class Blocks:
         return replace(self, gram=self.gram[..., *np.triu_indices(self.gram.shape[-1])])
 
     def unpack(self, size: int) -> Blocks:
-        """Restore the m = `size` columns that `pack` left out; raise InputError if the stored shapes do not fit."""
+        """Restore the Gram matrices (`size`, `size`) after `pack`; raise InputError if the stored shapes do not fit."""
         upper, lower = np.triu_indices(size)
         lengths = {len(getattr(self, name)) for name in self.__dataclass_fields__}
         if self.gram.shape[2:] != upper.shape or lengths != {len(self.start)}:
@@ -114,16 +114,17 @@ class Blocks:
 
     @property
     def is_moving(self) -> NDArray[np.bool_]:
-        """Flags (K,) of the blocks with at least `rest.moves` (`priors.toml`) times `moving_flow`.
+        """Flags (K,) of the blocks in which the pump moves the piston.
 
-        The flow of a pump that only holds a load is smaller.
+        Their flow is at least `rest.moves` (`priors.toml`) times `moving_flow`; a pump that holds a load has less.
         """
         return np.asarray(self.flow >= INFERENCE.rest.moves * self.moving_flow)
 
     def merge(self, max_blocks: int = MAX_BLOCKS) -> Blocks:
-        """Merge groups of equally many neighbouring blocks, the last perhaps smaller, to at most `max_blocks` blocks.
+        """Merge neighbouring blocks in groups of equal size, so that at most `max_blocks` blocks remain.
 
-        Gram matrices and numbers of rows are added, flow and pressures averaged by rows; the first block gives `zero`.
+        The last group may be smaller. Gram matrices and numbers of rows are added, flow and pressures averaged with the
+        numbers of rows as weights; `zero` is that of a group's first block.
         """
         group_size = -(-len(self) // max_blocks)  # rounded up
         if group_size <= 1:
@@ -151,16 +152,18 @@ class Blocks:
         return np.asarray(np.abs(self.pressures - subtracted).mean(axis=1))
 
     def mean_root(self) -> Array:
-        """Compute the mean of sqrt(abs(p_A - p_B - zero)) [Pa^0.5] in each block (K,), which drives an orifice."""
+        """Compute the mean of sqrt(abs(p_A - p_B - zero)) [Pa^0.5] in each block (K,), for the flow of an orifice."""
         return np.asarray(np.sqrt(np.abs(self.pressures - self.zero[:, None])).mean(axis=1))
 
     def driving_pressure(self, names: Sequence[str], term: str) -> float:
-        """Estimate the root mean square of the pressure that drives a term [Pa], such as p_B for a leak out of side B.
+        """Estimate the root mean square (rms) of the pressure that drives the flow of a leak or another `term` [Pa].
 
-        `names`: names of the columns of `gram`. With the sums of squares s_term^2 and s_leak^2 of the columns of term
-        and leak, over the equations that contain the term, and the root mean square rms,
+        It is p_B, for example, for a leak out of side B. `names`: names of the columns of `gram`. The result is
 
-            pressure = rms(p_A - p_B) s_term / s_leak.
+            rms(p_A - p_B) s_term / s_leak,
+
+        where s_term^2 and s_leak^2 are the sums of squares of two columns, the term's and the one of p_A - p_B, over
+        the equations that contain the term.
         """
         squares = np.einsum("keii->ei", self.gram)  # (E, m): sum of squares of each column in each equation
         squares = squares[squares[:, names.index(term)] > 0.0].sum(axis=0)  # equations that contain the term
@@ -254,17 +257,17 @@ class ColumnRoles:
         return roles
 
     def replace_leak(self, name: str) -> ColumnRoles:
-        """Return a copy in which the term `name` is tested instead of the leak, which becomes an ordinary term."""
+        """Return a copy in which the term `name` takes the place of the leak, which becomes an ordinary term."""
         roles = copy(self)
         roles.leak, roles.between_deviation = self.names.index(name), self.between_deviation.copy()
         roles.between_deviation[self.leak] = INFERENCE.between.pump
         return roles
 
     def leak_deviation(self, column: int, blocks: Blocks) -> float:
-        """Compute a healthy machine's prior standard deviation of the leak's coefficient in `column`, in its unit.
+        """Compute the prior standard deviation of the leak coefficient of `column` in a healthy machine.
 
-        For an orifice it gives the same mean flow as that of a laminar leak past the piston alone, since the pump's
-        leakage is laminar. It is infinite if no pressure drives the column.
+        For an orifice the mean flow is that of a laminar leak past the piston alone, since the pump's leakage is
+        laminar. The result is in the coefficient's unit, and infinite if no pressure drives the flow of this column.
         """
         driver = self.drivers[column] if column < self.left else ""
         pressure, root = float(np.mean(blocks.mean_pressure())), float(np.mean(blocks.mean_root()))
@@ -277,9 +280,10 @@ class ColumnRoles:
     def offset_deviation(self, column: int, blocks: Blocks) -> float:
         """Compute the prior standard deviation of the error that a pressure sensor's offset causes in a `column`.
 
-        It is in Pa for a laminar leak, in Pa^0.5 for an orifice, and 0 if no pressure drives the term. It is also 0 in
-        an equation without flow offset, by whose column the error is removed (`_shift_offset`). The offset's own
-        deviation is limited to the mean of abs(p_A - p_B) over `blocks`, since recordings may be in counts.
+        It is in Pa for a laminar leak, in Pa^0.5 for an orifice, and 0 if no pressure drives the column's term. It is
+        also 0 in an equation without flow offset, since the column of this offset is needed to remove the error
+        (`_shift_offset`). The prior standard deviation of the sensor's offset [Pa] is limited to the mean of
+        abs(p_A - p_B) over `blocks`: pressures recorded in counts are much smaller numbers.
         """
         # what drives the flow of the column's term: "pressure", "root" (square root of a pressure), or "" for neither
         driver = self.drivers[column] if column < self.left and self.bias is not None else ""
@@ -324,8 +328,8 @@ class Weighting:
         """Compute the Gram matrices (K, E, m, m) of K blocks, in which outlying rows have smaller weights.
 
         `values`: for each equation the rows (r, m) of all blocks; `ends` (K,): index past the last row of each block.
-        The fit to these and earlier blocks has coefficients of fast columns that are free in each block, and common
-        ones of slow columns (`ColumnRoles`). The sums over earlier blocks are updated.
+        The weights follow from one fit to these and earlier blocks. The coefficients of fast columns are free in each
+        block, those of slow columns common to all (`ColumnRoles`). The sums over earlier blocks are updated.
         """
         self._count += len(ends)
         update_fraction = min(1.0, SUPPORT / self._count)  # the last fifth of all blocks counts most
@@ -368,16 +372,17 @@ def information(blocks: Blocks, columns: Sequence[ColumnRoles], test: int, left_
     """Compute the joint likelihood of one coefficient's values in all blocks, with the other coefficients eliminated.
 
     For a leak the result also contains the prior standard deviation of the coefficient in a healthy machine (`level`).
-    The likelihoods of the equations are multiplied. `test`: index of the coefficient's column, or of the left side to
-    test a change of its scale; `left_out`: another column to leave out.
+    The likelihoods of the equations are multiplied. `test`: index of the coefficient's column, or of the left side for
+    a change of the left side's scale; `left_out`: another column to omit.
 
     With the residual variance s^2 of a row, precision and vector of an equation are the Schur complements
 
         precision = (N - C (G + P)^-1 C') / s^2,    vector = (n - C (G + P)^-1 (b + P mu)) / s^2.
 
-    N is the diagonal matrix of the tested column's sums of squares in each block, n its products with the left side,
-    and C those with the nuisance columns, the other terms. G is the Gram matrix of the nuisance columns and b their
-    products with the left side. P / s^2 is the prior precision of their coefficients, and mu the prior mean.
+    The nuisance columns are those of the other coefficients. N is the diagonal matrix of the tested column's sums of
+    squares in each block, n contains its products with the left side, and C those with the nuisance columns. G is the
+    Gram matrix of the nuisance columns and b their products with the left side. P / s^2 is the prior precision of their
+    coefficients, and mu the prior mean.
     """
     count = len(blocks)
     precision, vector = np.zeros((count, count)), np.zeros(count)
@@ -525,7 +530,7 @@ def _fit_equation(
     g between blocks also changes the constant flow -g z, and so reveals z. z is small, since a first estimate of the
     offset is already removed from the Gram matrices (`pressure_offset.remove_pressure_offset`).
 
-    `equation`: its index; `test`: column of g, by default the leak's; `left_out`: another column to leave out.
+    `equation`: index of the equation; `test`: column of g, by default the leak's; `left_out`: another column to omit.
     """
     gram, test = blocks.gram[:, equation], roles.leak if test is None else test
     nuisance = [k for k in roles.nuisance if k not in (test, left_out)]
@@ -534,18 +539,18 @@ def _fit_equation(
     total = gram.sum(axis=0)
     constants = solve(total[np.ix_(nuisance, nuisance)], total[nuisance, roles.left])  # without drifts
     magnitudes = np.minimum(np.abs(constants), roles.level_deviation[nuisance])  # at most the prior deviation
-    # standard deviations of the drifts over the recording; the last one is the offset's, which does not drift
+    # standard deviations of the drifts over the recording; the last is 0, since the sensor offset does not drift
     drift = np.append(magnitudes * roles.drift_rate[nuisance] * minutes, 0.0)
     offset_deviation = roles.offset_deviation(test, blocks)
-    # inf: the level of the offset has the prior deviation `offset_deviation` instead
+    # inf for the constant part of the offset: its prior standard deviation is `offset_deviation` instead
     prior = _Prior(np.append(roles.level_deviation[nuisance], np.inf), drift, offset_deviation)
     nuisance_and_offset = [*nuisance, gram.shape[1]]  # `_shift_offset` appends the offset's column
     offset, tested_coefficients = 0.0, np.zeros(len(blocks))  # z, and g in each block
     for iteration in range(_MAX_OFFSET_STEPS + 1):
         shifted = _shift_offset(gram, roles, test, tested_coefficients, offset)
         normal = _build_normal_equations(shifted, polynomials, nuisance_and_offset, test, roles.left)
-        parts = _fit_nuisance(normal, prior._replace(current_offset=offset), n_polynomials, n_rows)
-        fit = _EquationFit(nuisance, polynomials, normal, offset, *parts)
+        nuisance_fit = _fit_nuisance(normal, prior._replace(current_offset=offset), n_polynomials, n_rows)
+        fit = _EquationFit(nuisance, polynomials, normal, offset, *nuisance_fit)
         step = float(fit.coefficients[-n_polynomials])  # constant part of the last coefficient, the offset's error
         is_last = iteration == _MAX_OFFSET_STEPS or not offset_deviation > 0.0
         # in the first iteration g is 0, so that the offset has no effect
@@ -588,7 +593,7 @@ def offset_cost(offset: Any) -> Any:
 def estimate_offset(blocks: Blocks, columns: Sequence[ColumnRoles]) -> float:
     """Estimate the total sensor offset of p_A - p_B [Pa] in a recording, as the mean of one estimate per equation.
 
-    Only changes of the leak between blocks show it; without them the estimate stays near the offset already removed.
+    Only a leak that changes between blocks reveals it; otherwise the estimate stays near the offset already removed.
     """
     offsets = [_fit_equation(blocks, e, roles).offset for e, roles in enumerate(columns)]
     return float(np.mean(blocks.zero)) + float(np.mean(offsets))
@@ -627,7 +632,8 @@ def estimate_leak_and_bias(blocks: Blocks, roles: ColumnRoles) -> tuple[Array, A
 def estimate_weighted_mean(blocks: Blocks, roles: ColumnRoles, weights: Mapping[int, float]) -> tuple[float, float]:
     """Estimate a weighted mean of several coefficients of the first volume balance, and its standard error.
 
-    `weights`: weight of each coefficient by the index of its nuisance column, with the sum 1. Drifts do not count.
+    `weights`: weight of each coefficient by the index of its nuisance column, with the sum 1. The coefficients are
+    their constant parts, without the drifts.
     """
     fit = _fit_equation(blocks, 0, roles)
     contrast = np.zeros(len(fit.coefficients))  # weights of all coefficients of the fit

@@ -76,7 +76,7 @@ def compare_with_healthy(
 ) -> Observable | None:
     """Test a value by Student's t for a difference from the values of healthy recordings.
 
-    - `name`, `data`: name and kind of data of the observable;
+    - `name`, `data`: name of the quantity and its kind of data, for the result;
     - `error`: standard error of a single value;
     - `above`: count only a value above the healthy ones;
     - `prior_change`: standard deviation of a true change, infinite if unknown. If it is known, the p-value is at least
@@ -123,7 +123,7 @@ def compare_estimates(
 ) -> Observable | None:
     """Test an estimate for a difference from the estimates of healthy recordings, each with a known standard error.
 
-    - `name`, `data`: name and kind of data of the observable;
+    - `name`, `data`: name of the quantity and its kind of data, for the result;
     - `prior`: prior on the scatter between recordings;
     - `above`: count only an estimate above the healthy ones;
     - `further_deviation`: standard deviation of the judged estimate from further causes, such as an unusual load.

@@ -41,9 +41,9 @@ _TINY = np.finfo(float).tiny
 def apparent_conductances(blocks: Blocks, columns: Sequence[ColumnRoles]) -> dict[float, Array]:
     """Compute the conductance that a leak with the flow |p_A - p_B|^e appears to have in each of K blocks.
 
-    It is the regression coefficient of this flow on p_A - p_B within the block. For an orifice, e = 1/2, the Gram
-    matrices give this coefficient r. For the other exponents it is approximated by r^(2 (1 - e)), which is 1 for
-    laminar flow, e = 1. The result maps each exponent e of `EXPONENTS` to an array (K,) [Pa^(e - 1)].
+    It is the regression coefficient of this flow on p_A - p_B within the block. For an orifice, e = 1/2, this
+    coefficient r follows from the Gram matrices. For the other exponents it is approximated by r^(2 (1 - e)), which is
+    1 for laminar flow, e = 1. The result maps each exponent e of `EXPONENTS` to an array (K,) [Pa^(e - 1)].
     """
     leak, orifice = columns[0].leak, columns[0].names.index(ORIFICE)
     gram = blocks.gram.sum(axis=1)  # sum over the equations
@@ -53,9 +53,9 @@ def apparent_conductances(blocks: Blocks, columns: Sequence[ColumnRoles]) -> dic
 
 
 def law_flows(blocks: Blocks) -> dict[float, Array]:
-    """Compute the mean flow in each of K blocks of a leak with the flow |p_A - p_B|^e times a coefficient of 1.
+    """Compute the mean of |p_A - p_B|^e in each of K blocks: the flow of a leak with the coefficient 1.
 
-    With dp = p_A - p_B, and <> for the mean over a block, the flow is approximated by
+    With dp = p_A - p_B, and <> for the mean over a block, it is approximated by
 
         <|dp|>^(2 e - 1) <|dp|^(1/2)>^(2 - 2 e),
 
@@ -66,9 +66,9 @@ def law_flows(blocks: Blocks) -> dict[float, Array]:
 
 
 def law_priors() -> Array:
-    """Return the prior probability of each exponent of `EXPONENTS`: `size.laminar` (`priors.toml`) of laminar flow.
+    """Return the prior probability of each exponent in `EXPONENTS`, the power of |p_A - p_B| that a leak follows.
 
-    The others are equally probable.
+    Laminar flow has the probability `size.laminar` (`priors.toml`); the other exponents are equally probable.
     """
     laminar: float = INFERENCE.size.laminar
     n_others = len(EXPONENTS) - 1
@@ -76,12 +76,12 @@ def law_priors() -> Array:
 
 
 def find_leak_step(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Information) -> StepTest | None:
-    """Test for a leak that begins within a recording, with a flow proportional to a power of |p_A - p_B| (its law).
+    """Test for a leak that begins within a recording, with a flow proportional to a power of |p_A - p_B|.
 
-    The p-value (`chance`) of the test for each exponent of `EXPONENTS` is divided by the prior probability of the law,
-    and the test with the smallest one is returned. The step's size is the change of the conductance, averaged over the
-    blocks by their information. `leak`: likelihood of the leak's coefficient in the blocks. Return None if too few
-    blocks have information.
+    There is a test for each exponent of `EXPONENTS`. Its p-value (`chance`) is divided by the prior probability of the
+    exponent, and the test with the smallest quotient is returned. The step's size is the change of the conductance,
+    averaged over the blocks with their information as weights. `leak`: likelihood of the leak's coefficient in the
+    blocks. Return None if too few blocks determine this coefficient.
     """
     weights = np.maximum(leak.precision.sum(axis=0), 0.0)  # information of each block
     shapes = apparent_conductances(blocks, columns)
@@ -174,9 +174,10 @@ def _weigh_rise_onsets(leak: Information, test: StepTest | None, value: float) -
     """Weigh the possible onsets of a leak whose coefficient has risen by `value` on average over the recording.
 
     Returns the log weight of each onset, and the fraction of the recording's information after the onset, (o,) each.
-    The first onset is the recording's start, with log weight 0 and fraction 1. The others are those of `test` with a
-    fraction above `MIN_FRACTION`, weighted by the likelihood of the step that they need, `value` / fraction, relative
-    to no step, over their number. Without a `test`, or if `value` is not positive, only the first onset remains.
+    The first onset is the recording's start, with log weight 0 and fraction 1. The others are the n onsets of `test`,
+    without those whose fraction is below `MIN_FRACTION`. A leak from such an onset on is a step by `value` / fraction.
+    Its weight is the likelihood ratio of this step to no step, divided by n. Without a `test`, or if `value` is not
+    positive, only the first onset remains.
     """
     if test is None or not value > 0.0:
         return np.zeros(1), np.ones(1)

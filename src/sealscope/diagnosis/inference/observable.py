@@ -63,11 +63,10 @@ class Observable:
     def from_test(
         cls, name: str, data: str, test: StepTest, *, n_tests: float = 1.0, sign: float = 1.0, advantage: float = 0.0
     ) -> Observable:
-        """Make the observable of a step, a sudden lasting change, within the recording.
+        """Make an observable from a test for a step, a sudden lasting change, within the recording.
 
-        `test`: the best of `n_tests` tests, whose chance is therefore multiplied by their number (Bonferroni); `sign`:
-        1 for a step up, -1 for a step down, whose size the test states as positive. The other arguments are fields of
-        the observable.
+        `test`: the best of `n_tests` tests, whose p-value is therefore multiplied by their number (Bonferroni); `sign`:
+        1 for a step up, -1 for a step down, whose size the test states as positive. The others are fields of the class.
         """
         return cls(
             name=name,
@@ -165,11 +164,11 @@ class LeakMeasure(Protocol):
 
     @property
     def rise(self) -> RiseTest | None:
-        """Test of the mean leakage against the leakage of healthy recordings; None without these."""
+        """Test of the mean leakage against the leakage of healthy recordings; None without such recordings."""
 
     @property
     def rise_flow(self) -> Flow | None:
-        """Mean flow [m^3/s] above healthy recordings, or of the total leakage without these; None if it is unknown."""
+        """Mean leakage [m^3/s] above that of healthy recordings, or in total if there are none; None if unknown."""
 
     @property
     def rise_onset(self) -> Interval | None:
@@ -189,7 +188,7 @@ class LeakMeasure(Protocol):
 
     @property
     def step_rise(self) -> LeakRise | None:
-        """Leakage above that of healthy recordings, with the evidence for a step as its cause; None without these."""
+        """Leakage above that of healthy recordings, and how well a step explains it; None without such recordings."""
 
     @property
     def lpm_per_flow(self) -> float | None:
@@ -216,11 +215,11 @@ class LeakMeasure(Protocol):
     def total(self, detectable_flow: float | None) -> TotalLeakage | None:
         """Return the total leakage and the smallest detectable leak; None if both are unknown.
 
-        `detectable_flow`: flow [m^3/s] of the smallest leak that would be detected within the recording, or None.
+        `detectable_flow`: flow [m^3/s] of the smallest leak that would be detected, None if it is unknown.
         """
 
     def history(self, onset_s: float | None) -> LeakCourse | None:
-        """Return the leakage over time, or with an onset [s] its growth since then; None if it is unknown."""
+        """Return the leakage over time, or its growth since `onset_s` [s] if that is given; None if it is unknown."""
 
 
 class Ringing(NamedTuple):

@@ -92,7 +92,7 @@ class Information(NamedTuple):
     walk: float = float("inf")
 
     def fraction_after(self, onset: float) -> float:
-        """Compute the fraction, 0 to 1, of the information on the mean of g in the blocks after `onset` [s]."""
+        """Compute the fraction of the coefficient's information that lies in the blocks after `onset` [s], 0 to 1."""
         weights = self.precision.sum(axis=0)
         after = weights[self.time >= onset].sum()
         return float(np.clip(after / max(weights.sum(), np.finfo(float).tiny), 0.0, 1.0))
@@ -177,7 +177,7 @@ class StepTest:
         return bound_steps(self.weights, self.size, self.deviation, BOUND_PROBABILITY)
 
     def share_alarms(self, share: float) -> StepTest:
-        """Return this test with its p-value divided by `share`, its fraction of the false alarms of several tests."""
+        """Return this test with its p-value divided by `share`, its fraction of a joint false-alarm probability."""
         return replace(self, chance=min(1.0, self.chance / share), law=self.law._replace(share=share))
 
     def detectable_step(self, chance: float, power: float = 0.9) -> float:
@@ -229,7 +229,7 @@ class History(NamedTuple):
     covariance: Array
 
     def average(self, weights: Array) -> Interval:
-        """Compute the mean of the coefficient by `weights` (K,) of the blocks, with sum 1, and its 95 % interval."""
+        """Compute the weighted mean of the coefficient and its 95 % interval; the `weights` (K,) have the sum 1."""
         value = float(weights @ self.mean)
         half_width = WITHIN_95 * float(np.sqrt(np.maximum(weights @ self.covariance @ weights, 0.0)))
         return Interval(value, value - half_width, value + half_width)
@@ -244,9 +244,10 @@ class History(NamedTuple):
 def fit_history(information: Information, test: StepTest | None, *, with_step: bool) -> History:
     """Estimate a coefficient in each block of a recording, as the sum of a level, a slope and a random walk.
 
-    `test`: step test of the coefficient, whose fitted variances of walk and noise are used. Without a test there is no
-    walk, and the noise has the variance 1. With fewer than `MIN_BLOCKS` blocks there is no slope. `with_step`: add a
-    step at the best onset of `test`, and use the variances that were fitted together with a step.
+    `information`: likelihood of the coefficient in the blocks; `test`: step test of the coefficient, whose fitted
+    variances of walk and noise are used. Without a test there is no walk, and the noise has the variance 1. With fewer
+    than `MIN_BLOCKS` blocks there is no slope. `with_step`: add a step at the best onset of `test`, and use the
+    variances that were fitted together with a step.
     """
     time = information.time
     count = len(time)
@@ -315,7 +316,7 @@ def step_test(information: Information, signs: Sequence[float] = (1.0,), shape: 
 
 
 def step_tests(information: Information, signs: Sequence[float], shape: Array | None = None) -> list[StepTest]:
-    """Test a coefficient for a step with each of the `signs`, as in `step_test`; empty without enough information."""
+    """Test a coefficient for a step of each sign, 1 up or -1 down (`step_test`); empty if too few blocks reveal it."""
     whitened = _whiten_blocks(information)
     if whitened is None:
         return []
@@ -384,7 +385,7 @@ def _fit_steps(z: Array, steps: Array, eigen: Array) -> _StepFits:
 
 
 def _residual_squares(total: Array, moments: Array, energies: Array) -> Array:
-    """Compute `residual_squares` of `_StepFits` from its other fields, kept above rounding errors."""
+    """Compute `_StepFits.residual_squares`, the sums of squares after the fit, limited to at least 1e-12 of `total`."""
     return np.asarray(np.maximum(total[:, None] - np.maximum(moments, 0.0) ** 2 / energies, 1e-12 * total[:, None]))
 
 
@@ -403,8 +404,7 @@ def step_shapes(count: int, positions: Array, growth: float = 0.0) -> Array:
 class _Whitening(NamedTuple):
     """Matrices that whiten the estimates of a coefficient in K blocks, from their precision and priors only.
 
-    The whitened values z (n,) have independent noise of variance 1. Level and slope of the coefficient are projected
-    out.
+    The whitened values z (n,) have independent noise of variance 1. The level and slope are projected out.
 
     - `root` (r,), `vectors` (K, r): square roots of the non-zero eigenvalues of the precision, and their eigenvectors;
     - `complement` (n, r + s): directions orthogonal to level and slope; s = 1 with a prior on the slope;
@@ -426,16 +426,16 @@ class _Whitening(NamedTuple):
     walk_log_priors: Array
 
     def whiten(self, vector: Array) -> Array:
-        """Transform the `vector` (K,) of `Information` to z (n,)."""
+        """Transform the `vector` (K,) of `Information`, precision times estimates, to n independent values z."""
         z = (self.vectors.T @ vector) / self.root
         z = np.append(z, np.zeros(self.complement.shape[1] - len(z)))  # a prior on the slope is one more estimate, 0
         return np.asarray(self.basis.T @ (self.complement @ z))
 
     def transform_steps(self, positions: Array, shape: Array | None = None, growth: float = 0.0) -> Array:
-        """Compute the change of z by a unit step at each of o onsets, shape (n, o).
+        """Compute the change of the n whitened values by a unit step at each of o onsets, shape (n, o).
 
         `positions`, `growth`: as in `step_shapes`; `shape`: factor on the step in each block of the recording, by
-        default 1. A prior on the level is the first of the K blocks, without an entry in `shape`.
+        default 1. If a prior on the level counts as a further first block, it has no entry in `shape`.
         """
         count = self.transform.shape[1]
         steps = step_shapes(count, positions, growth)
@@ -447,8 +447,8 @@ class _Whitening(NamedTuple):
 def _whiten_blocks(information: Information) -> tuple[_Whitening, Array, Array] | None:
     """Transform the estimates of a coefficient in blocks to independent values of variance 1.
 
-    Returns the matrices, the values z (n,), and the times of the possible onsets (o,) [s]; None without enough
-    information.
+    Returns the matrices of this transform, the values z (n,), and the times of the possible onsets (o,) [s]. Returns
+    None if too few blocks determine the coefficient.
     """
     time, precision, vector = _prepend_level_prior(information)
     if not np.isfinite(precision).all():
@@ -469,7 +469,7 @@ def _unit_whitening(count: int, slope: float, walk: float) -> _Whitening | None:
 
 
 def _build_whitening(precision: Array, slope: float, walk: float) -> _Whitening | None:
-    """Build the matrices that whiten K blocks with a given precision (K, K); None if too few have information.
+    """Build the matrices that whiten K blocks with a given precision (K, K); None if too few blocks have information.
 
     `slope`, `walk`: scales of the priors on the linear change and on the random walk over all blocks (`Information`).
     """
@@ -496,7 +496,7 @@ def _build_whitening(precision: Array, slope: float, walk: float) -> _Whitening 
     eigen, basis = np.linalg.eigh(unit * covariance)
     transform = basis.T @ transform
     positions = np.arange(EDGE, count - EDGE + 1e-9, 1.0 / PARTS)  # 1e-9 includes the upper end
-    # a step before or after all blocks with information changes nothing that is not level or slope
+    # before or after all blocks with information a step cannot be told from level and slope: its energy is zero
     energies = ((transform @ step_shapes(count, positions)) ** 2).sum(axis=0)
     return _Whitening(
         root=root,
@@ -513,7 +513,7 @@ def _build_whitening(precision: Array, slope: float, walk: float) -> _Whitening 
 
 
 def _prepend_level_prior(information: Information) -> tuple[Array, Array, Array]:
-    """Return `time`, `precision` and `vector` with a prior on the level, if any, as a block before the first."""
+    """Return `time`, `precision` and `vector`, with a known prior on the level added as a block before the first."""
     time, precision, vector, level, _, _ = information
     if not np.isfinite(level) or len(time) < MIN_BLOCKS:
         return time, precision, vector

@@ -41,7 +41,8 @@ def remove_pressure_offset(blocks: Blocks, columns: Sequence[ColumnRoles]) -> Bl
     """Estimate the sensor offset of p_A - p_B in a recording, and return the blocks after subtracting it.
 
     The most probable offset is subtracted in the Gram matrices and added to `Blocks.zero` [Pa], the offset removed so
-    far. The blocks are unchanged without a column for a constant flow, or if too few have information.
+    far. The blocks are returned unchanged if an equation has no column for a constant flow (`columns`), or if too few
+    blocks determine the leak.
     """
     if len(blocks) < MIN_BLOCKS or any(roles.bias is None for roles in columns):
         return blocks
@@ -79,7 +80,7 @@ def _find_relative_offset(leak_steps: Array, flow_offset_steps: Array, residuals
     q; `offset_cost` states the prior on the offset. The search is over asinh of the offset.
     """
     usual, far = INFERENCE.zero.pressure, INFERENCE.zero.far  # standard deviations of the prior [Pa]
-    # only walks up to the best one without an offset: with a larger walk an offset could fit changes that are no leak's
+    # no walk larger than the best one without an offset: otherwise an offset could explain changes that no leak causes
     walks = WALKS[: int(_walk_likelihoods(leak_steps, residuals, WALKS).argmax()) + 1]
 
     # the residual of the balance repeats from cycle to cycle, so not all residuals are independent
@@ -111,8 +112,8 @@ def _whiten_steps(blocks: Blocks, roles: ColumnRoles) -> tuple[Array, Array, Arr
 
     The 2 K estimates by the first equation (K leaks, K constant flows) have the inverse covariance P. With R such that
     P = R' R, the residuals are R times the estimates. Slow changes are then projected out: level and slope of the leak,
-    and a quadratic drift of the constant flow. Returns the arguments of `_find_relative_offset`, with steps in m^3/s
-    per Pa and m^3/s; None if the blocks have too little information.
+    and a quadratic drift of the constant flow. Returns the arguments of `_find_relative_offset`, for unit steps of
+    1 m^3/(s Pa) and 1 m^3/s; None if too few blocks determine the estimates.
     """
     count = len(blocks)
     # the constant flow is stated at each block's mean pressure difference `pressure`; a leak g adds g `pressure` to it

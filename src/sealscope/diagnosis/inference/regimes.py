@@ -46,10 +46,10 @@ def apply_regime(blocks: Blocks, roles: ColumnRoles, shut: bool, *, has_holds: b
 
     - Open valves: these columns are dropped from the Gram matrices.
     - Shut valves: the flow offset in motion replaces the flow offset of all times (`terms.shut_at_rest`). The column
-      `HOLDING`, of a pump that holds the load, remains only if some hold lasts for seconds (`has_holds`) and the pump
-      is off at other times; otherwise it becomes zero. If all holds are short, the pump is off at times, and valves
-      certainly are shut at rest (`is_certain`), it is first added to the column `TURNING`, of a pump that moves the
-      piston: a press that builds up its pressure is connected to its pump.
+      `HOLDING`, the leakage of a pump that holds the load, remains only if some hold lasts for seconds (`has_holds`)
+      and the pump is off at other times; otherwise it becomes zero. If all holds are short and the pump is off at other
+      times, they are those of a press that builds up its pressure, connected to its pump. Provided that valves are
+      certainly shut at rest (`is_certain`), these holds count as motion: they are first added to the column `TURNING`.
     """
     names = (*roles.names, "left")
     if not shut:
@@ -84,14 +84,14 @@ def add_pump_columns(gram: Array, names: Sequence[str]) -> Array:
 
 
 def has_rests(blocks: Blocks, roles: ColumnRoles) -> bool:
-    """Return True if pump or piston rest for more than rounding errors; `roles` include those of `terms.with_rests`."""
+    """Return True if pump or piston rest at times; the columns (`roles`) must include those of `terms.with_rests`."""
     return _rest_share(blocks, roles, TURNING) > NEGLIGIBLE
 
 
 def _rest_share(blocks: Blocks, roles: ColumnRoles, *states: str) -> float:
-    """Compute the fraction of the sum of squares of p_A - p_B that lies outside of some states of the machine.
+    """Compute the fraction of the sum of squares of p_A - p_B that falls outside the given states of the machine.
 
-    `states`: names of columns that are p_A - p_B in one state and else 0, such as `TURNING` (in motion).
+    `states`: names of columns that equal p_A - p_B in one state and 0 otherwise, such as `TURNING` (pump in motion).
     """
     leak, *columns = (roles.names.index(name) for name in (LEAK, *states))
     energies = np.diagonal(blocks.gram[:, 0], axis1=1, axis2=2).sum(axis=0)
@@ -101,19 +101,18 @@ def _rest_share(blocks: Blocks, roles: ColumnRoles, *states: str) -> float:
 def shut_odds(blocks: Blocks, roles: ColumnRoles) -> float:
     """Compute the log odds that valves cut the pump off from the cylinder while the pump rests (`rest_log_odds`).
 
-    `roles`: roles of the columns of `blocks`, among them those of `terms.with_rests`. The leakage in motion is
-    estimated from blocks with motion, and that at rest from the other blocks, given the former. Leakage at rest lets
-    the pressures relax, and the rate shows only its ratio to the compliance. A regression over all blocks could
-    therefore make both zero at rest. Thus all coefficients but the leakage and the flow offset are those in motion.
-    With the columns X of leakage and flow offset at rest, the left side y, the other columns Z and their coefficients b
-    in motion, the leakage r at rest is the first of
+    `roles`: roles of the columns of `blocks`, among them those of `terms.with_rests`. All coefficients are estimated
+    from blocks with motion; then leakage and flow offset at rest are estimated from the other blocks, given all other
+    coefficients. A single regression could make leakage and compliance zero at rest: the pressures relax at a rate that
+    shows only the ratio of both. With the columns X of leakage and flow offset at rest, the left side y, the other
+    columns Z and their coefficients b in motion, the leakage r at rest is the first of
 
         (X'X)^-1 X'(y - Z b),    variance = White's variance + J cov(b) J' + k^2 sum (J_c b_c)^2,
 
-    where J = d r/db is the first row of -(X'X)^-1 X'Z. The last term is a relative error k = `rest.compliance`
-    (`priors.toml`) of each compliance c: those of low pressures and of high ones differ by the air in the oil.
-    Pressures that stay the same at rest, or a pump that makes good the leakage, have no such error. The result is 0 if
-    fewer than `MIN_STATE_BLOCKS` blocks lie in either state, or without a variance.
+    where J = d r/db is the first row of -(X'X)^-1 X'Z. The last term allows for a relative error k = `rest.compliance`
+    (`priors.toml`) of each compliance c, which air in the oil makes larger at low pressures. It vanishes for pressures
+    that stay the same at rest, for example because a pump replaces the leaking oil. The result is 0 if fewer than
+    `MIN_STATE_BLOCKS` blocks are in motion or at rest, or if a variance is not positive.
     """
     gram, left = blocks.gram[:, 0], roles.left
     turning, holding, moving_bias = (roles.names.index(name) for name in (TURNING, HOLDING, MOVING_BIAS))
@@ -129,7 +128,7 @@ def shut_odds(blocks: Blocks, roles: ColumnRoles) -> float:
     rest_columns = [column for column in (roles.leak, roles.bias) if column is not None]
     shared = [k for k, column in enumerate(columns) if column not in (*rest_columns, turning, holding, moving_bias)]
     shared_columns = [columns[k] for k in shared]
-    # the left side without what the shared columns explain
+    # transform that subtracts the shared columns, times their coefficients, from the left side
     residual = np.eye(left + 1)
     residual[shared_columns, left] = -coefficients[shared]
     rest_gram = residual.T @ gram[is_rest] @ residual
@@ -169,7 +168,7 @@ def rest_log_odds(rest: float, motion: float, *, rest_variance: float, differenc
 def fit_with_robust_covariance(gram: Array, columns: list[int], left: int) -> tuple[Array, Array]:
     """Fit coefficients (c,) by least squares, with White's covariance (c, c) for errors that differ between K blocks.
 
-    `gram` (K, m, m): Gram matrices of the columns in each block; `columns`, `left`: those fitted and the left side.
+    `gram` (K, m, m): Gram matrix of each block; `columns`, `left`: indices of the columns to fit and of the left side.
     """
     grams, moments = gram[:, columns][:, :, columns], gram[:, columns, left]
     total = grams.sum(axis=0)

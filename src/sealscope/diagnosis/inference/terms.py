@@ -13,8 +13,7 @@ G is the same in both chambers.
 
 The priors on the drift of each coefficient are in `priors.toml`, with unit and source.
 
-Source: Merritt, Hydraulic Control Systems, 1967, sections 5.2 and 6.3 (continuity of the chambers, flow of the
-edges).
+Source: Merritt, Hydraulic Control Systems, 1967, sections 5.2 and 6.3 (continuity of the chambers, flow of edges).
 """
 
 from __future__ import annotations
@@ -126,7 +125,7 @@ class Signals:
         return (self._channels["p_A"] > self._channels["p_B"] + self._offset).astype(float)
 
     def directed_step(self, outward: bool, by_A: bool) -> Array:
-        """Compute the increments (n - 1,) of x [m] in one direction of motion under one loaded side, else 0.
+        """Compute the increments (n - 1,) of x [m] in a given direction while a given side carries the load, else 0.
 
         `outward`: true for motion towards B or standstill, false for motion towards A; `by_A`: true if A carries the
         load (`carried_by_A`), false if B does. If direction or loaded side change within an interval, half of its
@@ -148,7 +147,7 @@ class Signals:
         return self._find_states(pump_volume)[1]
 
     def _find_states(self, pump_volume: Callable[[Signals], Array]) -> tuple[Array, Array]:
-        """Compute the flags of `moving` and `holding`, only once: all terms of a balance have one `pump_volume`."""
+        """Compute the flags of `moving` and `holding`, only once: all terms of a balance share the `pump_volume`."""
         limits = self._rest_limits
         if limits is None:
             return np.ones_like(self.time_step), np.zeros_like(self.time_step)
@@ -243,7 +242,7 @@ class Term(NamedTuple):
 
     @property
     def compared(self) -> bool:
-        """True if only a comparison of recordings fits the coefficient: in one, the motion varies too little."""
+        """True if the coefficient is fitted only to several recordings: in one, the motion varies too little."""
         return self.drift == "speed"
 
 
@@ -312,7 +311,7 @@ def _conductance_term(
     needs: tuple[str, ...] = _PRESSURES,
     drift: Coefficient | Literal[""] = "",
 ) -> Term:
-    """Make a `Term` of an unknown conductance [m^3/(s Pa)] times a pressure over the intervals [Pa s]."""
+    """Make the term of an unknown conductance; `increments` computes the driving pressure times dt [Pa s]."""
     return Term(name, "m^3/(s Pa)", increments, cause, drift=drift, needs=needs, driver="pressure")
 
 
@@ -324,7 +323,7 @@ _LEAKS = (
 
 
 def _motion_term(outward: bool, by_A: bool) -> Term:
-    """Make the term of the piston's motion in one direction under one loaded side, with an area as coefficient."""
+    """Make the term of the piston's motion `outward` (to B) or inward, while side A (`by_A`) or B carries the load."""
     name = f"motion {'out' if outward else 'in'}, {'A' if by_A else 'B'} carries"
     return _sensor_term(name, "m^2", lambda s: s.directed_step(outward, by_A), drift="motion", needs=("x",))
 
@@ -332,9 +331,8 @@ def _motion_term(outward: bool, by_A: bool) -> Term:
 def _chamber_terms(side: str) -> tuple[Term, ...]:
     """Make the four terms of one chamber, `side` "A" or "B": two of its compliance, and two of the air in its oil.
 
-    With the chamber's pressure p, the piston's position x, and changes d over a sampling interval, the increments are
-    dp for a constant compliance, x dp for its change over the stroke, d(1/p) for free air, and d ln p (absolute) for
-    dissolving air.
+    With the chamber's absolute pressure p, the position x, and changes d over a sampling interval, the increments are
+    dp for a constant compliance, x dp for its change over the stroke, d(1/p) for free air, d ln p for dissolving air.
     """
     p, name = f"p_{side}", f"compliance {side}"
     compliance_term = partial(Term, cause="air in the oil", drift="compliance")
@@ -533,9 +531,9 @@ def circulation(rig: Rig, channels: frozenset[str]) -> Equation | None:
 
 
 def locked(rig: Rig, channels: frozenset[str]) -> Equation | None:
-    """Return the volume balance of a load that is held by shut valves; None if circuit or channels do not suffice.
+    """Return the volume balance of a load that is held by shut valves; None if circuit or channels do not allow it.
 
-    The left side is the volume that must have leaked from A to B for the piston's motion: -dx times the piston's area
+    The left side is the volume that must have leaked from A to B to let the piston move: -dx times the piston's area
     on the loaded side, where x is assumed to grow as A fills. Leaks of seal, valve and line cannot be separated.
 
     The balance needs the position and both pressures. If a command or the pump's flow is recorded, the circuit must
@@ -582,9 +580,9 @@ def pump_volume(rig: Rig, channels: frozenset[str]) -> Callable[[Signals], Array
 
 
 def with_rests(equation: Equation) -> Equation:
-    """Return a pump's volume balance with three more terms, which are zero in some states of the machine (`STATES`).
+    """Add three terms to a pump's volume balance that are zero in some states of the machine (`STATES`).
 
-    Inserted before the terms of the leak, they have the increments
+    They are inserted before the terms of the leak, and have the increments
 
     - (p_A - p_B) dt while the pump moves the piston (`TURNING`),
     - (p_A - p_B) dt while the pump turns and the piston rests, to hold the load (`HOLDING`),
@@ -596,9 +594,9 @@ def with_rests(equation: Equation) -> Equation:
 
 
 def shut_at_rest(equation: Equation) -> Equation:
-    """Return a pump's volume balance for valves that cut the pump off from the cylinder while the pump rests.
+    """Adapt a pump's volume balance to valves that cut the pump off from the cylinder while the pump rests.
 
-    The pump's leakage has two terms of its own: while it moves the piston, and while it only holds the load. The
+    Two terms are added for the pump's leakage: while it moves the piston, and while it only holds the load. The
     constant flow (`BIAS`) counts only while pump and piston move.
     """
     left = equation.left
@@ -614,10 +612,11 @@ def shut_at_rest(equation: Equation) -> Equation:
 def _pump_leakage_terms(
     pump_volume: Callable[[Signals], Array], drift: Coefficient | Literal[""] = ""
 ) -> tuple[Term, Term]:
-    """Make the terms (p_A - p_B) dt of a pump's leakage while it moves the piston, and while it holds the load; else 0.
+    """Make two terms of a pump's leakage: while it moves the piston, and while it turns to hold the load.
 
-    `pump_volume` computes the volume [m^3] that the pump delivers in each interval; `drift`: entry of `priors.toml`
-    with the prior on the drift of both coefficients, or "" for terms that are not part of every fit.
+    Their increments are (p_A - p_B) dt in this state, and 0 at other times. `pump_volume` computes the volume [m^3]
+    that the pump delivers in each interval; `drift`: entry of `priors.toml` with the prior on the drift of both
+    coefficients, or "" for terms that are not part of every fit.
     """
     # no further channels are needed: the balance requires both pressures anyway
     make_term = partial(_conductance_term, cause="pump leak", needs=(), drift=drift)

@@ -85,9 +85,9 @@ def estimate_low_drifts(recording: Recording) -> LowDrifts | None:
 
     In a closed circuit a chamber that carries no load is at the charge pressure. Samples before the pump first turns do
     not count, as shut valves may enclose any pressure until then. The drift of a chamber is unknown if its lowest
-    pressure is by `charge.near` (`priors.toml`) or more above the other chamber's, or if at most the fraction
+    pressure exceeds that of the other chamber by `charge.near` (`priors.toml`) or more, or if at most the fraction
     `charge.share` of its samples lies within `charge.near` of the lowest pressure. Return None if neither drift is
-    known, without both pressures, or without the pump's angle or speed.
+    known, or if a pressure, or both angle and speed of the pump, are not recorded.
     """
     flow_channel = flow_source(recording.channels)
     if len(recording) < MIN_SAMPLES or flow_channel not in PUMP or not {"p_A", "p_B"} <= set(recording.channels):
@@ -103,7 +103,7 @@ def estimate_low_drifts(recording: Recording) -> LowDrifts | None:
     drifts = list[float]()
     for p, low in zip(pressures, lowest, strict=True):
         is_low = is_known & np.isfinite(p) & (p < low + prior.near)
-        is_at_charge = low < min(lowest) + prior.near and is_low.mean() > prior.share  # else fit no samples: NaN
+        is_at_charge = low < min(lowest) + prior.near and is_low.mean() > prior.share  # else fit nothing: drift NaN
         drifts += _fit_drift(recording.t, p, regressors, np.flatnonzero(is_low & is_at_charge))
     return LowDrifts(*drifts) if np.isfinite(drifts).any() else None
 
@@ -147,9 +147,10 @@ class ChargeTrend(NamedTuple):
 
 
 def estimate_charge_trend(recording: Recording) -> ChargeTrend | None:
-    """Estimate how fast the charge pressure of a closed circuit falls, as a weighted mean over `estimate_low_drifts`.
+    """Estimate how fast the charge pressure of a closed circuit falls, from the lowest pressures of both chambers.
 
-    Return None if no chamber is at times near the charge pressure, or without the pump's angle or speed.
+    The rate is the weighted mean of their drifts (`estimate_low_drifts`). Return None if neither chamber is at times
+    near the charge pressure, or if neither angle nor speed of the pump is recorded.
     """
     drifts = estimate_low_drifts(recording)
     if drifts is None:
@@ -167,8 +168,7 @@ def _regressors(recording: Recording, flow_channel: str) -> Array:
     """Compute the quantities (n, 2 or 3) that change the charge pressure besides a drift: pump flow and position.
 
     The columns are the positive and the negative part of the flow, relative to its largest magnitude, and, if recorded,
-    the position [m] minus its mean, all averaged over `charge.seconds` of `priors.toml`. `flow_channel`: channel of the
-    pump's angle or speed.
+    the position [m] minus its mean. All are averaged over `charge.seconds`. `flow_channel`: the pump's angle or speed.
     """
     drive = average_over(CHANGES.charge.seconds, recording[flow_channel], recording.rate)
     flow = np.gradient(drive) if flow_channel == "theta" else drive
@@ -252,8 +252,8 @@ def compare_low_drifts(judged: LowDrifts, healthy: Sequence[LowDrifts]) -> Itera
     if fall is None:
         return
     if len(drifts) > 1:
-        differences = [_difference(other) for other in healthy if np.isfinite(other).all()]
-        difference = compare_estimates(FALL, DRIFT, _difference(judged), differences, scatter)
+        differences = [_drift_difference(other) for other in healthy if np.isfinite(other).all()]
+        difference = compare_estimates(FALL, DRIFT, _drift_difference(judged), differences, scatter)
         chance = 1.0 if difference is None else min(1.0, fall.chance / max(difference.chance, TINY))
         fall = replace(fall, chance=chance)
     yield replace(fall, advantage=-size_penalty(CHANGES.charge_fall, fall.size))
@@ -273,7 +273,7 @@ def _mean_fall(drifts: LowDrifts, variances: Mapping[str, float]) -> Estimate | 
     return Estimate(-mean, error)
 
 
-def _difference(drifts: LowDrifts) -> Estimate:
+def _drift_difference(drifts: LowDrifts) -> Estimate:
     """Compute the drift of p_A minus that of p_B [Pa/s] with its standard error; NaN if one is unknown."""
     error = float(np.hypot(drifts.low_A_error, drifts.low_B_error))
     return Estimate(drifts.low_A - drifts.low_B, error)

@@ -41,8 +41,7 @@ def duty_tests(recording: Recording) -> list[StepTest]:
     """
     length, cycle = len(recording) // BLOCKS, find_cycle(recording)
     if "x" in recording and cycle is not None:
-        # blocks of whole cycles; not without a position, as the motion is then the drive's, which a leak changes within
-        # a cycle
+        # blocks of whole cycles need a position: without it the motion is the drive's, which a leak changes in a cycle
         cycle_samples = cycle * recording.rate
         length = round(max(1, math.ceil(length / cycle_samples)) * cycle_samples)
     time, blocks = _split_blocks(recording, length)
@@ -62,9 +61,10 @@ def time_in_motion(speeds: Array, max_speed: float, rate: float) -> Array:
 
 
 def is_in_motion(fractions: Array) -> NDArray[np.bool_]:
-    """Flag the blocks (K,) in motion: for at least `features.busy` (`priors.toml`) times the time of the busiest block.
+    """Flag the blocks (K,) in which the piston moves for long enough.
 
-    `fractions` (K,): fraction of each block's samples in which the piston moves (`time_in_motion`).
+    `fractions` (K,): fraction of each block's samples in which it moves (`time_in_motion`). It must be at least
+    `features.busy` (`priors.toml`) times that of the busiest block.
     """
     return np.asarray(fractions >= _PRIORS.busy * fractions.max(initial=0.0))
 
@@ -151,8 +151,7 @@ def sensor_features(blocks: Mapping[str, Array], rate: float) -> Iterator[tuple[
 
     The features (`SENSOR_FEATURES`) are the correlation of p_A - p_B with the flow, the noise of both pressures, the
     difference of their noise, and the hum at the frequencies of the mains. The first word of a name is its kind of data
-    (`Observable.data`). `blocks`: samples (K, length) by channel name, with p_A and p_B, NaN where missing; `rate`:
-    sampling rate [Hz].
+    (`Observable.data`). `blocks`: samples (K, length) by channel, NaN where missing; `rate`: sampling rate [Hz].
     """
     p_A, p_B = blocks["p_A"], blocks["p_B"]
     if channel := next((name for name in ("omega", "u", "theta", "x") if name in blocks), None):
@@ -180,8 +179,8 @@ def sensor_features(blocks: Mapping[str, Array], rate: float) -> Iterator[tuple[
 def _log_hum(blocks: Array, frequency: float) -> Array:
     """Compute the log power (K,) of a spectral line in blocks (K, n), relative to the power of the neighbouring bins.
 
-    Ringing is wider than a line, so it raises the neighbouring bins as well and cancels. `frequency`: that of the line
-    over the sampling rate. The power is the mean over both halves of each block (Welch's estimate).
+    Ringing is wider than a line, so it raises the neighbouring bins as well and cancels. `frequency`: frequency of the
+    line, divided by the sampling rate. The power is the mean over both halves of each block (Welch's estimate).
     """
     length = blocks.shape[1] // 2
     halves = blocks[:, : 2 * length].reshape(-1, 2, length)
@@ -196,8 +195,8 @@ def _log_hum(blocks: Array, frequency: float) -> Array:
 def _row_statistic(statistic: Callable[..., Array], without_missing: Callable[..., Array], values: Array) -> Array:
     """Compute a statistic of the known values of each row (K, n); NaN for a row without known values.
 
-    `statistic`: function for rows without missing values, such as `np.median`; `without_missing`: one that skips
-    missing values, such as `np.nanmedian`; ten times slower, it is used only where needed.
+    `statistic`: function for rows without missing values, such as `np.median`; `without_missing`: the ten times slower
+    function that skips missing values, such as `np.nanmedian`, for the other rows.
     """
     results = np.full(len(values), np.nan)
     is_known = np.isfinite(values)

@@ -64,36 +64,37 @@ class HealthyLevels:
         """Summarise a recording by friction, drifts and spectra; None if nothing can be estimated.
 
         The summary maps names to numbers, such as "friction_pressure" [Pa], and each name in `PAIRS` (a pair of
-        channels) to spectra: an array (4, k) with the fields of `Octaves` in k octaves. Unknown entries are missing. It
-        is computed once.
+        channels) to spectra: an array (4, k) with the fields of `Octaves` in k octaves. Unknown entries are missing.
         """
         return compute_once(recording, ("healthy levels",), _estimate_levels)
 
     def compare(self, recording: Recording, baseline: Sequence[Healthy]) -> Iterator[Observable]:
-        """Compare friction, spectra and drifts, in motion and of the lowest readings, with those of healthy recordings.
+        """Compare friction, spectra and drifts of the pressures with those of the healthy recordings in `baseline`.
 
-        Yields one test for each, without quantities that the recording or too many of the `baseline` lack.
+        Drifts are those in motion and those of the lowest readings. A quantity that is missing in the recording or in
+        too many healthy ones has no test.
         """
         judged = self.learn(recording)
         if judged is None:
             return
         healthy = healthy_summaries(self, baseline)
-        if (low_drifts := _low_drifts(judged)) is not None:
-            healthy_drifts = [drifts for summary in healthy if (drifts := _low_drifts(summary)) is not None]
+        if (low_drifts := _read_low_drifts(judged)) is not None:
+            healthy_drifts = [drifts for summary in healthy if (drifts := _read_low_drifts(summary)) is not None]
             yield from compare_low_drifts(low_drifts, healthy_drifts)
-        if (spectra := compare_spectra(_octaves(judged), [_octaves(summary) for summary in healthy])) is not None:
+        healthy_spectra = [_read_octaves(summary) for summary in healthy]
+        if (spectra := compare_spectra(_read_octaves(judged), healthy_spectra)) is not None:
             yield spectra
         if (friction := _compare_friction(judged, healthy)) is not None:
             yield friction
         yield from _compare_drifts(judged, healthy)
 
 
-def _octaves(summary: Summary) -> dict[str, Octaves]:
+def _read_octaves(summary: Summary) -> dict[str, Octaves]:
     """Read the spectra of all pairs of channels in a recording's summary, by the names of the pairs in `PAIRS`."""
     return {name: Octaves(*np.asarray(summary[name], dtype=float)) for name in PAIRS if name in summary}
 
 
-def _low_drifts(summary: Summary) -> LowDrifts | None:
+def _read_low_drifts(summary: Summary) -> LowDrifts | None:
     """Read the drifts of the low pressures from a recording's summary; None if it contains no such drift."""
     if not set(LowDrifts._fields) & set(summary):
         return None
@@ -129,10 +130,10 @@ def _log_frictions(
 
     `key`, `error_key`: keys of friction and standard error [Pa] in the summaries. The usual sign of the friction
     depends on the motion's channel; the sum of friction / error over the healthy recordings has this sign. As friction
-    resists the motion, healthy frictions of the other sign show that the errors are too small. All errors are therefore
-    multiplied by the upper quartile, but at least by 1, of abs(friction) / error over the healthy recordings, with 0
-    for a friction of the usual sign. A friction is usable if it has the usual sign and exceeds its error; others are
-    None or left out.
+    resists the motion, healthy frictions of the other sign show that the errors are too small. Let the excess of a
+    healthy recording be abs(friction) / error if the sign is wrong, else 0. All errors are multiplied by the upper
+    quartile of the excesses, but at least by 1. A friction is usable if it has the usual sign and exceeds its error;
+    otherwise the judged one is None, and a healthy one is left out.
     """
     known = [summary for summary in healthy if {key, error_key} <= set(summary)]
     if not known or not {key, error_key} <= set(judged):
@@ -154,15 +155,16 @@ def _log_frictions(
 def _compare_drifts(judged: Summary, healthy: Sequence[Summary]) -> Iterator[Observable]:
     """Compare the drifts of p_A and p_B during motion with those of healthy recordings.
 
-    If the judged recording and enough healthy ones have both drifts, yields a test for each of three alternative
-    explanations: p_A drifts, p_B drifts, or both drift alike. In the last case p_A - p_B does not drift, so that
+    Yields a test for each of three alternative explanations: p_A drifts, p_B drifts, or both drift alike. Yields
+    nothing unless the judged recording and enough healthy ones have both drifts. If both drift alike, p_A - p_B does
+    not drift, and p-value and score of this explanation are
 
         chance = min(1, chance_A chance_B / chance_difference),    score = max(0, score_A + score_B - score_difference).
     """
-    judged_drifts = _drifts(judged)
+    judged_drifts = _read_drifts(judged)
     if judged_drifts is None:
         return
-    healthy_drifts = [drifts for summary in healthy if (drifts := _drifts(summary)) is not None]
+    healthy_drifts = [drifts for summary in healthy if (drifts := _read_drifts(summary)) is not None]
     prior = CHANGES.healthy
     scatter = PriorScatter(prior.drift, recordings=prior.drift_recordings, inflation=prior.drift_inflation)
     drift_A, drift_B, difference = (
@@ -178,7 +180,7 @@ def _compare_drifts(judged: Summary, healthy: Sequence[Summary]) -> Iterator[Obs
     yield replace(difference, chance=min(chance, 1.0), score=score)  # named DRIFTS[2], "drift of both"
 
 
-def _drifts(summary: Summary) -> tuple[Estimate, Estimate, Estimate] | None:
+def _read_drifts(summary: Summary) -> tuple[Estimate, Estimate, Estimate] | None:
     """Read the drifts [Pa] of p_A, p_B and p_A - p_B in motion from a recording's summary; None if it has none."""
     if not set(summary) >= set(DRIFT_KEYS):
         return None
@@ -190,7 +192,7 @@ def _drifts(summary: Summary) -> tuple[Estimate, Estimate, Estimate] | None:
 
 @np.errstate(all="ignore")
 def _estimate_levels(recording: Recording) -> Summary | None:
-    """Estimate friction, drifts and spectra in a recording, by their names; None if it allows none."""
+    """Estimate friction, drifts and spectra of a recording, by their names; None if none of them can be estimated."""
     levels = dict[str, float]()
     for keys, without_slow_changes in zip(FRICTION_KEYS, (False, True), strict=True):
         fit = fit_difference(recording, without_slow_changes=without_slow_changes)
@@ -213,7 +215,7 @@ def _estimate_levels(recording: Recording) -> Summary | None:
 def _estimate_drift(motion: Motion, pressure: Array) -> Estimate:
     """Estimate the drift [Pa] of a `pressure` (n,) over the whole recording, from the samples in `motion`.
 
-    Its error allows for residuals that are correlated within a stroke; infinite if the drift is undetermined.
+    Its error allows for residuals that are correlated within a stroke. It is infinite if the drift is undetermined.
     """
     values = pressure[motion.rows]
     coefficients, weight = fit_robustly(motion.design, values)

@@ -109,8 +109,8 @@ def estimate_levels(recording: Recording) -> PressureLevels | None:
 
     The samples in motion are fitted by p = level + half sign(v) + b v + c dv/dt + d x. Level and half difference are
     free in each block; the slopes b, c and d on speed v, acceleration and position x are common to the recording.
-    Without a recorded motion the levels are means and the half differences zero. Of several lengths of blocks, whole
-    cycles first, the first with enough samples of both directions in every block is used. Return None if there is none.
+    Without a recorded motion the levels are means and the half differences zero. Several block lengths are tried, whole
+    cycles first; the first with enough samples of both directions in every block is used. Return None if none has.
     """
     if not {"p_A", "p_B"} <= set(recording.channels):
         return None
@@ -182,17 +182,16 @@ def fit_pressure_levels(gram: Array, length: float, means: Array) -> Array | Non
 
 
 def level_tests(recording: Recording) -> tuple[LevelChange, ...]:
-    """Test a recording for a step in each pattern of its pressure levels (`pattern_tests`); empty without levels."""
+    """Test a recording for a step in each pattern of pressure levels (`pattern_tests`); empty if they are unknown."""
     levels = estimate_levels(recording)
     return () if levels is None else pattern_tests(*levels)
 
 
 def pattern_tests(time: Array, values: Array) -> tuple[LevelChange, ...]:
-    """Test pressure levels for a step in each of several patterns, the highest rank, i.e. the most likely one, first.
+    """Test pressure levels for a step in each of several patterns; the most likely one (highest rank) comes first.
 
     A pattern (`PATTERNS`) is the combination of levels that one cause changes, such as friction or a sensor's offset.
-    `time` (K,): times of K blocks [s]; `values` (K, 4): their levels, as in `PressureLevels`. Patterns that cannot be
-    tested are left out.
+    Those that cannot be tested are left out. `time` (K,), `values` (K, 4): times [s] and levels of `PressureLevels`.
     """
     whitening = _whitening_matrix(values)
     mean = values.mean(axis=0)
@@ -217,7 +216,7 @@ def _whitening_matrix(values: Array) -> Array:
     """Compute the matrix (c, 4) that transforms pressure levels to c numbers with independent errors of equal variance.
 
     The matrix W is a root of the inverse of S, W' W = S^-1, where S is the covariance of the differences between
-    neighbouring blocks. `values` (K, 4): `PressureLevels.values`, of whose four columns c are not constant.
+    neighbouring blocks. `values` (K, 4): `PressureLevels.values`; c of its columns are not constant.
     """
     varying = np.flatnonzero(np.ptp(values, axis=0) > 0.0)  # half differences are constant without a motion
     differences = np.diff(values[:, varying], axis=0)

@@ -142,9 +142,8 @@ def fit_robustly(design: Array, values: Array) -> tuple[Array, Array]:
     """Fit coefficients c (m,) of `design` (n, m) to `values` (n,), values = design c, by reweighted least squares.
 
     The weights are 1/(1 + (residual/scale)^2), where the scale is `WEIGHT_SCALE` times the median of abs(residual),
-    plus `MIN_RESIDUAL`. The iteration is run twice: from equal weights, and from weights by the distance of the values
-    from their median, which are small in contact with a workpiece. Returns coefficients and weights of the fit with the
-    smaller scale.
+    plus `MIN_RESIDUAL`. It is run twice: from equal weights, and from weights that are small far from the median of the
+    values, as in contact with a workpiece. Returns coefficients and weights of the fit with the smaller scale.
     """
     equations = stack_equations(design, values)
     fits = list[tuple[float, Array, Array]]()
@@ -235,10 +234,10 @@ def remove_slow_changes(motion: Motion, design: Array, values: Array, t: Array) 
 
 
 def fit_difference(recording: Recording, *, without_slow_changes: bool = False) -> Resistance | None:
-    """Fit p_A - p_B in motion by friction, which reverses with the motion, and a viscous drop; computed only once.
+    """Fit p_A - p_B in motion by friction, which reverses with the motion, and a viscous drop.
 
     `without_slow_changes`: first remove loads that change slowly (`remove_slow_changes`), and with them most of the
-    viscous drop of a steady motion. The result is None without enough motion.
+    viscous drop of a steady motion. The result is computed only once; it is None if too few samples are in motion.
     """
     key = ("motion fit of p_A - p_B", without_slow_changes)
     return compute_once(recording, key, lambda recording: _fit_difference(recording, without_slow_changes))
@@ -246,7 +245,7 @@ def fit_difference(recording: Recording, *, without_slow_changes: bool = False) 
 
 @np.errstate(all="ignore")
 def _fit_difference(recording: Recording, without_slow_changes: bool) -> Resistance | None:
-    """Fit p_A - p_B in motion by friction and a viscous drop (`fit_difference`); None without enough motion.
+    """Fit p_A - p_B in motion by friction and a viscous drop (`fit_difference`); None if too few samples are in motion.
 
     The standard errors allow for residuals that are correlated within `equal_parts` of the rows.
     """

@@ -144,9 +144,9 @@ def _octave_powers(
 def compare_spectra(judged: Mapping[str, Octaves], healthy: Sequence[Mapping[str, Octaves]]) -> Observable | None:
     """Test for a new low-pass filter of one pressure, such as a clogged line, against healthy recordings.
 
-    `judged`, `healthy`: spectra in each recording, by the names of the pairs in `PAIRS`. The observable is named after
-    the pressure that is more probably filtered; its size is the most probable cut-off frequency [Hz]. Healthy
-    recordings with fewer octaves of a pair than the judged one are left out. Return None if too few are left.
+    `judged`, `healthy`: spectra of each recording for pairs of channels, by their names in `PAIRS`. The result is named
+    after the pressure that is more probably filtered; its size is the most probable cut-off frequency [Hz]. Healthy
+    recordings with fewer octaves of a pair than the judged one are left out. Return None if too few remain.
     """
     from scipy.special import logsumexp
 
@@ -154,11 +154,12 @@ def compare_spectra(judged: Mapping[str, Octaves], healthy: Sequence[Mapping[str
         _compare_pair(octaves, [spectra[name] for spectra in healthy if name in spectra], PAIRS[name])
         for name, octaves in judged.items()
     )
-    factors = [factor for factor in comparisons if factor is not None]
-    if not factors:
+    filters = [comparison for comparison in comparisons if comparison is not None]
+    if not filters:
         return None
-    log_factor = float(logsumexp([log_factor for log_factor, _, _ in factors]) - np.log(len(factors)))
-    _, channel, cutoff = max(factors, key=lambda factor: factor[0])
+    # log of the mean Bayes factor of the pairs
+    log_factor = float(logsumexp([log_factor for log_factor, _, _ in filters]) - np.log(len(filters)))
+    _, channel, cutoff = max(filters, key=lambda comparison: comparison[0])
     return Observable(
         name=FILTER_NAMES[channel],
         data=SIDES,

@@ -42,7 +42,7 @@ def _test_signals(recording: Recording) -> Observed:
 
 
 def run_tests(*tests: Callable[[], Iterator[Observable]]) -> tuple[Observable, ...]:
-    """Collect the observables of all tests; a test in which numbers overflow or a matrix is singular ends early."""
+    """Collect the results of all tests; a test in which numbers overflow or a matrix is singular ends early."""
     observables: list[Observable] = []
     for test in tests:
         with suppress(ArithmeticError, np.linalg.LinAlgError):
@@ -56,11 +56,11 @@ _MIN_STEP_RATIO = math.tan(math.pi / 8.0)
 
 
 def duty_observables(tests: Sequence[StepTest]) -> Iterator[Observable]:
-    """Yield an observable of a step of the duty if the amplitudes of command and motion change by similar ratios.
+    """Yield an observable if the machine's duty (commanded motion) changes suddenly, else nothing.
 
-    `tests`: step tests of the log amplitudes of command and motion (`duty_tests`). The smaller step must exceed
-    `_MIN_STEP_RATIO` times the larger one, since a leak changes only one amplitude. Score, onset and size are those of
-    the test with the lower score. The p-value is twice the higher one, as each test covers a rise and a fall.
+    `tests`: step tests of the log amplitudes of command and motion (`duty_tests`). Both must change: the smaller step
+    must exceed `_MIN_STEP_RATIO` times the larger one, since a leak changes only one amplitude. Score, onset and size
+    are those of the test with the lower score. The p-value is twice the higher one, since a step may be up or down.
     """
     steps = np.abs([test.fitted.size for test in tests])
     if tests and steps.min() > _MIN_STEP_RATIO * steps.max():
@@ -77,9 +77,10 @@ def duty_observables(tests: Sequence[StepTest]) -> Iterator[Observable]:
 
 
 def sensor_observables(tests: Iterable[tuple[str, StepTest]]) -> Iterator[Observable]:
-    """Convert step tests of sensor features, such as noise and hum, with the features' names, to observables.
+    """Convert step tests of sensor features, such as noise and hum, to observables (test results).
 
-    The first word of a name is its kind of data. The p-value is doubled, as each test is the better of two.
+    `tests`: pairs of a feature's name, whose first word is the kind of data, and its test. The p-value is doubled, as
+    each test is the better of two, for a step up and a step down.
     """
     for name, test in tests:
         yield Observable.from_test(name, name.split()[0], test, n_tests=2.0)
@@ -90,12 +91,12 @@ _MAX_EXPONENT = 700.0
 
 
 def level_observables(changes: Sequence[LevelChange]) -> Iterator[Observable]:
-    """Convert tests for steps of the pressure levels to observables.
+    """Convert tests for steps of the pressure levels to observables (test results).
 
-    `changes`: one test for each pattern of levels, the highest rank first. The rank (`LevelChange`) becomes the score.
-    The p-value of change k is chance_k = min(1, chance_1 exp(rank_1 - rank_k)). Half of the exponent is the log Bayes
-    factor of change 1 over change k (Schwarz's approximation), the other half a prior against patterns that need
-    further coefficients. The interval of an onset is one block to either side.
+    `changes`: a test for each pattern, the combination of levels that a cause changes, with the highest rank first. The
+    rank (`LevelChange`) becomes the score. The p-value of change k is chance_k = min(1, chance_1 exp(rank_1 - rank_k)).
+    Half of the exponent is the log Bayes factor of change 1 over change k (Schwarz's approximation), the other half a
+    prior against patterns that need further coefficients. The interval of an onset is one block to either side.
     """
     for change in changes:
         onset = Interval(change.onset, change.onset - change.block, change.onset + change.block)

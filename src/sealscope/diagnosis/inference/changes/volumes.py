@@ -65,21 +65,20 @@ def volume_observables(
     flow_scale: float = 1.0,
     with_orifice: bool = True,
 ) -> tuple[Observable, ...]:
-    """Test the coefficients of a volume balance for a step up or down, or only up for leaks; highest score first.
+    """Test each coefficient of a volume balance for a step, and return the results by falling score.
 
-    A leak is tested as a laminar flow, and as a flow proportional to a power of p_A - p_B below 1. The coefficients of
-    the motion are tested together, for a change of their common scale. The `advantage` of an observable comes from the
-    priors on its size and its law, the sensor offset, and the oil that the accumulator lost.
+    A leak is tested for a step up only, as a laminar flow, and as a flow proportional to a power of p_A - p_B below 1.
+    The coefficients of the motion are tested together, for a change of their common scale. The `advantage` of a result
+    comes from the priors on its size and on the power, the sensor offset, and the oil that the accumulator lost.
 
-    - `blocks`, `plain`: blocks of the recording without the sensor offset of p_A - p_B, for the tests of laminar leaks,
-      and with the pressures as recorded, for all other tests.
+    - `blocks`: blocks of the recording after removal of the sensor offset of p_A - p_B, for tests of laminar leaks.
+    - `plain`: its blocks with the pressures as recorded, for all other tests.
     - `balances`, `columns`: the equations, and the roles of their columns.
     - `oil_loss`: tests for an external leak by the oil that the accumulator lost, by the name of the term.
     - `volume_ratio`: measured over assumed ratio of piston area to pump displacement.
     - `charge`: trend of the charge pressure, None if it is unknown.
     - `flow_scale`: true flow over the flow of the balance.
-    - `with_orifice`: false to leave out the test of an orifice's own flow, which in a few blocks looks like a change of
-      the motion's scale.
+    - `with_orifice`: false to omit the test of an orifice's flow: with few blocks it resembles a change of scale.
     """
     centred, recorded = (series.merge(max_blocks=INFERENCE.blocks.coarse) for series in (blocks, plain))
     # a laminar leak is tested without the sensor offset, so an improbable offset counts against the leak
@@ -96,12 +95,12 @@ def volume_observables(
         else:
             advantage = -_size_penalty(name, step.fitted.size, recorded, columns[0].names, volume_ratio, flow_scale)
         advantage += 2.0 * _law_log_prior(name)
-        # a leak whose oil a check valve makes up has a name of its own, which ends with MADE_UP
+        # MADE_UP at the end of a name marks a leak whose lost oil a check valve replaces
         if (accumulator_test := oil_loss.get(name.removesuffix(MADE_UP))) is not None:
             advantage += _accumulator_support(step, accumulator_test)
         elif charge is not None and (name == OUTSIDE or name.startswith("external leak")):
             term = name.removesuffix(MADE_UP)
-            # the coefficient of a loss to the outside is a flow, that of another leak a flow over a pressure
+            # the coefficient of a loss to the outside (OUTSIDE) is a flow, that of other leaks a flow per pressure
             unit_flow = 1.0 if name == OUTSIDE else recorded.driving_pressure(columns[0].names, term)
             flow = step.fitted.size * unit_flow * flow_scale
             advantage += charge.loss_support(flow, float(step.onsets[step.best]))
@@ -114,11 +113,11 @@ def volume_observables(
 def _size_penalty(
     name: str, size: float, blocks: Blocks, names: Sequence[str], volume_ratio: float, flow_scale: float
 ) -> float:
-    """Compute how improbable the size of a step is: -2 log(prior density / largest density), 0 without a prior on it.
+    """Compute how improbable the size of a step is: -2 log(prior density / largest density).
 
-    `name`: name of the observable, whose coefficient in the volume balance changes by `size`; `names`: names of the
-    columns of `blocks`; `volume_ratio`, `flow_scale`: as in `volume_observables`; they convert `size` to the quantity
-    that the prior describes. Where the prior only limits the size, small steps have no penalty (`above`).
+    It is 0 if there is no prior on the size, and for small steps where the prior only limits it (`above`). `name`: name
+    of the coefficient in the volume balance that changes by `size`; `names`: names of the columns of `blocks`.
+    `volume_ratio` and `flow_scale` convert `size` to the quantity of the prior (`volume_observables`).
     """
     if name == SCALE:
         return size_penalty(INFERENCE.scale, size)
@@ -134,10 +133,9 @@ def _size_penalty(
 
 
 def _law_log_prior(name: str) -> float:
-    """Compute the log prior probability of the law by which an observable describes a leak, over that of laminar flow.
+    """Compute the log prior odds of a leak's flow law, the power of p_A - p_B that it follows, to laminar flow.
 
-    A law is a power of p_A - p_B (`law_priors`). `name`: name of the observable. The result is 0 for a laminar leak,
-    and if the observable is no leak.
+    `name`: name of the tested step, which states the power. The result is 0 for a laminar leak and for other steps.
     """
     laminar, *_ = priors = law_priors()
     return float(np.log(priors[EXPONENTS.index(_LEAK_EXPONENTS.get(name, 1.0))] / laminar))
@@ -146,12 +144,12 @@ def _law_log_prior(name: str) -> float:
 def _step_hypotheses(
     centred: Blocks, recorded: Blocks, terms: Sequence[Term], columns: Sequence[ColumnRoles], has_accumulator: bool
 ) -> Iterator[tuple[str, Sequence[float], Information, Array | None]]:
-    """Yield the steps to test: of each term's coefficient, of leaks under other laws, and of the motion's scale.
+    """Yield the steps to test: of each term's coefficient, of leaks that are not laminar, and of the motion's scale.
 
-    `centred`, `recorded`: blocks of the recording without the sensor offset of p_A - p_B, for the tests of laminar
-    leaks, and with the pressures as recorded; `has_accumulator`: true if the accumulator's volume shows external leaks.
-    Yields for each step the name of its observable, the signs to test (1 up, -1 down), the likelihood of the
-    coefficient in K blocks, and the change of the coefficient in each block by a unit step (K,), None for 1.
+    `centred`: blocks of the recording after removal of the sensor offset of p_A - p_B, for tests of laminar leaks;
+    `recorded`: blocks with the pressures as recorded, for all other tests; `has_accumulator`: true if the accumulator's
+    volume shows external leaks. Yields for each step its name, the signs to test (1 up, -1 down), the likelihood of the
+    coefficient in K blocks, and the change (K,) of the coefficient by a unit step, None if it is 1 in every block.
     """
     first = columns[0]
     for term in terms:
@@ -169,19 +167,19 @@ def _step_hypotheses(
         if exponent < 1.0:  # 1 is the laminar leak, tested above
             yield f"{LEAK} of exponent {exponent:g}", (1.0,), leak, shape
     scale = first.names.index(ORIFICE)  # the column of the orifice, no longer needed, takes the motion's volume
-    motion = information(_with_fitted_motion(recorded, columns, scale), columns, scale)
+    motion = information(_insert_fitted_motion(recorded, columns, scale), columns, scale)
     yield SCALE, (1.0, -1.0), motion._replace(level=np.inf), None  # without the prior on the orifice's leak
 
 
 def _is_tested(term: Term, roles: ColumnRoles, has_accumulator: bool) -> bool:
     """Return True if the coefficient of a term of the volume balance is tested for a step by itself.
 
-    It is not if it changes only together with others, or if another test covers its steps. `has_accumulator`: true if
-    the recording shows the volume of an accumulator.
+    A coefficient is left out if it changes only together with others, or if another test covers its steps.
+    `has_accumulator`: true if the recording shows the volume of an accumulator.
     """
-    # a change of area, displacement or a sensor's scale changes all coefficients of motion: the test of SCALE covers
-    # them; in one recording the motion varies too little for SPEED_LOSS; a leaking piston raises HOLDING as well: the
-    # test of the leak covers it
+    # The coefficients of motion change together, with an area, the displacement or a sensor's scale: the test of SCALE
+    # covers them. The motion of one recording varies too little to test SPEED_LOSS. A leaking piston raises HOLDING as
+    # well, which the test of the leak covers.
     if term.name.startswith("motion") or term.name in (SPEED_LOSS, HOLDING):
         return False
     if AIR in roles.names and term.cause == "air in the oil" and term.nuisance:
@@ -193,8 +191,8 @@ def _is_tested(term: Term, roles: ColumnRoles, has_accumulator: bool) -> bool:
 def _accumulator_support(balance_test: StepTest, accumulator_test: StepTest) -> float:
     """Compute twice the log likelihood ratio of an external leak to no leak, by the oil that the accumulator lost.
 
-    With the size b of the leak by the volume balance, and the size a by the accumulator for the same onset with the
-    standard error s, the result is (a/s)^2 - ((a - b)/s)^2.
+    Let b be the size of the leak estimated from the volume balance, a its size estimated from the accumulator for the
+    same onset, and s the standard error of a. The result is (a/s)^2 - ((a - b)/s)^2.
     """
     onset = balance_test.onsets[balance_test.best]
     nearest = int(np.abs(accumulator_test.onsets - onset).argmin())
@@ -203,11 +201,11 @@ def _accumulator_support(balance_test: StepTest, accumulator_test: StepTest) -> 
     return float(measured**2 - (measured - expected) ** 2)
 
 
-def _with_fitted_motion(blocks: Blocks, columns: Sequence[ColumnRoles], index: int) -> Blocks:
-    """Return the blocks with column `index` replaced by the volume that the piston's motion takes, as fitted.
+def _insert_fitted_motion(blocks: Blocks, columns: Sequence[ColumnRoles], index: int) -> Blocks:
+    """Return the blocks with column `index` replaced by the fitted volume of the piston's motion.
 
-    The new column tests for a change of the scale of position or speed: a relative change by s is a step of its
-    coefficient by s. It is the sum of the columns of motion, each times its fitted coefficient.
+    This volume is the sum of the columns of motion, each times its fitted coefficient. The coefficient of the new
+    column shows a change of the scale of position or speed: a relative change by s is a step by s.
     """
     gram = blocks.gram.copy()
     for equation, (roles, total) in enumerate(zip(columns, sum_blocks(blocks, columns), strict=True)):

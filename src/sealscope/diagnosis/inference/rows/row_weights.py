@@ -126,8 +126,7 @@ def _sum_products(values: Any, begin: int, end: int, weights: Any, gram: Any) ->
 def _eliminate_fast(gram: Any, column_order: Any, n_fast: int, reduced: Any) -> None:
     """Eliminate the coefficients that are free in each block (fast) from the Gram matrix `gram` (m, m) of one block.
 
-    The result is written to `reduced` (c, c). `column_order`: indices of its c columns in `gram`, the `n_fast` fast
-    ones first.
+    `reduced` (c, c) receives the result. `column_order`: its columns' indices in `gram`, the `n_fast` fast ones first.
     """
     for i in range(len(column_order)):
         for j in range(len(column_order)):

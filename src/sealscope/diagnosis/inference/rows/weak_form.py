@@ -85,13 +85,13 @@ OVERLAP = _variance_inflation()
 
 
 def weak_form_rows(increments: Sequence[Array], rate: float) -> Rows:
-    """Compute the rows of a regression: integrals of each test function times the increments of c columns.
+    """Compute the rows of a regression in weak form: the integrals of c columns, weighted by each test function.
 
-    `increments`: an array (n,) for each of the c columns, with NaN for missing samples; `rate`: sampling rate [Hz].
+    `increments`: for each column its increments (n,) between samples, NaN where missing; `rate`: sampling rate [Hz].
 
-    The samples are divided into pieces as long as the distance of neighbouring test functions (`stride_samples`), of
-    which a test function spans `SPAN`. There is one row for each test function that lies within the samples. A piece
-    with a missing sample, or with integrals beyond `MAX_READING`, counts as zeros, and its rows are not `whole`.
+    The samples are divided into pieces as long as the distance of neighbouring test functions (`stride_samples`). Each
+    test function spans `SPAN` pieces, and gives one row if it lies within the samples. A piece with a missing sample,
+    or with integrals beyond `MAX_READING`, counts as zeros, and its rows are not `whole`.
     """
     stride = stride_samples(rate)
     n_pieces = len(increments[0]) // stride
@@ -116,7 +116,8 @@ def weights_near_holes(holes: Array, rate: float) -> Array:
     `holes` (n,): 1 for a sample in a hole, a long gap of missing samples that was filled in, else 0; `rate`: sampling
     rate [Hz]. A weight below `MIN_WEIGHT` is replaced by 0.
     """
-    # length [s] of each sampling interval that touches a hole, else 0: its integral is the fraction in holes
+    # length [s] of each sampling interval that touches a hole, else 0; the sum of these lengths, weighted by a test
+    # function of integral 1, is the fraction of the function in holes
     hole_time = np.maximum(holes[1:], holes[:-1]) / rate
     weights = 1.0 - weak_form_rows([hole_time], rate).values[:, 0]
     return np.where(weights < MIN_WEIGHT, 0.0, np.minimum(weights, 1.0))
