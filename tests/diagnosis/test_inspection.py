@@ -16,6 +16,7 @@ from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.recordings.recording import Recording
 
 from ..refusals import refusal
+from .balance_machine import machine, step
 
 
 def copied(recording: Recording) -> Recording:
@@ -68,6 +69,32 @@ def test_of_copies_the_one_with_the_most_channels_is_kept(healthy: list[Recordin
     few = whole.only(["u", "p_A", "p_B"])
     for baseline in ([few, whole], [whole, few]):
         assert select_comparable(inspect_recording(healthy[0]), baseline).parts == (whole,)
+
+
+PUMP_LINES = ("p_1", "p_2")
+
+
+def without_pump_lines(recording: Recording) -> Recording:
+    return recording.only(name for name in recording.channels if name not in PUMP_LINES)
+
+
+def test_a_recording_is_judged_by_the_channels_of_its_healthy_recordings() -> None:
+    """Pressures in the pump's lines add terms to the balance: compared with none, a leak from the start was hidden."""
+    healthy = [without_pump_lines(machine(seed, rate=100.0, duration=60.0)) for seed in range(1, 6)]
+    leaky = machine(9, G=step(0.0, 3.0e-12, at=0.0), rate=100.0, duration=60.0)
+    fewer, result = diagnose(without_pump_lines(leaky), healthy), diagnose(leaky, healthy)
+    assert (result.verdict, result.leak_lpm) == (fewer.verdict, fewer.leak_lpm)
+    assert result.verdict == "leak"
+    (finding,) = [finding for finding in result.quality if finding.code == "channels_left_out"]
+    assert finding.text.endswith("p_1, p_2")
+
+
+def test_no_leak_is_not_stated_where_the_healthy_recordings_give_another_balance() -> None:
+    healthy = [machine(seed, rate=100.0, duration=60.0) for seed in range(1, 6)]
+    leaky = without_pump_lines(machine(9, G=step(0.0, 3.0e-12, at=0.0), rate=100.0, duration=60.0))
+    result = diagnose(leaky, healthy)
+    assert result.verdict == "cannot tell"
+    assert "another balance of volumes" in result.reason
 
 
 @pytest.mark.usefixtures("two_methods")

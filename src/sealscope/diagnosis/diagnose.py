@@ -132,8 +132,9 @@ class Examination:
         for name in names:
             if name not in ORDER or not any(is_decided(decision) for decision in decisions.values()):
                 decisions[name] = self._decide_by(name, reports)
-        failures = [self.report(name).lack for name in ORDER if name in decisions and self.report(name).has_failed]
-        refusal = self.refusal or next(iter(failures), None)  # reason not to state "no leak"
+        reports_in_order = [self.report(name) for name in ORDER if name in decisions]
+        refusals = [report.lack if report.has_failed else report.refusal for report in reports_in_order]
+        refusal = self.refusal or next(filter(None, refusals), None)  # reason not to state "no leak"
         return combine(list(decisions.values()), refusal)
 
     def _decide_by(self, name: str, reports: Sequence[Observed], *, weigh_rivals: bool = True) -> Evidence:
@@ -211,7 +212,7 @@ def diagnose(
         inspection = inspect_recording(recording)
         comparable = select_comparable(inspection, healthy)
         examination = Examination(
-            inspection.part,
+            comparable.judged,
             comparable.parts,
             false_alarm_probability=false_alarm_probability,
             rig=used_rig,

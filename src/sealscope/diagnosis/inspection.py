@@ -17,6 +17,7 @@ import numpy as np
 from sealscope.diagnosis.healthy import Healthy, SummarisedRecording
 from sealscope.paragraphs import join_names
 from sealscope.recordings.chambers import chambers_of
+from sealscope.recordings.channels import SLOW
 from sealscope.recordings.corrections.samples import correct_samples
 from sealscope.recordings.hydraulics import describe_missing_chambers, find_implausibility
 from sealscope.recordings.quality import SHORTEST, Finding, Severity, inspect
@@ -92,6 +93,7 @@ def _inspect(recording: Recording, names: Sequence[str]) -> Inspection:
 class Baselines(NamedTuple):
     """Leak-free recordings that can be compared with the judged one, and reasons for those that cannot."""
 
+    judged: Recording  # the judged recording, without channels that none of the comparable ones has
     parts: tuple[Healthy, ...]  # the comparable recordings: samples that can be analysed, or stored summaries
     findings: tuple[Finding, ...]  # baselines that were left out, with the reasons
     refusal: str | None  # if all given baselines were left out, the most frequent reason
@@ -103,6 +105,7 @@ def select_comparable(judged: Inspection, baseline: Sequence[Healthy]) -> Baseli
     A baseline is left out if it cannot be trusted, if it lacks a chamber pressure of the judged recording or has it in
     another unit, or if its samples are those of the judged recording. Of baselines with the same samples, the one with
     the most channels is kept. Differences of speed, load and temperature are accepted, as the detectors allow for them.
+    Channels that only the judged recording has are left out, because other channels give other estimates.
     """
     healthy = [entry if isinstance(entry, SummarisedRecording) else inspect_recording(entry) for entry in baseline]
     index_of_digest: dict[str, int] = {}  # index of each comparable recording, by its digest
@@ -130,7 +133,13 @@ def select_comparable(judged: Inspection, baseline: Sequence[Healthy]) -> Baseli
         refusal = f"no baseline recording can be used: {most_frequent_reason}"
     entries = [healthy[k] for k in sorted(index_of_digest.values())]  # in the order of `baseline`
     parts = tuple(entry.part if isinstance(entry, Inspection) else entry for entry in entries)
-    return Baselines(parts, tuple(findings), refusal)
+    part = judged.part
+    known = SLOW.union(*(entry.units for entry in entries)) if entries else part.channels.keys()
+    if unknown := [name for name in part.channels if name not in known]:
+        note = f"left out, as no baseline recording has it: {', '.join(unknown)}"
+        findings.append(Finding("channels_left_out", "note", channel=None, count=len(unknown), first_t=None, text=note))
+        part = part.only(name for name in part.channels if name in known)
+    return Baselines(part, parts, tuple(findings), refusal)
 
 
 def _find_obstacle(entry: Inspection | SummarisedRecording, judged: Inspection) -> tuple[Severity, str] | None:

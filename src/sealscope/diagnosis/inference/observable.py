@@ -262,6 +262,8 @@ class Observed:
         Time of the last judged sample, as a fraction of the recording.
     has_failed : bool
         True if the detector raised an error.
+    refusal : str
+        Reason why none of the given healthy recordings could be compared, else "".
     """
 
     provider: str
@@ -272,3 +274,4 @@ class Observed:
     share: float = 1.0
     judged_until: float = 1.0
     has_failed: bool = False
+    refusal: str = ""

@@ -21,8 +21,8 @@ from sealscope.storage.plain_state import restore_attributes, save_attributes
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-#: Channels of an actuator to store: those that it may be watched by, and the oil temperature.
-CHANNELS = ("x", "theta", "omega", "p_A", "p_B", "p_1", "p_2", "u", "T_oil")
+#: Channels of an actuator to store: those by which its blocks or recordings are judged, and the oil temperature.
+CHANNELS = ("x", "theta", "omega", "q_pump", "p_A", "p_B", "p_1", "p_2", "u", "T_oil")
 _PRIORS = LIVE.samples
 #: Limits of the step between successive samples, in sampling intervals.
 _MIN_STEP, _MAX_STEP = _PRIORS.follows

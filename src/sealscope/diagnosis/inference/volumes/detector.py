@@ -269,7 +269,10 @@ class VolumeBalance:
         names = [name for name in balance.columns[0].names if name not in (TURNING, HOLDING)]
         comparable = [summary for summary in summaries if summary["terms"] == names]
         healthy = [_sums_from_summary(summary, balance.shut, balance.locked) for summary in comparable]
-        return self._report(balance, healthy)
+        report = self._report(balance, healthy)
+        if comparable or not summaries or report.lack:
+            return report
+        return replace(report, refusal="the channels of the healthy recordings give another balance of volumes")
 
     def observe_regimes(self, recording: Recording) -> Mapping[bool, Observed]:
         """Report on a recording without healthy ones, under both assumptions on the valves while the pump rests.
