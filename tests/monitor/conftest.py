@@ -8,9 +8,13 @@ from pathlib import Path
 
 import pytest
 
+import sealscope as ss
+from sealscope.diagnosis.commissioned.machine_file import write_machine
+from sealscope.diagnosis.verdict.machine import unstated_rig
 from sealscope.monitor.settings import MonitorSettings
 
-from .plant import LINES, Rows, rows_of, served, settings_in
+from ..diagnosis.balance_machine import machine
+from .plant import LINES, MAP, Rows, log, rows_of, served, settings_in
 from .servers import Broker
 
 
@@ -46,3 +50,16 @@ def broker(tmp_path: Path) -> Iterator[Broker]:
     broker = Broker(tmp_path)
     yield broker
     broker.stop()
+
+
+@pytest.fixture(scope="session")
+def commissioned(tmp_path_factory):
+    """A machine's file of which areas, map and rate alone are stated."""
+    folder = tmp_path_factory.mktemp("machine")
+    days = ((seed, folder / f"healthy/run_2026-03-{10 + seed}_0600.csv") for seed in range(1, 6))
+    files = [log(path, machine(seed, rate=100.0, duration=60.0)) for seed, path in days]
+    rig = unstated_rig()
+    areas = rig.cylinder.A_A, rig.cylinder.A_B
+    rig = rig.with_areas(*areas, source="data sheet").with_overrides({"pump.q_b": 7.0e-6}, source="assumed: a guess")
+    known = ss.commission(files, rig=rig, map=MAP, rate=100.0, limit="20 mL/min", name="press")
+    return write_machine(known, folder / "press.toml")

@@ -42,6 +42,18 @@ name = "press 2"
 {more}
 """
 CHANNELS = ("p_A", "p_B", "x", "theta")
+HEADINGS = {"p_A": ("bottom [bar]", 1e-5), "p_B": ("rod [bar]", 1e-5), "x": ("stroke [mm]", 1e3)}
+MAP = {"p_A": "bottom", "p_B": "rod", "x": "stroke", "theta": "angle [rad]"}
+
+
+def log(path: Path, recording: Recording) -> Path:
+    """Write a log without a time column, in the headings of a plant."""
+    path.parent.mkdir(exist_ok=True)
+    columns = {name: recording[channel] * factor for channel, (name, factor) in HEADINGS.items()}
+    columns["angle [rad]"] = recording["theta"]
+    rows = np.transpose([*columns.values()])
+    np.savetxt(path, rows, delimiter=",", header=",".join(columns), comments="", fmt="%.9g")
+    return path
 
 
 def settings_in(folder: Path, more: str = "", database: str = "monitor.db", own: str = "") -> MonitorSettings:

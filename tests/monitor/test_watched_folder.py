@@ -15,7 +15,6 @@ from prometheus_client.parser import text_string_to_metric_families
 from starlette.testclient import TestClient
 
 import sealscope as ss
-from sealscope.diagnosis.commissioned.machine_file import write_machine
 from sealscope.diagnosis.commissioned.watched import is_remeasured, load_watched
 from sealscope.diagnosis.live.watch import Watch, watch
 from sealscope.diagnosis.verdict.machine import unstated_rig
@@ -31,40 +30,14 @@ from sealscope.monitor.sources.folder import WatchedFolder
 from sealscope.monitor.sources.source_block import SourceBlock, decode_message
 from sealscope.monitor.supervisor import PartAway
 from sealscope.monitor.verdicts import RecordingVerdict
-from sealscope.recordings.recording import Recording
 from sealscope.reporting import messages
 
 from ..diagnosis.balance_machine import machine, step
 from ..refusals import refusal
-from .plant import served
+from .plant import MAP, log, served
 
 APRIL = datetime(2026, 4, 1, tzinfo=UTC).timestamp()
 LEAK, LARGE = 3.0e-13, 3.0e-12
-HEADINGS = {"p_A": ("bottom [bar]", 1e-5), "p_B": ("rod [bar]", 1e-5), "x": ("stroke [mm]", 1e3)}
-MAP = {"p_A": "bottom", "p_B": "rod", "x": "stroke", "theta": "angle [rad]"}
-
-
-def log(path: Path, recording: Recording) -> Path:
-    """Write a log without a time column, in the headings of a plant."""
-    path.parent.mkdir(exist_ok=True)
-    columns = {name: recording[channel] * factor for channel, (name, factor) in HEADINGS.items()}
-    columns["angle [rad]"] = recording["theta"]
-    rows = np.transpose([*columns.values()])
-    np.savetxt(path, rows, delimiter=",", header=",".join(columns), comments="", fmt="%.9g")
-    return path
-
-
-@pytest.fixture(scope="module")
-def commissioned(tmp_path_factory):
-    """A machine's file of which areas, map and rate alone are stated."""
-    folder = tmp_path_factory.mktemp("machine")
-    days = ((seed, folder / f"healthy/run_2026-03-{10 + seed}_0600.csv") for seed in range(1, 6))
-    files = [log(path, machine(seed, rate=100.0, duration=60.0)) for seed, path in days]
-    rig = unstated_rig()
-    areas = rig.cylinder.A_A, rig.cylinder.A_B
-    rig = rig.with_areas(*areas, source="data sheet").with_overrides({"pump.q_b": 7.0e-6}, source="assumed: a guess")
-    known = ss.commission(files, rig=rig, map=MAP, rate=100.0, limit="20 mL/min", name="press")
-    return write_machine(known, folder / "press.toml")
 
 
 def watching(folder: Path, machine_file: Path, more: str = ""):

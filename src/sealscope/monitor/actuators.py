@@ -32,8 +32,9 @@ from sealscope.monitor.database.machine_files import record_mark
 from sealscope.monitor.database.store import MAX_IDENTITIES, MonitorStore, StoredCheckpoint, StoredRows, outage_reason
 from sealscope.monitor.settings import ActuatorSettings, WatchSettings
 from sealscope.monitor.sources.source_block import SourceBlock, count_bytes
+from sealscope.monitor.stream_recordings import StreamRecorder, judge_stream
 from sealscope.monitor.supervisor import Supervisor
-from sealscope.monitor.verdicts import RecordingVerdict
+from sealscope.monitor.verdicts import STREAM_SHARE, RecordingVerdict
 from sealscope.recordings.oil import measured_oil_temperature
 from sealscope.recordings.recording import Recording
 from sealscope.storage.plain_state import require_part, restore, save_attributes
@@ -64,7 +65,7 @@ class _Actuator:
     the machine's cycles; `stored_summary`: summary stored last; `oil_celsius`: oil temperature [deg C], None if
     unknown; `judged_s` [s]: end of the last judged samples; `verdict`: on the last recording, None if whole recordings
     are not judged; `alarm_samples`: last samples during an alarm, which may become a healthy recording in the machine's
-    file.
+    file; `recorder`: cuts the stream of a commissioned machine into recordings, None for files and other actuators.
     """
 
     settings: ActuatorSettings
@@ -79,15 +80,17 @@ class _Actuator:
     judged_s: float | None = None
     verdict: RecordingVerdict | None = None
     alarm_samples: list[Recording] = field(default_factory=list)
+    recorder: StreamRecorder | None = None
 
     def judge_samples(
         self, samples: Recording, *, follows: bool, settings: WatchSettings, verdict: RecordingVerdict | None = None
     ) -> tuple[list[BlockEstimate], list[_AlarmEvent]]:
         """Judge new samples; return the leakage estimates of blocks of some seconds, and the changes of the alarm.
 
-        `follows`: False after a gap; `settings`: thresholds of the alarm; `verdict`: verdict on the samples as a whole
-        recording, None for none. If this verdict decides (`RecordingVerdict.decides`), only it updates the alarm, and
-        the estimates state its leak; otherwise each estimate updates the alarm. The result depends only on arguments
+        `follows`: False after a gap; `settings`: thresholds of the alarm; `verdict`: verdict on the recording that ends
+        with these samples, None for none. Of a file, that recording is these samples: if its verdict decides
+        (`RecordingVerdict.decides`), only it updates the alarm, and the estimates state its leak. Of a stream, the
+        recording began before these samples: each estimate updates the alarm, too. The result depends only on arguments
         and state.
         """
         estimates: list[BlockEstimate] = []
@@ -101,23 +104,45 @@ class _Actuator:
             self.last = self.watch.with_cycle_means(estimate)
             if estimate.judged or self.judged_s is None or self.judged_s > estimate.t:  # the clock may be set back
                 self.judged_s = estimate.t
-            if deciding_verdict is not None:
+            if deciding_verdict is not None and self.recorder is None:
                 estimates.append(deciding_verdict.restate_block(estimate))
                 continue
             estimates.append(estimate)
             change = self.judge.update(self.last, leak, self._baseline_version(), settings)
             if change is not None:
                 events.append((*change, estimate.t))
-        if deciding_verdict is not None:
-            if deciding_verdict.clears and self.watch.leak is not None:  # the detector withdraws its leak
-                self.watch.dismiss()
-            version = self._baseline_version()
-            change = self.judge.update_from_verdict(deciding_verdict, self.verdict, version, settings)
-            if change is not None:
-                events.append((*change, deciding_verdict.end_s))
-        self.verdict = verdict
+                if change[1] == "raised":  # newer than the verdict on an earlier recording
+                    self.verdict = None
+        if verdict is not None or self.recorder is None:
+            events.extend(self._apply_verdict(verdict, settings))
+        elif self.verdict is not None and len(samples):
+            age_s = float(samples.t[-1]) - self.verdict.end_s  # long if no recording could be judged since
+            self.verdict = None if age_s > settings.not_comparable_s else self.verdict
         self._update_alarm_samples(samples, follows=follows)
         return estimates, events
+
+    def _apply_verdict(self, verdict: RecordingVerdict | None, settings: WatchSettings) -> list[_AlarmEvent]:
+        """Keep the verdict on a recording and, if it decides, update the alarm; return the changes of the alarm.
+
+        The verdict `no leak` on a recording of a stream is dropped if this recording was too short to show the leak
+        that the detector found over a longer time.
+        """
+        earlier_verdict, self.verdict = self.verdict, verdict
+        if verdict is None or not verdict.decides:
+            if self.recorder is not None and self.last is not None:  # the blocks of the stream tell more
+                self.verdict = None
+            return []
+        alarm, leak = self.judge.alarm, self.watch.leak
+        if verdict.clears:
+            leak_flows = [found.leak_lpm for found in (alarm, leak) if found is not None]  # [L/min], None if unknown
+            if self.recorder is not None and not verdict.excludes(leak_flows):
+                self.verdict = None
+                return []
+            if leak is not None:  # the detector withdraws its leak
+                self.watch.dismiss()
+        is_stream, version = self.recorder is not None, self._baseline_version()
+        change = self.judge.update_from_verdict(verdict, earlier_verdict, version, settings, is_stream=is_stream)
+        return [] if change is None else [(*change, verdict.end_s)]
 
     def _baseline_version(self) -> int:
         """Return the version number of the actuator's healthy baseline, 0 while a baseline is being learned."""
@@ -140,7 +165,8 @@ class _Actuator:
 
     def state(self) -> dict[str, Any]:
         """Convert the detector, the alarm and the last results to plain values, for a checkpoint in the database."""
-        return save_attributes(self, ("watch", "judge", "last", "oil_celsius", "judged_s", "verdict"))
+        saved = ("watch", "judge", "last", "oil_celsius", "judged_s", "verdict", "n_stored")
+        return {**save_attributes(self, saved), "recorder": None if self.recorder is None else self.recorder.state()}
 
     def load_state(self, state: Mapping[str, Any]) -> None:
         """Restore detector and last results from `state`, plain values of a checkpoint; the alarm stays as it is."""
@@ -149,6 +175,8 @@ class _Actuator:
         self.oil_celsius, self.judged_s = state.get("oil_celsius"), state.get("judged_s")
         if state.get("verdict") is not None:
             self.verdict = restore(RecordingVerdict, state["verdict"], "verdict")
+        if self.recorder is not None and state.get("recorder") is not None:
+            self.recorder.load_state(state["recorder"])
 
     def _machine_state(self) -> MachineState:
         """Determine the state of the machine by NAMUR NE 107, such as "good" or "maintenance required".
@@ -194,7 +222,7 @@ class _Actuator:
             baseline_values = {"version": baseline.version, "hours": baseline.hours, "lpm": baseline.lpm}
         return {
             "blocks": self.watch.blocks,
-            "t": t if verdict is None else verdict.end_s,
+            "t": t if verdict is None else max(verdict.end_s, t or -math.inf),
             "status": last.status if verdict is None else verdict.summary,
             "state": self._machine_state().as_dict(),
             "by": self.watch.method,
@@ -235,14 +263,16 @@ class WatchedActuators:
         """Restore an actuator from its last checkpoint in the database and the samples since, or create a new one."""
         name = settings.name
         machine = load_watched(settings.rig)
+        is_recorded = machine.machine is not None and settings.folder is None and settings.recording_s > 0.0
         fresh = watch(
             machine.rig,
-            false_alarms_per_1000_h=settings.false_alarms_per_1000_h,
+            false_alarms_per_1000_h=settings.false_alarms_per_1000_h * (1.0 - STREAM_SHARE if is_recorded else 1.0),
             learn_hours=settings.learn_hours,
             healthy=machine.healthy,
         )
         n_stored = self.store.last_number(self.store.tables.blocks, name)
-        actuator = _Actuator(settings, fresh, AlarmJudge(name), n_stored=n_stored)
+        recorder = StreamRecorder(name, settings.recording_s) if is_recorded else None
+        actuator = _Actuator(settings, fresh, AlarmJudge(name), n_stored=n_stored, recorder=recorder)
         checkpoint = self.store.checkpoint(name)
         if checkpoint is None or self._load_checkpoint(actuator, checkpoint):  # a new checkpoint is needed
             rows = StoredRows()
@@ -270,9 +300,17 @@ class WatchedActuators:
         stored_settings = None
         with suppress(ValidationError):  # another version may have written them in another form
             stored_settings = WatchSettings.model_validate_json(stored.settings)
-        for samples, follows, verdict in stored.pending:  # judged with the settings of the first time, if readable
+        n_judged = state.get("n_stored", 0)  # number of the last block whose effect the state includes
+        for number, samples, follows, verdict in stored.pending:
+            if number <= n_judged:
+                if actuator.recorder is not None:
+                    actuator.recorder.refill(number, samples)
+                continue
+            if actuator.recorder is not None:  # a recording that ends here has the stored verdict
+                actuator.recorder.take(number, samples)
+            # with the settings of the first time, if readable
             actuator.judge_samples(samples, follows=follows, settings=stored_settings or settings, verdict=verdict)
-        actuator.watch.false_alarms_per_1000_h = settings.false_alarms_per_1000_h  # may change without a new baseline
+        actuator.watch.false_alarms_per_1000_h = fresh.false_alarms_per_1000_h  # may change without a new baseline
         if actuator.watch.healthy is not None:  # None after a person has marked a repair
             actuator.watch.healthy = fresh.healthy
         rig, *learning_settings = fresh.learned_with
@@ -361,23 +399,29 @@ class WatchedActuators:
     def _add_samples(self, rows: StoredRows, actuator: _Actuator, block: SourceBlock, samples: Recording) -> None:
         """Judge the samples of an actuator's block, and add the results to the database rows that will be stored."""
         settings, follows, verdict = actuator.settings, block.follows, block.verdict
-        name = settings.name
+        name, number, recorder = settings.name, actuator.n_stored, actuator.recorder
+        if recorder is not None and (recording := recorder.take(number, samples)) is not None:
+            verdict = judge_stream(settings, recording)
         estimates, events = actuator.judge_samples(samples, follows=follows, settings=settings, verdict=verdict)
         rows.add_estimates(name, estimates, actuator.oil_celsius)
         for event in events:
             rows.add_alarm(*event)
         # the hash of the name spreads the checkpoints of the actuators over time
         is_due = (actuator.n_stored + zlib.crc32(name.encode())) % PENDING_BLOCKS == 0
-        if is_due or actuator.bytes >= PENDING_BYTES:
+        is_due = is_due or actuator.bytes >= PENDING_BYTES
+        if is_due:
             self._checkpoint(actuator, rows)
         else:
-            rows.add_pending(name, actuator.pending, samples, follows, verdict)
             self._add_summary(actuator, rows)
+        if not is_due or (recorder is not None and recorder.first):  # the recording is judged when it ends
+            rows.add_pending(name, number, samples, follows, verdict)
 
     def _checkpoint(self, actuator: _Actuator, rows: StoredRows) -> None:
         """Add a checkpoint of an actuator's state to the rows to store, and mark its old rows for deletion."""
         settings = actuator.settings
-        rows.add_checkpoint(settings.name, settings.watched_with.model_dump_json(), actuator.state())
+        state, recorder = actuator.state(), actuator.recorder
+        first_kept = recorder.first if recorder is not None and recorder.first else actuator.n_stored + 1
+        rows.add_checkpoint(settings.name, settings.watched_with.model_dump_json(), state, first_kept)
         self._add_summary(actuator, rows)
         n_kept_estimates = self._keep_s / actuator.watch.block_seconds
         rows.old_blocks[settings.name] = actuator.n_stored - MAX_IDENTITIES
@@ -423,6 +467,8 @@ class WatchedActuators:
             try:
                 if mark in ("invalid", "repaired") and actuator.verdict is not None:
                     actuator.verdict = actuator.verdict.neutral_after_mark(mark)
+                if mark in ("invalid", "repaired") and actuator.recorder is not None:
+                    actuator.recorder.clear()
                 if mark == "invalid":
                     actuator.watch.dismiss()
                 elif mark == "repaired":

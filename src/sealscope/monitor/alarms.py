@@ -197,16 +197,22 @@ class AlarmJudge:
         return self.alarm
 
     def update_from_verdict(
-        self, verdict: RecordingVerdict, earlier: RecordingVerdict | None, baseline: int, settings: WatchSettings
+        self,
+        verdict: RecordingVerdict,
+        earlier: RecordingVerdict | None,
+        baseline: int,
+        settings: WatchSettings,
+        *,
+        is_stream: bool = False,
     ) -> tuple[Alarm, str] | None:
         """Update the alarm with the verdict on a whole recording; return the alarm and the name of the event.
 
-        A leak at or above the warning threshold raises an alarm if the verdict on the `earlier` recording (None for
-        none) was `leak`, too, or if leak-free recordings get such a verdict seldom enough for the allowed rate of false
-        alarms. The verdict `no leak`, or a leak below the warning threshold, ends the alarm. `baseline`: version of the
-        healthy baseline; `settings`: thresholds and the allowed rate. The event is "raised", "error" or "warning" (a
-        change of the level), "returned" (the leak has ended), or "" for none of these. Returns None for the verdict
-        `cannot tell`, or if no alarm was active and none is raised.
+        A leak at or above the warning threshold raises an alarm if leak-free recordings get this verdict, together with
+        that on the `earlier` recording (None for none), seldom enough for the allowed rate of false alarms. The verdict
+        `no leak`, or a leak below the warning threshold, ends the alarm. `baseline`: version of the healthy baseline;
+        `settings`: thresholds and the allowed rate; `is_stream`: True for recordings of a stream. The event is
+        "raised", "error" or "warning" (a change of the level), "returned" (the leak has ended), or "" for none of
+        these. Returns None for the verdict `cannot tell`, or if no alarm was active and none is raised.
         """
         alarm, lpm = self.alarm, verdict.leak_lpm
         is_active = alarm is not None and alarm.active
@@ -232,8 +238,7 @@ class AlarmJudge:
             is_worse = level == "error" and alarm.level == "warning"
             state: AlarmState = "new" if is_worse and alarm.state != "valid" else alarm.state
             return self._set_alarm(replace(alarm, **findings, state=state)), "" if level == alarm.level else level
-        is_repeated = earlier is not None and earlier.leaks
-        if not (is_repeated or verdict.is_rare(settings.false_alarms_per_1000_h)):
+        if not verdict.is_rare(settings.false_alarms_per_1000_h, earlier, is_stream=is_stream):
             return None
         onset_s = verdict.start_s if verdict.onset_s is None else verdict.onset_s
         # a leak present from the first sample on began after the last recording without a leak

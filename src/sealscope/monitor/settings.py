@@ -38,6 +38,13 @@ def _resolve_in_folder(place: _PathLike, info: ValidationInfo) -> _PathLike:
 _File = Annotated[Path, AfterValidator(_resolve_in_folder)]
 
 
+def _check_recording_length(seconds: float) -> float:
+    """Return the length of the recordings of a stream [s]; raise ValueError unless it is 0 or 60 to 600."""
+    if seconds != 0.0 and not 60.0 <= seconds <= 600.0:
+        raise ValueError(f"must be 0 or 60 to 600 s, got {seconds:g}")
+    return seconds
+
+
 class _Table(BaseModel):
     """A table of the settings, which cannot be changed and must not have unknown keys."""
 
@@ -51,8 +58,9 @@ class WatchSettings(_Table):
     operation; `learn_hours`: time in which the leakage of the healthy machine is learned; `warning_lpm`, `error_lpm`
     [L/min]: leaks at which an alarm is a warning or an error, None for no error; `debounce_blocks`: number of
     successive blocks (some seconds each) beyond a threshold after which the alarm changes; `return_share`: fraction of
-    a threshold below which the leak counts as ended; `no_data_s`, `not_comparable_s` [s]: time without samples, or
-    without a judged block, after which the state of the actuator is "no data" or "not comparable".
+    a threshold below which the leak counts as ended; `recording_s` [s]: length of the recordings into which the stream
+    of a commissioned machine is cut, to be judged as a whole, 0 for none; `no_data_s`, `not_comparable_s` [s]: time
+    without samples, or without a judged block, after which the state of the actuator is "no data" or "not comparable".
     """
 
     rig: Annotated[_Text, AfterValidator(_resolve_in_folder)] = "thesis"
@@ -62,6 +70,7 @@ class WatchSettings(_Table):
     error_lpm: float | None = Field(default=None, gt=0, allow_inf_nan=False)
     debounce_blocks: int = Field(default=2, ge=1, le=1000)
     return_share: float = Field(default=0.7, gt=0, lt=1)
+    recording_s: Annotated[float, AfterValidator(_check_recording_length)] = 180.0
     no_data_s: float = Field(default=3600.0, gt=0)
     not_comparable_s: float = Field(default=3600.0, gt=0)
 

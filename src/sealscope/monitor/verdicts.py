@@ -7,6 +7,8 @@ present from the first sample on, which a watch that learns from the same sample
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -22,6 +24,8 @@ from sealscope.recordings.recording import Recording
 from sealscope.reporting.messages import how_much
 
 _FALSE_ALARM = DECISION.false_alarm
+#: Fraction of an actuator's allowed false alarms that the recordings of its stream get; its detector gets the others.
+STREAM_SHARE = 0.5
 
 
 @dataclass(frozen=True)
@@ -103,6 +107,11 @@ class RecordingVerdict:
         """True if the verdict is "no leak"."""
         return bool(self.verdict == NO_LEAK)
 
+    def excludes(self, leak_flows: Iterable[float | None]) -> bool:
+        """Return True unless a leak of one of these flows [L/min] may be there; None stands for an unknown flow."""
+        bound = self.bound_lpm
+        return bound is None or all(flow is None or bound < flow for flow in leak_flows)
+
     @property
     def decides(self) -> bool:
         """True if the condition of the machine follows from this verdict, not from the estimates of single blocks.
@@ -111,14 +120,20 @@ class RecordingVerdict:
         """
         return self.leaks or self.clears or self.mark != ""
 
-    def is_rare(self, false_alarms_per_1000_h: float) -> bool:
-        """Return True if leak-free recordings get such a verdict so rarely that it may raise an alarm by itself.
+    def is_rare(self, false_alarms_per_1000_h: float, earlier: RecordingVerdict | None, *, is_stream: bool) -> bool:
+        """Return True if leak-free recordings get such a verdict so rarely that it may raise an alarm.
 
-        The probability `chance` must be unknown or at most `false_alarms_per_1000_h` times the length of the recording
-        in units of 1000 h. The smallest probability that can be known, `rarest` of `priors.toml`, is always permitted.
+        The probability of this verdict, and of that on the `earlier` recording if that was `leak`, too, must not exceed
+        `false_alarms_per_1000_h` times the length of the recording in units of 1000 h, or `STREAM_SHARE` of that for a
+        stream (`is_stream`), whose detector raises alarms, too. `chance` counts as at least `rarest` of `priors.toml`,
+        the smallest probability that can be known, and so does the limit for files, which are fewer than recordings of
+        a stream. A `chance` of None is rare.
         """
         allowed_chance = false_alarms_per_1000_h * (self.end_s - self.start_s) / 3.6e6  # [s] in 1000 h
-        return self.chance is None or self.chance <= max(_FALSE_ALARM.rarest, allowed_chance)
+        allowed_chance = STREAM_SHARE * allowed_chance if is_stream else max(_FALSE_ALARM.rarest, allowed_chance)
+        verdicts = [self] if earlier is None or not earlier.leaks else [self, earlier]
+        chances = [max(_FALSE_ALARM.rarest, verdict.chance) for verdict in verdicts if verdict.chance is not None]
+        return self.chance is None or math.prod(chances) <= allowed_chance * (1.0 + 1e-9)  # rounding
 
     @property
     def by_chance_per_1000_h(self) -> float | None:

@@ -44,6 +44,7 @@ class StoredRows:
 
     - `estimates`, `pending` (samples since the last checkpoint), `events`: new rows.
     - `alarms` by id, `actuators` (checkpoints) and `summaries` by actuator: rows that are new or replace stored ones.
+    - `first_kept`: by actuator with a new checkpoint, the running number before which pending samples are deleted.
     - `old_blocks`, `old_estimates`: by actuator, the running number up to which old rows are deleted.
     """
 
@@ -53,6 +54,7 @@ class StoredRows:
     alarms: dict[str, dict[str, Any]] = field(default_factory=dict)
     actuators: dict[str, dict[str, Any]] = field(default_factory=dict)
     summaries: dict[str, dict[str, Any]] = field(default_factory=dict)
+    first_kept: dict[str, int] = field(default_factory=dict)
     old_blocks: dict[str, int] = field(default_factory=dict)
     old_estimates: dict[str, int] = field(default_factory=dict)
 
@@ -71,8 +73,8 @@ class StoredRows:
     ) -> None:
         """Add a block of samples, which a monitor that restarts before the next checkpoint judges again.
 
-        `number`: running number of the block since the last checkpoint, from 1; `follows`: False if there is a gap
-        before these samples; `verdict`: verdict on the samples as a whole recording, None for none.
+        `number`: running number of the block among all blocks of the actuator; `follows`: False if there is a gap
+        before these samples; `verdict`: verdict on the recording that ends with the samples, None for none.
         """
         packed_samples = _pack_samples(samples, follows, verdict)
         self.pending.append({"actuator": actuator, "number": number, "samples": packed_samples})
@@ -89,9 +91,14 @@ class StoredRows:
             event = {"actuator": alarm.actuator, "kind": kind, "by_whom": by_whom, "text": text}
             self.events.append({**event, "t": t, "alarm_id": alarm.id, "alarm": plain})
 
-    def add_checkpoint(self, actuator: str, settings: str, state: dict[str, Any]) -> None:
-        """Add settings (JSON) and state of an actuator; drop its pending samples, whose effect the state includes."""
-        self.pending = [row for row in self.pending if row["actuator"] != actuator]
+    def add_checkpoint(self, actuator: str, settings: str, state: dict[str, Any], first_kept: int) -> None:
+        """Add settings (JSON) and state of an actuator; drop its pending samples before the block `first_kept`.
+
+        The state includes the effect of all pending samples. Those from this running number on are kept, because they
+        belong to a recording that has not ended.
+        """
+        self.pending = [row for row in self.pending if row["actuator"] != actuator or row["number"] >= first_kept]
+        self.first_kept[actuator] = first_kept
         plain = json.dumps(state, allow_nan=False)
         self.actuators[actuator] = {"actuator": actuator, "settings": settings, "checkpoint": plain}
 
@@ -104,8 +111,12 @@ class StoredRows:
 
 
 class StoredSamples(NamedTuple):
-    """Samples of a stored block; `follows`: False after a gap; `verdict`: on them as a whole recording, or None."""
+    """Samples of a stored block, with its running `number` among all blocks of the actuator.
 
+    `follows`: False after a gap; `verdict`: verdict on the recording that ends with the samples, None for none.
+    """
+
+    number: int
     samples: Recording
     follows: bool
     verdict: RecordingVerdict | None
@@ -225,8 +236,10 @@ class MonitorStore:
         """
         actuator = bindparam("name", type_=sa.String)
         if rows.actuators:  # a checkpoint replaces the samples before it
-            delete_pending = tables.pending.delete().where(tables.pending.c.actuator == actuator)
-            connection.execute(delete_pending, [{"name": name} for name in rows.actuators])
+            pending = tables.pending.c
+            is_replaced = (pending.actuator == actuator) & (pending.number < bindparam("first"))
+            parameters = [{"name": name, "first": first} for name, first in rows.first_kept.items()]
+            connection.execute(tables.pending.delete().where(is_replaced), parameters)
         if rows.events and self.engine.dialect.name == "postgresql":
             # events are committed in the order of their numbers: otherwise an output could miss a smaller number
             connection.execute(sa.text("lock table events in exclusive mode"))
@@ -300,10 +313,12 @@ class MonitorStore:
     def checkpoint(self, actuator: str) -> StoredCheckpoint | None:
         """Read the checkpoint of an actuator with the samples since then; return None if there is no checkpoint."""
         states, pending = tables.actuators, tables.pending
-        samples = select(pending.c.samples).where(pending.c.actuator == actuator).order_by(pending.c.number)
+        samples = (
+            select(pending.c.number, pending.c.samples).where(pending.c.actuator == actuator).order_by(pending.c.number)
+        )
         with self.engine.connect() as connection:
             row = connection.execute(select(states).where(states.c.actuator == actuator)).first()
-            blocks = [_unpack_samples(data) for (data,) in connection.execute(samples)]
+            blocks = [_unpack_samples(number, data) for number, data in connection.execute(samples)]
         return None if row is None else StoredCheckpoint(row.settings, json.loads(row.checkpoint), blocks)
 
     def last_samples(self, actuator: str) -> list[Recording]:
@@ -416,8 +431,8 @@ def _format_header(units: tuple[tuple[str, str], ...], rate: float, follows: boo
     return json.dumps({"units": dict(units), "rate": rate, "follows": follows}).encode() + b"\n"
 
 
-def _unpack_samples(data: bytes) -> StoredSamples:
-    """Unpack a block of samples from the bytes in which the database stores it (`_pack_samples`)."""
+def _unpack_samples(number: int, data: bytes) -> StoredSamples:
+    """Unpack the block of samples with a running `number` from the bytes that `_pack_samples` made."""
     line, _, numbers = data.partition(b"\n")
     header = json.loads(line)
     # a row of the times, then a row for each channel
@@ -425,7 +440,7 @@ def _unpack_samples(data: bytes) -> StoredSamples:
     samples = Recording(t, dict(zip(header["units"], channels, strict=True)), header["units"], header["rate"])
     verdict = header.get("verdict")
     stored_verdict = None if verdict is None else restore(RecordingVerdict, verdict, "verdict")
-    return StoredSamples(samples, header["follows"], stored_verdict)
+    return StoredSamples(number, samples, header["follows"], stored_verdict)
 
 
 def _event_from_row(row: Any) -> dict[str, Any]:

@@ -1,0 +1,144 @@
+"""Cut the samples of a running actuator into recordings, which are judged as whole as the files of a folder are.
+
+A test of single blocks of some seconds cannot use what only minutes show, such as holds, other laws of the leak, or the
+comparison with healthy recordings. So the monitor also judges the last minutes of a commissioned machine's stream.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from hashlib import blake2b
+from typing import Any
+
+import numpy as np
+
+from sealscope.diagnosis.commissioned.watched import load_watched
+from sealscope.monitor.settings import ActuatorSettings
+from sealscope.monitor.sources.source_block import count_bytes
+from sealscope.monitor.supervisor import describe_error
+from sealscope.monitor.verdicts import RecordingVerdict, judge_recording
+from sealscope.recordings.formats.timebase import clock_text
+from sealscope.recordings.recording import Recording
+from sealscope.storage.plain_state import restore_attributes, save_attributes
+
+_log = logging.getLogger(__name__)
+
+#: Longest gap within a recording [s]. A file may have such gaps, too.
+_MAX_GAP_S = 10.0
+#: Shortest recording that is judged [s]; it is also the shortest file of a folder.
+_MIN_DURATION_S = 60.0
+#: Largest recording [bytes]: 180 s of eight channels at 2.5 kHz.
+_MAX_BYTES = 32_000_000
+
+
+@dataclass
+class StreamRecorder:
+    """Collect the blocks of one actuator's stream, and cut them into recordings of `duration_s`.
+
+    A recording also ends before a gap, a clock set back, or a change of channels, units or rate, and at `_MAX_BYTES`.
+    Those shorter than `_MIN_DURATION_S` are dropped. The first after such an end is shorter than `duration_s`, by up to
+    a half that depends on the `actuator`'s name: recordings of many actuators then do not end at the same moment.
+
+    Attributes
+    ----------
+    first : int
+        Running number of the first collected block, 0 if none is collected.
+    follows : bool
+        True if the collected blocks follow a recording that ended at its full length.
+    """
+
+    actuator: str
+    duration_s: float
+    first: int = 0
+    follows: bool = False
+    blocks: list[Recording] = field(default_factory=list)
+
+    def take(self, number: int, samples: Recording) -> Recording | None:
+        """Collect the block of samples with the running `number`; return the recording that ends, if it is long enough.
+
+        A recording that reaches its full length contains `samples`; one that ends for another reason does not. The
+        times of the result are those of the blocks.
+        """
+        if not len(samples):
+            return None
+        ended = None
+        if self.blocks and not _continues(self.blocks[-1], samples):
+            ended = self._end(follows=False)
+        self.first = self.first or number
+        self.blocks.append(samples)
+        if ended is not None:
+            return ended
+        is_full = sum(map(count_bytes, self.blocks)) >= _MAX_BYTES
+        return self._end(follows=True) if is_full or self._duration() >= self._full_duration() else None
+
+    def _end(self, *, follows: bool) -> Recording | None:
+        """Join and forget the collected blocks; return None if they are shorter than `_MIN_DURATION_S`.
+
+        `follows`: True if the next block continues the stream.
+        """
+        blocks, duration = self.blocks, self._duration()
+        self.clear()
+        self.follows = follows
+        if duration < _MIN_DURATION_S:
+            return None
+        first = blocks[0]
+        channels = {name: np.concatenate([block[name] for block in blocks]) for name in first.channels}
+        return Recording(np.concatenate([block.t for block in blocks]), channels, first.units, first.rate)
+
+    def _duration(self) -> float:
+        """Compute the time from the first to the last collected sample [s], 0 without samples."""
+        return float(np.nanmax(self.blocks[-1].t) - np.nanmin(self.blocks[0].t)) if self.blocks else 0.0
+
+    def _full_duration(self) -> float:
+        """Compute the length at which the present recording ends [s]."""
+        digest = blake2b(self.actuator.encode(), digest_size=4).digest()
+        fraction = 1.0 if self.follows else 0.5 + 0.5 * int.from_bytes(digest) / 2**32
+        return max(_MIN_DURATION_S, fraction * self.duration_s)
+
+    def clear(self) -> None:
+        """Forget the collected blocks, as after a repair."""
+        self.first, self.follows, self.blocks = 0, False, []
+
+    def state(self) -> dict[str, Any]:
+        """Return what the collected blocks do not tell as plain values; `refill` returns the blocks themselves."""
+        return save_attributes(self, ("first", "follows"))
+
+    def load_state(self, state: Mapping[str, Any]) -> None:
+        """Restore the values that `state` saved."""
+        restore_attributes(self, ("first", "follows"), state)
+
+    def refill(self, number: int, samples: Recording) -> None:
+        """Collect a stored block again after `load_state`, if it belongs to the present recording."""
+        if 0 < self.first <= number and len(samples):
+            self.blocks.append(samples)
+
+
+def judge_stream(settings: ActuatorSettings, recording: Recording) -> RecordingVerdict | None:
+    """Judge a recording of an actuator's stream by its machine's healthy recordings.
+
+    Returns None, and logs why, if the machine's file cannot be read or the recording cannot be judged.
+    """
+    start = float(recording.t[0])
+    name = f"stream from {clock_text(start)} to {clock_text(float(recording.t[-1]))}"
+    try:
+        watched = load_watched(settings.rig)  # read anew, as the file may have changed
+        if watched.machine is None:
+            return None
+        limit_lpm = None if settings.error_lpm == watched.limit_lpm else settings.error_lpm
+        relative = replace(recording, t=recording.t - start)
+        return judge_recording(watched.machine, relative, name, start, limit_lpm=limit_lpm)
+    except Exception as error:
+        _log.warning("%s: the %s is not judged as a whole: %s", settings.name, name, describe_error(error))
+        return None
+
+
+def _continues(earlier: Recording, samples: Recording) -> bool:
+    """Test whether `samples` continue the block `earlier`: the same channels, units and rate, and at most a short gap.
+
+    Samples without a finite time do not.
+    """
+    has_same_format = (samples.units, samples.rate) == (earlier.units, earlier.rate)
+    gap = float(samples.t[0] - earlier.t[-1])
+    return has_same_format and 0.0 < gap <= _MAX_GAP_S

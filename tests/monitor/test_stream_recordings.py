@@ -1,0 +1,219 @@
+"""The stream of a commissioned machine is judged in recordings, as the files of a folder are."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import sealscope as ss
+from sealscope.diagnosis.verdict.states import state_of
+from sealscope.monitor.alarms import AlarmJudge
+from sealscope.monitor.service import Service
+from sealscope.monitor.settings import WatchSettings, read_settings
+from sealscope.monitor.stream_recordings import StreamRecorder
+from sealscope.monitor.verdicts import RecordingVerdict
+from sealscope.recordings.recording import Recording
+
+from ..diagnosis.balance_machine import machine, step
+from ..refusals import refusal
+from .plant import CHANNELS, lines_of, moved, rows_of, served
+
+LEAK = 3.0e-12
+APRIL = 1.775e9
+FULL_S = 60.0
+
+
+def settings_of(folder: Path, machine_file: Path, more: str = ""):
+    """Settings of one machine whose samples come as lines, in recordings of a minute."""
+    file = folder / "watch.toml"
+    file.write_text(
+        f'database = "monitor.db"\nlines = true\n[[actuator]]\nname = "press"\nmachine = "{machine_file}"\n'
+        f"recording_s = {FULL_S}\nfalse_alarms_per_1000_h = 20.0\n{more}",
+        encoding="utf-8",
+    )
+    return read_settings(file)
+
+
+def stream(seed: int, start: float, *, leaks: bool) -> Recording:
+    """Two minutes of the machine, which leaks from the first sample on or never."""
+    leak = step(0.0, LEAK, at=0.0) if leaks else None
+    options = {} if leak is None else {"G": leak}
+    return moved(machine(seed, rate=100.0, duration=130.0, **options).only(CHANNELS), APRIL + start)
+
+
+def lines_in(recordings: Sequence[Recording]) -> bytes:
+    return b"".join(lines_of({"press": recording}, 100) for recording in recordings)
+
+
+@pytest.fixture(scope="module")
+def leak_lines() -> bytes:
+    return lines_in([stream(9, 0.0, leaks=True)])
+
+
+@pytest.mark.slow
+def test_a_leak_from_the_first_sample_on_is_what_diagnose_says(commissioned, tmp_path, leak_lines):
+    service, out = served(settings_of(tmp_path, commissioned), leak_lines)
+    samples = [json.loads(line) for line in leak_lines.splitlines()][:61]
+    channels = {name: np.concatenate([block[name] for block in samples]) for name in CHANNELS}
+    units = {name: ss.read_machine(commissioned).healthy[0].units[name] for name in CHANNELS}
+    first = Recording(np.arange(len(channels["x"])) / 100.0, channels, units, 100.0)
+    diagnosis = ss.read_machine(commissioned).diagnose(first)
+    assert (diagnosis.verdict, diagnosis.onset_s) == ("leak", None)
+    assert [json.loads(line)["event"] for line in out.splitlines()] == ["raised"]
+    (alarm,) = service.store.alarms(open_only=True)
+    assert alarm["evidence"].startswith("stream from 2026-03-31 23:34:2")
+    assert alarm["leak_lpm"] == pytest.approx(diagnosis.leak_lpm, rel=0.1)
+    summary = service.summaries()["press"]
+    assert (summary["recording"]["verdict"], summary["state"]["condition"]) == ("leak", "leak")
+
+
+@pytest.mark.slow
+def test_the_verdict_on_a_healthy_recording_ends_the_alarm(commissioned, tmp_path, leak_lines):
+    settings = settings_of(tmp_path, commissioned)
+    _, out = served(settings, leak_lines + lines_in([stream(12, 1000.0, leaks=False)]))
+    assert [json.loads(line)["event"] for line in out.splitlines()] == ["raised", "returned"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("n_lines", [40, 75])
+def test_a_monitor_that_restarts_within_a_recording_has_the_rows_of_one_that_did_not(
+    commissioned, tmp_path, leak_lines, n_lines
+):
+    (tmp_path / "other").mkdir()
+    whole, halves = settings_of(tmp_path, commissioned), settings_of(tmp_path / "other", commissioned)
+    served(whole, leak_lines)
+    lines = leak_lines.splitlines(keepends=True)
+    served(halves, b"".join(lines[:n_lines]))
+    served(halves, b"".join(lines[n_lines:]))
+    expected, rows = rows_of(whole.database), rows_of(halves.database)
+    assert len(expected["alarms"]) == 1
+    for table in ("estimates", "alarms", "events", "summaries", "pending"):
+        assert rows[table] == expected[table], table
+
+
+def test_only_the_samples_of_a_recording_that_has_not_ended_are_stored(commissioned, tmp_path):
+    lines = lines_in([stream(12, 0.0, leaks=False)]).splitlines(keepends=True)
+    service, _ = served(settings_of(tmp_path, commissioned), b"".join(lines[:70]))
+    recorder = service.actuators._actuator("press").recorder
+    assert recorder is not None
+    numbers = [block.number for block in service.store.checkpoint("press").pending]
+    assert numbers == list(range(numbers[0], 71))
+    assert sum(map(len, recorder.blocks)) < 7000
+    again = Service(service.settings, once=True)
+    again.close()
+    restored = again.actuators._actuator("press").recorder
+    assert (restored.first, restored.follows) == (recorder.first, recorder.follows)
+    assert [len(block) for block in restored.blocks] == [len(block) for block in recorder.blocks]
+
+
+def test_a_mark_that_ends_an_alarm_forgets_the_samples_before_it(commissioned, tmp_path):
+    lines = lines_in([stream(12, 0.0, leaks=False)]).splitlines(keepends=True)
+    service, _ = served(settings_of(tmp_path, commissioned), b"".join(lines[:20]))
+    actuator = service.actuators._actuator("press")
+    assert actuator.recorder.blocks
+    leak = {"start_s": 0.0, "end_s": 60.0, "chance": None}
+    actuator.judge.update_from_verdict(verdict("leak", **leak), None, 1, WatchSettings(), is_stream=True)
+    service.actuators.apply_mark("press", "repaired")
+    assert (actuator.recorder.blocks, actuator.recorder.first) == ([], 0)
+    assert service.store.checkpoint("press").pending == []
+
+
+def pieces(duration: float, start: float = 0.0, rate: float = 10.0) -> list[Recording]:
+    """Blocks of 5 s, as long as `duration` together."""
+    t = start + np.arange(round(duration * rate)) / rate
+    whole = Recording(t, {"p_A": t, "p_B": t}, {"p_A": "Pa", "p_B": "Pa"}, rate)
+    size = round(5.0 * rate)
+    return [whole.samples(slice(k, k + size)) for k in range(0, len(t), size)]
+
+
+def recordings_of(recorder: StreamRecorder, blocks: Sequence[Recording]) -> list[Recording]:
+    taken = (recorder.take(number, block) for number, block in enumerate(blocks, 1))
+    return [recording for recording in taken if recording is not None]
+
+
+def test_recordings_follow_each_other_without_loss_and_the_first_is_shorter():
+    blocks = pieces(1000.0)
+    recordings = recordings_of(StreamRecorder("press", 180.0), blocks)
+    durations = [recording.duration for recording in recordings]
+    assert 90.0 <= durations[0] <= 185.0
+    assert all(abs(duration - 180.0) < 6.0 for duration in durations[1:])
+    joined = np.concatenate([recording.t for recording in recordings])
+    assert np.array_equal(joined, np.concatenate([block.t for block in blocks])[: len(joined)])
+    others = {recordings_of(StreamRecorder(f"press {k}", 180.0), blocks)[0].duration for k in range(20)}
+    assert len(others) > 8  # many machines do not end their recordings at once
+
+
+@pytest.mark.parametrize("pause", [-500.0, 11.0, 3600.0])
+def test_a_gap_or_a_clock_set_back_ends_a_recording(pause):
+    before = pieces(80.0)
+    after = pieces(40.0, start=80.0 + pause)
+    ended = recordings_of(StreamRecorder("press", 600.0), before + after)
+    assert [recording.duration for recording in ended] == pytest.approx([80.0], abs=0.2)
+    assert not recordings_of(StreamRecorder("press", 600.0), before[:8] + after)  # 40 s are too short
+
+
+def test_a_pause_of_some_seconds_stays_within_a_recording():
+    ended = recordings_of(StreamRecorder("press", 60.0), pieces(40.0) + pieces(40.0, start=45.0))
+    assert len(ended) == 1 and np.diff(ended[0].t).max() == pytest.approx(5.1)
+
+
+def test_another_rate_or_channel_ends_a_recording():
+    other_rate = pieces(20.0, start=80.0, rate=20.0)
+    assert len(recordings_of(StreamRecorder("press", 600.0), pieces(80.0) + other_rate)) == 1
+    fewer_channels = [block.only(["p_A"]) for block in pieces(20.0, start=80.0)]
+    assert len(recordings_of(StreamRecorder("press", 600.0), pieces(80.0) + fewer_channels)) == 1
+
+
+def test_a_recorder_holds_no_more_samples_than_it_may(monkeypatch):
+    monkeypatch.setattr("sealscope.monitor.stream_recordings._MAX_BYTES", 20_000)
+    recorder = StreamRecorder("press", 600.0)
+    for number, block in enumerate(pieces(2000.0), 1):
+        recorder.take(number, block)
+        assert sum(8 * 3 * len(held) for held in recorder.blocks) < 20_000
+
+
+def verdict(word: str = "leak", chance: float | None = 1e-3, **more) -> RecordingVerdict:
+    state = state_of(word, "piston leak" if word == "leak" else None).as_dict()
+    words = {"file": "stream", "summary": word, "size": "", "reason": "", "cause": ""}
+    return RecordingVerdict(
+        verdict=word, state=state, chance=chance, **words, **{"start_s": 0.0, "end_s": 180.0, **more}
+    )
+
+
+def test_the_alarms_of_a_stream_keep_the_stated_rate():
+    """One healthy recording of 3 min in 1000 is 20 an hour's thousand: two in turn are needed, each rare enough."""
+    settings = WatchSettings(false_alarms_per_1000_h=1.0)  # half of it for recordings: 2.5e-5 each
+    once = AlarmJudge("press").update_from_verdict(verdict(chance=1e-9), None, 1, settings, is_stream=True)
+    assert once is None  # rarer than 1e-4 is not known
+    for chance, is_alarm in ((1e-3, True), (9e-3, False)):
+        change = AlarmJudge("press").update_from_verdict(
+            verdict(chance=chance), verdict(chance=chance), 1, settings, is_stream=True
+        )
+        assert (change is not None) == is_alarm
+    many = WatchSettings(false_alarms_per_1000_h=20.0)
+    assert AlarmJudge("press").update_from_verdict(verdict(chance=1e-4), None, 1, many, is_stream=True)
+
+
+@pytest.mark.parametrize(("bound", "ends"), [(0.001, True), (0.02, False), (None, True)])
+def test_no_leak_ends_only_the_alarm_of_a_leak_that_it_excludes(commissioned, tmp_path, bound, ends):
+    """Three minutes show a leak above the bound only: the detector has found a smaller one over hours."""
+    service, _ = served(settings_of(tmp_path, commissioned))
+    actuator = service.actuators._actuator("press")
+    settings = WatchSettings(false_alarms_per_1000_h=20.0)
+    actuator.judge.update_from_verdict(verdict(chance=None, leak_lpm=0.01), None, 1, settings)
+    block = Recording([], {}, {}, 100.0)
+    cleared = verdict("no leak", bound_lpm=bound)
+    _, events = actuator.judge_samples(block, follows=True, settings=settings, verdict=cleared)
+    assert [event for _, event, _ in events] == (["returned"] if ends else [])
+    assert actuator.judge.alarm is None or actuator.judge.alarm.active != ends
+    assert (actuator.verdict is None) != ends
+
+
+def test_the_length_of_a_recording_is_none_or_a_minute_to_ten(commissioned, tmp_path):
+    for seconds in ("30", "601", "nan"):
+        with refusal("recording_s", seconds):
+            settings_of(tmp_path, commissioned, f"[defaults]\nrecording_s = {seconds}\n")
