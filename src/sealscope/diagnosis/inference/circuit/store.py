@@ -48,8 +48,8 @@ def cycle_length(speed: Array, rate: float) -> float | None:
 def recorded_oil_loss_tests(recording: Recording, rig: Rig, offset: float) -> dict[str, StepTest]:
     """Test a recording with a position for an external leak that begins within it (`oil_loss_tests`).
 
-    `offset`: sensor offset of p_A - p_B [Pa]. The result is empty for a double rod: as its strokes draw no oil from the
-    accumulator, the check valves may stay shut, and the pressure of neither chamber need be that of the accumulator.
+    `offset`: sensor offset of p_A - p_B [Pa]. The result is empty for a double rod: its strokes draw no oil from the
+    accumulator, so the check valves may stay shut, and no chamber then has the pressure of the accumulator.
     """
     if not rig.cylinder.single_rod:
         return {}
@@ -65,11 +65,10 @@ def oil_loss_tests(signals: Signals, rig: Rig, cycle: float | None, begin: float
     The accumulator is connected to the unloaded side. The oil that it has delivered follows from the pressure of this
     side by the polytropic law of the gas, less the oil that the rod displaces if the position is recorded. The leak's
     conductance is tested for a step between blocks (`step_test`). Blocks are whole multiples of the machine's `cycle`
-    [s], so that motion within a cycle averages out, or of any length if it is None. `begin`: time of the first sample
-    [s].
+    [s], so that motion within it averages out, or of any length if it is None. `begin`: time of the first sample [s].
 
-    The result maps "external leak A" and "external leak B" to their tests, without a side that cannot be tested. It is
-    empty without an accumulator (`makeup.check_valves` = "absent") or for fewer than `MIN_BLOCKS` blocks.
+    The result maps "external leak A" and "external leak B" to their tests; a side that cannot be tested is left out. It
+    is empty without an accumulator (`makeup.check_valves` = "absent") or for fewer than `MIN_BLOCKS` blocks.
     """
     if rig.makeup.check_valves == "absent":
         return {}
@@ -96,7 +95,7 @@ def oil_loss_tests(signals: Signals, rig: Rig, cycle: float | None, begin: float
 
 
 def _block_means(values: Array, edges: Array) -> Array:
-    """Average the known samples of `values` (n,) between K + 1 indices `edges`, (K,); NaN without known samples."""
+    """Average `values` (n,) over K blocks with the bounds `edges` (K + 1,), ignoring NaN; NaN if all values are NaN."""
     is_known = np.isfinite(values)
     sums, counts = (
         np.concatenate([[0.0], np.cumsum(series)])[edges] for series in (np.where(is_known, values, 0.0), is_known)
@@ -109,8 +108,8 @@ def _estimate_conductance(volume: Array, pressure: Array, block_s: float, begin:
     """Compute the likelihood of an external leak's conductance [m^3/(s Pa)] in K blocks of `block_s` [s].
 
     The initial volume and the effect of the gas temperature, linear and quadratic in time, are eliminated. `volume`
-    (K,): mean volume that the accumulator has delivered by each block [m^3]; `pressure` (K,): mean pressure that drives
-    the leak [Pa]; `begin`: start of the first block [s].
+    (K,): block means of the volume [m^3] that the accumulator has delivered so far; `pressure` (K,): block means of the
+    pressure that drives the leak [Pa]; `begin`: start of the first block [s].
     """
     n_blocks = len(volume)
     time = (np.arange(n_blocks, dtype=float) + 0.5) * block_s

@@ -63,8 +63,8 @@ def cycle_balances(recording: Recording, rig: Rig) -> list[CycleBalance]:
     """Compute the volume balances of a recording without position or without flow, over whole cycles and over holds.
 
     A hold is a time in which the piston is held at standstill. Without a position, the pump's flow is balanced over
-    cycles and over holds. With a position but no flow, what the creeping piston displaces is balanced over the holds in
-    which valves are shut. The list is empty if no balance is possible.
+    cycles and over holds. With a position but no flow, the volume that the creeping piston displaces is balanced over
+    the holds in which valves are shut. The list is empty if no balance is possible.
     """
     channels, begin = frozenset(recording.channels), float(recording.t[0])
     equation = locked(rig, channels) if "x" in channels else circulation(rig, channels)

@@ -21,16 +21,16 @@ from sealscope.recordings.recording import Array
 
 
 def coefficient_level(gram: Array, columns: Sequence[ColumnRoles]) -> tuple[float, float]:
-    """Estimate the leak coefficient, at least 0, and its standard error from the Gram matrices `gram` (E, m, m).
+    """Estimate the leak coefficient, at least 0, and its standard error from Gram matrices of the volume balance.
 
-    Coefficients that recordings do not share are already eliminated (`eliminate_unshared`). The precisions and moments
-    of the equations are added up. Both results are 0 without information on the leak.
+    `gram` (E, m, m): Gram matrices of E equations, with the coefficients that recordings do not share already
+    eliminated (`eliminate_unshared`). Both results are 0 without information on the leak.
     """
     precision, moment = 0.0, 0.0
     for e, roles in enumerate(columns):
         nuisance = [k for k in roles.compared if k != roles.leak and np.isfinite(roles.between_deviation[k])]
-        parts = reduce_to_tested(gram[e], gram[e][:, roles.left], roles.leak, nuisance)
-        precision, moment = precision + parts[0], moment + parts[1]
+        equation_precision, equation_moment = reduce_to_tested(gram[e], gram[e][:, roles.left], roles.leak, nuisance)
+        precision, moment = precision + equation_precision, moment + equation_moment
     return (max(moment, 0.0) / precision, precision**-0.5) if precision > 0.0 else (0.0, 0.0)
 
 
@@ -60,8 +60,9 @@ def motion_change(judged: Array, healthy: Array, roles: ColumnRoles) -> tuple[fl
     `judged`, `healthy`: Gram matrices (m, m) of the volume balance in the recording and of the sum of the healthy ones.
     Each of the two fits gives a coefficient for each direction of the motion and each loaded side. Their mean, weighted
     by the sums of squares of these columns in the recording, is the motion coefficient [m^2]. In the recording's fit
-    the motion, its delay (`terms.LAG`) and the leak are free; without it, the motion would absorb leakage in proportion
-    to the speed. The others differ from the healthy ones by a normal prior (`between` in `priors.toml`).
+    the coefficients of the motion, of its delay (`terms.LAG`) and of the leak are free. Without a free leak, the motion
+    would absorb leakage in proportion to the speed. All other coefficients have normal priors about the healthy ones
+    (`between` in `priors.toml`).
     """
     motion = [k for k in roles.motion if roles.names[k] != LAG]
     fitted = [k for k in roles.compared if k == roles.leak or np.isfinite(roles.between_deviation[k])]
@@ -106,8 +107,8 @@ def residual_products(
 
     `gram`, `reference` (m, m): Gram matrices of the recording and of the sum of the others. Returns the products (m,)
     of the residual with each column, and last with itself; the indices of the c columns whose coefficients may differ
-    between recordings; and the precisions (c,) of the priors on these differences. They are the compared coefficients
-    with such a prior, and with `has_leak` the leak's, with the prior `between.pump`.
+    between recordings; and the precisions (c,) of the priors on these differences. `has_leak`: true if the coefficient
+    of the leak is among the c coefficients, with the prior `between.pump` (`priors.toml`).
     """
     compared = [k for k in roles.compared if k == roles.leak or np.isfinite(roles.between_deviation[k])]
     coefficients = np.zeros(len(gram))
@@ -138,8 +139,8 @@ def estimate_leak_excess(
     for e, roles in enumerate(columns):
         residual, nuisance, prior = residual_products(gram[e], reference[e], roles)
         for index, width in enumerate(widths):
-            parts = reduce_to_tested(gram[e], residual, roles.leak, nuisance, prior / width**2)
-            precision[index], moment[index] = precision[index] + parts[0], moment[index] + parts[1]
+            reduced = reduce_to_tested(gram[e], residual, roles.leak, nuisance, prior / width**2)
+            precision[index], moment[index] = precision[index] + reduced[0], moment[index] + reduced[1]
     is_known = precision > 0.0
     divisor = np.where(is_known, precision, 1.0)
     return np.where(is_known, moment / divisor, 0.0), np.where(is_known, divisor**-0.5, 0.0)

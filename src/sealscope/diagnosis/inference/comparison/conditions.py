@@ -29,8 +29,8 @@ class UnusualCondition(NamedTuple):
 def find_unusual_conditions(judged: RecordingSums, baseline: Sequence[RecordingSums]) -> list[UnusualCondition]:
     """List the conditions (load, speed, oil temperature) of a recording outside of the range of healthy recordings.
 
-    A tolerance (`conditions` in `priors.toml`) is added to the range. Unknown temperatures are not compared, nor loads
-    (or speeds) if any of them is 0.
+    A tolerance (`conditions` in `priors.toml`) is added to the range. Unknown temperatures are not compared, and loads
+    (or speeds) are not compared if any of them is 0.
     """
     allowed = INFERENCE.conditions
     unusual: list[UnusualCondition] = []

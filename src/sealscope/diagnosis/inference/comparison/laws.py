@@ -62,8 +62,8 @@ def compare_with_leak(
 ) -> float | None:
     """Compare how well the leak and another term of the volume balance, `rival`, explain a recording's excess flow.
 
-    Each is fitted in turn to the residual of the recording under the coefficients of the healthy recordings,
-    `baseline`. Returns the log likelihood ratio of the rival to the leak for one residual,
+    Each of the two is fitted to the residual of the recording `judged` under the coefficients of the healthy
+    recordings, `baseline`. Returns the log likelihood ratio of rival to leak per independent residual,
 
         -log(residual sum of squares with the rival / the same with the leak) / 2.
 

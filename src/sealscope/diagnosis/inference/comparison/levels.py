@@ -91,10 +91,10 @@ def rise(judged: RecordingSums, baseline: Sequence[RecordingSums], columns: Sequ
 
 
 def held_rise(judged: RecordingSums, baseline: Sequence[RecordingSums]) -> Rise | None:
-    """Estimate the rise of the leakage past the piston over healthy recordings, from holds behind shut valves.
+    """Estimate the rise of the leakage past the piston over healthy recordings, measured while valves hold a load.
 
     The leak may have begun within the recording, whose mean then contains only a part of it (`Rise.may_be_partial`).
-    Return None if the judged recording has no holds, or fewer than `MIN_WITH_HOLDS` healthy recordings have them.
+    Return None if no load is held in the judged recording, or in fewer than `MIN_WITH_HOLDS` healthy recordings.
     """
     min_crossover = INFERENCE.scatter.largest * judged.conductance_of_flow
     held = _compare_held(judged, baseline, "held", min_crossover=min_crossover)
@@ -102,7 +102,7 @@ def held_rise(judged: RecordingSums, baseline: Sequence[RecordingSums]) -> Rise 
 
 
 def held_pump_rise(judged: RecordingSums, baseline: Sequence[RecordingSums]) -> Rise | None:
-    """Estimate the rise of the pump's leakage over healthy recordings, from the time just before holds.
+    """Estimate the rise of the pump's leakage over healthy recordings, measured just before valves shut to hold a load.
 
     Return None if it is unknown in the judged recording, or known in fewer than `MIN_WITH_HOLDS` healthy ones.
     """
@@ -117,11 +117,12 @@ def _compare_held(
     min_crossover: float = 0.0,
     session_share: float | None = None,
 ) -> Rise | None:
-    """Estimate the rise of a leak that holds measure over its mean in the healthy recordings, `baseline`.
+    """Estimate the rise of a leak, measured while valves hold a load, over its mean in the healthy recordings.
 
-    `name`: field of `RecordingSums` whose first two values are conductance and standard deviation [m^3/(s Pa)] of the
-    leak; `min_crossover`: as in `_Estimates`; `session_share`: its `session_deviation` over the healthy mean. Return
-    None if the judged recording has no such field, or fewer than `MIN_WITH_HOLDS` healthy recordings have it.
+    `baseline`: the healthy recordings; `name`: field of `RecordingSums` whose first two values are the leak's
+    conductance and standard deviation [m^3/(s Pa)]; `min_crossover`: as in `_Estimates`; `session_share`: standard
+    deviation between sessions, over the healthy mean, or None (`_Estimates.session_deviation`). Return None if the
+    field is None in the judged recording, or known in fewer than `MIN_WITH_HOLDS` healthy recordings.
     """
     baseline = [recording for recording in baseline if getattr(recording, name) is not None]
     if getattr(judged, name) is None or len(baseline) < MIN_WITH_HOLDS:
@@ -302,11 +303,11 @@ class _LevelScale(NamedTuple):
 def leak_deviations_from_mean(recordings: Sequence[RecordingSums], columns: Sequence[ColumnRoles]) -> Array:
     """Compute the deviation of each recording's leak coefficient from the mean of all n recordings, shape (n,).
 
-    It is (n - 1)/n times the difference from the common coefficient of the other n - 1 recordings. The other
-    coefficients may differ between recordings within the usual prior, the flow offset freely.
+    It is (n - 1)/n times the difference from the common leak coefficient of the other n - 1 recordings. The other
+    coefficients of the balance may differ between recordings within their usual priors, and the flow offset freely.
     """
-    usual_width, columns = np.ones(1), [roles.with_free_zero() for roles in columns]  # a factor of 1 on the priors
+    columns = [roles.with_free_zero() for roles in columns]  # without a prior on the flow offset
     all_sums = [eliminate_unshared(recording.sums, columns) for recording in recordings]
     total = np.sum(all_sums, axis=0)
-    rises = [estimate_leak_excess(sums, total - sums, columns, usual_width)[0] for sums in all_sums]
+    rises = [estimate_leak_excess(sums, total - sums, columns, widths=np.ones(1))[0] for sums in all_sums]
     return np.array(rises) * ((len(recordings) - 1) / len(recordings))

@@ -35,9 +35,9 @@ class OilHypothesis(NamedTuple):
 
 
 def predict_thinning(recordings: Sequence[RecordingSums]) -> Array:
-    """Predict by how much thin oil raised the log leakage of each recording (n + 1,), the judged one last.
+    """Predict the rise of each recording's log leakage by thinner oil, shape (n + 1,), the judged recording last.
 
-    It is relative to the healthy mean, and 0 if nothing shows the oil's viscosity.
+    The rise is relative to the healthy mean. It is 0 if nothing shows the oil's viscosity.
     """
     return oil_hypotheses(recordings)[0].thinning
 
@@ -64,7 +64,7 @@ def oil_hypotheses(recordings: Sequence[RecordingSums]) -> list[OilHypothesis]:
 
 
 def _oils_by_drop(recordings: Sequence[RecordingSums], unknown_deviation: float) -> list[OilHypothesis]:
-    """List the hypotheses by which the viscous drop of the motion shows the oil of `recordings`, the judged one last.
+    """List the hypotheses on the oil that follow from the viscous drop of the motion in `recordings`, the judged last.
 
     The resistance to the motion at the top speed v, friction + drop v, is known well. Friction and viscous drop are
     known less well, since friction varies with speed and load. There are two hypotheses:

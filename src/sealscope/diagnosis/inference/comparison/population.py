@@ -38,8 +38,8 @@ class Population:
         self._sample = np.unique(np.linspace(0, n - 1, min(n, MAX_RECORDINGS)).astype(int))
         healthy = candidates[:, self._sample[:, None], self._sample]
         eigen, basis = np.linalg.eigh(healthy)
-        # the other quantities are stored along these eigenvectors; axes (g, 1, n): 1 for the grid of sigma; `_cross`:
-        # covariance of each healthy value with the judged one; `_ones`: change of the values with their mean
+        # The other quantities are components along these eigenvectors, of shape (g, 1, n); the second axis is for the
+        # grid of sigma. `_cross`: covariance of each healthy value with the judged one; `_ones`: vector of ones.
         self._eigen, self._basis = np.maximum(eigen, 0.0)[:, None], basis
         self._cross = np.einsum("gij,gi->gj", basis, candidates[:, self._sample, n])[:, None]
         self._ones = basis.sum(axis=1)[:, None]

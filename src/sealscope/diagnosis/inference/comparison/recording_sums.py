@@ -52,7 +52,7 @@ class RecordingSums(NamedTuple):
     def from_blocks(
         cls, blocks: Blocks, columns: Sequence[ColumnRoles], start_s: float | None = None, oil_degC: float | None = None
     ) -> RecordingSums:
-        """Summarise a recording from its `blocks`; the means of flow and pressure are weighted by numbers of rows."""
+        """Summarise a recording; means of flow and pressure are weighted by the number of equations, `Blocks.rows`."""
         weights = np.maximum(blocks.rows, 1e-9)  # positive, so that the means exist
         flow = float(np.average(blocks.flow, weights=weights))
         pressure = float(np.average(blocks.mean_pressure(), weights=weights))

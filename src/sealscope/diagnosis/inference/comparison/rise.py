@@ -80,11 +80,11 @@ class Rise(NamedTuple):
     share: float = 1.0
 
     def share_alarms(self, share: float) -> Rise:
-        """Return this rise with its p-value divided by `share`, its fraction of the false alarms of several tests."""
+        """Return this rise with only the fraction `share` of the allowed false alarms, which divides its p-value."""
         return self._replace(share=share)
 
     def widen(self, variance: float) -> Rise:
-        """Add an independent error of the `variance`, if positive, to the rise; unchanged if it has no mixture."""
+        """Add an error with the given `variance` to the rise; unchanged for a variance <= 0 or without a mixture."""
         if self.mixture is None or not variance > 0.0:
             return self
         mixture = self.mixture._replace(deviations=np.sqrt(self.mixture.deviations**2 + variance))
@@ -97,7 +97,7 @@ class Rise(NamedTuple):
 
     @property
     def chance(self) -> float:
-        """Probability that a healthy recording has a higher score (a one-sided p-value), over `share`, at most 1."""
+        """Probability that a healthy recording scores higher (one-sided p-value), divided by `share`; at most 1."""
         from scipy.special import ndtr, stdtr
 
         if self.mixture is None:
@@ -117,11 +117,11 @@ class Rise(NamedTuple):
         return self.mixture.quantile(probability) / self.deviation
 
     def log_ratio(self, rise: float, log_deviation: float = 0.0) -> float:
-        """Compute the log likelihood ratio of a true rise of the leak's coefficient by `rise` to no rise.
+        """Compute the log likelihood ratio of two hypotheses: the leak's coefficient rose by `rise`, and it did not.
 
         `rise` is in the unit of `value`, with which both hypotheses are compared. `log_deviation`: standard deviation
-        of the logarithm of the true rise about log(`rise`); 0 if the true rise is known to be `rise`. If it is known
-        and `may_be_partial`, `value` may contain any fraction of it, over which the likelihood is averaged.
+        of the logarithm of the true rise about log(`rise`); 0 if the true rise is exactly `rise`. In that case, and if
+        `may_be_partial`, `value` may contain any fraction of the rise; the likelihood is averaged over the fraction.
         """
         if log_deviation > 0.0 and rise > 0.0:
             return self._log_ratio_lognormal(rise, log_deviation)
@@ -133,7 +133,7 @@ class Rise(NamedTuple):
         return float(np.logaddexp.reduce(densities) - np.log(len(densities))) - self._log_density(self.value)
 
     def log_ratio_within(self, rise: float, tail: float) -> float:
-        """Compute the log likelihood ratio of a true rise by `rise` to no rise, robust to outlying estimates.
+        """Compute the log likelihood ratio between a rise by `rise` and no rise, robust to outlying estimates.
 
         Each of the two densities of `value` is at least the density at the quantiles `tail` and 1 - `tail` of a healthy
         recording. An estimate that is improbable with the rise and without it is therefore evidence for neither.
@@ -144,9 +144,10 @@ class Rise(NamedTuple):
         return with_rise - max(self._log_density(self.value), min_log_density)
 
     def _log_ratio_lognormal(self, rise: float, log_deviation: float) -> float:
-        """Compute the log likelihood ratio of a true rise with a log-normal prior about `rise` to no rise.
+        """Compute the log likelihood ratio of two hypotheses: a true rise of about `rise`, and no rise.
 
-        `log_deviation`: standard deviation of its logarithm. The grid resolves both the prior and the likelihood.
+        The true rise has a log-normal prior: its logarithm is normal about log(`rise`), with the standard deviation
+        `log_deviation`. The integral over it uses a grid that resolves both the prior and the likelihood.
         """
         grid_deviations = np.linspace(-MAX_LOG, MAX_LOG, NODES)
         grid = np.concatenate(
@@ -192,7 +193,7 @@ def rise_of_mixture(predicted: Mixture, values: Array) -> Rise:
 
     `values` (s,): the judged value by s alternative estimates; `predicted`: mixture of predicted values of shape (s,
     ...), with log weights. Their difference follows the mixture over all estimates. The rise is its median, and the
-    standard deviation half of its central 68 % interval.
+    standard deviation is half the width of its central 68 % interval.
     """
     judged = np.reshape(values, (-1, *[1] * (predicted.centres.ndim - 1)))  # (s, 1, ..., 1)
     log_weights, deviations = predicted.weights.ravel(), predicted.deviations.ravel()

@@ -46,7 +46,7 @@ class PressureResponse:
         return None if leak is None else {"level": leak.level[0]}
 
     def observe(self, recording: Recording, baseline: Sequence[Healthy] = ()) -> Observed:
-        """Report on a recording: tests of the response's parameters for a step, and the leakage.
+        """Test each parameter of a recording's pressure response for a step, measure the leakage, and report both.
 
         The leakage is compared with that of the healthy recordings in `baseline`. `share` and `judged_until` of the
         report follow from the samples that were recorded and not filled in. If the leakage cannot be measured or a leak

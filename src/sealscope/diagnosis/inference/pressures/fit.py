@@ -87,7 +87,7 @@ class Linearisation(NamedTuple):
     squares: Array
 
     def cost(self, variance: float, prior: Normal) -> float:
-        """Compute -2 log posterior of the parameters `theta`, up to a constant; `variance`: of the noise [Pa^2]."""
+        """Compute -2 log posterior of the parameters `theta`, up to a constant, for a noise `variance` [Pa^2]."""
         deviations = prior.deviations(self.theta)
         # gram[0, 0] is the residual sum of squares
         return float(self.gram[0, 0] / variance + deviations @ prior.precision @ deviations)
@@ -183,8 +183,7 @@ def _estimate_noise(blocks: Sequence[Block], deviations: Array, parameter: int) 
     """Compute the variance of the residual [Pa^2], and the factor by which its correlation raises the variance of fits.
 
     The factor is the variance of the scores (`Block`) over their variance under white noise, at least 1. `deviations`
-    (K p,): deviations of the parameters from `theta` of each block, in `Priors.unit`; `parameter`: index of the tested
-    parameter.
+    (K p,): deviations of the parameters from each block's `theta`, in `Priors.unit`; `parameter`: the tested index.
     """
     # residual at these deviations: (1, -deviations) times the rows of residual and Jacobian
     directions = [np.append(1.0, -deviation) for deviation in deviations.reshape(len(blocks), -1)]

@@ -136,8 +136,8 @@ class ResponseLeak:
     def step_rise(self) -> LeakRise | None:
         """Leakage above that of healthy recordings, and the evidence that a step within the recording caused it.
 
-        The evidence (`step_log_ratio`) is the log likelihood ratio of the rise of the mean conductance that the step
-        would cause to no rise. None without healthy recordings.
+        The evidence (`step_log_ratio`) is the log likelihood ratio of two hypotheses: the mean conductance rose by as
+        much as the step would cause, and it did not rise. None without healthy recordings.
         """
         if self.rise is None:
             return None

@@ -95,8 +95,7 @@ def _advance_friction(
     """Advance the friction force by LuGre's law over a time step h [s].
 
     Returns the friction force after the step and the friction of steady sliding at the speed `v` [m/s] after it, both
-    [N]. `friction_0`, `steady_0`: the same two forces before the step; `theta`: fitted parameters; `m`: sizes of the
-    rig.
+    [N]. `friction_0`, `steady_0`: the same two forces before the step; `theta`: fitted parameters; `m`: sizes.
 
     The law, without the damping of the contact, is c dF/dt = v - |v| F/F_m for the friction force F, with the contact's
     compliance c and the magnitude F_m of the steady friction (`_steady_friction`). The step is L-stable and of order 2:
@@ -237,7 +236,7 @@ class Machine(NamedTuple):
     def from_rig(rig: Rig, rate: float, law: str = STRIBECK) -> Machine:
         """Make the simulator of a rig for samples at a `rate` [Hz] and a `law` of friction.
 
-        The piston has the mean area of both sides. The creep speed `v_th` is that of the law, else that of the rig.
+        The piston has the mean area of both sides. The creep speed is that of the law if it has one, else the rig's.
         """
         numbers = rig_numbers(rig)
         numbers = numbers._replace(A_A=0.5 * (numbers.A_A + numbers.A_B), v_th=_FRICTION[law].creep or numbers.v_th)

@@ -94,7 +94,7 @@ class Segment:
 
     @cached_property
     def n_samples(self) -> float:
-        """Number of samples with a weight."""
+        """Number of samples with a weight above zero."""
         return float(np.count_nonzero(self.sample_weights))
 
     @cached_property
@@ -116,7 +116,7 @@ class Segment:
     def residual_squares(self, sets: Array) -> Array:
         """Compute the residual sums of squares (m,) of p_A - p_B [Pa^2] for each of up to 16 parameter sets (m, p).
 
-        Its mean and the mains hum do not count. The result is infinite for a set whose simulation diverges.
+        The mean of the residual and the mains hum are removed. The result is infinite if a simulation diverges.
         """
         states = self.states[:, np.zeros(len(sets), dtype=int)]  # each set starts from the state in column 0
         simulated, _ = self.machine.simulate(self.command, sets, states)
@@ -221,9 +221,9 @@ class Segment:
         return bool(cost <= self.n_samples + _FOLLOW.unexplained * math.sqrt(2.0 * self.n_samples))
 
     def block_sums(self, fit: Linearisation) -> Block:
-        """Reduce a linearised fit of these samples to the sums for the joint fit of all blocks (`fit.Joint`).
+        """Reduce a linearised fit of these samples to the sums of products that the joint fit needs (`fit.Joint`).
 
-        The tested parameter is the leakage conductance G, with scores for each second; the mains hum is projected out.
+        The result also has the scores of the leakage conductance G, a sum for each second, without the mains hum.
         """
         rows = fit.rows - (fit.rows @ self.waves.T) @ self._wave_gram_inverse @ self.waves
         first = np.arange(0, self.dp.size, round(self.machine.rate))  # index of the first sample of each second
@@ -236,8 +236,8 @@ def fit_from_priors(segment: Segment, total: Array, noise: float) -> Linearisati
 
     The ringing causes many local minima. Therefore the slow part of p_A - p_B is fitted first, from the best of several
     gains and stiffnesses of the load. Then the unsmoothed p_A - p_B is fitted from several breakaway forces and several
-    stiffnesses of the oil, two of them by the strongest ringing (`Machine.ringing_stiffnesses`). `total` (n,): p_A +
-    p_B [Pa]; `noise`: variance of the noise [Pa^2].
+    stiffnesses of the oil, two of which follow from the strongest ringing (`Machine.ringing_stiffnesses`).
+    `total` (n,): p_A + p_B [Pa]; `noise`: variance of the noise [Pa^2].
     """
     priors = segment.priors
 
@@ -331,7 +331,7 @@ class Follower:
         return follower
 
     def _converge_on_beginning(self, recording: Recording) -> None:
-        """Refine the parameters by filtering the beginning of a recording, to start again at the first sample."""
+        """Refine the parameters by filtering the beginning of a recording, then return to its first sample."""
         covariance, states = self.covariance, self.states
         length = round(_FOLLOW.block * recording.rate)
         # blocks that begin before `stop` lie within the recording
@@ -362,7 +362,7 @@ class Follower:
     def next_segment(self, block: Recording) -> Segment:
         """Prepare the samples of the next block for a fit.
 
-        At the start and after a gap the stroke is centred, and while the drive settles samples have no weight.
+        At the start or after a gap the stroke is centred, and samples have no weight until the drive has settled.
         """
         u, n = block["u"], len(block)
         sample_weights = np.ones(n) if block.bridged is None else (~block.bridged).astype(float)
@@ -459,7 +459,7 @@ def fit_response(recording: Recording, rig: Rig) -> Joint | None:
 def measure_leak(recording: Recording, rig: Rig) -> ResponseLeak | None:
     """Measure the leakage of a recording without position by the response of its pressures.
 
-    Return None if it does not meet the requirements, or if no parameters describe the response under `rig`.
+    Return None if a requirement is not met (`find_unmet_requirement`), or if no parameters describe the response.
     """
     joint = fit_response(recording, rig) if find_unmet_requirement(recording, rig) is None else None
     if joint is None:
@@ -478,8 +478,7 @@ def parameter_information(joint: Joint, time: Array, seconds: float) -> dict[str
 
     All other parameters are eliminated. Each likelihood comes with the scale of the priors on a linear change and on a
     random walk of the parameter: the standard deviation that a walk reaches over the recording (for the leakage
-    conductance G that of a healthy machine). `time` (K,): middles of the blocks [s]; `seconds`: length of the recording
-    [s].
+    conductance G that of a healthy machine). `time` (K,): middles of the blocks [s]; `seconds`: duration recorded [s].
     """
     # `Priors.wander` is reached within the time `blocks.wander`; a random walk grows with the root of the time
     growth = math.sqrt(seconds / PRESSURE.blocks.wander)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def find_unmet_requirement(recording: Recording, rig: Rig) -> str | None:
-    """Find the first requirement of a fit of the pressure response that a recording does not meet, as a text, or None.
+    """Find the first requirement of a pressure-response fit that a recording does not meet; return a text, or None.
 
     The fit needs the command [V] and both pressures [Pa] of a pump that drives a cylinder of two equal areas, recorded
     for long enough and at a high enough rate, without missing samples.

@@ -72,18 +72,18 @@ class BalanceLeak:
         """Cause of a leak, such as "piston leak", or "piston or pump leak" if the balance cannot separate them.
 
         - "internal or external leak" if only the creep of a held load is known: leaking valves and lines cause it, too.
-        - "piston leak" if a servo valve drives the cylinder, or if holds measure the leakage, i.e. times in which shut
-          valves separate the pump from the loaded cylinder. The balance must assume such valves at every rest, or the
-          leakage in the holds must be too high for a healthy machine.
+        - "piston leak" if a servo valve drives the cylinder, or if the leakage is measured in holds, i.e. while shut
+          valves separate the pump from the loaded cylinder. Either the balance already assumes that they do so at every
+          rest, or the leakage in the holds must be too high for a healthy machine.
         - "piston or pump leak" otherwise.
         """
         if self.balance.is_creep:
             return "internal or external leak"
         hold_rise = self._rises.get(True)
-        is_clear = self.balance.shut or (hold_rise is not None and hold_rise.chance < INFERENCE.held_oil.rare)
-        in_holds = hold_rise is not None and self.rise is hold_rise and is_clear
+        is_unusual = hold_rise is not None and hold_rise.chance < INFERENCE.held_oil.rare  # for a healthy machine
+        is_measured_in_holds = hold_rise is not None and self.rise is hold_rise and (self.balance.shut or is_unusual)
         has_servo_valve = len(self.balance.columns) > 1  # one balance for each chamber
-        return "piston leak" if has_servo_valve or in_holds else "piston or pump leak"
+        return "piston leak" if has_servo_valve or is_measured_in_holds else "piston or pump leak"
 
     @property
     def step(self) -> StepTest | None:
@@ -117,17 +117,17 @@ class BalanceLeak:
     def rise(self) -> Rise | None:
         """Amount by which the mean leakage [m^3/(s Pa)] exceeds that of healthy recordings; None without these.
 
-        Of `_rises`, the one with the smallest p-value counts, that in holds if both are equal.
+        It is the rise in `_rises` with the smaller p-value; if both are equal, the rise in holds.
         """
         return min(self._rises.values(), key=lambda rise: rise.chance, default=None)
 
     @cached_property
     def _rises(self) -> dict[bool, Rise]:
-        """Rises of the leakage over healthy recordings, with their shares of the false alarms; empty without these.
+        """Rises of the leakage over healthy recordings, each with its share of the false alarms; empty without these.
 
-        The key False is for the rise over the whole recording, True for that in holds (`_hold_rise`). Holds do not show
-        a leak that begins after them. With the prior probability s of such a leak, the rise over the whole recording
-        may use the fraction s of the false alarms, that in holds the rest (weighted Bonferroni correction).
+        The key False is for the rise in the whole recording, True for the rise in holds (`_hold_rise`). Holds do not
+        show a leak that begins after them. If s is the prior probability of such a leak, the rise in the whole
+        recording gets the fraction s of the false alarms, and the rise in holds 1 - s (weighted Bonferroni correction).
         """
         motion_rise, hold_rise, chambers = self._motion_rise, self._hold_rise, self.balance.chambers
         if motion_rise is None:
@@ -162,7 +162,7 @@ class BalanceLeak:
 
     @cached_property
     def rise_flow(self) -> Flow:
-        """Mean flow [m^3/s] of the leakage above healthy recordings from its onset on; of all leakage without these."""
+        """Mean flow [m^3/s] of the leakage above healthy recordings since its onset; of all leakage without any."""
         balance = self.balance
         if self.rise is None:
             value, low, high = (balance.mean_pressure() * conductance for conductance in balance.conductance)
@@ -194,9 +194,9 @@ class BalanceLeak:
 
     @property
     def rise_onset(self) -> Interval | None:
-        """Onset [s] of the leakage above healthy recordings, from holds, in which shut valves keep the load in place.
+        """Onset [s] of the leakage above healthy recordings, estimated while shut valves keep the load in place.
 
-        None if these do not clearly show the leakage, or if the leak may have begun before them.
+        None if these holds do not clearly show the leakage, or if the leak may have begun before them.
         """
         hold_rise, chambers = self._hold_rise, self.balance.chambers
         if hold_rise is None or chambers is None or not hold_rise.chance < INFERENCE.held_oil.rare:
@@ -204,7 +204,7 @@ class BalanceLeak:
         return chambers.piston_onset
 
     def _hold_flow(self, hold_rise: Rise) -> Flow:
-        """Estimate the mean flow of the leak that shows while shut valves hold the load, averaged over its laws.
+        """Estimate the mean flow of a leak from the times in which shut valves hold the load, averaged over its laws.
 
         The variance of `hold_rise`, the rise over healthy recordings in these times, is added to that of the fits.
         """
@@ -219,8 +219,8 @@ class BalanceLeak:
         """Leak past the piston, fitted to the times in which shut valves hold the load, for each law and piston area.
 
         A law is an exponent of `EXPONENTS` and a relative growth of the coefficient between onset and end
-        (`growth_priors`); the flow is the coefficient times abs(p_A - p_B)^exponent. Each is fitted with each area of
-        `HeldChambers.area_variants`, whose weights sum to the probability of that area.
+        (`growth_priors`); the flow is the coefficient times abs(p_A - p_B)^exponent. Each law is fitted with each area
+        of `HeldChambers.area_variants`. The weights of all laws for one area sum to the probability of this area.
         """
         chambers = self.balance.chambers
         assert chambers is not None
@@ -299,7 +299,7 @@ class BalanceLeak:
         """95 % upper bound of the leak's mean flow over the recording [m^3/s]; infinite if nothing was tested.
 
         With healthy recordings the bound is on the leakage above theirs (`_hold_bound` if holds measure it), otherwise
-        on a leak that begins within the recording. The uncertain scale of flows and law of the leak raise it.
+        on a leak that begins within the recording. The uncertain scale of flows and the uncertain law raise the bound.
         """
         test = self.step if self._motion_rise is None else self._motion_rise
         if test is None:
@@ -351,9 +351,9 @@ class BalanceLeak:
     def step_rise(self) -> LeakRise | None:
         """Leakage above that of healthy recordings, and the evidence that a step within the recording caused it.
 
-        The evidence (`step_log_ratio`) is the log likelihood ratio of the rise that the step would cause to no rise.
-        Holds after the step's onset, in which shut valves keep the load in place, show the whole step; without them,
-        the mean over the recording shows a part of it. None without healthy recordings.
+        The evidence (`step_log_ratio`) is the log likelihood ratio of two hypotheses: a rise as large as the step would
+        cause, and no rise. If shut valves hold the load after the step's onset, these holds show the whole step;
+        otherwise the mean over the recording shows a part of it. None without healthy recordings.
         """
         step, total_rise, motion_rise = self.step, self.rise, self._motion_rise
         if total_rise is None:
@@ -391,7 +391,7 @@ class BalanceLeak:
     def relative(self, flow: Flow) -> RelativeLeak:
         """Convert a leak's flow to a fraction of the pump's mean flow, and to the speed [m/s] of a creeping piston.
 
-        Both have 95 % intervals. The fraction is None for a flow of zero, the speed if the area is unknown.
+        Both have 95 % intervals. The fraction is None if the pump's flow is zero, the speed if the area is unknown.
         """
         pump_flow, area = self.balance.mean_flow, self.balance.size.area
         half_width = WITHIN_95 * flow.deviation
@@ -481,8 +481,7 @@ def _flow_mixture(rise: Rise, value: float, *, unit: float, weight: float, oil_d
 
     Its weights sum to `weight`, as it is a part of a larger mixture. `rise`: rise over healthy recordings, of which
     only the distribution of the error is used; `value`: estimate of the rise, a negative one counting as 0; `unit`:
-    mean flow [m^3/s] for a coefficient of 1; `oil_deviation`: additional standard deviation of the coefficient due to
-    the uncertain properties of the oil.
+    mean flow [m^3/s] for a coefficient of 1; `oil_deviation`: standard deviation of the coefficient by uncertain oil.
     """
     # the true rise is `value` minus an error that is distributed as a healthy recording's rise
     weights, deviations, centres = rise.mixture or Mixture(np.ones(1), np.array([rise.deviation]), np.zeros(1))
@@ -490,7 +489,7 @@ def _flow_mixture(rise: Rise, value: float, *, unit: float, weight: float, oil_d
 
 
 def _divide_interval(interval: tuple[float, float], divisor: float | None) -> tuple[float, float] | None:
-    """Divide both ends of an interval, the lower one at least 0, by `divisor`; None unless the divisor is positive."""
+    """Divide an interval by `divisor` and raise a negative lower end to 0; None unless the divisor is positive."""
     if divisor is None or not divisor > 0.0:
         return None
     return max(interval[0], 0.0) / divisor, interval[1] / divisor

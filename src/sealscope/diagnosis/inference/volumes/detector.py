@@ -111,11 +111,11 @@ class VolumeBalance:
         is_locked: bool = False,
         sign_log_odds: Array | float = 0.0,
     ) -> RecordedBalance | None:
-        """Set up the volume balance of a recording; None if its channels or its length allow none.
+        """Set up the volume balance of a recording; return None if its channels or its length allow no balance.
 
-        `odds`: log odds, prior and from healthy recordings, that valves cut a resting pump off from the cylinder;
-        `is_locked`: true if valves certainly cut the pump off, whatever this recording shows; `sign_log_odds` (E,): log
-        odds of each balance, from healthy recordings, that the recorded flow has the right sign.
+        `odds`: log odds, before this recording, that valves cut a resting pump off from the cylinder; `is_locked`: true
+        if healthy recordings show that they do; `sign_log_odds` (E,): log odds by healthy recordings that the recorded
+        flow has the right sign, for each of E balance equations.
         """
         if not equations(self.rig, frozenset(recording.channels)):
             return self._balance_without_position(recording)
@@ -131,8 +131,8 @@ class VolumeBalance:
     def _balance_without_position(self, recording: Recording) -> RecordedBalance | None:
         """Choose the volume balance with the smallest upper bound of a leak, among those that need no position.
 
-        It must be that of a load behind shut valves, or of a pump that `compensates_leakage`; None without such a
-        balance.
+        Only balances of a load behind shut valves, or of a pump that replaces the leakage (`compensates_leakage`), are
+        considered. Return None if there is no such balance.
         """
         balances = compute_once(
             recording, (self.name, self.rig), lambda samples: cycle_balances(samples, self.rig), READ
@@ -145,7 +145,7 @@ class VolumeBalance:
         return min(usable, key=lambda candidate: BalanceLeak(self.name, candidate).bound_flow, default=None)
 
     def _compute_blocks(self, recording: Recording) -> RecordedBlocks | None:
-        """Compute the blocks of a recording for a volume balance with a position, only once; None if it allows none."""
+        """Compute the blocks for a volume balance with a position, once for a recording; None if it allows none."""
         if not equations(self.rig, frozenset(recording.channels)):
             return None
         return compute_once(recording, (self.name, self.rig), lambda samples: recorded_blocks(samples, self.rig), READ)
@@ -165,16 +165,16 @@ class VolumeBalance:
         """Summarise a healthy recording for later comparisons; None if it allows no volume balance.
 
         A single recording may leave open whether valves cut the pump off from the cylinder while it rests. The summary
-        therefore has the sums for both cases, and log odds, which are later combined over all healthy recordings:
+        therefore has Gram matrices for both cases, and log odds, which are later combined over all healthy recordings:
 
         - the fields of `recording_sums.RecordingSums` that are known, for a pump that stays connected at rest;
         - `terms`: names of the balance's terms;
         - `scale`: factor from computed to true flows (`Size`), 0 if no flow can be stated in L/min;
-        - `shut_sums`, `shut_odds`, if the machine rests: Gram matrices for a pump that valves cut off at rest, and log
-          odds that they do, from the leakage at rest;
+        - `shut_sums`, `shut_odds`, if the machine rests: Gram matrices for a pump that valves cut off at rest, and the
+          log odds of this case, from the leakage at rest;
         - `held`, `held_odds`, if it holds a load at rest: leaks while shut valves hold the load, and log odds that the
-          valves are shut, from these leaks; `held_pump`, if known: leakage of the pump just before;
-        - `sign_log_odds`, with a position: log odds of each balance that the recorded flow has the right sign;
+          valves are shut, from these leaks; `held_pump`, if known: leakage of the pump just before the valves shut;
+        - `sign_log_odds`, with a position: log odds that the recorded flow has the right sign, for each balance;
         - `stroke`, with a position: ends of the recorded motion [m];
         - `creep_odds`, if no pump's flow is recorded (`is_creep`): log odds that the load creeps by leakage.
         """
@@ -206,7 +206,7 @@ class VolumeBalance:
         The rise is the leakage of a recording minus that of the healthy recordings with the given `summaries`
         (`learn`). Without a leak it scatters about 0, by differences between days and errors of the estimates; a leak
         must exceed this scatter. The later recording is taken to have the Gram matrices of the first healthy one, and
-        the median flow and pressure. `n_repeats`: how often the healthy recordings count, as if repeated.
+        the median flow and pressure. `n_repeats`: number of times that each healthy recording counts.
         """
         shut = _are_valves_shut(summaries) or self._shut_log_odds(summaries, channels) > 0.0
         healthy = [_sums_from_summary(summary, shut) for summary in summaries]
@@ -220,9 +220,10 @@ class VolumeBalance:
     def _shut_log_odds(self, summaries: Sequence[Summary], channels: frozenset[str]) -> float:
         """Compute the log odds that valves cut the pump off at rest, from summaries of healthy recordings (`learn`).
 
-        The prior log odds are `rest.valves` (`priors.toml`). The leakage at rest and in motion of each recording adds
-        its log odds (`regimes.shut_odds`). The right assumption on the valves also makes the estimated leakage scatter
-        less between recordings: n (`MIN_FOR_SCATTER` or more) add (n - 1) log(scatter if connected / if cut off).
+        The prior log odds are `rest.valves` (`priors.toml`). Each recording adds the log odds that follow from its
+        leakage at rest and in motion (`regimes.shut_odds`). The right assumption on the valves also makes the estimated
+        leakage scatter less: n recordings (`MIN_FOR_SCATTER` or more) together add (n - 1) log(scatter if the pump is
+        connected / scatter if it is cut off).
         """
         with_rests = [summary for summary in summaries if "shut_sums" in summary]
         odds = float(INFERENCE.rest.valves + _sum_log_odds(with_rests, "shut_odds"))
@@ -243,11 +244,11 @@ class VolumeBalance:
         return [ColumnRoles(shut_at_rest(equation) if shut else equation) for equation in balances]
 
     def observe(self, recording: Recording, baseline: Sequence[Healthy] = ()) -> Observed:
-        """Report on a recording: tests of each term of the volume balance for a step, and the leakage.
+        """Test each term of a recording's volume balance for a step, measure the leakage, and report both.
 
-        The leakage is compared with that of the healthy recordings in `baseline` that have the same terms. Without a
-        recorded flow of the pump, the creep of a load that valves hold shows the leakage. If nothing shows it, the
-        report says what is missing.
+        The leakage is compared with that of the healthy recordings in `baseline` whose balance has the same terms.
+        Without a recorded flow of the pump, the creep of a load that valves hold shows the leakage. If the leakage
+        cannot be measured, the report says what is missing.
         """
         summaries = healthy_summaries(self, baseline)
         is_locked = _are_valves_shut(summaries)
@@ -264,8 +265,8 @@ class VolumeBalance:
         if balance is None or (balance.is_creep and not is_held):
             return Observed(self.name, lack=_NO_CREEP.format(self.rig.circuit.needed_channels))
         balance = replace(balance, locked=is_locked, known_stroke=_joint_stroke(summaries))
-        # summaries do not list the leakage of a pump that turns or holds the load, which has terms of its own if valves
-        # cut the pump off at rest
+        # terms of the leakage of a pump that turns or holds the load; the balance has them only if valves cut the pump
+        # off at rest, and the summaries do not list them
         names = [name for name in balance.columns[0].names if name not in (TURNING, HOLDING)]
         comparable = [summary for summary in summaries if summary["terms"] == names]
         healthy = [_sums_from_summary(summary, balance.shut, balance.locked) for summary in comparable]
@@ -275,9 +276,9 @@ class VolumeBalance:
         return replace(report, refusal="the channels of the healthy recordings give another balance of volumes")
 
     def observe_regimes(self, recording: Recording) -> Mapping[bool, Observed]:
-        """Report on a recording without healthy ones, under both assumptions on the valves while the pump rests.
+        """Report on a recording without a baseline, for each assumption on the valves while the pump rests.
 
-        The key False is for a pump that stays connected; True, for a recording with rests, for one that is cut off.
+        The key True stands for valves that cut the pump off (missing if it never rests), False for open valves.
         """
         recorded = self._compute_blocks(recording)
         if recorded is None:
@@ -291,15 +292,15 @@ class VolumeBalance:
         """Make the report of a volume balance: tests, leakage, and how much of the recording is judged.
 
         `Observed.share` is the fraction of the samples that were used, `Observed.judged_until` the end of the last
-        block with used samples, as a fraction of the recording. The report contains only a reason if the leakage can be
-        tested neither for a step nor against the healthy recordings, of which there may be none.
+        block with used samples, as a fraction of the recording. If the leakage can be tested neither for a step nor
+        against the `healthy` recordings (none if empty), the report states only the reason.
         """
         leak, rows = BalanceLeak(self.name, balance, healthy), balance.blocks.rows
         if leak.step is None and leak.rise is None:
             lack = "p_A and p_B hardly differ, or too few samples are whole: no leak would show"
             return Observed(self.name, lack=lack)
-        # a block with missing samples has fewer rows; without a position the number also depends on the motion, and the
-        # whole recording counts as judged
+        # a block with missing samples has fewer rows (equations); without a position the number also depends on the
+        # motion, and the whole recording counts as judged
         has_position = balance.equations[0].name == CYLINDER or len(balance.columns) > 1
         share = float(rows.mean() / max(rows.max(), 1.0)) if has_position else 1.0
         # end of the last block with rows, over the number of blocks
@@ -322,9 +323,9 @@ def compare_motion(
 ) -> Iterator[Observable]:
     """Test whether the piston's motion takes more or less flow for the same speed than in healthy recordings.
 
-    Yields one observable, or nothing if there are too few healthy recordings. A change means that the recording is from
-    another machine, or that the scale of a sensor has changed. A load or speed outside of the range of the healthy
-    recordings adds `further_deviation` to the error of the comparison.
+    Yields the result of the test, or nothing if there are too few healthy recordings. A change means that the recording
+    is from another machine, or that the scale of a sensor has changed. A load or speed outside of the range of the
+    healthy recordings makes the comparison less certain. `roles`: roles of the columns of the volume balance.
     """
     prior, healthy_sums = INFERENCE.repeats, np.sum([recording.sums[0] for recording in healthy], axis=0)
 
@@ -346,10 +347,10 @@ def compare_motion(
 
 
 def _healthy_sign_log_odds(summaries: Sequence[Summary], n_balances: int) -> Array:
-    """Compute for each balance the log odds, from healthy recordings, that the recorded flow has the right sign.
+    """Add the log odds of all healthy recordings that the recorded flow has the right sign, for each balance equation.
 
-    Those in the `summaries` with `n_balances` balances are added. The sums are limited, since the sensor may have been
-    reversed since then (`sense.rewired` of `priors.toml`).
+    A machine has `n_balances` equations; `summaries` with another number are omitted. The sums are limited, since the
+    sensor may have been reversed since these recordings (`sense.rewired` of `priors.toml`).
     """
     recorded = (summary.get("sign_log_odds", ()) for summary in summaries)
     total = sum((values for values in recorded if len(values) == n_balances), start=np.zeros(n_balances))
@@ -373,7 +374,7 @@ def _sum_log_odds(summaries: Sequence[Summary], key: str) -> float:
 def _are_valves_shut(summaries: Sequence[Summary]) -> bool:
     """Return True if the healthy recordings show that valves cut the pump off at rest.
 
-    Their mean log odds by all rests ("shut_odds"), or by rests with a load ("held_odds"), must exceed `rest.locked`.
+    Their mean log odds from all rests ("shut_odds") or from rests under load ("held_odds") must exceed `rest.locked`.
     """
     log_odds = ([summary[key] for summary in summaries if key in summary] for key in ("shut_odds", "held_odds"))
     return any(bool(odds) and float(np.mean(odds)) > INFERENCE.rest.locked for odds in log_odds)
@@ -390,8 +391,9 @@ def _shift_start(recorded: RecordingSums, n_ages: int) -> float | None:
 def _sums_from_summary(summary: Summary, shut: bool = False, locked: bool = False) -> RecordingSums:
     """Restore the Gram matrices, flow, pressure and date of a healthy recording from its summary (`learn`).
 
-    `shut`: true for the Gram matrices under the assumption that valves cut the pump off at rest, which have separate
-    columns of the pump (added here for a recording without rests); `locked`: true to include the leaks in holds.
+    `shut`: true for the Gram matrices under the assumption that valves cut the pump off at rest. These have additional
+    columns for the pump's leakage, which are added here if the recording has no rests. `locked`: true to include the
+    leaks measured while valves hold the load.
     """
     sums = np.asarray(summary["sums"], dtype=float)
     if shut:

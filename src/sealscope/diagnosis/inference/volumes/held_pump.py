@@ -38,9 +38,8 @@ def estimate_pump_leakage(
     """Estimate the leakage conductance of the pump [m^3/(s Pa)] from the time just before each hold.
 
     `pumped` (n - 1,): volume that the pump delivers between the samples of the recording [m^3]; `holds`: holds of the
-    recording, in which shut valves keep the load in place; `leaks`: leaks measured in the holds, of which the one past
-    the piston and the external one of the loaded side are subtracted. Return None for fewer than two holds or too few
-    samples.
+    recording, in which shut valves hold the load; `leaks`: leaks measured in the holds. The leak past the piston and
+    the external leak of the loaded side are subtracted. Return None for fewer than two holds or too few samples.
     """
     rate, t = recording.rate, 0.5 * (recording.t[1:] + recording.t[:-1])
     difference = recording["p_A"] - recording["p_B"]

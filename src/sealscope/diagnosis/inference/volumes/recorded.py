@@ -121,7 +121,7 @@ class RecordedBalance:
 
     @property
     def is_creep(self) -> bool:
-        """True if the balance's flow is the creep of a load that valves hold, as no pump's flow is known."""
+        """True if the balance's flow is the creep of a load that valves hold, since no pump's flow is known."""
         return self.equations[0].name == LOCKED
 
     @cached_property
@@ -134,7 +134,7 @@ class RecordedBalance:
     def running_blocks(self) -> Blocks:
         """Blocks from the first motion on, which are tested for steps.
 
-        Before, the machine may be off; if its pump then begins to hold the load, its flow rises without a leak.
+        Before that, the machine may be off; if its pump then begins to hold the load, its flow rises without a leak.
         """
         return self.blocks[self._first_motion :]
 
@@ -228,7 +228,7 @@ class RecordedBalance:
         return self.equations[0].left(Signals(dict(self.recording.channels), self.recording.rate, {}))
 
     def _lost_flow(self, sides: CylinderSides) -> Array:
-        """Compute the magnitude of the pump's flow [m^3/s] that does not move the piston, averaged, shape (n - 1,).
+        """Compute the averaged magnitude of the pump's flow [m^3/s] that does not move the piston, shape (n - 1,).
 
         It is positive while the pump holds a load or compresses oil. The flow that moves the piston is its speed times
         the area of the side with the higher pressure.
@@ -243,9 +243,9 @@ class RecordedBalance:
         return np.asarray(np.maximum(flow - displaced, 0.0))
 
     def _is_pump_off(self, hold: LockedHold) -> bool:
-        """Return True if the pump probably rests in a hold, as its mean flow is too small for a pump that holds a load.
+        """Return True if the pump probably rests in a hold, since its mean flow is too small to hold the load.
 
-        Such a pump is assumed to deliver the fraction `rest.holding` (`priors.toml`) of its flow in motion.
+        To hold a load, a pump is assumed to deliver the fraction `rest.holding` (`priors.toml`) of its flow in motion.
         """
         recording = self.recording
         # time in which the pump's flow may still fall: the first interval, and the longest extension by `extend_rests`
@@ -276,11 +276,12 @@ class RecordedBalance:
         return float(self._load_log_odds(np.array([pressure]))[0]) > oil.loaded
 
     def _load_log_odds(self, pressure: Array) -> Array:
-        """Compute the log odds (n,) that values of abs(p_A - p_B) (n,) [Pa] are loads and not an offset of the sensors.
+        """Compute the log odds (n,) that a load causes abs(p_A - p_B), and not an offset between the two sensors.
 
-        All loads up to the largest of the recording are equally probable; the offset is normal about 0.
+        `pressure` (n,): values of abs(p_A - p_B) [Pa]. All loads up to the largest of the recording are equally
+        probable; the offset is normal about 0.
         """
-        # minus the log density of an offset is this constant plus half of its cost
+        # an offset z has the log probability density -offset_cost(z) / 2 - log_offset_norm
         log_offset_norm = float(np.log(INFERENCE.zero.pressure * np.sqrt(2.0 * np.pi)))
         difference = np.abs(self.recording["p_A"] - self.recording["p_B"])
         max_load = float(np.nanquantile(difference, 1.0 - END_QUANTILE))
@@ -291,8 +292,8 @@ class RecordedBalance:
         """Compute the log odds that valves are shut in holds, and not open; None without holds.
 
         With open valves the leakage in holds would be the total leakage of pump and piston; with shut valves it is
-        smaller. The total leakage is measured just before the holds, at the same pressures, or else it is the
-        `conductance` [m^3/(s Pa)] over the whole recording, by the balance for open valves.
+        smaller. The total leakage is measured just before the holds, at the same pressures. If it is unknown there, it
+        is `conductance` [m^3/(s Pa)], that of the whole recording under the assumption of open valves.
         """
         if self.chambers is None:
             return None
@@ -335,11 +336,11 @@ class RecordedBalance:
         """Estimate the piston areas of A and B [m^2], as measured with the assumed displacement of the pump.
 
         Returns both areas, and the standard deviations of the logarithms of their magnitudes. The areas are negative if
-        the position x is reversed, and zero if nothing moves. The area of a side is the mean of the coefficients of the
-        motion under its load in the volume balance, weighted by the sums of squares of their columns. The main side is
-        the one with more motion in which it surely carries the load. The area of the other side is corrected for motion
-        that may belong to the main side (`log_area_ratio`). Areas in the rig's file are used instead, scaled to the
-        flows of the balance.
+        the position x is reversed, and zero if nothing moves. Areas in the rig's file are used if they are stated,
+        scaled to the flows of the balance. Otherwise the area of a side is the mean coefficient of the motion under its
+        load in the volume balance, weighted by the sums of squares of the columns. The main side has more motion in
+        which it surely carries the load. The area of the other side is corrected for motion that may belong to the main
+        side (`log_area_ratio`).
         """
         roles, total = self.columns[0], self.blocks.gram[:, 0].sum(axis=0)
         nuisance = list(roles.nuisance)
@@ -370,10 +371,10 @@ class RecordedBalance:
         return area_A, area_B, deviation_A, deviation_B
 
     def _loaded_shares(self) -> tuple[float, float]:
-        """Compute, for A and for B, the fraction of the motion with this side loaded in which the load is certain.
+        """Compute the fractions of A's and of B's motion under load in which the load is certain.
 
-        A side counts as loaded while its pressure is higher. The load is certain if p_A - p_B almost certainly is not
-        an offset of the sensors (`_load_log_odds`). The motion is measured by the sum of squared speeds over the
+        A side counts as loaded while it has the higher pressure. The load is certain if p_A - p_B almost certainly is
+        not an offset of the sensors (`_load_log_odds`). The motion is measured by the sum of squared speeds over the
         samples. A side that is never loaded has the fraction 0.
         """
         recording = self.recording
@@ -388,7 +389,7 @@ class RecordedBalance:
 
     @cached_property
     def pressure_offset(self) -> float:
-        """Sensor offset of p_A - p_B [Pa]; near 0 without a change of the leak, which alone reveals it."""
+        """Estimated sensor offset of p_A - p_B [Pa]; near 0 unless a change of the leak reveals the offset."""
         return estimate_offset(self.blocks, self.columns)
 
     @cached_property
@@ -414,23 +415,23 @@ class RecordedBalance:
 
         The leak is driven by the root mean square of its pressure (`Blocks.driving_pressure`).
         """
-        names, recorded = self.columns[0].names, self.blocks if self.plain is None else self.plain
+        names, blocks = self.columns[0].names, self.blocks if self.plain is None else self.plain
         return {
-            name: recorded.driving_pressure(names, name) * self.size.scale
+            name: blocks.driving_pressure(names, name) * self.size.scale
             for name in names
             if name.startswith("external leak")
         }
 
     @cached_property
     def mean_flow(self) -> float:
-        """Mean magnitude of the pump's flow [m^3/s]; with `is_creep`, of the flow that the piston displaces."""
+        """Mean magnitude of the pump's flow [m^3/s]; if `is_creep`, of the flow that the piston displaces."""
         if not self.is_creep:
             return self.mean_of_blocks(self.blocks.flow)
         area = max(self.rig.cylinder.A_A, self.rig.cylinder.A_B)
         return area * float(np.nanmean(np.abs(np.diff(self.recording["x"])))) * self.recording.rate
 
     def mean_of_blocks(self, values: Array, since: float = -np.inf) -> float:
-        """Average `values` (K,) over the blocks from `since` [s] on, at least the last, weighted by numbers of rows."""
+        """Average `values` (K,) over the blocks after `since` [s] (at least the last), weighted by `Blocks.rows`."""
         is_after = self.blocks.time >= since
         if not is_after.any():
             is_after[-1] = True
@@ -443,8 +444,8 @@ class RecordedBalance:
 
         - Behind a servo valve, and for a load that shut valves hold, the areas give the flow, and the factor is 1.
           While a held load creeps, its oil also expands, which adds to the uncertainty.
-        - The factor is also 1 for a flow meter.
-        - A stated displacement gives the factor 1. If a stated area disagrees, the difference is the uncertainty.
+        - A flow meter or a stated displacement gives the factor 1. If a stated area disagrees with the displacement,
+          the difference is the uncertainty.
         - If only the area is stated, the factor follows from the measured ratio of displacement to area. If neither is
           stated, it is 1, with the uncertainty of both.
         """
@@ -478,9 +479,10 @@ class RecordedBalance:
 
     @cached_property
     def _loaded_area(self) -> _Area | None:
-        """Piston area of the loaded side, a weighted mean over directions of motion and loaded sides, or None.
+        """Piston area of the loaded side, a mean over the directions of motion and the loaded sides; None if unknown.
 
-        Each has a column of the balance, whose weight is its sum of squares: a side counts by its motion under load.
+        The balance has one column for each direction and loaded side, with the area as its coefficient. The mean is
+        weighted by the sums of squares of the columns.
         """
         roles, cylinder = self.columns[0], self.rig.cylinder
         motion = [k for k in roles.motion if roles.names[k].startswith("motion")]
@@ -502,10 +504,10 @@ class RecordedBalance:
     def creep_log_odds(self) -> float:
         """Compute the log odds that a held load creeps by leakage, rather than that a control loop holds it.
 
-        A loop replaces the leakage, so that the piston hardly moves: a flow near zero in holds speaks against creep,
-        one near the leakage of a typical machine for it.
+        A control loop replaces the oil that leaks, so that the piston hardly moves. A displaced flow near zero thus
+        indicates a control loop, and a flow near the leakage of a typical machine indicates creep.
         """
-        holding_flow, roles = INFERENCE.rest.holding * self.mean_flow, self.columns[0]
+        holding_flow, roles = INFERENCE.rest.holding * self.mean_flow, self.columns[0]  # [m^3/s] of typical leakage
         # conductance: displaced volume over the integral of p_A - p_B, the chambers' compliance being neglected
         conductance, conductance_variance = fit_with_robust_covariance(self.blocks.gram[:, 0], [roles.leak], roles.left)
         flow = float(conductance[0]) * self.mean_pressure()
@@ -518,8 +520,8 @@ class RecordedBalance:
     def total_history(self) -> History:
         """Total leakage of pump and piston in each block, as a conductance [m^3/(s Pa)] with its covariance.
 
-        A separate term of the pump's leakage is left out, so that the leak's term contains both. The history includes a
-        step of the leakage if a test finds one with a p-value below `RAREST`.
+        If the pump's leakage has a separate term, it is left out, so that the term of the leak contains both. The
+        history includes a step of the leakage if a test finds one with a p-value below `RAREST`.
         """
         roles = self.columns[0]
         pump = roles.names.index(PUMP) if PUMP in roles.names else None

@@ -43,8 +43,9 @@ def rival_rises(
 ) -> tuple[Observable, ...]:
     """Test for faults other than a leak past the piston that explain a change since the healthy recordings.
 
-    These rivals of the leak are external leaks, leakage of the turning pump, and free air; there is one observable for
-    each that can be compared. External leaks are compared only while shut valves hold the load, if `held_rivals` can.
+    These rivals of the leak are external leaks, leakage of the turning pump, and free air. The result has one test for
+    each rival that can be compared. If external leaks can be measured while shut valves hold the load (`held_rivals`),
+    they are compared only there.
 
     `volume_ratio`: measured over assumed ratio of the piston's area to the pump's displacement, by which volumes of air
     scale; `unit_flows`: flow [m^3/s] of an external leak with a conductance of 1 m^3/(s Pa), by the name of its term. A
@@ -129,10 +130,10 @@ def _without_oil(coefficients: Array, thinning: Array) -> Array:
 def held_rivals(
     judged: RecordingSums, healthy: Sequence[RecordingSums], unit_flows: Mapping[str, float] | None = None
 ) -> tuple[Observable, ...] | None:
-    """Test for external leaks of chambers A and B, measured while shut valves hold the load, above healthy recordings.
+    """Test whether chamber A or B leaks to the outside more than in healthy recordings, while valves hold the load.
 
-    Return one observable for each chamber that can be compared, or None if the judged recording has no such holds, or
-    fewer than `MIN_WITH_HOLDS` healthy recordings have them. `unit_flows`: as in `rival_rises`.
+    Return one test for each chamber that can be compared, or None if no load is held in the judged recording or in
+    fewer than `MIN_WITH_HOLDS` healthy recordings. `unit_flows`: as in `rival_rises`.
     """
     healthy_leaks = [HeldLeaks(*recording.held) for recording in healthy if recording.held is not None]
     if judged.held is None or len(healthy_leaks) < MIN_WITH_HOLDS:
@@ -151,11 +152,11 @@ def held_rivals(
 
 
 def _penalise_size(observable: Observable, judged: RecordingSums, unit_flows: Mapping[str, float] | None) -> Observable:
-    """Return the observable of an external leak with the penalty for its size as `advantage`, which is at most 0.
+    """Set the `advantage` of a test for an external leak to a penalty for the size of the leak, which is at most 0.
 
     A large external leak is improbable, since someone would have noticed the oil outside. The penalty is 2 log(prior
     density / largest prior density) of the leak's flow, and 0 for flows below the centre of the prior (`outside` in
-    `priors.toml`). `unit_flows`: as in `rival_rises`.
+    `priors.toml`). `observable`: the test; `unit_flows`: as in `rival_rises`.
     """
     flow = observable.size * (unit_flows or {}).get(observable.name, judged.pressure)
     return replace(observable, advantage=-size_penalty(INFERENCE.outside, flow, above=True))
@@ -165,9 +166,9 @@ def _estimate_change(gram: Array, reference: Array, columns: Sequence[ColumnRole
     """Estimate by how much a coefficient of a recording differs from healthy recordings, with the standard error.
 
     `gram`, `reference` (E, m, m): Gram matrices of the recording, and of the sum of the healthy recordings, for E
-    equations; `tested`: index of the column, whose coefficient counts as 0 in the healthy recordings. The differences
-    of the other coefficients have normal priors, and are eliminated. Except for the leak, columns without a finite
-    prior deviation are left out. Without information the change is 0 and the error infinite.
+    equations; `tested`: column of the coefficient, which counts as 0 in the healthy recordings. The differences of the
+    other coefficients have normal priors and are eliminated. Except for the leak, columns without a finite prior
+    deviation are left out. Without information the change is 0 and the error infinite.
     """
     precision, moment = 0.0, 0.0
     for e, roles in enumerate(columns):
@@ -176,6 +177,6 @@ def _estimate_change(gram: Array, reference: Array, columns: Sequence[ColumnRole
         coefficients = solve(reference[e][np.ix_(free, free)], reference[e][free, roles.left])
         residual = gram[e][:, roles.left] - gram[e][:, free] @ coefficients
         prior_precisions = roles.difference_precisions(free, coefficients, coefficients[free.index(leak)])
-        parts = reduce_to_tested(gram[e], residual, tested, free, prior_precisions)
-        precision, moment = precision + parts[0], moment + parts[1]
+        equation_precision, equation_moment = reduce_to_tested(gram[e], residual, tested, free, prior_precisions)
+        precision, moment = precision + equation_precision, moment + equation_moment
     return (moment / precision, precision**-0.5) if precision > 0.0 else (0.0, np.inf)

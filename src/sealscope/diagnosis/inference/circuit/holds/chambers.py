@@ -139,7 +139,7 @@ class HeldChambers:
     def _is_closed(self, hold: LockedHold, p: Array) -> NDArray[np.bool_]:
         """Flag the samples (n,) of a hold in which no check valve refills a chamber.
 
-        Its absolute pressure `p` (n,) [Pa], averaged, then exceeds the charge pressure by a relative and an absolute
+        The averaged absolute pressure `p` (n,) [Pa] then exceeds the charge pressure by a relative and an absolute
         margin, `held_oil.charge` and `held_oil.resolved` (`priors.toml`).
         """
         prior = INFERENCE.held_oil
@@ -148,7 +148,7 @@ class HeldChambers:
 
     @cached_property
     def _above_charge(self) -> list[NDArray[np.bool_]]:
-        """Flags (2, n), for each hold of n samples, of the samples in which A and B are above the charge pressure."""
+        """Flags (2, n) for each hold of n samples, true where A (row 0) or B (row 1) is above the charge pressure."""
         return [np.array([self._is_closed(hold, p) for p in (hold.p_A, hold.p_B)]) for hold in self.holds]
 
     def _closed_flags(self, refilled: tuple[bool, bool]) -> list[NDArray[np.bool_]]:
@@ -160,7 +160,7 @@ class HeldChambers:
         return [flags | ~np.array(refilled)[:, None] for flags in self._above_charge]
 
     def _closed_share(self, refilled: tuple[bool, bool]) -> float:
-        """Compute the fraction of the samples of both sides in all holds in which no check valve refills the chamber.
+        """Compute the fraction of samples, over both sides and all holds, in which no check valve refills the chamber.
 
         `refilled`: as in `_closed_flags`. While a chamber is refilled, its readings (sample means) fit any leak, so
         that the variance of all readings is too small by this factor.
@@ -222,7 +222,7 @@ class HeldChambers:
 
     @cached_property
     def _fits_without_leak(self) -> dict[tuple[bool, bool], LeakRegression]:
-        """Fits of the oil's properties without any leak, by the sides that check valves refill."""
+        """Fits of the oil's properties without any leak; the keys are the sides that check valves refill."""
         n_rows = len(self._regressions[NEITHER].displaced)  # the same in all regressions
         no_columns = np.empty((n_rows, 0))
         return {
@@ -249,8 +249,7 @@ class HeldChambers:
 
             s sqrt(sum of u_0^2) / (sum of the integrals of u), summed over the holds.
 
-        Only the time after the onset (`conditions`) counts, so that a leak which begins within a hold has no such error
-        there.
+        Only the time after the onset (`conditions`) counts: a leak that begins within a hold has no such error there.
         """
         start_flows, integrals = [0.0], [0.0]
         for hold in self.holds:
@@ -291,7 +290,7 @@ class HeldChambers:
         return [fit for fit in fits if fit.deviation < UNKNOWN]
 
     def _fit_leak(self, leak: UnitLeak, onset: float) -> LeakFit:
-        """Fit the coefficient, at least 0, of a leak since `onset` [s] to all holds; 0 +- `UNKNOWN` if no oil flows."""
+        """Fit the coefficient (>= 0) of a leak since `onset` [s] to all holds; 0 +- `UNKNOWN` if it has no flow."""
         column = self._leak_columns(leak, np.array([onset]))
         fit_without_leak = self._fits_without_leak[leak.refilled]
         value, deviation, by_oil, variance = 0.0, UNKNOWN, 0.0, fit_without_leak.variance
@@ -325,9 +324,9 @@ class HeldChambers:
         return np.asarray(np.log(np.append(from_start, np.full(n_later, (1.0 - from_start) / max(n_later, 1)))))
 
     def _leak_columns(self, leak: UnitLeak, onsets: Array) -> Array:
-        """Compute the volume lost by each of r readings through a leak that begins at each of o `onsets`, (r, o).
+        """Compute the volume lost up to each of r readings through a leak that begins at each of o `onsets`, (r, o).
 
-        The volumes (sample means) are those that leave each side, relative to their mean over the hold.
+        The readings (sample means) of each hold, side A before side B, are relative to their mean over the hold.
         """
         columns = []
         for hold, sides in zip(self.holds, leak.flows, strict=True):
@@ -361,7 +360,7 @@ class HeldChambers:
 
     @cached_property
     def _offset_grid(self) -> Array:
-        """Candidates of the sensor offset of p_A - p_B [Pa] in ascending order: a fixed grid, and the ends of holds.
+        """Candidates for the sensor offset of p_A - p_B [Pa], sorted: a fixed grid and the last reading of each hold.
 
         If a leak has equalised the pressures by the end of a hold, the offset is the recorded p_A - p_B.
         """
@@ -408,8 +407,8 @@ class HeldChambers:
     def _fit_growing_leak(self, leak: UnitLeak, onset: float) -> LeakFit:
         """Fit a leak that may grow from its `onset` [s] on; its coefficient is the mean from the onset to the end.
 
-        The result has the coefficient of the most probable growth of `growth_priors`, and the log of the likelihood
-        that is averaged over the growths by their prior probabilities.
+        Returns the fit with the most probable growth of `growth_priors`. Its likelihood is replaced by the mean over
+        all growths, weighted by their prior probabilities.
         """
         fits, log_weights = list[LeakFit](), list[float]()
         for growth, probability in growth_priors():
@@ -448,7 +447,7 @@ class HeldChambers:
 
     @cached_property
     def _leak_hypotheses(self) -> list[LeakHypothesis]:
-        """Three possible leaks with their probabilities, past the piston, to the outside from A, and from B."""
+        """Hypotheses of a leak past the piston, from A to the outside, and from B to the outside, in this order."""
         return self._weigh_hypotheses([self._unit_outside_leak(is_A) for is_A in (True, False)])
 
     def _weigh_hypotheses(self, leaks: Sequence[UnitLeak]) -> list[LeakHypothesis]:
@@ -479,8 +478,8 @@ class HeldChambers:
     def total_leak(self) -> Flow:
         """Estimate the mean conductance [m^3/(s Pa)] of all leaks in the holds, even if the valves are open.
 
-        The leak is past the piston, to the outside, or through open valves and the pump, each weighted by its
-        probability. A check valve would hide the oil that leaves a chamber, so no refilling is assumed.
+        A leak may be past the piston, to the outside, or through open valves and the pump; each of these is weighted by
+        its probability. A check valve would hide the oil that leaves a chamber, so no refilling is assumed.
         """
         # without a charge pressure check valves stay closed
         chambers = self if self._closed_share(BOTH) == 1.0 else replace(self, charge=0.0)
@@ -520,7 +519,7 @@ class HeldChambers:
     def probability_after_holds(self) -> float:
         """Prior probability that a leak begins after the last hold, so that no hold shows it.
 
-        It is that of a leak that begins within the recording, times the fraction of the time after the last hold.
+        It is the probability of a beginning within the recording, times the fraction of the time after the last hold.
         """
         time_after, begins_within = self.end - float(self.holds[-1].t[-1]), 1.0 - INFERENCE.held_oil.from_start
         return begins_within * time_after / max(self.end - self.begin, np.finfo(float).tiny)

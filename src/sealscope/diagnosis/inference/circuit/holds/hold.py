@@ -64,7 +64,7 @@ class LockedHold:
     def centre(self, readings: Array, is_A: bool) -> Array:
         """Subtract the mean over the hold from `readings` (k, ...) of side A, or of side B if `is_A` is False.
 
-        The first reading of the side with the higher pressure becomes 0: the valves may still be shutting.
+        The first reading of the side with the higher pressure becomes 0, since the valves may still be shutting.
         """
         first = int(self.carries(is_A))  # first reading that counts: 1 on the side with the higher pressure, else 0
         centred = np.asarray(readings - readings[first:].mean(axis=0))
@@ -106,9 +106,9 @@ class LockedHold:
         return difference
 
     def steepest_time(self) -> float:
-        """Find the time [s] after which p_A - p_B changes most within the time `held_oil.equalises` (`priors.toml`).
+        """Find the start [s] of the time window of the length `held_oil.equalises` in which p_A - p_B changes most.
 
-        Within such a time a large leak equalises the pressures.
+        Within such a time (`priors.toml`) a large leak equalises the pressures.
         """
         n_equalising = int(np.searchsorted(self.t, self.t[0] + INFERENCE.held_oil.equalises))  # [samples]
         difference = self.difference
@@ -120,9 +120,8 @@ def find_charge_pressure(lower_pressure: Array, rests: NDArray[np.bool_], rate: 
 
     It is the lowest pressure while the pump rests, but at most the median while the pump turns, since a leak may
     equalise the pressures in every rest. If the pump never rests, it is the lowest pressure of the recording, which may
-    be too low by the drop of check valves through which a moving piston draws oil. `lower_pressure` (n,): the lower of
-    both chamber pressures [Pa]; `rests` (n - 1,): flags of the intervals in which the pump rests; `rate`: sampling rate
-    [Hz].
+    be too low by the drop of check valves through which a moving piston draws oil. `lower_pressure` (n,): lower chamber
+    pressure [Pa]; `rests` (n - 1,): flags of the intervals in which the pump rests; `rate`: sampling rate [Hz].
     """
     steady_pressure = average_over(INFERENCE.held_oil.steady, lower_pressure, rate)
     if not rests.any():
@@ -134,7 +133,7 @@ def find_charge_pressure(lower_pressure: Array, rests: NDArray[np.bool_], rate: 
 
 
 def extend_rests(rests: NDArray[np.bool_], flow: Array, rate: float) -> NDArray[np.bool_]:
-    """Extend each rest of the pump back to the time at which its flow has fallen to half of the level before.
+    """Extend each rest of the pump back to the time at which its flow has fallen to half of its earlier level.
 
     Rests are found by the mean flow over the time `rest.averaged` (`priors.toml`), and therefore begin too late, by at
     most this time. A large leak may equalise the pressures earlier, as soon as the valves shut. `rests` (n,): flags of
@@ -158,7 +157,7 @@ def find_locked_holds(channels: Sequence[Array], rests: NDArray[np.bool_], rate:
     The time in which the valves shut is the first interval of a hold; the time in which they open is left out. Holds
     that are too short, or have missing samples, are omitted. `channels`: time [s], absolute pressures of A and B [Pa],
     and position [m], (n,) each; `rests` (n - 1,): flags of the sampling intervals in which the pump rests; `rate`:
-    sampling rate [Hz]. The samples of a hold are averages at less than twice `MAX_RATE`.
+    sampling rate [Hz]. Neighbouring samples are averaged to a rate below 2 `MAX_RATE`.
     """
     prior, holds = INFERENCE.held_oil, list[LockedHold]()
     decimation = max(1, int(rate / MAX_RATE))  # number of samples that are averaged to one

@@ -65,12 +65,12 @@ class OilRegression(NamedTuple):
     misfit_variance: float
 
     def leaked(self, changes: Array) -> Array:
-        """Compute the volume that left a chamber by each reading (r,) [m^3], for `changes` (4,) of the oil."""
+        """Compute the volume that left a chamber up to each reading (r,) [m^3]; `changes` (4,): as in the class."""
         oil, air, volumes = _oil_factors(changes)
         return self.displaced - (oil * self.strained + air * self.aired) @ volumes
 
     def slopes(self, changes: Array) -> Array:
-        """Compute the derivatives (r, 4) of the compressed volumes [m^3] by the `changes` (4,) of the oil."""
+        """Compute the derivatives (r, 4) of the compressed volumes [m^3] by `changes` (4,), as in the class."""
         oil, air, volumes = _oil_factors(changes)
         strained, aired = oil * self.strained, air * self.aired
         dead = strained[:, 1:] + aired[:, 1:]  # derivatives by the relative changes of the dead volumes of A and B
@@ -80,8 +80,8 @@ class OilRegression(NamedTuple):
 def _oil_factors(changes: Array) -> tuple[float, float, Array]:
     """Convert `changes` (4,) of the oil's properties (`OilRegression`) to factors on compressed volumes.
 
-    Returns the factor on the compressibility, that on the free air, and those (3,) on the volume of the stroke (always
-    1, as it is not estimated) and on the dead volumes of A and B.
+    Returns a factor on the compressibility, a factor on the free air, and factors (3,) on the volume of the stroke
+    (always 1, since it is not estimated) and on the dead volumes of A and B.
     """
     compressibility, dead_A, dead_B, air = changes
     return float(np.exp(compressibility)), float(np.exp(air)), np.array([1.0, 1.0 + dead_A, 1.0 + dead_B])
@@ -153,7 +153,7 @@ def build_regression(
 def fit_leaks(regression: OilRegression, columns: Array, n_readings: float) -> LeakRegression:
     """Fit the coefficients of c leaks together with the properties of the oil.
 
-    `columns` (r, c): volume [m^3] that has left the chamber by each of r readings (means of samples), for each leak
+    `columns` (r, c): volume [m^3] that has left a chamber up to each of r readings (means of samples), for each leak
     with a coefficient of 1; `n_readings`: effective number of independent readings. The properties are found by
     iteration, and so is the variance of a reading, which weights their priors against the readings. A dead volume that
     reaches its lower limit stays there. The covariance is split into two parts (`LeakRegression`).
@@ -163,8 +163,8 @@ def fit_leaks(regression: OilRegression, columns: Array, n_readings: float) -> L
     leaked, misfit_variance = regression.leaked(changes), regression.misfit_variance
     degrees_of_freedom = max(n_readings - n_leaks, 1.0)
     variance = max(float(leaked @ leaked) / len(leaked), misfit_variance)
-    # precisions of the priors (0 for leaks, which have none). The fit counts all r readings as independent, so that the
-    # covariance is multiplied by `inflation` below; the precisions are too, lest the priors become weaker
+    # precisions of the priors (0 for leaks, which have none). The fit counts all r readings as independent; to correct
+    # this, the covariance is multiplied by `inflation` below. Hence the precisions are multiplied by it, too.
     precisions = np.append(np.zeros(n_leaks), regression.inflation / _oil_deviations() ** 2)
     lowest = _lowest_changes()
     is_lowest = np.zeros(4, dtype=bool)  # properties that stay at their lower limit
@@ -205,9 +205,9 @@ def fit_leaks(regression: OilRegression, columns: Array, n_readings: float) -> L
 def residual_squares(regression: OilRegression, columns: Array, variance: float) -> Array:
     """Compute the residual sum of squares of the fit of a leak with a coefficient >= 0, for each of o onsets, (o,).
 
-    The `regression` is linearised at the usual properties of the oil. `columns` (r, o): volume leaked with a
-    coefficient of 1 since each onset, at each reading; `variance`: variance of a reading, which weights the priors on
-    the properties against the readings. The properties are changes relative to their usual values, each with a lower
+    The `regression` is linearised at the usual properties of the oil. `columns` (r, o): volume lost up to each reading
+    through a leak with a coefficient of 1 since each onset; `variance`: variance of a reading, which weights the priors
+    on the properties against the readings. The properties are changes relative to their usual values, each with a lower
     limit, which is -1 (nothing left) for compressibility and free air.
     """
     usual = np.zeros(4)
