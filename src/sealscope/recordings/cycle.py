@@ -22,7 +22,7 @@ _EQUAL_PEAKS = 0.05
 def find_cycle(recording: Recording) -> float | None:
     """Find the period of the duty cycle [s], with which the machine's motion repeats; None if nothing repeats.
 
-    It is that of the command if this moves, else of p_A - p_B or the only chamber pressure, and is cached.
+    The period is estimated from the command if it moves, else from p_A - p_B or the only chamber pressure, and cached.
     """
     names = ("u",) if "u" in recording and is_moving(recording["u"]) else chambers_of(recording)
     if not names:

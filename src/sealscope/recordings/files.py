@@ -76,7 +76,7 @@ def _detect_format(path: Path) -> str:
 
 
 def _find_format(head: bytes, *, is_text: bool) -> str | None:
-    """Find the format, text or not, whose function `recognise` (`formats.toml`) accepts a file's first bytes `head`."""
+    """Find the text or binary format whose `recognise` function accepts a file's first bytes; None if none does."""
     candidates = {
         kind: entry["recognise"]
         for kind, entry in _FORMATS.items()

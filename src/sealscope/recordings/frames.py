@@ -42,8 +42,8 @@ def to_pandas(
 def read_pandas(frame: pandas.DataFrame, request: Request) -> RecordingFields:
     """Read the requested columns of a data frame to the fields of a recording.
 
-    The frame's index is also read as a column if it has a name or contains dates, time differences or floating-point
-    numbers; without a name it is called `t`.
+    An index with a name is also read as a column. An index of dates, time differences or floating-point numbers may
+    lack a name, and is then called `t`.
     """
     pandas = import_library("pandas", "a data frame", "pandas")
     if not isinstance(frame, pandas.DataFrame):

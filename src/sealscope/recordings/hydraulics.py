@@ -20,8 +20,7 @@ def find_implausibility(recording: Recording) -> str | None:
 
     They cannot if p_B is a copy of p_A, if the motor speed differs from the rate of the motor angle by a constant
     factor, or if p_A - p_B (or the only chamber pressure that varies) is nothing but noise. Unit, offset and range of
-    the pressures do not matter. Constant and absent channels are ignored, as one chamber may rest at the charge
-    pressure.
+    the pressures do not matter. Constant and absent channels are ignored, as a chamber may rest at charge pressure.
     """
     # the third difference of `_is_noise` needs four samples
     names = [name for name in chambers_of(recording) if len(recording) > 3 and not is_constant(recording[name])]
@@ -39,10 +38,10 @@ def find_implausibility(recording: Recording) -> str | None:
 
 
 def _describe_speed_mismatch(recording: Recording) -> str | None:
-    """Describe a motor speed that differs from the rate of the motor angle by a constant factor, as by a wrong unit.
+    """Describe a motor speed that is a constant factor off the rate of the motor angle, as a wrong unit would cause.
 
-    None if the least-squares factor is between 1 / m and m, with m = `readings.misfit` of `priors.toml`, if the two do
-    not correlate or are in raw counts, or if samples are missing.
+    Returns None if the least-squares factor is between 1 / m and m, with m = `readings.misfit` of `priors.toml`, if the
+    two do not correlate or are in raw counts, or if samples are missing.
     """
     if not {"theta", "omega"} <= {name for name, unit in recording.units.items() if unit != "count"}:
         return None
@@ -63,15 +62,15 @@ def _describe_speed_mismatch(recording: Recording) -> str | None:
 def _is_noise(values: Array) -> bool:
     """Test whether a signal (n,) is mostly white noise, or has missing samples.
 
-    White noise must have over the fraction `readings.noise` (`priors.toml`) of the signal's variance. The mean square
-    of the third difference of white noise is 20 times its variance.
+    White noise must have more than the fraction `readings.noise` (`priors.toml`) of the signal's variance. The mean
+    square of the third difference of white noise is 20 times its variance.
     """
     # `not <=`, so that missing samples count as noise
     return not np.mean(np.diff(values, 3) ** 2) <= 20.0 * _PRIORS.noise * np.var(values)
 
 
 def describe_missing_chambers(recording: Recording) -> str | None:
-    """Describe in words, with the unused columns, that a recording has no chamber pressure; None if one is present."""
+    """Report that a recording has no chamber pressure, and name its file's unused columns; None if it has one."""
     if chambers_of(recording):
         return None
     unused = [line for line in recording.history if line.startswith(UNUSED)]

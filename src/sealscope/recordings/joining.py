@@ -32,8 +32,8 @@ _TWELVE_HOURS = re.compile(
 def start_seconds(recording: Recording, file: str = "") -> float | None:
     """Find the time of a recording's first sample [s since 1970]; None if it is not known.
 
-    The time of t = 0 is the entry `start` of the provenance, else the date in the file's name. This name is that in the
-    provenance, else `file`. Dates and times are taken as UTC; a date without a time of day means midnight.
+    The time of t = 0 is the entry `start` of the provenance, else the date in the file's name, which the provenance or
+    else `file` states. Dates and times are taken as UTC; a date without a time of day means midnight.
     """
     start = parse_epoch(str(recording.provenance.get("start", "")))
     if start is None:
@@ -42,7 +42,10 @@ def start_seconds(recording: Recording, file: str = "") -> float | None:
 
 
 def file_seconds(recording: Recording, path: Path) -> float:
-    """Find the time of a file's first sample [s since 1970]: as stated, else last modification less duration."""
+    """Find the time of a file's first sample [s since 1970].
+
+    If it is not stated, it is estimated as the time of the file's last change minus the duration of the recording.
+    """
     start = start_seconds(recording, path.name)
     if start is not None:
         return start
@@ -89,9 +92,8 @@ def _check_compatible(recordings: Sequence[Recording], names: Sequence[str]) -> 
 def join(recordings: Sequence[Recording], *, names: Sequence[str] | None = None) -> Recording:
     """Join the recordings of one run to a single recording.
 
-    Each recording must begin after the previous one has ended. Their order follows from the start times in their
-    files. If these are not all known, or are all equal, it follows from the times `t`. Time between recordings stays
-    a gap, which `inspect` reports.
+    Each recording must begin after the previous one has ended. Their order follows from the start times in their files
+    or, if these are not all known or are all equal, from the times `t`. Time between recordings stays a gap.
 
     Parameters
     ----------

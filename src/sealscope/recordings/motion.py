@@ -1,7 +1,6 @@
 """Tests whether a reading moves: constant channels, held values, and changes that are only rounding.
 
-The noise of a transducer never stops. A value that stays identical for longer than the noise allows is an end of its
-range, a value that the logger repeats, or a dead channel.
+A transducer's noise never stops: a value that stays longer than it allows is clipped, repeated or from a dead channel.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ def is_constant(values: Array) -> bool:
 
 
 def is_moving(values: Array) -> bool:
-    """Test whether a reading (n,) has no missing sample and at least two different values."""
+    """Test whether a channel (n,) has no missing sample and at least two different values."""
     return values.size > 1 and bool(np.isfinite(values).all()) and not is_constant(values)
 
 
@@ -96,7 +95,7 @@ def find_runs(flags: NDArray[np.bool_]) -> NDArray[np.intp]:
 
 
 def smallest_step(values: Array) -> float:
-    """Find the smallest step between sorted `values` (n,) above rounding, `ROUNDING` of their range; 0 if none."""
+    """Find the smallest step between sorted `values` (n,) that exceeds `ROUNDING` times their range; 0 if none does."""
     steps = np.diff(values)
     steps = steps[steps > ROUNDING * (values[-1] - values[0])]
     return float(steps.min()) if steps.size else 0.0

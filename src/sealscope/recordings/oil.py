@@ -8,7 +8,7 @@ from sealscope.recordings.recording import Recording
 
 
 def oil_temperature(recording: Recording) -> float | None:
-    """Compute the mean oil temperature [deg C] of a recording, else read it in the file's header; None if unknown."""
+    """Find the oil temperature [deg C]: the mean of a measured one, else that in the file's header; None if unknown."""
     measured = measured_oil_temperature(recording)
     return stated_oil_temperature(recording.provenance) if measured is None else measured
 

@@ -95,8 +95,7 @@ class HumPriors(PriorTable):
     - `loud`: fraction of this power from which hum is a warning.
     - `alone`: fraction of this power from which the sensor may be disconnected.
     - `around` [Hz]: the spectrum up to this distance from a line of hum is its background.
-    - `over_rest`, `over_median`: smallest ratios of the line to the largest and to the median amplitude of the
-      background.
+    - `over_rest`, `over_median`: smallest ratios of the line to the largest and to the median background amplitude.
     - `shortest` [s]: shortest channel that is searched for hum.
     """
 
@@ -209,8 +208,7 @@ class GapPriors(PriorTable):
 class RecordingPriors(PriorTable):
     """All tables of `recordings/priors.toml`, the assumptions on loggers, sensors and machines.
 
-    The table `possible` is a mapping from SI unit to the largest magnitude that any sensor reads in it; "any" stands
-    for all other units.
+    The table `possible` maps an SI unit, "any" for all others, to the largest magnitude that any sensor reads in it.
     """
 
     clock: ClockPriors

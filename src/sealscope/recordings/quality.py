@@ -36,10 +36,9 @@ _MIN_STEP, _MAX_STEP = _CLOCK.regular
 class Finding:
     """One defect of a recording.
 
-    `code`: name of the kind of defect; `severity`: ``fatal`` (the recording cannot be analysed as it is), ``warning``
-    (check the time or the channel before relying on a verdict) or ``note``; `channel`: the channel, None for the time;
-    `count`: number of samples or intervals concerned; `first_t`: time of the first of them [s], None if it has none;
-    `text`: description in words.
+    `code`: kind of defect; `severity`: ``fatal`` (the recording cannot be analysed as it is), ``warning`` (check the
+    time or the channel before relying on a verdict) or ``note``; `channel`: None for the time; `count`: number of
+    samples or intervals; `first_t`: time of the first [s], None if it has none; `text`: description in words.
     """
 
     code: str
@@ -244,7 +243,7 @@ def _describe_missing(values: Array, rate: float) -> tuple[str, int, int, str] |
 
 
 def flag_impossible(values: Array, unit: str) -> NDArray[np.bool_]:
-    """Flag the finite samples (n,) over the magnitude that any sensor reads in `unit` (`possible` of `priors.toml`)."""
+    """Flag the finite samples (n,) in `unit` whose magnitude no sensor can read (`possible` of `priors.toml`)."""
     limit: float = _SENSOR_LIMITS.get(unit, _SENSOR_LIMITS["any"])
     return np.asarray(np.isfinite(values) & (np.abs(values) > limit))
 
@@ -276,7 +275,7 @@ def uniform_segments(recording: Recording, channels: Sequence[str] | None = None
         steps = np.diff(recording.t) * recording.rate
         is_even = (steps > _MIN_STEP) & (steps < _MAX_STEP)
     continues = is_complete[1:] & is_complete[:-1] & is_even
-    # [:n] and [-n:] make the flags of no samples empty
+    # the slices [:n] and [-n:] drop the added True if there are no samples
     starts = np.flatnonzero(is_complete & np.r_[True, ~continues][:n])
     stops = np.flatnonzero(is_complete & np.r_[~continues, True][-n:]) + 1 if n else starts
     return [slice(int(a), int(b)) for a, b in zip(starts, stops, strict=True)]
@@ -376,8 +375,7 @@ def find_hum(values: Array, rate: float) -> list[HumLine]:
     spectrum = np.fft.rfft(detrended, n_fft)
     squared_amplitudes = (spectrum.real**2 + spectrum.imag**2) * (2.0 / window.sum()) ** 2
     bin_width = rate / n_fft
-    # power from `hum.lowest` on (1e-9: rounding). A Hann window spreads a line over bins: the sum of amplitude^2 / 2
-    # over these is 1.5 n_fft / n times its power
+    # power from `hum.lowest` on (1e-9: rounding); a Hann window makes the sum over the bins 1.5 n_fft / n times larger
     power = float(squared_amplitudes[math.ceil(_HUM.lowest / bin_width - 1e-9) :].sum()) / 2 / (1.5 * n_fft / n)
     lines = []
     for mains in (50.0, 60.0):

@@ -194,7 +194,7 @@ class Recording:
 
     @property
     def unused_temperatures(self) -> tuple[str, ...]:
-        """Names of the columns of the file with temperatures, if the oil's temperature is not read."""
+        """Names of the file's columns of temperatures, if none of them is read as the oil temperature."""
         return self._names_in_provenance("unused_temperatures")
 
     def _names_in_provenance(self, key: str) -> tuple[str, ...]:
@@ -253,7 +253,7 @@ class Recording:
     def series(self) -> tuple[dict[str, Array], dict[str, str], dict[str, Any]]:
         """Return the content for writers of files: (name -> samples, name -> unit, description).
 
-        The time is `t`; the description has rate, provenance and history as JSON values, or raises InputError.
+        The time is `t`; the description has rate, provenance and history. Raises InputError if JSON lacks their types.
         """
         from sealscope.recordings.formats.table import make_description
 

@@ -146,7 +146,7 @@ def run_in_subprocess(
 
 
 def run_on_file(work: Callable[..., T], file: Path, *arguments: Any, **limits: Any) -> T:
-    """Run ``work(file, *arguments)`` by `run_in_subprocess`; errors name the file as the caller did."""
+    """Run ``work(file, *arguments)`` by `run_in_subprocess`, with the path of the file as given in error messages."""
     place = file.absolute()  # the process may work in another folder
     try:
         return run_in_subprocess(work, place, *arguments, **limits)
@@ -173,7 +173,7 @@ def _set_limits(seconds: float, memory: int, disk: int) -> None:
 
 
 def _is_spent() -> bool:
-    """Test whether this process occupies over `_MAX_IDLE_MEMORY`; False on a system that does not say."""
+    """Test whether this process occupies more memory than `_MAX_IDLE_MEMORY`; False if the system does not say."""
     try:
         pages = int(Path("/proc/self/statm").read_text().split()[5])  # data pages, which RLIMIT_DATA limits
     except OSError:

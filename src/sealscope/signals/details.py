@@ -61,7 +61,7 @@ class Details:
         return np.asarray(self.values[level - 1])
 
     def product(self) -> Array:
-        """Compute the product d_3 d_4 sample by sample, (n,) [unit^2], the thesis's d3d4."""
+        """Compute the product (n,) of the details d_3 and d_4 of each sample [unit^2], called d3d4 in the thesis."""
         return self[3] * self[4]
 
     def quantities(self) -> Array:
@@ -69,7 +69,7 @@ class Details:
         return np.vstack([self.values, self.product()])
 
     def inside(self, level: int | None = None) -> slice:
-        """Return the slice of the samples that do not depend on padding in a level, by default in any level."""
+        """Return the slice of the samples whose details of a `level` (default: all levels) do not depend on padding."""
         before, after = self.edges[(level or self.levels) - 1]  # the deepest level has the longest edges
         return slice(int(before), self.values.shape[1] - int(after))
 
@@ -123,7 +123,7 @@ def details(
 
     The signal is padded by `edge` beyond its ends; `Details.inside` excludes the samples that depend on it.
 
-    The alignment is that of PyWavelets: the energy of an event appears 5, 7, 9 and 13 samples early in db8's d_1 .. d_4
+    The alignment is that of PyWavelets: the energy of a pulse appears 5, 7, 9 and 13 samples early in db8's d_1 .. d_4
     (5 in every decimated level, 0 in every reconstructed one). A causal system knows d_j of sample n only at sample ``n
     + (L/2)(2^j - 1)``, for db8 8, 24, 56 and 120 samples later.
 
@@ -146,7 +146,7 @@ def details(
 
 
 def mean_squares(transformed: Details, bounds: ArrayLike) -> Array:
-    """Compute the mean squares (k, 5) of d1, d2, d3, d4 and d3 d4 in k segments; `bounds`: see `segment_means`."""
+    """Compute the mean squares (k, 5) of d1, d2, d3, d4 and d3d4 in k segments with the limits `bounds` (k + 1,)."""
     return segment_means(np.square(transformed.quantities()), bounds).T
 
 
@@ -206,10 +206,10 @@ def _mallat_details(x: Array, wavelet: Any, levels: int, edge: Edge) -> tuple[Ar
 
 
 def _inverse_details(x: Array, wavelet: Any, levels: int, edge: Edge) -> tuple[Array, Array]:
-    """Compute reconstructed details (levels, n), d_1 first, and approximation (n,) of a signal x (n,), their sum.
+    """Compute the reconstructed details (levels, n), d_1 first, and the approximation (n,) of a signal x (n,).
 
-    Mallat's transform is inverted with the coefficients of one level at a time. `wavelet`: a `pywt.Wavelet`; `edge`:
-    mode of `pywt.wavedec` and `pywt.waverec` at the signal's ends.
+    Their sum is the signal. Mallat's transform is inverted with the coefficients of one level at a time. `wavelet`: a
+    `pywt.Wavelet`; `edge`: mode of `pywt.wavedec` and `pywt.waverec` at the signal's ends.
     """
     import pywt
 

@@ -1,8 +1,7 @@
 """Compiled wavelet filters for many live signals, of which eight share a vector register.
 
 Each output sums its taps in the same order, whether it is computed together with seven neighbours or alone. Blocks of
-any size therefore give identical results. Products and sums may be contracted (see `physics.lanes`): the values agree
-with `details.details`, by PyWavelets, to rounding.
+any size give identical results. Contracted products (`physics.lanes`) agree with `details.details` up to rounding.
 """
 
 from __future__ import annotations

@@ -13,8 +13,7 @@ TINY = 1e-300
 def average_over(seconds: float, values: Array, rate: float) -> Array:
     """Average the known values (..., n) over a window of `seconds` [s] around each sample, to remove noise and ripple.
 
-    `rate`: sampling rate [Hz]. Unknown values are NaN, as is the result (..., n) in a window without known values. The
-    signal is mirrored at its ends.
+    `rate`: sampling rate [Hz]. The result (..., n) is NaN in a window without known values. The ends are mirrored.
     """
     from scipy.ndimage import uniform_filter1d
 

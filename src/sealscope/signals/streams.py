@@ -28,8 +28,7 @@ class DetailStream:
     The results equal those of ``details(..., transform="stationary")`` to rounding. A causal filter knows level j of
     a sample only ``(L/2)(2^j - 1)`` samples later (db8: 8, 24, 56, 120). All levels are returned with the delay of
     the deepest one, so that a column has all levels of one sample: column i, counted from the beginning of the
-    stream, is the detail of sample ``i - delay``. The first `settling` columns depend on the zeros before the
-    beginning. The next column belongs to sample `first`.
+    stream, is the detail of sample ``i - delay``. The first `settling` columns depend on zeros before the beginning.
 
     Parameters
     ----------
@@ -167,10 +166,10 @@ class DetailStream:
     def state_dict(self) -> dict[str, Any]:
         """Return the state of the stream as plain values and arrays, from which `from_state` continues.
 
-        `history` has the last inputs of each level's filters, of the shape (rows, levels, samples, columns), where the
-        signals form a table of these rows and columns.
+        `history` (rows, levels, samples, columns) has the last inputs of each level's filters, for signals in a table
+        of rows and columns (`channels`); a plain number of signals is one row.
         """
-        # the columns of the table are in groups (first axis) of WIDTH (last axis): bring both axes together
+        # the buffers hold the columns in groups (first axis) of WIDTH columns (last axis): bring both axes together
         history = np.moveaxis(self.buffers[:, :, :, self._fill - self._history : self._fill], 0, -2)
         return {
             "channels": self.channels,
@@ -184,13 +183,13 @@ class DetailStream:
     def from_state(cls, state: dict[str, Any], *, threads: int = 1) -> DetailStream:
         """Continue a saved `state_dict` as if it had not been interrupted; raise InputError if it is not valid."""
         channels, levels, wavelet = (require_part(state, name, object) for name in ("channels", "levels", "wavelet"))
-        table = tuple(channels) if isinstance(channels, list) else channels
-        stream = cls(table, levels, wavelet=wavelet, threads=threads)
+        channels = tuple(channels) if isinstance(channels, list) else channels  # JSON has no tuples
+        stream = cls(channels, levels, wavelet=wavelet, threads=threads)
         shape = (stream._shape_2d[0], stream.levels, stream._history, stream._shape_2d[1])
         history = require_numbers(state, "history", shape)
         stream.samples = require_count(state, "samples")
         groups, width = stream.buffers.shape[0], stream.buffers.shape[-1]
-        # the columns of the table (last axis), filled up with zeros to whole groups and divided into groups
+        # divide the signals of a row (last axis) into groups of `width`, after filling up the last group with zeros
         lanes = np.pad(history, [(0, 0)] * 3 + [(0, groups * width - shape[-1])]).reshape(*shape[:3], groups, width)
         stream.buffers[:, :, :, : stream._history] = np.moveaxis(lanes, -2, 0)
         return stream

@@ -2,8 +2,7 @@
 
 The windows lie over the coefficients of the transformed signal (by default 1000 samples, 500 apart: "Understanding
 Effect and Diagnosis of Internal Leakage in Hydrostatic Actuation Systems", section 5.2). Squares are summed over pieces
-of gcd(size, step) samples, and each window adds its pieces in order. Unlike a running sum, this subtracts nothing, so
-that long or drifting series lose no precision.
+of gcd(size, step) samples, and each window adds its pieces in order. Unlike a running sum, this loses no precision.
 """
 
 from __future__ import annotations

@@ -28,9 +28,9 @@ MAX_LATE_FRACTION: float = _PRIORS.late
 def resample_evenly(recording: Recording) -> Recording:
     """Resample a recording to evenly spaced times, with NaN in rows that the logger has lost.
 
-    Evenly spaced samples stay. If the intervals are whole numbers of sampling steps, to within `clock.scatter` of
-    `priors.toml`, rows of NaN are inserted for lost samples; else the samples are interpolated linearly. Rows without a
-    time, or not later than all rows before, are dropped. Of several recordings in one file only the longest is used.
+    If the intervals are whole numbers of sampling steps, to within `clock.scatter` of `priors.toml`, rows of NaN are
+    inserted for lost samples; else the samples are interpolated linearly. Rows without a time, or not later than all
+    rows before, are dropped. If long breaks divide the recording, only its longest stretch is used.
     """
     rows = _ordered_rows(recording.t)
     rows = rows[_longest_dense_stretch(recording.t[rows], recording.rate)]
@@ -47,10 +47,10 @@ def resample_evenly(recording: Recording) -> Recording:
 
 
 def _ordered_rows(t: Array) -> NDArray[np.intp]:
-    """Find the indices of the rows that are later than all rows before; `t` (n,): times [s], NaN if missing.
+    """Find the indices of the rows that are later than all earlier rows of a log; `t` (n,): times [s], NaN if missing.
 
-    If over the fraction `MAX_LATE_FRACTION` of the rows are not later, the longest run of rows without a step back is
-    used, without repeated times.
+    If more than the fraction `MAX_LATE_FRACTION` of the rows are not, the result is the longest run of rows whose times
+    do not step back, without repeated times.
     """
     timed = np.flatnonzero(np.isfinite(t))
     if timed.size < 2:
@@ -69,13 +69,12 @@ def _longest_dense_stretch(t: Array, rate: float) -> slice:
 
     `t` (n,): increasing times [s]; `rate` [Hz]: number of samples that a complete recording has per second.
     """
-    # surplus of a row: number of rows before it, less the smallest number for a dense stretch up to its time. A stretch
-    # is dense enough if the surplus of its last row is not below that of its first row
+    # surplus of a row: number of rows before it, less the number that a dense stretch must have up to its time. A
+    # stretch is dense enough if the surplus of its last row is not below that of its first row
     first_time = t[:1].sum()  # 0 if there are no rows
     surplus = np.arange(t.size) - (1.0 - MAX_GAP_FRACTION) * rate * (t - first_time)
     max_later_surplus = np.maximum.accumulate(surplus[::-1])[::-1]
-    # for each first row, the last row whose surplus is not below its own; with minus signs, as `searchsorted` needs
-    # increasing values
+    # for each first row, the last row whose surplus is not below its own (minus: `searchsorted` needs rising values)
     last = np.searchsorted(-max_later_surplus, -surplus, side="right") - 1
     first = int(np.argmax(last - np.arange(t.size))) if t.size else 0
     return slice(first, int(last[first]) + 1 if t.size else 0)
@@ -109,7 +108,7 @@ def _interpolate_rows(recording: Recording, rows: NDArray[np.intp]) -> Recording
 def _interpolate(even_times: Array, t: Array, values: Array, *, is_slow: bool) -> Array:
     """Interpolate samples (n,) at times `t` (n,) linearly to the times `even_times` (m,), with NaN beyond the ends.
 
-    Unless the channel `is_slow`, intervals over `MAX_INTERVAL` times the median interval are NaN, too.
+    Unless the channel `is_slow`, times within intervals over `MAX_INTERVAL` times the median interval get NaN, too.
     """
     if t.size < 2:
         return np.full(even_times.size, np.nan)

@@ -76,8 +76,8 @@ def remove_impossible(recording: Recording) -> Recording:
 def bridge(recording: Recording, needed: Sequence[str]) -> Recording:
     """Fill the gaps of the `needed` channels, except at the ends, and mark them in `Recording.bridged`.
 
-    A short gap is filled by a spline, others from another cycle of the motion or by a straight line; so are missing
-    values of other channels in the same rows. The times must be evenly spaced.
+    A short gap is filled by a spline, others from another cycle of the motion or by a straight line. Values that other
+    channels miss in the same rows are filled in the same way. The times must be evenly spaced.
     """
     is_complete = np.all([np.isfinite(recording[name]) for name in needed], axis=0)
     if not len(recording) or is_complete.all() or not is_complete.any():
@@ -130,7 +130,7 @@ def interpolate_short_gaps(recording: Recording, needed: Sequence[str]) -> Recor
 
 
 def flag_bridged(recording: Recording, bounds: Array | NDArray[np.integer]) -> Flags:
-    """Flag the blocks (n,) of samples of which over the fraction `MAX_BRIDGED_FRACTION` was filled.
+    """Flag the blocks (n,) of samples in which filled samples are more than the fraction `MAX_BRIDGED_FRACTION`.
 
     `bounds` (n + 1,): index of the first sample of each block, and the end of the last block.
     """
@@ -165,7 +165,7 @@ def _copy_other_cycle(channels: dict[str, Array], needed: Sequence[str], first: 
     `stop` - 1; `needed`: channels that must be complete in the copied cycle; `period`: length of a cycle [samples].
     """
     half_cycle = round(0.5 * period)
-    # the gap, and half a cycle beside it, must not overlap the copied samples
+    # the copied samples must not overlap the gap, nor the half cycle next to it
     min_cycles = math.ceil((stop - first + half_cycle) / period)
     for shift in (sign * round(n_cycles * period) for n_cycles in (min_cycles, min_cycles + 1) for sign in (-1, 1)):
         shifts = range(shift - _SLACK, shift + _SLACK + 1)
@@ -184,9 +184,10 @@ def _cycle_mismatch(
     """Compute how much the machine's motion around a gap differs from its motion `shift` samples later.
 
     The motion is seen in the command, else in p_A - p_B or the only chamber pressure (`duty_signal`). The gap, i.e. the
-    samples `first` to `stop` - 1, and up to `half_cycle` on either side are compared with the stretch `shift` samples
-    later: their rms difference, without means, over the standard deviation of the latter. It is infinite if too few
-    samples are known, or if one of the `needed` channels (name -> values (n,)) lacks samples to copy into the gap.
+    samples `first` to `stop` - 1, and up to `half_cycle` samples on either side are compared with the stretch `shift`
+    samples later. The result is the rms difference of both, after their means are subtracted, over the standard
+    deviation of the latter. It is infinite if too few samples are known, or if one of the `needed` channels lacks
+    samples to copy into the gap. `channels`: name -> values (n,).
     """
     n = next(iter(channels.values())).size
     # half a cycle on either side of the gap, as far as both stretches lie within the recording
@@ -206,7 +207,10 @@ def _cycle_mismatch(
 
 
 def _copy_shifted(values: Array, first: int, stop: int, shift: int) -> None:
-    """Fill missing values from index `first` to `stop` - 1, in place, by those `shift` later plus a linear offset."""
+    """Fill a gap, the missing values from `first` to `stop` - 1, in place with the values `shift` samples later.
+
+    A linear offset is added to these, so that they join the values before and after the gap.
+    """
     ends = (slice(first - _N_END, first), slice(stop, stop + _N_END))
     offset_before, offset_after = (
         _finite_mean(values[end]) - _finite_mean(values[end.start + shift : end.stop + shift]) for end in ends

@@ -35,8 +35,7 @@ from sealscope.recordings.recording import Recording
 class CorrectedSamples(NamedTuple):
     """A recording after the correction of its samples.
 
-    - `recording`: the samples at evenly spaced times, from the first to the last row with all chamber pressures and the
-      command.
+    - `recording`: evenly spaced samples, from the first to the last row with all chamber pressures and the command.
     - `findings`: the corrections that `correct_samples` reports.
     - `stuck`: names of chamber pressures that repeat one value for too long to be used.
     - `used_fraction`: fraction of the original samples within the time span of `recording`.

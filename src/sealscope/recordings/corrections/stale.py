@@ -1,9 +1,8 @@
 """Stale samples: a slow channel, or a logger that got no new value, repeats the previous sample.
 
 Repeated samples are not readings. They are interpolated between fresh ones; otherwise a channel that repeats each
-sample for 0.1 s would be 0.05 s late on average. A quantised channel at rest also repeats its value. The time for
-which a channel repeats its samples is therefore estimated from runs that begin and end with a jump of more than a
-quantisation step. Called by the inspection.
+sample for 0.1 s would be 0.05 s late on average. A quantised channel at rest also repeats its value. The time of
+repetition is therefore estimated from runs that begin and end with a large jump. Called by the inspection.
 """
 
 from __future__ import annotations
@@ -35,8 +34,7 @@ _MAX_REPEAT = 3
 def interpolate_stale_samples(recording: Recording) -> tuple[Recording, list[Finding]]:
     """Replace samples that repeat the previous one by linear interpolation between new readings; also return findings.
 
-    Either a channel holds each reading for a fixed time (`estimate_holding_period`), or the logger repeats a row of all
-    channels (`_flag_repeated_rows`).
+    Either a channel holds each reading for a fixed time (`estimate_holding_period`), or the logger repeats whole rows.
     """
     names = [name for name in recording.channels if name not in SLOW and name != "u"]
     channels, findings = dict(recording.channels), list[Finding]()
@@ -82,8 +80,7 @@ def flag_frozen_rows(recording: Recording) -> NDArray[np.bool_]:
     """Flag the rows (n,) in which a logger repeats its last row for a long time.
 
     All channels are constant or missing there, and both chamber pressures for longer than their noise allows
-    (`motion.find_holds`). No channel jumps at the first of these rows, but one does after the last, as the machine
-    moved on.
+    (`find_holds`). No channel jumps at the first of these rows, but one does after the last, as the machine moved on.
     """
     flags = np.zeros(len(recording), dtype=bool)
     pressures = [recording[name] for name in CHAMBERS if name in recording]
@@ -123,7 +120,7 @@ def _moves_in(values: Array, rows: NDArray[np.intp]) -> bool:
 
 
 def _find_equal_runs(values: Array) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """Find the k runs in which a channel (n,) repeats one value: first indices (k,), and flags (k,).
+    """Divide a channel (n,) into its k runs of equal values; return their first indices (k,) and flags (k,).
 
     A run is flagged if it both begins and ends with a jump by more than `_MIN_JUMP` times the channel's resolution.
     """
@@ -134,12 +131,12 @@ def _find_equal_runs(values: Array) -> tuple[NDArray[np.intp], NDArray[np.bool_]
 
 
 def estimate_holding_period(t: Array, values: Array) -> float | None:
-    """Estimate the time [s] for which a channel (n,), slower than its logger, repeats each reading; None if not.
+    """Estimate the time [s] for which a channel (n,) that is slower than its logger repeats each reading.
 
     It is the mean duration of the regular runs of equal values that begin and end with a jump (`_find_equal_runs`).
     There must be `stale.runs` runs (`priors.toml`), and the fraction `stale.share` must be regular, i.e. differ from
-    the median by at most the fraction `stale.spread`. A median below two samples, or a mean below `stale.shortest`,
-    gives None. `t` (n,): times [s].
+    the median by at most the fraction `stale.spread`. Returns None with fewer runs, for a median below two samples and
+    for a mean below `stale.shortest`. `t` (n,): times [s].
     """
     t, values = t[:_N_ESTIMATE], values[:_N_ESTIMATE]
     known = np.isfinite(values) & np.isfinite(t)
@@ -179,10 +176,10 @@ def _flag_held(t: Array, values: Array, period: float) -> NDArray[np.bool_]:
 def _flag_repeated_rows(channels: list[Array]) -> NDArray[np.bool_]:
     """Flag the rows (n,) in which a logger got no new readings and repeated the previous row.
 
-    All of `channels` (n,) that vary repeat their samples there, in one or two rows, and one channel jumps, by more than
-    `_MIN_JUMP` quantisation steps, before and after. They are flagged only if they are at least `stale.repeats`
-    (`priors.toml`) times as many as expected by chance. That is the fraction of rows that repeat if the channels repeat
-    independently, or `stale.fewest` if this is larger.
+    In such a row, or two, all of `channels` (n,) that vary repeat their samples, and one channel jumps before and after
+    it by more than `_MIN_JUMP` quantisation steps. Nothing is flagged unless there are `stale.repeats` (`priors.toml`)
+    times as many such places as expected by chance. The expected fraction of rows is that for channels that repeat
+    independently of each other, but at least `stale.fewest`.
     """
     moving = [values for values in channels if np.isfinite(values).any() and np.nanmax(values) > np.nanmin(values)]
     if not moving or moving[0].size < _PRIORS.runs:

@@ -5,8 +5,7 @@ valve chooses the side. In both cases the flow into chamber A is about a v + c (
 the pressure term is the flow that replaces leakage while the piston stands. The formula is fitted to the signed
 magnitude, in turn with a search for the signs. A sign changes only where the magnitude passes zero: the signs are the
 most likely path of a hidden Markov chain with two states. Without a position the sign is that of the command. At rest
-the magnitude is that of noise, whose mean is not zero; the signs of that noise are drawn at random. Called by the
-inspection.
+the magnitude is that of noise, with a positive mean; its signs are drawn at random. Called by the inspection.
 
 Source: A. J. Viterbi, IEEE Trans. Inf. Theory 13 (1967) 260 (most likely path).
 """
@@ -52,7 +51,7 @@ def restore_speed_sign(recording: Recording) -> tuple[Recording, list[Finding]]:
 
 
 def _has_one_sign(values: Array) -> bool:
-    """Test whether a channel (n,) stays on one side of zero, but for noise (`unsigned.noise` of `priors.toml`)."""
+    """Test whether a channel (n,) stays on one side of zero, except for noise (`unsigned.noise` of `priors.toml`)."""
     finite = values[np.isfinite(values)]
     if not finite.size:
         return False
@@ -78,7 +77,7 @@ def _find_sign(recording: Recording, magnitude: Array) -> tuple[Array | None, st
 
 
 def _piston_speed(x: Array, rate: float) -> Array:
-    """Compute the piston speed (n,) [m/s] from the position `x` (n,) [m] over `unsigned.half` [s] before and after."""
+    """Compute the piston speed (n,) [m/s] from positions `x` (n,) [m] `unsigned.half` [s] before and after a sample."""
     n_half = max(1, round(_PRIORS.half * rate))
     known = np.isfinite(x)
     x = np.interp(np.arange(x.size), np.flatnonzero(known), x[known]) if known.any() else np.zeros(x.size)
@@ -90,7 +89,7 @@ def _piston_speed(x: Array, rate: float) -> Array:
 def _moves_both_ways(values: Array) -> bool:
     """Test whether a speed or command (n,) moves far enough in both directions.
 
-    The shorter way must be over `unsigned.least` (`priors.toml`) times the longer one.
+    The sum of its values on one side of zero must exceed `unsigned.least` (`priors.toml`) times that on the other.
     """
     smaller, larger = sorted(float(np.nansum(np.maximum(signed, 0.0))) for signed in (values, -values))
     return smaller > _PRIORS.least * larger > 0.0
@@ -188,16 +187,14 @@ def _most_likely_signs(log_odds: Array, cost_of_change: Array) -> Array:
 
     `log_odds` l (n,): log odds of a positive over a negative sign, from each sample alone; `cost_of_change` c (n - 1,):
     log odds against a change of sign after each sample. The log odds of the best path up to sample k are o_k = l_k +
-    min(max(o_(k-1), -c_(k-1)), c_(k-1)). From the end backwards, sample k has the sign of o_k if |o_k| > c_k, else that
-    of sample k + 1.
+    min(max(o_(k-1), -c_(k-1)), c_(k-1)). Sample k has the sign of o_k if |o_k| > c_k, else that of sample k + 1.
     """
     path_odds = np.empty(log_odds.size)
     odds = 0.0
     for k, (evidence, cost) in enumerate(zip(log_odds.tolist(), [0.0, *cost_of_change.tolist()], strict=True)):
         odds = min(max(odds, -cost), cost) + evidence
         path_odds[k] = odds
-    # a sample whose odds exceed the cost of the next change keeps its sign whatever follows; the others take
-    # the sign of the next such sample, and the last sample keeps its own
+    # if its odds exceed the cost of the next change, a sample keeps its sign whatever follows
     decided = np.abs(path_odds) > np.append(cost_of_change, 0.0)
     decided[-1:] = True
     following = np.flatnonzero(decided)[np.searchsorted(np.flatnonzero(decided), np.arange(log_odds.size))]

@@ -141,7 +141,7 @@ def explicit_columns(channel_map: ChannelMap) -> dict[str, str]:
 
 
 def reconstruct_map(provenance: Mapping[str, object]) -> dict[str, str]:
-    """Reconstruct the map, channel -> column with its unit, with which a recording was read, from its provenance."""
+    """Reconstruct the map from channel to column and unit that a recording was read with, from its provenance."""
     names = provenance.get("columns")
     columns = {str(channel): str(heading) for channel, heading in names.items()} if isinstance(names, Mapping) else {}
     proposed = proposed_map([Label.parse(heading) for heading in columns.values()])
@@ -149,7 +149,7 @@ def reconstruct_map(provenance: Mapping[str, object]) -> dict[str, str]:
 
 
 def _find_unit(label: Label, channel: str) -> str | None:
-    """Find the unit of a column in its heading, or one that suits `channel` at the end of its name; None if none."""
+    """Find the unit of a column in its heading, else at the end of its name if it suits `channel`; None if unknown."""
     name_unit = split_unit(label.name)[1] if label.unit is None else None
     is_possible = name_unit is not None and same_dimension(name_unit, "s" if channel == "t" else CHANNEL_UNITS[channel])
     return name_unit if is_possible else label.unit
@@ -161,11 +161,11 @@ def _format_columns(labels: Sequence[Label]) -> str:
 
 
 def _find_column(labels: Sequence[Label], name: str, description: str, mapped: bool = False) -> int | None:
-    """Find the index, from 0, of the column called `name`, which may be a number such as `#4`, from 1; None without it.
+    """Find the index of the column called `name`; None if there is none.
 
     Names are compared by criteria from strict to loose; the first that a column meets decides. With `mapped`, the last
-    words of a column's name are enough, such as `ch2`. Raises InputError, which calls the column `description`, if
-    several columns meet the criterion.
+    words of a column's name are enough, such as `ch2`. A name such as `#4` may also be a number, counted from 1. Raises
+    InputError, which calls the column `description`, if several columns meet the criterion.
     """
     folded = name.casefold()
     for matches_name in (
@@ -191,8 +191,8 @@ def _find_column(labels: Sequence[Label], name: str, description: str, mapped: b
 def _parse_mapping(labels: Sequence[Label], channel: str, column_text: str) -> Formula[int]:
     """Convert the entry of a channel in a user's map to a formula of column numbers.
 
-    `column_text`: a column's name, possibly with a unit, or a formula of several columns. Their headings state the unit
-    if it does not. Raises InputError if a column does not exist, or if their units differ.
+    `column_text`: a column's name, possibly with a unit, or a formula of several columns. Without a unit, that in the
+    columns' headings is used. Raises InputError if a column does not exist, or if these units differ.
     """
     description = f"{column_text}, mapped to {channel},"
     name_before_blank, _, unit_after_blank = column_text.rpartition(" ")
@@ -319,7 +319,7 @@ def _find_time(labels: Sequence[Label]) -> int | None:
 
 
 def _choose_time_columns(choice: ColumnMap) -> None:
-    """Choose the time of a table in several columns, or in a column whose name does not mean a time, for `choice`.
+    """Complete `choice` with a time in several columns, or in a column whose name does not mean a time.
 
     - Columns of hours, minutes and seconds form the time, alone or with a date.
     - Otherwise, without a time column and a rate, the time is a column of dates, or the only column in a unit of time.
@@ -332,7 +332,7 @@ def _choose_time_columns(choice: ColumnMap) -> None:
         time = parts["hour"] if choice.time is None else choice.time
         time = dates[0] if dates and "year" not in parts else time  # the date to which the parts are added
         names = ", ".join(labels[i].whole for i in dict.fromkeys((time, *parts.values())))
-        # the unit counts only if the values prove to be no parts of a time: a time column found by name is then in s
+        # if the values prove not to be parts of one time, a time column that was found by its name is read alone, in s
         choice.time_label = Label(names, names, "s" if choice.time is not None else None)
         choice.time, choice.parts = time, parts
         return
@@ -422,6 +422,5 @@ def choose_columns(labels: Sequence[Label], request: Request, stated_rate: float
         # without columns of hours, minutes, ... (`parts`) a time column that is called a date may have only dates
         is_date = labels[choice.time].name.casefold() in WORDS["date"]
         choice.date = choice.time if is_date else choice.date
-    # channels in the order of their columns
     choice.channels = dict(sorted(choice.channels.items(), key=lambda item: next(iter(item[1].factors))))
     return choice

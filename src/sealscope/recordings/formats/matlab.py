@@ -89,7 +89,7 @@ def _check_links(file: Any) -> None:
 def _read_streams(file: Any) -> Iterator[Series]:
     """Yield the signals of an open HDF5 file that stores the samples of each signal as a stream of doubles.
 
-    Of each signal, `CompressedTime` contains first time, step and number of samples, and `DataR2` its stream's number.
+    Each signal has `CompressedTime` (first time, step, number of samples) and `DataR2` (the number of its stream).
     """
     import h5py
 

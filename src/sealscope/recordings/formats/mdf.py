@@ -21,7 +21,7 @@ from sealscope.recordings.formats.table import Clock, RecordingFields, Series, b
 
 
 def read_mdf(path: Path, request: Request) -> RecordingFields:
-    """Read the requested channels of an MDF file, in physical values, without frames of a bus; needs asammdf."""
+    """Read the requested channels of an MDF file in physical values, without decoding bus frames; needs asammdf."""
     with _open_file(import_library("asammdf", "MDF", "asammdf").MDF, path) as file:
         start_time = np.datetime64(file.header.start_time.astimezone(UTC).replace(tzinfo=None), "us")
         # a file without a date states 1980 or before

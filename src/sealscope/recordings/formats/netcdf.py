@@ -141,9 +141,10 @@ def _read_values(data: Any, name: str, file_size: int) -> NDArray[Any]:
 
 
 def _read_texts(data: Any, name: str, file_size: int) -> list[str]:
-    """Read the data set `name` of texts (n,), in chunks if the lengths of the texts vary, to bound the memory.
+    """Read the data set `name` of texts (n,), in chunks if the lengths of the texts vary.
 
-    Many cells may refer to one text as long as the file. Raises InputError for too many, too long or no texts.
+    Chunks bound the memory, as many cells may refer to the same text, which may be as long as the file. Raises
+    InputError for too many or too long texts, and for other types.
     """
     import h5py
 

@@ -1,7 +1,6 @@
 """Spreadsheets (Excel's .xlsx, .xlsb and .xls, OpenDocument's .ods), with python-calamine.
 
-A sheet is written as tab-separated text and read as a text log, so that headings, unit rows, lines above the header,
-stamps and missing cells follow the same rules.
+A sheet is written as tab-separated text and read as a text log, so that all rules for text logs apply.
 """
 
 from __future__ import annotations

@@ -3,9 +3,8 @@
 A reader of a format lists the series in a file, i.e. its named columns of samples; `build_fields` turns them into the
 fields of a recording. Series are in groups, which may have different sampling rates. If several groups have series of
 the same name, that in the group with most channels is used. Channels are brought to the clock of the chamber pressures:
-slower ones by linear interpolation, faster ones by averages over its intervals. Gaps of a series, and the time before
-its first and after its last sample, stay empty. In a long table, each row has one sample of one channel, and each name
-is a series.
+slower ones by linear interpolation, faster ones by averages over its intervals. Gaps and ends of a series stay empty.
+In a long table, each row has one sample of a named channel, and each name is a series.
 """
 
 from __future__ import annotations
@@ -256,7 +255,8 @@ def _convert_channels(
 def _join_time(choice: ColumnMap, columns: Mapping[int, NDArray[Any]], label: Label, notes: list[str]) -> NDArray[Any]:
     """Combine the columns that form the time, such as date and hours, and add a line for the history to `notes`.
 
-    If they are no parts of one time, returns the time column unchanged, or raises InputError if it has the hours.
+    If their values cannot be parts of one time, the time column is returned unchanged; if it is that of the hours,
+    InputError is raised. `columns`: column -> values (n,); `label`: heading of the time column.
     """
     assert choice.time is not None
     parts = {part: np.asarray(columns[column], dtype=np.float64) for part, column in choice.parts.items()}
@@ -280,10 +280,10 @@ def _has_time_of_day(time: NDArray[Any]) -> bool:
 
 
 def _assign_clocks(series: Sequence[Series]) -> list[Series]:
-    """Give the series without sampling times the times in the column of times of their group.
+    """Assign sampling times to the series that have none, from the column of times in the same group of the file.
 
-    A single column of times stays, as that of the whole file; others are left out. A series that is alone in its group
-    gets the group's name if its own says nothing, as `data` or `value`.
+    These columns are then left out; if the file has only one, it stays as the time of all groups. A series that is
+    alone in its group gets the group's name if its own name says nothing, such as `data` or `value`.
     """
     time_of_group: dict[str, Series] = {}
     for member in series:
@@ -308,8 +308,8 @@ def _assign_clocks(series: Sequence[Series]) -> list[Series]:
 def read_times(time: Series, start: np.datetime64 | None = None) -> tuple[Array, np.datetime64 | None]:
     """Read the series `time`, a column of times; return the times (n,) [s] and the time stamp of 0 s.
 
-    Date stamps count from the first one; the time stamp of 0 s is then the first one, or None for a column in a group.
-    For numbers and timedelta64 it is `start`, None if it is not known. Raises InputError if no row has a time.
+    Date stamps are converted to seconds from the first one, which is then the time stamp of 0 s (None for a column in a
+    group). For numbers and timedelta64 it is `start`, None if unknown. Raises InputError if no row has a time.
     """
     values = time.values()
     if values.dtype.kind == "m":
@@ -333,7 +333,7 @@ def _make_names_unique(series: Sequence[Series]) -> tuple[list[Series], list[str
     """Give each series of a file a unique name; return the series, and lines for the history.
 
     The series in the group with most channels or, among equal groups, with most samples keeps its name. Others are
-    called by their paths, `group/name`. Series without groups stay.
+    called by their paths, `group/name`. If no series has a group, all stay as they are.
     """
     if all(member.group == "" for member in series):
         return list(series), []
@@ -363,9 +363,9 @@ def _make_names_unique(series: Sequence[Series]) -> tuple[list[Series], list[str
 
 
 def _read_samples(series: Series, *, as_time: bool = False) -> NDArray[Any]:
-    """Read the samples (n,) of a series as doubles or, with `as_time`, as datetime64; raise InputError for others.
+    """Read the samples (n,) of a series as doubles or, with `as_time`, as datetime64; raise InputError for other types.
 
-    Up to the fraction `MAX_WORD_FRACTION` of words in a column of texts becomes NaN.
+    In a column of texts, words become NaN, up to the fraction `MAX_WORD_FRACTION` of the cells.
     """
     values = series.values()
     if values.dtype.kind in "OSU":
@@ -387,10 +387,11 @@ def _read_samples(series: Series, *, as_time: bool = False) -> NDArray[Any]:
 
 
 def _align_clocks(choice: ColumnMap, used: dict[int, Series]) -> tuple[dict[int, NDArray[Any]], list[str]]:
-    """Resample the columns to read, `used`, to common sampling times, those of the chamber pressures.
+    """Resample the columns to read, column -> series in `used`, to the sampling times of the chamber pressures.
 
-    Without these, they are those of the pressures at the pump, or of the longest series. Returns column -> values (n,),
-    with the time, and lines for the history. Raises InputError without sampling times, or if counts differ.
+    If there are none, the times are those of the pressures at the pump, or of the longest series. Returns column ->
+    values (n,), including the time, and lines for the history. Raises InputError if no series has sampling times, or
+    one without them has another number of samples.
     """
     channel_of = choice.channel_of
     rank = {channel: number for number, channel in enumerate(_BASE_CHANNELS)}
@@ -424,10 +425,10 @@ def _align_clocks(choice: ColumnMap, used: dict[int, Series]) -> tuple[dict[int,
 
 
 def _resample(values: Array, member: Series, t: Array, start: np.datetime64 | None) -> tuple[Array, str]:
-    """Resample the samples `values` of the series `member` to the times `t` (n,) [s] after the stamp `start`, if known.
+    """Resample the samples `values` of the series `member` to the times `t` (n,) [s] after the time stamp `start`.
 
-    Also returns a note for the history, or "". At the same or a lower sampling rate, values are interpolated linearly,
-    and NaN within long intervals; at a higher rate, they are averaged around the times. Times must increase.
+    Samples that are slower than `t` or equally fast are interpolated linearly, with NaN within long intervals; faster
+    ones are averaged around the times. The series' times must increase. Also returns a note for the history, or "".
     """
     assert member.clock is not None
     times, member_start = member.clock.read()
@@ -447,7 +448,6 @@ def _resample(values: Array, member: Series, t: Array, start: np.datetime64 | No
         note = f"at {rate:g} Hz: averaged over each interval of {base_rate:g} Hz"
         return _average(values, times, t, 1.0 / base_rate), note
     result = np.interp(t, times, values, left=np.nan, right=np.nan)
-    # no values within long intervals
     next_sample = np.clip(np.searchsorted(times, t), 1, times.size - 1)
     interval = times[next_sample] - times[next_sample - 1]
     is_long = interval > _MAX_INTERVAL * float(np.median(np.diff(times)))
@@ -481,10 +481,11 @@ def _find_long_columns(labels: Sequence[Label]) -> dict[str, int] | None:
 def _read_long_channel(
     choice: ColumnMap, table: Mapping[int, NDArray[Any]], value_column: int, label: Label, rows: NDArray[np.intp]
 ) -> tuple[Array, Array, np.datetime64 | None]:
-    """Read a channel from its `rows` (k,) of a long table: values (n,), times (n,) [s], and the stamp of 0 s, if known.
+    """Read a channel of a long table, in which each row is one sample of a named channel; `rows` (k,) are its rows.
 
-    `table`: column -> cells. The rows with a time are read like a recording with a single channel, which is called `u`
-    and in counts, so that its values are not converted. Raises InputError if too many samples are words.
+    Returns its values (n,), times (n,) [s] and the time stamp of 0 s, None if unknown. `table`: column -> cells. The
+    rows with a time are read like a recording with the only channel `u`, in counts, so that values are not converted.
+    Raises InputError if too many samples are words.
     """
     assert choice.time is not None
     times = table[choice.time][rows]
@@ -587,7 +588,7 @@ def check_texts(count: int, width: int, name: str) -> None:
 
 
 def make_description(rate: float, provenance: Mapping[str, Any], history: Sequence[str]) -> dict[str, Any]:
-    """Collect rate, provenance and history of a recording as JSON values; raise InputError for others."""
+    """Collect the rate, provenance and history of a recording as JSON values; raise InputError for other types."""
     description = {"format": FORMAT_VERSION, "rate": rate, "provenance": dict(provenance), "history": list(history)}
     try:
         return json.loads(json.dumps(description, default=_convert_numpy))  # type: ignore[no-any-return]

@@ -36,7 +36,6 @@ def read_tdms(path: Path, request: Request) -> RecordingFields:
                 read_values = partial(channel.__getitem__, slice(None))
                 clock = _waveform_clock(properties, count)
                 series.append(Series(group.name, Label.parse(channel.name, unit), count, read_values, clock))
-        # remarks on the file, and on each group
         remarks, *group_remarks = (collect_attributes(member.properties) for member in (file, *file.groups()))
         rate = next(filter(None, map(stated_rate, (remarks, *group_remarks))), None)
         return build_fields(series, request, "TDMS", remarks, rate, size=path.stat().st_size)

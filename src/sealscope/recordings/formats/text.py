@@ -1,7 +1,6 @@
 """Text logs: CSV files written by Sealscope, and logs of other programs.
 
-A log is read in blocks of complete lines. pyarrow, if installed, reads the blocks that contain only numbers; others are
-read row by row.
+A log is read in blocks of complete lines: by pyarrow, if installed, where they contain only numbers, else row by row.
 """
 
 from __future__ import annotations
@@ -135,7 +134,7 @@ def read_text_parts(path: Path, request: Request, every: float) -> Iterator[Reco
     first = next(blocks, None)
     is_reversed = first is not None and choice.time is not None and is_falling(first.columns[choice.time])
     if first is not None and every < inf and not is_reversed:
-        # convert a copy of the first block, as `join_blocks` empties it, for its rate; then start the time again
+        # convert a copy of the first block to know its rate (`join_blocks` empties it); then forget its last time
         rows_per_part = max(1, round(every * make_part([first[:]], state).rate))
         state = TimeState(state.head, state.rate, state.resolution)
     pending: list[_Block] = []
@@ -148,9 +147,9 @@ def read_text_parts(path: Path, request: Request, every: float) -> Iterator[Reco
 
 
 def _read_several_clocks(path: Path, layout: Layout, time_columns: Sequence[int], request: Request) -> RecordingFields:
-    """Read a log whose channels have sampling times of their own, in `time_columns` before them.
+    """Read a log in which each channel has its own sampling times, in the nearest of the `time_columns` before it.
 
-    Without such columns it is read as a long table, in which each row is one sample of a named channel.
+    If there are no `time_columns`, the log is a long table: each row is one sample of a named channel.
     """
     cells_by_column: dict[int, NDArray[Any]] = {}
     columns = [column for column in range(len(layout.labels)) if column not in time_columns]
@@ -177,7 +176,7 @@ def _read_several_clocks(path: Path, layout: Layout, time_columns: Sequence[int]
 
     start = scope_start(layout.remarks)
     clocks = {time: Clock(time, partial(read_times, make_series(time), start)) for time in time_columns}
-    # the index of a series is that of its column in `columns`
+    # in the order of `columns`, as `prepare` expects
     members = [make_series(column, clocks[time_of_column[column]] if time_columns else None) for column in columns]
     return build_fields(members, request, layout.kind, layout.remarks, layout.rate, prepare=prepare)
 
@@ -197,7 +196,7 @@ def _find_channel_times(labels: Sequence[Label]) -> list[int]:
 
 
 def _split_blocks(blocks: Iterable[_Block], size: float) -> Iterator[list[_Block]]:
-    """Regroup a log's blocks into lists with `size` rows in all, inf for a single list; the last may have fewer."""
+    """Regroup a log's blocks into lists of `size` rows in all, or a single list if inf; the last may have fewer."""
     group: list[_Block] = []
     missing_rows = size
     for block in blocks:
@@ -287,7 +286,8 @@ class _Log:
             for first_line, content, end, is_cut in line_blocks:
                 block = self._read_by_arrow(first_line, content, end) if self.uses_arrow and not is_cut else None
                 if is_first and block is None:
-                    self.uses_arrow = False  # of a later block, a comment or a word alone may be unreadable for pyarrow
+                    # the first block fails if pyarrow cannot read the log, later ones also for a comment or a word
+                    self.uses_arrow = False
                 is_first = False
                 if block is None:
                     rows, line_numbers = self._split_rows(first_line, content[:end], is_cut)
@@ -300,7 +300,7 @@ class _Log:
         """Split a block of bytes of the log into rows of cells; also return the line number of each row.
 
         Lines that are not samples are left out. `first_line`: number of the block's first line, from 1; `is_cut`: the
-        file ends within the block's last line, whose incomplete number is then missing.
+        file ends within the block's last line, and an incomplete number at its end is left out.
         """
         lines = _decode_lines(block, self.layout)
         samples = self._select_samples(lines, max(0, self.layout.first_row + 1 - first_line))
@@ -341,7 +341,7 @@ class _Log:
             return None  # carriage returns inside a line
         names = [str(column) for column in self.kinds]
         table = None
-        # marks of missing samples: the short list is faster; once it fails, the long one stays
+        # a short list of the marks of missing samples is faster; once it fails, the long one is used for all blocks
         for nulls in (self.null_values, ["NaN", *MISSING]):
             with suppress(ArrowInvalid):
                 table = csv.read_csv(
@@ -381,7 +381,7 @@ class _Log:
         """Split lines of the log into cells; `line_numbers` are those in the file.
 
         Raises InputError for a quotation mark that is not closed on its line. If the file ends within the last line
-        (`is_cut`), a mark may be open there, and its cell becomes empty.
+        (`is_cut`), such a cell becomes empty instead.
         """
         delimiter = self.layout.delimiter
         if delimiter == " ":
@@ -405,10 +405,10 @@ class _Log:
     def _remove_text_rows(
         self, rows: list[list[str]], line_numbers: Sequence[int]
     ) -> tuple[list[list[str]], Sequence[int]]:
-        """Remove and count short rows of text, such as the mark of an event; also return the other rows' line numbers.
+        """Remove short rows of text, such as a note by the logger; return the other rows and their line numbers.
 
-        A row of text has fewer cells than a sample needs, no value and at most `_MAX_TEXT_LINE` characters. Raises
-        InputError for any other row with too few or too many cells.
+        A row of text has fewer cells than a sample needs, no value and at most `_MAX_TEXT_LINE` characters; these rows
+        are counted. Raises InputError for any other row with too few or too many cells.
         """
         layout, max_cells = self.layout, len(self.layout.labels)
         if min(map(len, rows)) >= self.min_cells and max(map(len, rows)) <= max_cells:
@@ -476,7 +476,7 @@ class _Log:
         return bool(self.has_stamps)
 
     def _join_dates(self, rows: Sequence[Sequence[str]], column: int) -> list[str]:
-        """Return the cells of the time `column`, after their dates if there is a date column; "" if one is missing."""
+        """Prefix the times in `column` with the dates of their rows, if the log has dates; "" if either is missing."""
         if not self.has_date or self.date is None:
             return [row[column] for row in rows]
         days = [row[self.date].strip() if self.date < len(row) else "" for row in rows]
@@ -484,16 +484,16 @@ class _Log:
         return [f"{day} {time}" if day and time else "" for day, time in zip(days, times, strict=True)]
 
     def _format_place(self, index: int, line_numbers: Sequence[int], column: int) -> str:
-        """Format the line, column and file of a cell for messages; `index` is its row in the block of these lines."""
+        """Format the line, column and file of the cell in row `index` of a block, whose `line_numbers` are given."""
         return f"(line {line_numbers[index]}, column {self.layout.labels[column].whole}, {self.place})"
 
     def _parse_dates(
         self, cells: list[str], format_place: Callable[[int], str]
     ) -> tuple[NDArray[np.datetime64], list[int]]:
-        """Parse cells of the time column to time stamps (n,); also return the indices of words, texts without digits.
+        """Parse cells of the time column to time stamps (n,), NaT for empty cells and words (texts without digits).
 
-        Words and missing cells become NaT. At the first ambiguous date, such as 05/06/2024, the log's dates decide
-        `day_first`. `format_place`: index of a cell -> its place. Raises InputError for a number that is not a stamp.
+        Also returns the indices of the words. At the first ambiguous date, such as 05/06/2024, the log's dates decide
+        `day_first`. Numbers that are no stamps raise InputError; `format_place`: index of a cell -> its place.
         """
         texts = ["" if cell.strip().lower() in MISSING else cell for cell in cells]
         if self.day_first is None and ambiguous_dates(texts):
@@ -537,7 +537,7 @@ class _Log:
     def join_blocks(self, blocks: list[_Block]) -> tuple[dict[int, NDArray[Any]], list[str]]:
         """Join blocks of the log to whole columns, column -> values (n,); also return lines for the history.
 
-        Rows without a time are left out, blocks emptied to save memory. Raises InputError if too many cells are words.
+        Rows with a word as the time are left out, and `blocks` are emptied. Raises InputError for too many words.
         """
         labels = self.layout.labels
         notes: list[str] = []
@@ -575,7 +575,7 @@ class _Log:
         return columns, notes
 
     def describe_text_lines(self) -> list[str]:
-        """Describe the lines of text left out of the log, for the history; raise InputError if they are too many."""
+        """Describe for the history which lines of text were left out; raise InputError if they are too many."""
         if self.n_text_lines > max(MAX_WORD_FRACTION * self.n_rows, _MAX_TEXT_LINES):
             raise InputError(f"a sample must be a number, got {self.first_text_line}")
         lines = format_count(self.n_text_lines, "line")
@@ -655,9 +655,9 @@ def write_text(
 
 
 def _arrow_values(cells: Any) -> Array:
-    """Convert a pyarrow ChunkedArray of doubles to an array (n,), NaN for null, by its buffers.
+    """Convert a pyarrow ChunkedArray of doubles to an array (n,), with NaN for null.
 
-    `to_numpy` would load pandas. The buffers of a chunk are bits, which are 1 for known values, and the values.
+    Pyarrow's `to_numpy` would load pandas. Each chunk has a buffer of bits, 1 for known values, and one of values.
     """
     parts = []
     for chunk in cells.chunks:

@@ -73,7 +73,7 @@ class Layout:
 def detect_encoding(head: bytes) -> str | None:
     """Detect the encoding of a text from the first bytes of its file; None if they are not text.
 
-    Tried in turn: a byte order mark, UTF-16, UTF-8, gb18030 and Shift-JIS if they give a known word, cp1252.
+    The first that fits is chosen: a byte order mark's, UTF-16, UTF-8, gb18030 or Shift-JIS with a known word, cp1252.
     """
     for mark, name in (
         (codecs.BOM_UTF8, "utf-8-sig"),
@@ -125,10 +125,10 @@ def _used_width(row: Sequence[str]) -> int:
 
 
 def _detect_dialect(body: Sequence[str]) -> tuple[str, str, int]:
-    """Detect (delimiter, decimal separator, number of cells in a row) from some lines of a log, else (",", ".", 1).
+    """Detect (delimiter, decimal separator, number of cells in a row) from lines of a log; (",", ".", 1) if unclear.
 
-    All pairs of `_DIALECTS` are rated by the fraction of cells, missing ones aside, that are values (numbers or time
-    stamps) in rows of one width. That width is the one with most values, at least half of all values.
+    For each pair of separators in `_DIALECTS`, the table is the rows of one width, that with most values (numbers and
+    time stamps), at least half of all. The best pair has most values in its table, relative to all cells not missing.
     """
     ranks: dict[tuple[str, str, int], tuple[float, float, bool, int]] = {}
     text = "\n".join(body)
@@ -146,7 +146,7 @@ def _detect_dialect(body: Sequence[str]) -> tuple[str, str, int]:
         if cells and 2 * n_values[width] >= n_values.total():
             n_present = sum(not is_missing(cell) for cell in cells)
             n_grouped = sum(is_grouped(cell, decimal) for cell in cells)  # prefer dialects without separated thousands
-            # the first number decides, the others only between equals
+            # later numbers decide only if the earlier ones are equal
             rank = n_values[width] / n_present, -n_grouped / n_present, delimiter != " ", width
             ranks[delimiter, decimal, width] = rank
     return max(ranks, key=ranks.__getitem__, default=(",", ".", 1))
@@ -155,8 +155,8 @@ def _detect_dialect(body: Sequence[str]) -> tuple[str, str, int]:
 def _split_heading(line: str, delimiter: str, width: int = 0) -> list[str]:
     """Split the heading line of a log into the names of columns.
 
-    At blanks, a unit in brackets stays with its name. If that does not give `width` names but splitting at wider spaces
-    does, the latter counts.
+    If the `delimiter` is a blank, a unit in brackets stays with its name. If this does not give `width` names, but a
+    split at wider spaces does, the latter is used.
     """
     if delimiter == " ":
         names = _SPACED_LABEL.findall(line)
@@ -166,7 +166,7 @@ def _split_heading(line: str, delimiter: str, width: int = 0) -> list[str]:
 
 
 def _parse_unit_row(cells: Sequence[str]) -> list[str | None] | None:
-    """Parse a row of units, each None for an empty cell; None for a row with under 60 % known units."""
+    """Parse a row of units, with None for an empty cell; return None if under 60 % of the units are known."""
     texts = [cell.strip().strip("[]()<>'").strip() for cell in cells]
     units = [text if text and text != "-" else None for text in texts]
     n_known = sum(unit is not None and is_unit(unit) for unit in units)
@@ -215,7 +215,10 @@ def _parse_heading(
 
 
 def _parse_keyed_rows(rows: Sequence[Sequence[str]]) -> tuple[list[Label], int] | None:
-    """Parse rows, from the lowest up, with keys such as `Name` and `Unit`, to (labels, number of rows); else None."""
+    """Parse heading rows, the lowest first, that begin with the keys `Name`, `Unit` or similar; None for other rows.
+
+    Returns (labels of the columns, number of rows).
+    """
     keys = [row[0].strip().rstrip(":").casefold() for row in rows]
     name_row = next((i for i, key in enumerate(keys) if key in WORDS["row"]["name"] and _used_width(rows[i]) > 1), None)
     unit_row = next((i for i, key in enumerate(keys) if key in WORDS["row"]["unit"]), None)
@@ -224,7 +227,6 @@ def _parse_keyed_rows(rows: Sequence[Sequence[str]]) -> tuple[list[Label], int] 
     # the lowest row may be the name of the first column, on a line of its own
     first_name = rows[0][0] if _used_width(rows[0]) == 1 else rows[name_row][0]
     names = [first_name, *rows[name_row][1:]]
-    # the first cell is the key of the row
     units = chain([None], _parse_unit_row(rows[unit_row][1:]) or [], repeat(None))
     labels = [Label.parse(name, unit) for name, unit in zip(names, units, strict=False)]
     return labels, max(name_row, unit_row) + 1
@@ -385,13 +387,13 @@ def _find_first_row(lines: Sequence[str], body: Sequence[str], delimiter: str, d
 
 
 def _expand_sample_prefixes(line: str) -> str:
-    """Replace SI prefixes of numbers, `2.5k` by `2.5e3`, in a line in which most cells are then numbers."""
+    """Replace the SI prefixes of numbers in a line, `2.5k` by `2.5e3`, if most of its cells are numbers then."""
     expanded = expand_prefixes(line)
     cells = re.split(r"[;,|\t]", expanded)
     return expanded if 2 * sum(is_value(cell, ".") for cell in cells) > len(cells) else line
 
 
 def _iter_splits(lines: Sequence[str]) -> Iterator[list[list[str]]]:
-    """Yield all lines, split into cells at each usual delimiter in turn; nothing if no number has letters after it."""
-    if any(map(_QUANTITY.search, lines)):  # a quick search, which spares most logs the rest
+    """Yield the cells of all `lines` once for each usual delimiter; yield nothing if no number has letters after it."""
+    if any(map(_QUANTITY.search, lines)):  # most logs have no such numbers, and need not be split
         yield from ([split_cells(line, delimiter) for line in lines] for delimiter in "\t;|,")

@@ -179,7 +179,7 @@ def is_day_first(columns: Collection[Iterable[str]]) -> bool:
         known_days = [day for dates in days for day in dates if day]
         goes_back = any(dates != sorted(dates) for dates in days)
         ranks[day_first] = goes_back, max(known_days, default=0) - min(known_days, default=0)
-    return min(ranks, key=ranks.__getitem__)  # of equals, the first
+    return min(ranks, key=ranks.__getitem__)  # if both ranks are equal, the first order
 
 
 def _ordinal_day(text: str, day_first: bool) -> int:
@@ -207,7 +207,7 @@ def _is_datetime(text: str) -> bool:
 
 
 def counts_from_1970(clock: float) -> bool:
-    """Test whether a clock reading [s] counts from 1970, i.e. then means a time from March 1973 to 5138."""
+    """Test whether a clock reading [s] counts from 1970: it must then mean a time from March 1973 to 5138."""
     return _MIN_EPOCH < clock < _MAX_EPOCH
 
 
@@ -244,7 +244,10 @@ def _format_clock(text: str) -> str:
 
 
 def _iso_date(parts: Mapping[str, str | None], day_first: bool) -> str:
-    """Format the date in a stamp's parts in ISO form, 1970-01-01 without one; `day_first` as in 31/12/2024."""
+    """Format the date in the `parts` of a time stamp in ISO form, or 1970-01-01 if they contain no date.
+
+    `day_first`: the day precedes the month, as in 31/12/2024.
+    """
     if days := parts.get("days"):  # a duration
         return str(np.datetime64(_NO_DATE) + int(days))
     year, month, day = (parts.get(name) for name in ("year", "month", "day"))
@@ -297,7 +300,7 @@ def _convert_stamps(values: NDArray[np.datetime64], name: str, state: TimeState)
         raise InputError("time must have a stamp in some row, got none")
     is_undated = bool((nanoseconds[known] < np.datetime64(_NO_DATE, "ns") + np.timedelta64(1, "D")).all())
     continues = is_undated and state.last_time is not None
-    if continues:  # prefix the last stamp of the previous part
+    if continues:  # prefix the last stamp of the previous part of the log
         nanoseconds, known = np.append(state.last_time, nanoseconds), np.append(True, known)
     stamps = nanoseconds[known]
     start = stamps[0]
@@ -342,8 +345,8 @@ def _remove_jumps(t: Array, step: float, single: bool) -> Array | None:
 def _convert_numbers(values: Array, unit: str | None, name: str, state: TimeState) -> _Seconds:
     """Convert a time column of numbers (n,) to seconds.
 
-    `unit`: may state an origin, as in `days since 1899-12-30`; None if it is to be guessed from the numbers. Only this
-    guess needs `name`, the column in messages, and `state` after the log's previous part, which it updates.
+    `unit`: may state an origin, as in `days since 1899-12-30`; None if it is to be guessed from the numbers. Only the
+    guess uses `name`, the column's name for messages, and `state`, what is known from earlier parts of the log.
     """
     finite = values[np.isfinite(values)]
     if not finite.size:
@@ -369,17 +372,17 @@ def _convert_numbers(values: Array, unit: str | None, name: str, state: TimeStat
 def _convert_without_unit(values: Array, finite: Array, name: str, state: TimeState) -> _Seconds:
     """Convert a time column of numbers (n,) without a unit to seconds; `finite` (m,) are the finite ones of `values`.
 
-    The finite values of a log's first part, kept in `state`, tell for all parts whether the numbers are days or
-    seconds, and from which date they count. Raises InputError if they count rows.
+    A long log is read in parts. The finite values of the first part, which `state` keeps, tell for all parts whether
+    the numbers are days or seconds, and from which date they count. Raises InputError if they only count rows.
     """
     first = float(finite[0])
     is_first_part = state.head is None
-    head = finite if state.head is None else state.head  # all parts are read as the first one
+    head = finite if state.head is None else state.head
     state.head = head
     if (days := _detect_days(head)) is not None:
         origin, meaning = days
         note = f"column {name} read as {meaning}"
-        if origin is None:  # fractions of a day have no start, and continue from part to part
+        if origin is None:  # fractions of a day have no start date, and continue from part to part
             previous = first if state.last_time is None else state.last_time
             return (values - previous) * _DAY + state.last_seconds, {}, [note]
         start = {"start": iso_moment(origin + np.timedelta64(round(first * _DAY * 1e6), "us"))}
@@ -400,11 +403,11 @@ def _convert_without_unit(values: Array, finite: Array, name: str, state: TimeSt
 
 
 def _detect_days(values: Array) -> tuple[np.datetime64 | None, str] | None:
-    """Find out if the numbers (n,) of a time column without a unit count days: (origin, meaning in words), else None.
+    """Find the meaning of numbers (n,) in a time column without a unit if they count days; None if they do not.
 
-    They do if the steps between them, taken as seconds, would be shorter than those of any logger, and if the first,
-    counted as spreadsheets or MATLAB count days, is a date from 1982 to 2078. With such steps, numbers between 0 and 1
-    are fractions of a day, and the origin is None.
+    Their steps, taken as seconds, must be shorter than those of any logger, and the first number must be a date from
+    1982 to 2078 in the count of spreadsheets or of MATLAB. With such steps, numbers between 0 and 1 are fractions of a
+    day. Returns (date of day 0, or None for fractions; meaning in words).
     """
     steps = np.diff(values)
     steps = steps[steps > 0]
@@ -432,7 +435,7 @@ def time_base(
 
     - `name`: the column in messages.
     - `stated_rate` [Hz]: rate in the file, with which samples that share stamps are spaced.
-    - `state`: state after the previous part of the log, which the values continue; it is updated. None for a whole log.
+    - `state`: of the time column after the previous part of the log, which is updated; None for a log read as a whole.
 
     Raises InputError for a column that is empty, counts rows, does not increase or has no unit of time.
     """
@@ -457,11 +460,11 @@ def time_base(
 
 
 def _space_shared_times(t: Array, state: TimeState) -> tuple[float, Array] | None:
-    """Spread samples that share a time, because the times of the log have coarse steps, evenly over these steps.
+    """Space samples evenly that share their times because the clock of the log has coarse steps.
 
-    Returns (step [s], new times (n,)) for the times `t` (n,) [s]; None if a time is missing or steps back, or
-    if the steps do not have about equally many samples, at least two. A part of a log that is too short to show this
-    gets step and rate from `state`.
+    Returns (clock step [s], new times (n,)) for the times `t` (n,) [s]; None if a time is missing or steps back, or if
+    the clock steps do not have about equally many samples, at least two. If the log is read in parts, one that is too
+    short to show this gets the clock step and the sampling rate of the earlier parts from `state`.
     """
     steps = np.diff(t)
     changes = np.flatnonzero(steps)  # indices of the last samples before the time changes

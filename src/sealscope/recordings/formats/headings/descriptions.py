@@ -65,8 +65,8 @@ def _rename_label(label: Label, description: str) -> Label:
 def parse_scope_heading(lines: Sequence[str], delimiter: str) -> tuple[list[Label], int] | None:
     """Parse the heading of a TwinCAT Scope export to (labels of the columns, number of heading lines); None for others.
 
-    `lines`: those above the first sample. Each row has one property, such as the unit: above each time column [ms] the
-    name of the property, and above each channel its value.
+    `lines`: those above the first sample. Each states a property of all channels, such as the unit: the cells above
+    time columns [ms] contain the name of the property, and those above channels its value.
     """
     rows = [[cell.strip() for cell in line.split(delimiter)] for line in lines]
     # the last row of names; a row of two cells is a remark on the file

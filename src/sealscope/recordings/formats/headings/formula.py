@@ -37,7 +37,7 @@ class Formula(Generic[K]):
         return next(iter(self.factors)) if self.constant == 0.0 and [*self.factors.values()] == [1.0] else None
 
     def plus(self, other: Formula[K], times: float = 1.0) -> Formula[K]:
-        """Add `times` another formula to this one; the sum states no unit."""
+        """Add another formula, multiplied by `times`, to this one; the sum has no unit."""
         factors = dict(self.factors)
         for name, factor in other.factors.items():
             factors[name] = factors.get(name, 0.0) + times * factor

@@ -32,9 +32,9 @@ _QUANTITY = re.compile(r"(?P<number>[+-]?\d{1,12}(?:[.,]\d{1,12})?(?:[eE][+-]?\d
 
 
 def stated_rate(remarks: Mapping[str, str]) -> float | None:
-    """Find the sampling rate [Hz] in the remarks of a file, which may state the interval instead; None without one.
+    """Find the sampling rate [Hz] in the remarks of a file; None if they state neither a rate nor an interval.
 
-    The unit may stand after the number, in the remark's name or not at all.
+    The unit may stand after the number or in the remark's name; without a unit, the number is in Hz or s.
     """
     for name, text in remarks.items():
         label = Label.parse(name)
@@ -81,7 +81,7 @@ def collect_remarks(pairs: Iterable[tuple[object, object]]) -> dict[str, str]:
 
 
 def collect_attributes(attributes: Mapping[Any, object]) -> dict[str, str]:
-    """Collect the remarks on a recording, name -> text, among the attributes of its file: texts and numbers."""
+    """Collect the attributes of a file that are texts or numbers as remarks on the recording, name -> text."""
     return collect_remarks(pair for pair in attributes.items() if isinstance(pair[1], str | int | float))
 
 

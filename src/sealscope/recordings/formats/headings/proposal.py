@@ -150,7 +150,7 @@ def split_unit(name: str) -> tuple[str, str | None]:
 
 
 def _find_name_and_unit(label: Label) -> tuple[str, str | None]:
-    """Find name and unit of a column; without a unit in its heading, that at the end of its name, or None."""
+    """Find the name and unit of a column; if its heading has no unit, a unit at the end of the name is split off."""
     return split_unit(label.name) if label.unit is None else (label.name, label.unit)
 
 
@@ -163,13 +163,13 @@ def ends_in(name: str, words: str) -> bool:
 
 
 def is_temperature(label: Label) -> bool:
-    """Test whether the unit of a column, in its heading or at the end of its name, is one of temperature."""
+    """Test whether a column has a unit of temperature, in its heading or at the end of its name."""
     _name, unit = _find_name_and_unit(label)
     return unit is not None and same_dimension(unit, "K")
 
 
 def is_measured(label: Label) -> bool:
-    """Test whether a column is a measured pressure, position, speed or flow, not a set point or computed."""
+    """Test whether a column is a measured pressure, position, speed or flow, and neither a set point nor computed."""
     if len(label.name) > _MAX_NAME:
         return False
     name, unit_of_name = split_unit(label.name)
@@ -193,8 +193,8 @@ def _strip_accents(text: str) -> str:
 def _split_words(name: str) -> set[str]:
     """Split a name into its words, in lower case, and parts of words.
 
-    Parts are both parts of a German compound with a known ending, such as `kolbenseite` and `druck`, without a linking
-    n or s; both letters of `pa` and `pb`; and known words of languages without spaces, such as Chinese.
+    Parts are both words of a German compound with a known ending, such as `kolbenseite` and `druck`, without an n or s
+    that links them; both letters of `pa` and `pb`; and known words of languages without spaces, such as Chinese.
     """
     words = {word for word in _UNSPACED if word in name}
     for token in (token.casefold() for token in _TOKEN.findall(_strip_accents(name))):
@@ -206,16 +206,19 @@ def _split_words(name: str) -> set[str]:
 
 
 def _find_head_side(labels: Sequence[Label]) -> str:
-    """Find the chamber that "head" means: "A" if a column is called rod or the like, "B" if cap, "" if unknown."""
+    """Find the chamber that the word "head" means in the headings of a log, "A" or "B"; "" if unknown or not used."""
     words = {word for label in labels if len(label.name) <= _MAX_NAME for word in _split_words(label.name)}
     if not words & _SIDE["head"]:
         return ""
-    # a rod is on side B, a cap on side A, and the head then on the other side; the letters alone name neither
+    # if a column is named after the rod (side B) or the cap (side A), not just by a letter, the head is opposite
     return "A" if words & (_SIDE["B"] - {"b"}) else "B" if words & (_SIDE["A"] - {"a"}) else ""
 
 
 def _guess_meaning(label: Label, head_side: str = "") -> _Guess | None:
-    """Guess the meaning of a column, or None; "head" means the chamber `head_side`, "A" or "B", or "" if unknown."""
+    """Guess the meaning of a column from its name and unit; None if they do not tell.
+
+    `head_side`: the chamber that the word "head" means, "A", "B" or "" if unknown.
+    """
     if len(label.name) > _MAX_NAME:
         return None
     name, unit = _find_name_and_unit(label)
@@ -224,7 +227,7 @@ def _guess_meaning(label: Label, head_side: str = "") -> _Guess | None:
     if unit is not None and same_dimension(unit, "Pa"):
         return None if words & (_KIND["other"] | _KIND["wanted"]) else _Guess("pressure", side, unit)
     if unit is not None and same_dimension(unit, "K"):  # before `other`, whose words include oil
-        # the oil's, or of nothing that is named, as in `TT101` or `Temp 1`
+        # the name has a word for oil, or none but words for a temperature, as in `TT101` or `Temp 1`
         is_oil = words & _KIND["oil"] or {word for word in words if not word.isdigit()} <= _KIND["temperature"]
         return _Guess("oil", "", unit) if is_oil else None
     if words & _MEASURED["spool"]:
@@ -256,12 +259,12 @@ def _is_command_unit(unit: str) -> bool:
 
 
 def is_current_or_fraction(unit: str) -> bool:
-    """Test whether a unit is one of current or of a fraction of full scale, such as %; both occur for commands."""
+    """Test whether a unit is that of a current or of a fraction of full scale, such as %; commands may have both."""
     return unit in _FRACTION_UNITS or same_dimension(unit, "A")
 
 
 def _guess_at_valve(label: Label, kind: str) -> _Guess | None:
-    """Guess the meaning of a column of pressures on a side of a valve, `kind` "before" or "behind"; None for others."""
+    """Guess whether a column is a pressure on the side `kind` of a valve, "before" or "behind"; None if it is not."""
     name, unit = _find_name_and_unit(label)
     words = _split_words(name)
     if unit is None or not same_dimension(unit, "Pa") or not words & _KIND[kind] or words & _KIND["wanted"]:
@@ -270,7 +273,7 @@ def _guess_at_valve(label: Label, kind: str) -> _Guess | None:
 
 
 def suggest_map_entry(label: Label) -> str:
-    """Format the entry of a map for a column and its likely channel, else `CHANNEL`: `q_pump=Flow [l/min]`."""
+    """Suggest the entry of a map for a column, such as `q_pump=Flow [l/min]`, or `CHANNEL=...` for unknown channels."""
     guess = _guess_meaning(label)
     channel = None if guess is None else guess.channel
     if guess is not None and guess.kind == "flow":  # to either side of the cylinder

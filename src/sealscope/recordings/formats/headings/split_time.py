@@ -24,10 +24,11 @@ _MIN_FRACTION = 0.9
 
 
 def find_time_parts(labels: Sequence[Label], used: Container[int], only_subsecond: bool = False) -> dict[str, int]:
-    """Find the columns outside `used` that together form the time: part of the time, such as "hour" -> column.
+    """Find the columns of the parts of the time, such as "hour"; return a mapping from part to column.
 
-    Hours, minutes and seconds must have one column each. Parts of a second are added, and year, month and day if all
-    three exist. With `only_subsecond`, parts of a second beside a time column of whole seconds are found.
+    Hours, minutes and seconds must have one column each, else the mapping is empty. Parts of a second are added, and
+    year, month and day if all three exist. With `only_subsecond`, there is a time column of whole seconds, and only the
+    parts of a second are searched for. Columns in `used` are left out.
     """
     columns_of_part: dict[str, int] = {}
     for part, words in WORDS["part"].items():
@@ -57,7 +58,7 @@ def combine_time_parts(base: NDArray[Any], parts: Mapping[str, Array], unit: str
     smallest_part = subsecond_parts[-1] if subsecond_parts else "second"
     for part, values in parts.items():
         known = values[np.isfinite(values)]
-        # microseconds beside milliseconds are parts of a millisecond
+        # if there are milliseconds, microseconds are parts of a millisecond
         limit = 1e3 if part in subsecond_parts[1:] else _UPPER_LIMIT.get(part, np.inf)
         if not known.size or known.min() < 0.0 or known.max() >= limit:
             return None

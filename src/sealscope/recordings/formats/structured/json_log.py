@@ -81,9 +81,9 @@ def read_json(path: Path, request: Request) -> RecordingFields:
 
 
 def _read_members(text: str, place: str) -> tuple[list[Any], bool]:
-    """Read the whole values of a JSON text; also return whether it breaks off within a further one, which is dropped.
+    """Read the complete values of a JSON text; also return whether the text breaks off within the next value.
 
-    Raises InputError for other damage.
+    Raises InputError for other damage. `place`: the file, for messages.
     """
     members, is_cut = list[Any](), False
     try:
@@ -150,8 +150,8 @@ def _iter_cells(group: str, name: str, value: Any, depth: int) -> Iterator[tuple
 def _parse_records(members: Sequence[Any], place: str) -> list[Series]:
     """Make a series of samples for each name in a sequence of JSON values.
 
-    The values are records (objects of the values of one row), rows (arrays, perhaps after one of names), or blocks of
-    columns (objects of arrays). Raises InputError for others, and for a name with several units.
+    Each value is a record (an object with the samples of one time), a row (an array of these; the first may contain the
+    names), or a block of columns (an object of arrays). Raises InputError for others, and for names with several units.
     """
     columns: dict[tuple[str, str], dict[int, Any]] = {}
     units: dict[tuple[str, str], str] = {}
@@ -219,10 +219,11 @@ def _parse_array(cells: Sequence[Any], name: str) -> NDArray[Any]:
 
 
 def _convert_lists(value: Any, place: str, depth: int = 0) -> Any:
-    """Convert the lists in a JSON document, at any `depth` of mappings, to arrays or mappings of columns.
+    """Convert the lists in a JSON value to arrays, or to mappings from names to columns.
 
-    A list of samples or of equally long rows becomes an array, one of records a mapping from name to column, one of
-    other mappings a mapping with the names `(1)`, `(2)`, ..., and any other list None.
+    Lists of samples and of equally long rows become arrays. A list of records (mappings from names to single values)
+    becomes a mapping from name to column, and a list of other mappings a mapping with the names `(1)`, `(2)`, ...;
+    other lists become None. `depth`: number of mappings around the value; `place`: the file, for messages.
     """
     if isinstance(value, Mapping) and depth < _MAX_TREE_DEPTH:
         return {key: _convert_lists(member, place, depth + 1) for key, member in value.items()}

@@ -47,7 +47,7 @@ class _Packet:
     def moment(self, index: int, day_first: bool) -> np.datetime64 | None:
         """Return the time stamp of the first sample of channel `index`; None if the header does not state it."""
         day, time = self.entry("date", index), self.entry("time", index).replace(",", ".")
-        seconds, _, fraction = time.partition(".")  # of the fraction 9 digits are used, i.e. nanoseconds
+        seconds, _, fraction = time.partition(".")  # the fraction is cut to 9 digits, i.e. nanoseconds
         try:
             return parse_stamps([f"{day} {seconds}.{fraction[:9] or '0'}"], day_first)[0] if day else None
         except ValueError:
@@ -103,7 +103,7 @@ def _iter_packets(lines: Iterator[tuple[int, str]], delimiter: str, decimal: str
             names = packet.names
 
             def format_place(index: int, number: int = number, names: Sequence[str] = names) -> str:
-                """Format the place of cell `index` in the present line, which the defaults fix, for messages."""
+                """Format line, column and file of a cell; the defaults keep the values of this step of the loop."""
                 return f"(line {number}, column {names[index]}, {place})"
 
             padded_cells = cells[: len(names)] + [""] * (len(names) - len(cells))
@@ -160,7 +160,7 @@ def _list_series(packets: Sequence[_Packet], x_columns: str) -> list[Series]:
 
 
 def _compute_times(packet: _Packet, index: int, count: int) -> Array:
-    """Compute the times (count,) [s] of channel `index` from start `X0`, else 0, and step `Delta_X` in the header."""
+    """Compute the times (count,) [s] of channel `index` from `X0` (by default 0) and `Delta_X` in a packet's header."""
     step = packet.number("delta_x", index)
     if not step > 0:
         raise InputError(f"Delta_X must be > 0 s, got {packet.head.get('delta_x')}")

@@ -51,7 +51,7 @@ def _iter_value(group: str, name: str, value: Any, clock: Clock | None, depth: i
 
 
 def _struct_fields(value: Any) -> Mapping[str, Any] | None:
-    """Return a struct's or object's fields by name, an array's structs by `(1)`, `(2)`, ...; None for other values."""
+    """Return the fields of a struct by name, or the structs in an array by `(1)`, `(2)`, ...; None for other values."""
     properties = getattr(value, "properties", value)
     if isinstance(properties, Mapping):
         return properties
@@ -66,7 +66,8 @@ def _struct_fields(value: Any) -> Mapping[str, Any] | None:
 def _iter_struct(group: str, name: str, fields: Mapping[str, Any], clock: Clock | None, depth: int) -> Iterator[Series]:
     """Yield the series of samples in a struct: a time series, a signal, or a group of other values.
 
-    A signal has samples and a unit or, in a Simulink log, a name and `values`. Other arguments as in `_iter_value`.
+    A signal has samples and a unit or, in a Simulink log, a name and `values`. `group`, `name`: names of the structs
+    around this one, and its name; `clock`: sampling times of series that state none; `depth`: number of structs around.
     """
     by_name = {key.rstrip("_").casefold(): value for key, value in fields.items()}
     unit = _first_text(by_name, _UNIT_FIELDS)
@@ -85,10 +86,11 @@ def _iter_struct(group: str, name: str, fields: Mapping[str, Any], clock: Clock 
 
 
 def _iter_time_series(group: str, name: str, by_name: Mapping[str, Any], clock: Clock, depth: int) -> Iterator[Series]:
-    """Yield the series of samples in a struct that also contains their times: `by_name` and the `clock`.
+    """Yield the series of samples in a struct that also contains their times; `clock` gives these times.
 
-    The samples are in the structs of `signals`, as in Simulink's structure with time, in an array `data`, as in
-    MATLAB's `timeseries`, or in another value `data`. Other arguments as in `_iter_value`.
+    The samples are in the structs of the field `signals`, as in Simulink's structure with time, in an array `data`, as
+    in MATLAB's `timeseries`, or in another value `data`. `by_name`: name in lower case -> field of the struct; `group`,
+    `name`: names of the structs around it, and its name; `depth`: number of structs around it.
     """
     data = by_name.get("data")
     if "signals" in by_name:
@@ -106,7 +108,8 @@ def _iter_time_series(group: str, name: str, by_name: Mapping[str, Any], clock: 
 def _iter_group(group: str, fields: Mapping[str, Any], clock: Clock | None, depth: int) -> Iterator[Series]:
     """Yield the series of samples in each field of a struct, with names and units from fields such as `units`.
 
-    `group`: names of the struct and of those around it, with slashes between; `depth`, `clock`: as in `_iter_value`.
+    `group`: names of the struct and of those around it, with slashes between; `depth`: number of the latter; `clock`:
+    sampling times of series that state none, None if unknown.
     """
     units, column_names = _find_field_units(fields), _find_column_names(fields)
     for key, value in fields.items():
@@ -133,7 +136,7 @@ def _is_vector(value: Any) -> bool:
 
 
 def _first_text(by_name: Mapping[str, Any], names: tuple[str, ...]) -> str | None:
-    """Return the text of the first of the fields `names` that is present, empty if it is no text; None without one."""
+    """Return the text of the first existing field of several `names`; "" if it is no text, None if no field exists."""
     return next((_single_text(by_name[name]) for name in names if name in by_name), None)
 
 
@@ -161,7 +164,7 @@ def _find_column_names(fields: Mapping[str, Any]) -> list[str]:
 
 
 def _read_struct_times(by_name: Mapping[str, Any]) -> NDArray[np.float64] | None:
-    """Read the times (n,) [s] of a struct with samples: numbers, or start, increment and length; else None."""
+    """Read the times (n,) [s] of a struct with samples from its fields `time` or `timeinfo`; None if it has neither."""
     if "signals" not in by_name and "data" not in by_name:
         return None
     time = by_name.get("time")
