@@ -57,7 +57,7 @@ def is_known_version(version: str) -> bool:
 
 @cache
 def _compiler() -> ModuleType:
-    """Import `numba_private` for a version of numba in `KNOWN_VERSIONS`, else `numba_pipeline`, after a warning."""
+    """Import the module that compiles laws: `numba_private` for `KNOWN_VERSIONS` of numba, else `numba_pipeline`."""
     if is_known_version(numba.__version__):
         return import_module("sealscope.numba_private")
     low, high = (".".join(map(str, version)) for version in KNOWN_VERSIONS)
@@ -80,7 +80,10 @@ def source_hash(root: Path) -> str:
 
 
 def _user_cache_folder() -> Path | None:
-    """Return the cache folder, `SEALSCOPE_CACHE_DIR` or else the user's; None if that is empty or no home is known."""
+    """Find the folder for compiled code: `SEALSCOPE_CACHE_DIR` if that is set, else the user's cache folder.
+
+    Returns None if the variable is set but empty, or if the user has no home folder.
+    """
     setting = os.environ.get("SEALSCOPE_CACHE_DIR")
     if setting is not None:
         return Path(setting) if setting else None
@@ -125,8 +128,7 @@ def cache_directory() -> Path | None:
     """Create the folder for the compiled code of these sources, and return its path.
 
     The user's cache folder is preferred; if it is not safe or not writable, a private folder among the temporary files
-    is used. Folders of older sources are removed (`_prune`). Returns None if caching is turned off, and None after a
-    warning if no folder can be used.
+    is used. Older folders are removed (`_prune`). Returns None if caching is off, or after a warning if none is usable.
     """
     base = _user_cache_folder()
     if base is None:
@@ -181,15 +183,14 @@ def law(function: _F) -> _F:
 
 
 def large_law(function: _F) -> _F:
-    """Compile a large function for calls from Python and from compiled functions, which do not contain its code."""
+    """Compile a large function for calls from Python and compiled functions, which call it and do not inline it."""
     return _compile_law(function, fastmath=False, inlined=False)
 
 
 def contracted(function: _F) -> _F:
     """Compile a small function like `law`, with fused multiply-adds and divisions by reciprocals allowed.
 
-    The last digits of the results then depend on the processor, but not on how samples are divided into blocks
-    and vector lanes.
+    The results' last digits then depend on the processor, but not on the division of samples into blocks or vectors.
     """
     return _compile_law(function, fastmath={"contract", "arcp"})  # fused multiply-adds, reciprocals
 
@@ -247,7 +248,7 @@ def record_dtype(*numbers: str, **parts: Any) -> np.dtype[Any]:
 
 
 def make_record(layout: np.dtype[Any], source: object = None, **values: Any) -> np.recarray[Any, Any]:
-    """Make a record array (1,) of dtype `layout`: a field is from `values`, else an attribute of `source`, else 0."""
+    """Make a record (1,) of dtype `layout`: each field is from `values`, else an attribute of `source`, else 0."""
     record = np.zeros(1, layout).view(np.recarray)
     for name in layout.fields or ():
         record[name] = values.get(name, getattr(source, name, 0.0))

@@ -12,7 +12,7 @@ _MAX_BEGINNING, _MAX_END = 1500, 2500
 
 
 def printable(text: str, kept: str = "", instead: str = "\N{REPLACEMENT CHARACTER}") -> str:
-    """Replace each unprintable character, which may control a terminal, except those in `kept`, by `instead`."""
+    """Replace unprintable characters, which may control a terminal, by `instead`, except the characters in `kept`."""
     return "".join(character if character.isprintable() or character in kept else instead for character in text)
 
 

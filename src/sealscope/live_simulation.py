@@ -68,7 +68,7 @@ def make_simulated_sources(settings: MonitorSettings, say: Callable[[str], None]
 def _make_experiment(actuator: ActuatorSettings, settings: SimulateSettings) -> Experiment:
     """Build the experiment that simulates an actuator.
 
-    Raises InputError for invalid settings, and for more blocks than the monitor's database can tell apart.
+    Raises InputError for invalid settings, and if the run has more blocks of data than the monitor can tell apart.
     """
     try:
         experiment = Experiment.of(rig=actuator.rig, **settings.model_dump(exclude={"speed"}))

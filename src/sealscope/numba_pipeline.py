@@ -94,7 +94,7 @@ class _FullCompiler(CompilerBase):  # type: ignore[misc]
     """numba's own compiler, with `ConstantLengths` after its pass that replaces other constants."""
 
     def define_pipelines(self) -> list[Any]:
-        """Build the list of numba's pipelines: one, with the usual passes and `ConstantLengths`."""
+        """Build a list with numba's usual pipeline, to which the pass `ConstantLengths` is added."""
         pipeline = DefaultPassBuilder.define_nopython_pipeline(self.state, "sealscope")
         pipeline.add_pass_after(ConstantLengths, RewriteSemanticConstants)
         pipeline.finalize()

@@ -114,7 +114,7 @@ class _ShortCompiler(CompilerBase):  # type: ignore[misc]
     """numba's compiler with only the passes in `_PASSES`."""
 
     def define_pipelines(self) -> list[Any]:
-        """Build the list of numba's pipelines: one, with the passes in `_PASSES`."""
+        """Build a list with one pipeline of numba, which has the passes in `_PASSES`."""
         pipeline = PassManager("nopython")
         for step in _PASSES:
             pipeline.add_pass(step, step.__name__)
@@ -160,7 +160,7 @@ class _LawLibrary(JITCodeLibrary):  # type: ignore[misc]
     """
 
     def _finalize_final_module(self) -> None:
-        """Skip the generation of machine code."""
+        """Mark the library as final without generating machine code, which numba would do here."""
         self._finalized = True
 
 
@@ -168,7 +168,7 @@ class _LawCompiler(_ShortCompiler):
     """Compiler of laws, functions for other compiled functions, to LLVM code in a `_LawLibrary`, not machine code."""
 
     def define_pipelines(self) -> list[Any]:
-        """Build the list of numba's pipelines: one, with the passes in `_PASSES` but without machine code."""
+        """Build a list with one pipeline of numba, with the passes in `_PASSES` but without machine code."""
         self.state.flags.no_compile = True
         self.state.library = _LawLibrary(self.state.targetctx.codegen(), self.state.func_id.func_qualname)
         return super().define_pipelines()
@@ -192,7 +192,7 @@ class _Law(CPUDispatcher):  # type: ignore[misc]
 
     @cached_property
     def _for_python(self) -> Any:
-        """The function for Python: the source of a small (inlined) law, or a kernel compiled from a large one's."""
+        """The function that Python calls: uncompiled for a small (inlined) law, a kernel for a large one."""
         inlined = self.targetoptions["forceinline"]
         return self.py_func if inlined else compile_kernel(self.py_func, self.targetoptions["fastmath"], self.folder)
 

@@ -29,7 +29,7 @@ def paragraph(text: str, head: str = "", indent: int | None = None, width: int =
 
 
 def paragraphs(rows: Iterable[tuple[str, str | None]], columns: int, width: int = WIDTH) -> list[str]:
-    """Format rows (label, text), except those without text, as paragraphs beside labels in `columns` characters."""
+    """Format pairs (label, text) as paragraphs, the label in the first `columns` characters; omit any without text."""
     return [paragraph(text, f"  {label}".ljust(columns), indent=columns, width=width) for label, text in rows if text]
 
 

@@ -48,7 +48,7 @@ class Unit(NamedTuple):
     offset: Fraction = Fraction(0)
 
     def times(self, other: Unit, power: Fraction) -> Unit:
-        """Multiply by `other` raised to a `power`, dropping offsets as that of degC.
+        """Multiply by `other` raised to a `power`; the product has no offset, such as that of degC.
 
         Raises ValueError if the factor of the product is beyond the range of doubles.
         """
@@ -251,8 +251,12 @@ def is_familiar(unit: str) -> bool:
     """
     names = {*_ATOMS, *_SPELLINGS} - {""}
     parts = [unit] if unit in names else unit.split("/")
-    # without a power, and without the mark of an absolute or gauge pressure
-    return all(names & {part, part.rstrip("23"), part[:-1] if part.endswith(("a", "g")) else part} for part in parts)
+    for part in parts:
+        without_power = part.rstrip("23")
+        without_mark = part[:-1] if part.endswith(("a", "g")) else part  # "a": absolute, "g": gauge pressure
+        if names.isdisjoint((part, without_power, without_mark)):
+            return False
+    return True
 
 
 @lru_cache(maxsize=1024)
@@ -268,7 +272,7 @@ def _conversion(unit: str, si_unit: str) -> _Conversion:
 
 
 def _find_conversion(unit: str, si_unit: str, name: str, place: str | None) -> _Conversion:
-    """Compute the `_conversion` from `unit` to `si_unit`; errors name the quantity, `name`, and the file, `place`."""
+    """Compute the `_conversion` from `unit` to `si_unit`; an InputError states quantity (`name`) and file (`place`)."""
     try:
         return _conversion(unit, si_unit)
     except InputError as error:
@@ -278,7 +282,7 @@ def _find_conversion(unit: str, si_unit: str, name: str, place: str | None) -> _
 
 
 def _convert_exactly(value: Fraction, conversion: _Conversion) -> float:
-    """Convert one number by a `_conversion`, exactly but for pi, and round it once; infinite if beyond doubles."""
+    """Convert a number by a `_conversion` in exact arithmetic, except for pi; infinite beyond the range of doubles."""
     factor, pi_power, first_offset, second_offset = conversion
     exact = (value + first_offset) * factor
     try:
@@ -298,9 +302,9 @@ def to_si(
 ) -> Array | float:
     """Convert `values` (any shape, or one number) in `unit` to doubles in `si_unit`.
 
-    One number is converted exactly and rounded once, except for units with pi, such as rpm; an array to within 2 units
-    in the last place. Raises InputError for a unit of another dimension; the message states `name`, the unit, the
-    expected dimension and the file `place`.
+    One number is converted exactly and rounded once, except for units with pi, such as rpm. An array is converted with
+    an error of up to 2 units in the last place. Raises InputError for a unit of another dimension; the message states
+    `name`, the unit, the expected dimension and the file `place`.
     """
     scalar = isinstance(values, int | float)
     if unit == si_unit:

@@ -14,7 +14,7 @@ from sealscope.units import P_ATM
 
 @law
 def mid_stroke_volumes(c: Any) -> tuple[float, float]:
-    """Compute the oil volumes [m^3] of sides A and B at mid-stroke from those of chamber, rod and hoses in `c`."""
+    """Compute the oil volumes [m^3] of sides A and B at mid-stroke; `c`: object with chamber, rod and hose volumes."""
     return c.V + c.V_hose_A, c.V - c.V_rod + c.V_hose_B
 
 

@@ -13,8 +13,7 @@ from sealscope.units import P_ATM
 def external_leakage(p: float, G_ext: float) -> float:
     """Compute the laminar leakage G_ext p [m^3/s] past the rod seal out of a chamber at the pressure `p` [Pa gauge].
 
-    It is 0 below atmospheric pressure, because the seal lets no air in (Merritt, Hydraulic Control Systems, 1967,
-    external leakage of an actuator).
+    It is 0 below atmospheric pressure: no air enters (Merritt, Hydraulic Control Systems, 1967, external leakage).
     """
     return G_ext * max(p, 0.0)
 
@@ -23,8 +22,7 @@ def external_leakage(p: float, G_ext: float) -> float:
 def accumulator_pressure(V_up: float, p_charge: float, V_gas: float) -> float:
     """Compute the pressure [Pa gauge] of a gas accumulator that has delivered the oil volume V_up [m^3].
 
-    The gas has the volume `V_gas` [m^3] at `p_charge` [Pa gauge], and expands isothermally by Boyle's law,
-    p_abs (V_gas + V_up) = constant.
+    The gas has the volume `V_gas` [m^3] at `p_charge` [Pa gauge], and p_abs (V_gas + V_up) is constant (isothermal).
     """
     return (p_charge + P_ATM) * V_gas / (V_gas + V_up) - P_ATM
 
@@ -90,7 +88,7 @@ def pilot_valve_flow(
 ) -> float:
     """Compute the flow [m^3/s] through a pilot-operated check valve, positive in the free direction.
 
-    It is G_check dp times the valve's opening, `pilot_opening` of the other arguments. `dp` [Pa]: inlet minus outlet
-    pressure; `G_check` [m^3/(s Pa)]: conductance of the fully open valve.
+    The flow is G_check dp times the valve's opening. `dp` [Pa]: inlet minus outlet pressure; `G_check` [m^3/(s Pa)]:
+    conductance of the fully open valve; other arguments: as in `pilot_opening`, which computes the opening.
     """
     return G_check * dp * pilot_opening(dp, dp_pilot, p_crack, k_pilot, p_open)

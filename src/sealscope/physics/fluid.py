@@ -90,8 +90,7 @@ def kinematic_viscosity(T: NDArray[np.float64], nu_40: float, nu_100: float) -> 
 def thermal_density_ratio(T: NDArray[np.float64], T_0: float, alpha: float) -> NDArray[np.float64]:
     """Compute the density ratio rho(T)/rho(T_0) = 1 - alpha (T - T_0) of an oil at the temperatures T and T_0 [K].
 
-    `alpha` [1/K]: thermal expansion. Source: Merritt, Hydraulic Control Systems, 1967, section 2.2, density of
-    petroleum fluids.
+    `alpha` [1/K]: thermal expansion. Source: Merritt, Hydraulic Control Systems, 1967, section 2.2 (petroleum fluids).
     """
     return np.asarray(1.0 - alpha * (T - T_0))
 

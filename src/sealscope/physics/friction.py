@@ -80,8 +80,7 @@ def lugre_friction(v: float, z: float, dz: float, sigma_0: float, sigma_1: float
     deflection and its rate (`bristle_rate`); `sigma_0` [N/m], `sigma_1` [N s/m]: stiffness and damping of the bristles;
     `F_v` [N s/m]: viscous coefficient. The damping decays at speeds above `v_th` [m/s]; else it could drive the motion.
 
-    Source: eq. (3) of the paper cited in `bristle_rate`; H. Olsson, Control Systems with Friction, Lund 1996, section
-    5.
+    Source: eq. (3) of the paper cited in `bristle_rate`; H. Olsson, Control Systems with Friction, Lund 1996, sect. 5.
     """
     relative_v = v / v_th
     return sigma_0 * z + sigma_1 * exponential(-relative_v * relative_v) * dz + F_v * v  # type: ignore[no-any-return]
@@ -100,8 +99,7 @@ def stribeck_friction(
     s/m]: viscous coefficient; `v_th` [m/s]: velocity below which friction is linear.
 
     Eq. (4.22) is printed with an unbalanced bracket. `literal_bracket` closes it after F_v v_th instead, F = v F_C [1 +
-    (K_brk - 1) exp(-C_c |v|) + F_v v_th] / v_th, so that F jumps at v_th (from 73.2 N to 145 N with Table 4.1 and no
-    pressure).
+    (K_brk - 1) exp(-C_c |v|) + F_v v_th] / v_th, so that F jumps at v_th (73.2 N to 145 N with Table 4.1, no pressure).
     """
     speed = abs(v)
     if literal_bracket:

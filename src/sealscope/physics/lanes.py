@@ -97,7 +97,7 @@ def _cast_to_lanes(context: Any, builder: Any, value_type: Any, lanes: Any, valu
 
 
 def _common_lanes_type(arg_types: tuple[Any, ...]) -> Lanes | None:
-    """Find the one type of lanes among a call's argument types, the rest being numbers; None for any other call."""
+    """Find the single vector type (lanes) among argument types; None without it, or if another type is no number."""
     lanes = {arg_type for arg_type in arg_types if isinstance(arg_type, Lanes)}
     compatible = len(lanes) == 1 and all(isinstance(arg_type, Lanes | types.Number) for arg_type in arg_types)
     return lanes.pop() if compatible else None
@@ -186,8 +186,8 @@ def register_lowering(function: Any, arity: int, infer_type: Any) -> Any:
     """Make a Python function of `arity` arguments callable in compiled code; the decorated function builds its code.
 
     `infer_type(arg_types)` returns the type of the result, or None if the function does not take arguments of these
-    types. The decorated function takes numba's context, LLVM's builder, and types and values of the arguments,
-    and returns the value of the result.
+    types. The decorated function takes numba's context, LLVM's builder, and types and values of the arguments, and
+    returns the value of the result.
     """
 
     @infer_global(function)
@@ -215,7 +215,7 @@ def select(condition: Any, yes: Any, no: Any) -> Any:
 
 
 def _select_type(arg_types: Any) -> Any:
-    """Find the type of the result of `select`: that of the vectors in its arguments, or a double without any."""
+    """Find the type of the result of `select`: that of the vectors among its arguments, double if there are none."""
     if isinstance(arg_types[0], Mask):  # the condition
         return arg_types[0].lanes
     return next((arg_type for arg_type in arg_types if isinstance(arg_type, Lanes)), types.float64)
@@ -234,7 +234,7 @@ def _lower_select(context: Any, builder: Any, arg_types: Any, values: Any) -> An
 
 
 def any_lane(condition: Any) -> Any:
-    """Return True if any truth value of a mask, or the single one of a run without lanes, is true."""
+    """Return True if any truth value of a mask is true; return a single truth value as it is."""
     return condition
 
 
@@ -267,7 +267,7 @@ def _lower_nearest_integer(context: Any, builder: Any, arg_types: Any, values: A
 
 
 def power_of_two(n: Any) -> Any:
-    """Compute 2^n for a whole number n, a float or lanes, in -1022..1023 (single precision: limited to -126..127)."""
+    """Compute 2^n for whole n (float or vector of floats) in -1022..1023; single precision limits n to -126..127."""
     return math.ldexp(1.0, int(n))
 
 
@@ -306,8 +306,8 @@ def _row_address(context: Any, builder: Any, arg_types: Any, values: Any) -> Any
 def load(array: Any, row: int) -> Any:
     """Load one row of a C-ordered array as lanes, a vector of numbers, in compiled code that `_lower_load` builds.
 
-    Its shape is (..., WIDTH) of doubles, or (..., SINGLE_WIDTH) in single precision. Rows are numbered over all axes
-    but the last.
+    `array`: (..., WIDTH) doubles, or (..., SINGLE_WIDTH) in single precision; `row`: number of the row,
+    counted over all axes but the last.
     """
 
 
@@ -320,6 +320,7 @@ def _loaded_type(arg_types: Any) -> Any:
 
 @register_lowering(load, 2, _loaded_type)
 def _lower_load(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
+    """Build the LLVM instructions of `load`, whose arguments are the array and the row."""
     return builder.load(_row_address(context, builder, arg_types, values), align=arg_types[0].dtype.bitwidth // 8)
 
 
@@ -335,6 +336,7 @@ def _stored_type(arg_types: Any) -> Any:
 
 @register_lowering(store, 3, _stored_type)
 def _lower_store(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
+    """Build the LLVM instructions of `store`, whose arguments are the array, the row and the vector."""
     builder.store(values[2], _row_address(context, builder, arg_types, values), align=arg_types[0].dtype.bitwidth // 8)
     return context.get_dummy_value()
 
@@ -345,6 +347,7 @@ def broadcast(value: Any) -> Any:
 
 @register_lowering(broadcast, 1, lambda _: LANES)
 def _lower_broadcast(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
+    """Build the LLVM instructions of `broadcast`, whose only argument is the number."""
     return _convert_to_lanes(context, builder, values[0], arg_types[0], LANES)
 
 

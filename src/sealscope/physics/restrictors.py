@@ -63,8 +63,7 @@ def _solve_scaled_flow(b: float, a: float) -> float:
 
     w r(w) with r = sqrt((w^2 + sqrt(w^4 + 4))/2) >= 1 is the orifice's pressure difference over dp_0: `orifice_flow`
     inverted. a w is a pressure difference that grows linearly with the flow, over dp_0; b is the sum of both. The left
-    side rises and is convex, so the root is unique. Halley's method finds it to a relative error of 1e-12, in a single
-    iteration if a >> 1, where r hardly matters.
+    side rises and is convex, so the root is unique. Halley's method finds it to a relative error of 1e-12.
     """
     w = b / (a + 1.0)  # first guess, with r = 1
     w = b / (a + select(w < 2.0, 1.0 + 0.25 * w * w, w))  # better, with r(w) approximated for small and for large w

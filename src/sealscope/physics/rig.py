@@ -171,7 +171,10 @@ def parameter_values(rig: Rig) -> RigValues:
 
 
 def throttle_readings(rig: Rig) -> tuple[float, bool]:
-    """Return a rig's readings of the thesis: the arguments `exponent` and `literal` of `throttle_flow_coefficients`."""
+    """Return the rig's interpretation of two ambiguous statements of the thesis about throttles.
+
+    They are the arguments `exponent` and `literal` of `throttle_flow_coefficients`, which explains them.
+    """
     return (2.0 if rig.line.closed_means == "diameter" else 1.0), rig.line.metering == "literal"
 
 
@@ -181,7 +184,7 @@ def throttle_coefficients(rig: Rig) -> tuple[float, float, float, float]:
 
 
 def rig_numbers(rig: Rig) -> RigNumbers:
-    """Convert a rig to the numbers and choices that the laws take; raise InputError if it cannot be simulated."""
+    """Convert a rig to the numbers and choices for its physical laws; raise InputError if it cannot be simulated."""
     check_circuit_property("a simulation", rig.name, rig.circuit, "simulated")
     values = parameter_values(rig)
     return RigNumbers(
@@ -194,7 +197,10 @@ def rig_numbers(rig: Rig) -> RigNumbers:
 
 @cache
 def _record_type(lengths: tuple[int, ...]) -> np.dtype[Any]:
-    """Build the NumPy dtype of the record of `pack_numbers` from the length of each law's tuple in `RigNumbers`."""
+    """Build the NumPy dtype of the record that `pack_numbers` makes.
+
+    `lengths`: lengths of the tuples in `RigNumbers` for the optional laws, 0 for an absent law.
+    """
     numbers = [(name, "f8") for name in NUMBERS]
     truth_values = [(name, "?") for name in CHOICES if name not in LAWS]
     laws = [(name, "f8", (length,)) for name, length in zip(LAWS, lengths, strict=True)]
@@ -237,7 +243,7 @@ def vapour_floor(q: float, p: RigNumbers) -> float:
 
     Below the vapour pressure `p_vap` [Pa absolute] the oil boils. The state q may fall further, so that mass balances
     hold: rho(q) V is the mass of oil in the volume V, with the density rho(q) that follows from the oil's bulk modulus.
-    Of V, V (1 - rho(q)/rho(p_vap)) is vapour.
+    The fraction 1 - rho(q)/rho(p_vap) of V is vapour.
 
     Source: E. B. Wylie, V. L. Streeter, Fluid Transients, 1978, chapter 8: vapour cavities at constant pressure.
     """
@@ -254,7 +260,7 @@ def pressures_of(y: State, p: RigNumbers) -> Pressures:
 
 @contracted
 def speed_error(y: State, u: float, p: RigNumbers) -> float:
-    """Compute the motor's set speed (by the command `u` [V], or `omega_P` of a supply) minus its speed [rad/s]."""
+    """Compute the motor's speed error [rad/s], set speed (by the command `u` [V], or a supply's `omega_P`) - speed."""
     if len(p.valved) > 0:  # an empty tuple in a rig without a servo valve
         return p.omega_P - y[OMEGA]  # type: ignore[no-any-return]
     return p.omega_per_volt * u - y[OMEGA]  # type: ignore[no-any-return]
@@ -281,7 +287,7 @@ def friction_force(y: State, applied: float, p: RigNumbers) -> tuple[float, floa
     F_C = friction.coulomb_friction(
         vapour_floor(y[P_A], p), vapour_floor(y[P_B], p), p.F_pr, p.F_cfr, p.coulomb_of_difference
     )
-    F_v, breakaway, no_rate = p.F_v, p.K_brk * F_C, 0.0 * v  # 0.0 * v: a zero of v's type, a number or lanes
+    F_v, breakaway, no_rate = p.F_v, p.K_brk * F_C, 0.0 * v  # 0.0 * v: a zero of v's type, a number or a vector
     if len(p.one_sided) > 0:
         breakaway = select(applied < 0.0, p.backward * breakaway, breakaway)
         side = select(v < 0.0, p.backward, 1.0)
@@ -438,7 +444,7 @@ def make_up_flows(y: State, p: RigNumbers) -> tuple[float, float]:
         makeup_1 = external.pilot_valve_flow(p_up - p_1, p_2 - p_up, p.p_crack, p.G_check, p.k_pilot, p.p_open)
         makeup_2 = external.pilot_valve_flow(p_up - p_2, p_1 - p_up, p.p_crack, p.G_check, p.k_pilot, p.p_open)
     else:
-        G_check = p.G_check if p.made_up else 0.0 * p.G_check  # a zero of G_check's type: a number or lanes
+        G_check = p.G_check if p.made_up else 0.0 * p.G_check  # a zero of G_check's type: a number or a vector
         makeup_1 = external.check_valve_flow(p_up - p_1, p.p_crack, G_check)
         makeup_2 = external.check_valve_flow(p_up - p_2, p.p_crack, G_check)
     if len(p.relieved) > 0:
@@ -504,7 +510,7 @@ def valve_rates(y: State, Q_1: float, p: RigNumbers) -> Pressures:
     p_A, p_B, p_P, p_T = y[P_A], y[P_B], y[P_1], y[P_2]
     Q_PA, Q_AT, Q_PB, Q_BT = valve_flows(y, p)
     V_A, V_B = volumes_at(y[POSITION], p)
-    # each flow at the pressures of its source and of its sink: drawn from the supply, and into the chamber
+    # oil is compressible: each flow has a value where it leaves its source and another where it enters its sink
     drawn_A, to_A = flows_at_both_ends(Q_PA, p_P, p_A, p)
     drawn_B, to_B = flows_at_both_ends(Q_PB, p_P, p_B, p)
     from_A, _ = flows_at_both_ends(Q_AT, p_A, p_T, p)
@@ -515,7 +521,7 @@ def valve_rates(y: State, Q_1: float, p: RigNumbers) -> Pressures:
         cylinder.pressure_rate(to_A - from_A, V_A, bulk_modulus(p_A, p)),  # eq. (4.18)
         cylinder.pressure_rate(to_B - from_B, V_B, bulk_modulus(p_B, p)),  # eq. (4.19)
         (fed - relief - drawn_A - drawn_B) / supply_compliance(p_P, p),
-        0.0 * p_T,  # a zero of p_T's type: a number or lanes
+        0.0 * p_T,  # a zero of p_T's type: a number, or a vector over runs
     )
 
 
@@ -571,7 +577,7 @@ def rates_without_throttles(y: State, u: float, G: float, C: float, F: float, p:
         rate_A = cylinder.pressure_rate(to_1 - p.A_A * v - from_A, V_A, K_A)
         rate_B = cylinder.pressure_rate(-from_2 + p.A_B * v + to_B, V_B, K_B)
         rate_1, rate_2 = rate_A, rate_B
-    fed, d_x_s, d_v_s = 0.0 * v, 0.0 * v, 0.0 * v  # zeros of v's type: a number or lanes
+    fed, d_x_s, d_v_s = 0.0 * v, 0.0 * v, 0.0 * v  # zeros of v's type: a number, or a vector over runs
     if len(p.open_circuit) > 0:
         external_part, fed = external_pressure_rates(y, p)  # rates of p_A, p_B, p_1 and p_2; flow of the accumulator
         rate_A, rate_B = rate_A + external_part[0], rate_B + external_part[1]
@@ -591,8 +597,7 @@ def rates(y: State, u: float, G: float, C: float, F: float, p: RigNumbers) -> St
     """Compute the rates dy/dt of all states of the rig from its physical laws.
 
     `y`: state in the order of `STATES`; `u` [V]: command; `G` [m^3/(s Pa)], `C` [m^3/(s Pa^0.5)]: conductance and flow
-    coefficient of the leakage past the piston, through a laminar gap and an orifice (`piston_leakage`); `F` [N]: load
-    in addition to the rig's own.
+    coefficient of the leakage past the piston (`piston_leakage`); `F` [N]: load in addition to the rig's own.
     """
     dy = rates_without_throttles(y, u, G, C, F, p)
     if len(p.throttled) > 0:  # an empty tuple in a rig without throttles

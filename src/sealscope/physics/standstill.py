@@ -35,8 +35,8 @@ def pressures_at_standstill(force: float, p: RigNumbers) -> tuple[float, float]:
     """Compute the chamber pressures p_A, p_B [Pa] that hold the piston at rest: p_A A_A - p_B A_B = force.
 
     `force` [N]: load against +x. With a make-up the lower pressure is the charge pressure. Without one the circuit
-    contains as much oil as with the charge pressure everywhere, so it is the mean of both pressures, weighted by the
-    oil volumes of the two sides.
+    contains as much oil as with the charge pressure everywhere. The mean of both pressures, weighted by the oil volumes
+    of the two sides, is therefore the charge pressure.
     """
     if p.made_up:  # each pressure for the case that the other one is the charge pressure
         p_B = max((p.p_charge * p.A_A - force) / p.A_B, p.p_charge)
@@ -58,7 +58,7 @@ def stand_still(y: Any, x: float, force: float, p: RigNumbers) -> int:
 
     `x` [m]: position; `force` [N]: load against +x. The motor holds the pump with the current i = T_load/C_m, eq.
     (4.5), for which the speed controller's integral is R_c i/K_i, eq. (4.3), or 0 if K_i = 0. The code is
-    `BELOW_VACUUM` if a pressure would be below vacuum, `BEYOND_DRIVE` if current or voltage are.
+    `BELOW_VACUUM` for a pressure below vacuum, `BEYOND_DRIVE` for a current or voltage beyond the drive's limit.
     """
     p_A, p_B = pressures_at_standstill(force, p)
     y[POSITION] = x
@@ -87,8 +87,7 @@ def pressures_behind_valve(force: float, A_A: float, A_B: float, p_1: float, p_2
 def supply_at_standstill(force: float, x: float, p: RigNumbers) -> tuple[float, float, float]:
     """Compute the supply pressure p_1 and chamber pressures p_A, p_B [Pa] of a rig at rest with a centred servo valve.
 
-    `force` [N]: load against +x; `x` [m]: position. p_1 is where dp_1/dt, which falls with rising p_1, is 0; bisection
-    finds it.
+    `force` [N]: load against +x; `x` [m]: position. dp_1/dt falls with rising p_1: bisection finds its root.
     """
     y = np.zeros(len(STATES))
     y[POSITION], y[P_2] = x, p.p_return

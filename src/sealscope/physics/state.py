@@ -30,7 +30,7 @@ def state_of(y: np.ndarray) -> State:
 
 @contracted
 def add_step(y: State, h: float, dy: State) -> State:
-    """Compute y + h dy, element by element, for a state or its rates `y` and for rates `dy`."""
+    """Compute y + h dy, element by element, for rates `dy` and a state `y` (or rates `y`, to sum rates)."""
     return (
         y[0] + h * dy[0],
         y[1] + h * dy[1],
@@ -51,6 +51,6 @@ def add_step(y: State, h: float, dy: State) -> State:
 
 @contracted
 def add_to_pressures(y: State, h: float, s: Pressures) -> State:
-    """Add h s to the pressures p_A, p_B, p_1, p_2 of a state, or of its rates, `y`; return all elements."""
+    """Add h s to p_A, p_B, p_1, p_2 of a state `y`, or to their rates in rates `y`; return the whole tuple."""
     p_A, p_B, p_1, p_2 = y[P_A] + h * s[0], y[P_B] + h * s[1], y[P_1] + h * s[2], y[P_2] + h * s[3]
     return y[0], y[1], y[2], y[3], y[4], y[5], p_A, p_B, p_1, p_2, y[10], y[11], y[12], y[13]

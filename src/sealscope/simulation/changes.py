@@ -82,7 +82,7 @@ def apply_effects(rig_value: T, effects: Sequence[Effect], field: str, t: Array)
 
 
 def changing_values(effects: Sequence[Effect], base: RigNumbers, t: Array) -> dict[str, Array]:
-    """Compute the parameters that the effects change from `base`, at times t (n,) [s], as values (n,) by name."""
+    """Compute the changed parameters, name -> values (n,) at times t (n,) [s]; `base`: parameters without effects."""
     names = dict.fromkeys(effect.field for effect in effects)
     return {name: apply_effects(np.full(t.size, float(getattr(base, name))), effects, name, t) for name in names}
 
@@ -93,9 +93,9 @@ def block_bounds(effects: Sequence[Effect], n_out: int, rate: float) -> np.ndarr
     Returns the bounds of the blocks (blocks + 1,) as indices, 0 to `n_out`, of the solver's outputs at `rate` [Hz].
 
     The first bounds are the breakpoints of effects, to within one output interval, and times `LONGEST_BLOCK` apart.
-    Then each block is divided into equal parts, as many as any effect needs: it changes by at most its `max_change`
-    from part to part, unless the parts would become shorter than its `min_block`. A part may therefore be shorter than
-    the `min_block` of a slower effect, and between close breakpoints shorter than that of any effect.
+    Then each block is divided into equal parts, as many as the most demanding effect needs: an effect may change by its
+    `max_change` from part to part, or more if the parts would otherwise be shorter than its `min_block`. A part may
+    therefore be shorter than the `min_block` of a slower effect, and between close breakpoints than that of any effect.
     """
     if not effects:
         return np.array([0, n_out], dtype=np.int64)
@@ -163,7 +163,7 @@ class Schedule:
         self.numbers = [numbers._replace(**dict(zip(values, row, strict=True))) for row in rows]
 
     def blocks_between(self, first: int, last: int) -> Iterator[tuple[int, int, RigNumbers]]:
-        """Yield (start, stop, parameters) for the outputs start <= k < stop of each block within first <= k < last."""
+        """Yield (start, stop, parameters) for each span of outputs in first <= k < last with constant parameters."""
         block = int(np.searchsorted(self.bounds, first, side="right")) - 1  # the block that contains output `first`
         while first < last:
             stop = min(int(self.bounds[block + 1]), last)
@@ -188,7 +188,7 @@ class Readings:
     holds: tuple[Hold, ...] = ()
 
     def value(self, parameter: str, rig_value: float, t: Array) -> Array | float:
-        """Compute a parameter, such as "sensors.p_A.noise", at times t [s] from its value in the rig."""
+        """Compute a parameter, such as "sensors.p_A.noise", at times t [s]; `rig_value`: its value without changes."""
         return apply_effects(rig_value, self.effects, parameter, t)
 
     def hold_readings(self, channel: str, values: Array, t: Array) -> Array:
@@ -272,7 +272,7 @@ _ABSOLUTE_MAX_CHANGES = {"F_l": 0.2}
 
 
 def is_absolute_drift(parameter: str) -> bool:
-    """Return True for errors of instruments and the load `F_l`, which drift by an amount because they may be 0."""
+    """Return True if a drift adds to the parameter, which may be 0; False if a drift is a fraction of its value."""
     return parameter.rpartition(".")[2] in ("offset", "gain_error", "scale_error", *_ABSOLUTE_MAX_CHANGES)
 
 
@@ -315,12 +315,12 @@ class ParameterDrift:
             raise InputError(f"a relative drift must stay above -100 %, got {100 * lowest:.4g} % ({self.parameter})")
 
     def effects(self) -> tuple[Effect, ...]:
-        """Build the drift's changes: of an instrument's parameter, or of all model parameters derived from a rig's."""
+        """Build the effects of the drift on an instrument, or on all model parameters derived from its parameter."""
         breakpoints = self.shape.breakpoints()
 
         def build_effect(name: str, power: float) -> Effect:
             """Build the change of one parameter: the drift is added if absolute, else (1 + drift)^power is a factor."""
-            if self.absolute:  # an instrument needs no limit: its changes do not divide a run into blocks
+            if self.absolute:  # without a limit for instruments, which the solver does not simulate
                 max_change = _ABSOLUTE_MAX_CHANGES.get(name, math.inf)
                 return Effect(name, self.shape.value_at, max_change, additive=True, breakpoints=breakpoints)
             return Effect(
@@ -336,7 +336,7 @@ class ParameterDrift:
 def model_parameters_derived_from(parameter: str) -> tuple[tuple[str, float], ...]:
     """List the model parameters that are proportional to a power of a rig parameter, as (name, exponent).
 
-    `parameter`: dotted name, or a group such as `friction`. Returns () if there are none, or if it cannot drift.
+    `parameter`: dotted name, or a group such as `friction`. The list is empty for a parameter that cannot drift.
     """
     from sealscope.physics.rig import NUMBERS
 

@@ -79,11 +79,11 @@ class Feedback:
             memory=memory,
             addresses=np.array([self._law.address, memory.ctypes.data, measured.ctypes.data]),
             numbers=np.array(self._loop_numbers),
-            counters=np.array([self._spacing, controller.delay, 0, 0]),  # 0 samples taken, 0: no flow reported
+            counters=np.array([self._spacing, controller.delay, 0, 0]),  # no sample taken, no flow reported yet
         )
 
     def raise_failure(self) -> None:
-        """Raise the exception of a controller in Python, else SimulationFailed: the voltage is not finite."""
+        """Raise the error of a controller written in Python, or SimulationFailed if its voltage is not finite."""
         reraise_python_error(self._law)
         t = self._inputs[self.loop.counters[SAMPLED], 0]
         raise SimulationFailed(
@@ -95,7 +95,7 @@ class Feedback:
         return np.asarray(self.loop.volts[np.arange(outputs) // self._spacing])
 
     def compensated_flow(self, outputs: int) -> Array | None:
-        """Return the compensated leakage flow [m^3/s] at the first `outputs` solver outputs; None if unreported."""
+        """Return the compensated flow [m^3/s] at the first `outputs` solver outputs, or None if none was reported."""
         if not self.loop.counters[REPORTED]:
             return None
         return np.asarray(self.loop.compensated[np.arange(outputs) // self._spacing])

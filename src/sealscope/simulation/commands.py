@@ -143,11 +143,11 @@ class Polyline:
         return self.value_at(t)
 
     def breakpoints(self) -> tuple[float, ...]:
-        """Return the times [s] at which slope or value jump, to divide a run; () for 1000 points or more."""
+        """Return the times [s] at which slope or value jump; () for 1000 points or more, too many to divide a run."""
         return tuple(map(float, np.unique(self.t))) if self.t.size < _MAX_BREAKPOINTS else ()
 
     def onset(self) -> float:
-        """Find the time [s] of the point before the first positive one; 0 if the first is positive, inf if none is."""
+        """Find the time [s] at which the signal begins to rise above 0: 0 if it starts above, inf if it never does."""
         if not np.any(self.y > 0):
             return math.inf
         first_positive = int(np.argmax(self.y > 0))
@@ -181,7 +181,10 @@ def polyline(points: Sequence[tuple[float, float]], words: str) -> Polyline:
 
 
 def polyline_from_table(t: Array, y: Array, what: str = "a table") -> Polyline:
-    """Make the polyline through the points `t` [s], `y` of a table (`what` in messages); InputError if unsuitable."""
+    """Make the polyline through the points of a table, with the values `y` at the times `t` [s].
+
+    `what`: name of the table in messages. Raises InputError if the times do not rise, or if a number is not finite.
+    """
     if t.ndim != 1 or t.shape != y.shape or t.size < 1 or np.any(np.diff(t) < 0):
         raise InputError(f"{what} must have one value for each time, and its times must rise")
     if not (np.all(np.isfinite(t)) and np.all(np.isfinite(y))):
@@ -266,7 +269,7 @@ class PseudoRandom:
 def sampled_signal(t: Array, u: Array, origin: str = "recorded") -> Polyline:
     """Make the polyline through the samples of a recorded signal, `u` (n,) at the times `t` (n,) [s].
 
-    `origin`: its name in messages and text. Raises InputError for fewer than two samples or two at one time.
+    `origin`: name of the signal in messages and text. Raises InputError for fewer than two samples, or equal times.
     """
     if t.size < 2 or np.any(np.diff(t) == 0):
         raise InputError(f"a recorded signal must have two samples or more, one at a time, got {t.size} ({origin})")
@@ -274,7 +277,7 @@ def sampled_signal(t: Array, u: Array, origin: str = "recorded") -> Polyline:
 
 
 def recorded_command(recording: Recording, origin: str) -> Polyline:
-    """Make a command of the channel `u` [V] of a recording, from t = 0 on; `origin`: its name in messages and text."""
+    """Make a command from the channel `u` [V] of a recording, from t = 0 on; `origin`: name of the recording."""
     return sampled_signal(recording.t - recording.t[0], recording["u"], origin)
 
 
@@ -318,7 +321,7 @@ def parse_seconds(text: str | None) -> float:
 
 
 def _parse_number(text: str | None, default: float = 0.0) -> float:
-    """Parse a number in the text of a command, None as `default`; raise InputError if it is not finite."""
+    """Parse a number in the text of a command; return `default` for None. Raise InputError if it is not finite."""
     if text is None:
         return default
     value = float(text.replace(" ", ""))
@@ -337,7 +340,7 @@ _MAX_CHARACTERS = 1000
 
 
 def normalize_blanks(text: str, what: str) -> str:
-    """Replace blanks in a text by single ones, but not in a path after ``file``; `what`: its name in messages."""
+    """Replace runs of blanks in a text by single blanks, except in a path after ``file``; `what`: noun for messages."""
     if len(text) > _MAX_CHARACTERS:
         raise InputError(f"{what} must be of at most {_MAX_CHARACTERS} characters, got {len(text)}")
     if file := re.fullmatch(r"(?:(position)\s+)?(file)\s+(.*)", text.strip(), re.IGNORECASE):

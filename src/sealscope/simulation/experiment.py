@@ -271,7 +271,7 @@ class Experiment:
     def scale_with_viscosity(self, leaks: tuple[Leak, ...]) -> tuple[Leak, ...]:
         """Divide the openings of laminar leaks by the oil's relative viscosity over time, if a fault warms the oil.
 
-        It is 1 at the rig's oil temperature, for which the leaks' coefficients hold.
+        The relative viscosity is 1 at the rig's oil temperature, for which the leaks' coefficients hold.
         """
         for fault in self.faults:
             if (viscosity := fault.viscosity_ratio(self.rig)) is not None:
@@ -341,7 +341,7 @@ class Experiment:
 def identity_values(value: Any) -> Any:
     """Convert a command, leak or other object to plain values that are equal only for equal objects.
 
-    An array becomes a hash of its bytes, a dataclass a list of its name and converted fields, any other its `repr`.
+    An array becomes its hash, a dataclass a list of its name and converted fields, and any other object its `repr`.
     """
     if isinstance(value, np.ndarray):
         return hashlib.sha256(np.ascontiguousarray(value, dtype=np.float64).tobytes()).hexdigest()
@@ -356,7 +356,7 @@ def _parse_several(
     """Parse an argument that states one or several leaks or faults.
 
     `argument`: a text, an object of the class `kind`, an iterable of these, or None. `parse` returns None for a text
-    such as ``none``, which is left out; `name` of the argument, for the InputError if it is anything else.
+    such as ``none``, which is left out. Raises InputError, with the `name` of the argument, if it is anything else.
     """
     if argument is None:
         return ()

@@ -88,7 +88,7 @@ class FaultRow:
 
     def parse(self, text: str) -> Fault | None:
         """Parse a text such as "pump leak x3 from 90 s" as a fault of this kind; return None for any other text."""
-        pattern = self.pattern.format(**_PATTERNS).replace(" ", r"\s+") + _WHEN[self.when]  # a blank stands for blanks
+        pattern = self.pattern.format(**_PATTERNS).replace(" ", r"\s+") + _WHEN[self.when]  # a blank stands for several
         match = re.fullmatch(pattern, text, re.IGNORECASE)
         if match is None:
             return None
@@ -166,8 +166,9 @@ class Fault:
     def effects(self, rig: Rig) -> tuple[Effect, ...]:
         """Build the changes of the machine's or a sensor's parameters over time that the fault causes.
 
-        The fault multiplies each of `row.parameters` or adds to it, in proportion to its opening, or has a function in
-        `_EFFECTS`. Raises InputError if this rig cannot have it: a part is absent, or a needed parameter is 0.
+        A fault with a function in `_EFFECTS` has the effects that it returns. Any other multiplies each of
+        `row.parameters` or adds to it, in proportion to its opening (0 to 1). Raises InputError if this rig cannot have
+        the fault: a part is absent, or a needed parameter is 0.
         """
         row = self.row
         if row.needs is not None:
@@ -195,9 +196,10 @@ class Fault:
         )
 
     def _addend(self, rig: Rig) -> float:
-        """Compute what the fault at full size adds to a parameter.
+        """Compute the amount by which the fault at full size changes a parameter.
 
-        It is the rig's parameter `row.adds`, if any, else `value`, divided by the rig's parameter `row.over`, if any.
+        It is the rig's parameter that `row.adds` names, if any. Otherwise it is `value`, divided by the rig's parameter
+        that `row.over` names, if any.
         """
         if self.row.adds:
             return float(rig[self.row.adds])
@@ -278,7 +280,7 @@ class ChangedDuty:
 
 
 def _shut_off_effects(fault: Fault, rig: Rig) -> tuple[Effect, ...]:
-    """Build the changes of a line's flow coefficients as its shut-off valve moves; InputError without throttles."""
+    """Build the changes of a line's flow coefficients by its shut-off valve; raise InputError without throttles."""
     from sealscope.physics.restrictors import orifice_coefficient, series_coefficient
     from sealscope.physics.rig import throttle_coefficients
 
@@ -298,7 +300,7 @@ def _shut_off_effects(fault: Fault, rig: Rig) -> tuple[Effect, ...]:
             opening = initial_opening + (fault.value - initial_opening) * fault.opening.value_at(t)
             return np.asarray(np.where(opening >= 1.0, c_open, series_coefficient(c_open, c_line, opening)) - c_initial)
 
-        max_change = 1e-6 * c_open  # so small that each solver output is a block while the valve moves
+        max_change = 1e-6 * c_open  # so small that the parameters change with each solver output
         return Effect(
             name, change, max_change, additive=True, breakpoints=fault.opening.breakpoints(), min_block=_VALVE_BLOCK
         )
@@ -315,7 +317,7 @@ def _oil_temperature_effects(fault: Fault, rig: Rig) -> tuple[Effect, ...]:
     assert viscosity is not None
 
     def density_power(power: float) -> Callable[[Array], Array]:
-        """Build a function of times [s]: a power of the oil's density over that at the rig's oil temperature."""
+        """Build a function that computes, at times t [s], the `power` of the oil's density relative to that at T_0."""
         alpha = rig.fluid.alpha
         return lambda t: np.asarray(thermal_density_ratio(fault._oil_temperature(rig, t), T_0, alpha) ** power)
 

@@ -34,9 +34,9 @@ class Outputs(Protocol):
 def anti_alias_taps(factor: int, delay: float = 0.0) -> Array:
     """Compute the anti-alias filter's coefficients (2 FILTER_REACH factor + 1,), a Kaiser-windowed sinc of unit gain.
 
-    They are applied unreversed: the first multiplies the earliest value, the middle one the value at the time of the
-    output. `factor`: the signal's rate over the recording's; `delay`: lag of the output behind the signal as a fraction
-    of the signal's sampling interval. For `factor` 1 without a delay there is a single coefficient, 1.
+    The first coefficient multiplies the earliest value, the middle one the value at the time of the output.
+    `factor`: the signal's rate over the recording's; `delay`: lag of the output behind the signal as a fraction of the
+    signal's sampling interval. For `factor` 1 without a delay there is a single coefficient, 1.
     """
     if factor == 1 and delay == 0.0:
         return np.ones(1)
@@ -52,8 +52,8 @@ def anti_alias_taps(factor: int, delay: float = 0.0) -> Array:
 def decimate(values: Array, factor: int, n: int, delay: float = 0.0) -> Array:
     """Filter a signal against aliasing (`anti_alias_taps`), and return `n` samples of it, one in `factor` values.
 
-    `values` must continue for FILTER_REACH x `factor` values after the last sample, and count as constant before their
-    beginning. `delay` >= 0: lag of the samples behind the signal in intervals of `values`, not necessarily whole.
+    `values` must continue for FILTER_REACH x `factor` values after the last sample. Before their beginning, the signal
+    is taken as constant. `delay` >= 0: lag of the samples behind the signal, in intervals of `values`.
     """
     if factor == 1 and delay == 0.0:
         return np.array(values[:n])
@@ -70,7 +70,7 @@ def decimate(values: Array, factor: int, n: int, delay: float = 0.0) -> Array:
 def filter_first_order(values: Array, lag: float, rate: float) -> Array:
     """Compute the output y of a first-order transducer for a signal at `rate` [Hz]: lag dy/dt + y = signal.
 
-    `lag` [s]. It is exact for a signal that is linear between its values and constant before the first.
+    `lag` [s]: time constant. The output is exact for a signal that is linear between its values and constant before.
     """
     if lag == 0.0:
         return values
@@ -85,11 +85,11 @@ def filter_first_order(values: Array, lag: float, rate: float) -> Array:
 
 
 def sample_with_jitter(sample: Callable[[Array], Array], values: Array, lateness: Array | None) -> Array:
-    """Compute the samples (n,) of a signal that a clock with jitter takes.
+    """Sample a signal by a clock with jitter; return the samples (n,).
 
-    `sample(values)` takes the samples (n,) of the signal `values` (any length) with a clock without jitter. `lateness`
-    (n,): delay of each sample in intervals of `values`, -1 .. 1, None for no jitter. The signal is interpolated by a
-    parabola through three of its values.
+    `values`: the signal, of any length; `sample`: function that computes its samples (n,) by a clock without jitter;
+    `lateness` (n,): delay of each sample in intervals of `values`, -1 .. 1, None for no jitter. The signal is
+    interpolated by a parabola through three of its values.
     """
     center = sample(values)
     if lateness is None:
@@ -148,7 +148,7 @@ def read_pressure(
 
 
 def _hum_harmonics(sensor: PressureTransducer, t: Array, random: np.random.Generator) -> Array:
-    """Compute the harmonics 2 to `HUM_HARMONICS` of a mains hum at times t [s], over the fundamental's amplitude.
+    """Compute the harmonics 2 to `HUM_HARMONICS` of a mains hum at times t [s], relative to the fundamental.
 
     Each harmonic has a random phase and `sensor.hum_harmonics` times the amplitude of the harmonic before it.
     """

@@ -126,7 +126,7 @@ class RunInputs:
 
 
 def oversampling(experiment: Experiment) -> int:
-    """Compute the solver outputs per recorded sample for the anti-alias filter and a controller's samples."""
+    """Compute the number of solver outputs per recorded sample that the anti-alias filter and a controller need."""
     max_step = experiment.step or DEFAULT_STEP[choose_method(experiment.rig, experiment.method)]
     min_outputs = oversampling_of(experiment.rate, max_step)
     controller = experiment.active_controller
@@ -134,9 +134,9 @@ def oversampling(experiment: Experiment) -> int:
 
 
 def oversampling_of(rate: float, step: float) -> int:
-    """Compute the solver outputs per sample at `rate` [Hz]: 4, which the anti-alias filter needs, or fewer.
+    """Compute the number of solver outputs per sample, for samples at `rate` [Hz] and steps of at most `step` [s].
 
-    They are fewer if a sample takes fewer than 4 solver steps of at most `step` [s].
+    It is 4 for the anti-alias filter, or fewer if a sample takes fewer than 4 steps.
     """
     return min(_OVERSAMPLING, steps_per_output(rate, step))
 
@@ -209,9 +209,9 @@ def run_with_sized_leaks(
 ) -> tuple[tuple[Leak, ...], Trajectory]:
     """Integrate an experiment with leaks of the stated mean flows; return the leaks with coefficients, and the run.
 
-    During the search for the coefficients (`size_leaks`), `progress(task, fraction)` is called; without a stated mean
-    flow, `report_time(t)` with the time reached [s]. Raises InputError for a leak larger than the pump's mean flow
-    |Q_1| or never open within the run; SimulationFailed if the search does not converge.
+    The search for the coefficients (`size_leaks`) calls `progress` with the name of a task and its completed fraction.
+    Without a stated mean flow, the only run calls `report_time` with the simulated time [s]. Raises InputError for a
+    leak larger than the pump's mean flow |Q_1| or never open, SimulationFailed if the search does not converge.
     """
     leaks, dp_0 = experiment.leaks, experiment.rig.line.dp_0
     initial_leaks = _start_of_search(leaks)
@@ -408,8 +408,7 @@ class _Integration:
     def compare_with_half_step(self, rows: Array, first: int, end: int, n_steps: int, check: StepErrorCheck) -> float:
         """Integrate a window of the run again at half the step; return the largest ratio of an error to its tolerance.
 
-        `rows`: outputs of the run with `n_steps` steps per output; the window has the outputs first <= k < end. The
-        errors are added to `check`.
+        `rows`: outputs of the run, each after `n_steps` steps; the window: first <= k < end. `check` keeps the errors.
         """
         from sealscope.physics.state import OUTPUTS, P_2, P_A, STATES
 
@@ -420,10 +419,10 @@ class _Integration:
         return check.add_window(rows[first:end, pressures], fine[:, pressures])
 
     def _check_rows(self, p: RigNumbers, h: float, rows: Array, first: int) -> None:
-        """Check outputs `rows` (n, 21), from number `first` of the run on, that were integrated with steps of h [s].
+        """Raise SimulationFailed if one of successive outputs of the solver has diverged.
 
-        `p`: the model's parameters at these outputs. Raises SimulationFailed if an output is not finite and, unless
-        unresolved runs are allowed, if a pressure is below vacuum or the step is too long for an end stop that was hit.
+        Unless unresolved runs are allowed, a pressure below vacuum or a step too long for an end stop that was hit
+        raises it, too. `rows` (n, 21): outputs; `first`: number of rows[0] in the run; `h` [s]: step; `p`: parameters.
         """
         from sealscope.physics.solvers.limits import longest_step_on_stop
         from sealscope.physics.state import OUTPUTS, P_2, P_A, POSITION
@@ -457,8 +456,8 @@ def refuse_long(h: float, limit: float, what: str) -> None:
 def refuse_unresolved(p: RigNumbers, h: float, method: str) -> None:
     """Raise SimulationFailed if steps of h [s] by `method` are too long for a rig `p` without its leaks.
 
-    All parts but leaks, throttles and end stops need `longest_step`. With throttles, rk4 also needs 2.785/lambda, where
-    lambda [1/s] is the fastest rate at which pressures equalise across a throttle (`stiffest_rate`).
+    The limit is `longest_step` for all parts but leaks, throttles and end stops, and 2.785/lambda for throttles with
+    rk4: lambda [1/s] is the fastest rate at which pressures equalise across a throttle (`stiffest_rate`).
     """
     from sealscope.physics.solvers.limits import DECAY_LIMIT, longest_step, stiffest_rate
 
@@ -528,7 +527,7 @@ class StepErrorCheck:
         return max(pressure_error / self._tolerance, detail_error / DETAIL_TOLERANCE)
 
     def describe_worst(self) -> str:
-        """Describe the worst difference, relative to its tolerance: of a pressure, or of a wavelet detail's RMS."""
+        """Describe the largest difference, relative to its tolerance, of a pressure or of a wavelet detail's RMS."""
         if self.pressure_error / self._tolerance >= self.detail_error / DETAIL_TOLERANCE:
             return f"a pressure by {self.pressure_error:.4g} Pa rms, which must be <= {self._tolerance:.4g} Pa"
         error, tolerance = 100 * self.detail_error, 100 * DETAIL_TOLERANCE

@@ -120,7 +120,10 @@ class Leak:
 
 
 def parse_opening(groups: Groups) -> Polyline:
-    """Build an opening from the times, if any, in the named groups of a text's match, such as of `WHEN`."""
+    """Build the opening of a leak or fault from the times in the named groups of a matched text, such as of `WHEN`.
+
+    Without times, it is fully open from 0 s on.
+    """
     if groups.get("start") is not None:
         return growing_opening(parse_seconds(groups["start"]), parse_seconds(groups["stop"]))
     until = groups.get("until")

@@ -76,7 +76,7 @@ class Difference:
 
     @property
     def resolved(self) -> bool:
-        """True if the difference is within its tolerance, or if there is none."""
+        """True if the difference is within its tolerance, or has no tolerance."""
         return self.tolerance is None or self.difference <= self.tolerance
 
 
@@ -268,7 +268,7 @@ def compare_trajectories(experiment: Experiment, coarse: Trajectory, fine: Traje
         noise_variance = getattr(experiment.rig.sensors, name).noise ** 2 + experiment.rig.sensors.common_noise**2
         coarse_details, fine_details = (details(decimate(run[name], factor, n)) for run in (coarse, fine))
         inside = coarse_details.inside()
-        limits = [inside.start, inside.stop]  # a single segment: the row [0] below
+        limits = [inside.start, inside.stop]  # one segment: `mean_squares` returns one row, [0]
         coarse_rms = np.sqrt(mean_squares(coarse_details, limits)[0] + noise_variance)
         fine_rms = np.sqrt(mean_squares(fine_details, limits)[0] + noise_variance)
         for level, quantity in enumerate(QUANTITIES[:4]):  # d1 to d4, not d3d4

@@ -27,7 +27,7 @@ def leak_flow(leak: Leak, t: Array, dp: Array, dp_0: float) -> Array:
     """Compute the flow |Q_L| (n,) [m^3/s] of a leak at times `t` (n,) [s] under `dp` (n,) = p_A - p_B [Pa].
 
     The flow is s G |dp| for a laminar leak and s C sqrt|dp| for an orifice, with the leak's opening s, 0 to 1, and its
-    coefficient G or C. That of an orifice is linear in dp for |dp| below about `dp_0` [Pa].
+    coefficient G or C. The flow of an orifice is linear in dp for |dp| below about `dp_0` [Pa].
     """
     from sealscope.physics.leakage import laminar_leakage, leakage_series
 
@@ -52,10 +52,10 @@ def next_coefficient(mean: float, previous: tuple[float, float], latest: tuple[f
     """Compute the next leakage coefficient to try in the search for a stated mean flow.
 
     `mean` [m^3/s]: the mean flow to reach; `previous`, `latest`: (coefficient, mean flow) of the last two runs, (0, 0)
-    for no run. For a `latest` coefficient of 0, the flow is that of a coefficient of 1 under the pressures of this run.
+    for no run. If the `latest` coefficient is 0, its flow is the one that a coefficient of 1 would give in that run.
 
     The next coefficient is on the straight line through both runs on logarithmic scales. Its slope is limited to 0.1 ..
-    1, the range that leaks have, and is 1 without a previous run with a leak, and for two close coefficients.
+    1, as is usual for leaks. It is 1 if the previous run was without a leak, or if the coefficients are nearly equal.
     """
     c_0, q_0 = previous
     c_1, q_1 = latest
@@ -77,11 +77,11 @@ def size_leaks(
 
     A coefficient has the unit m^3/(s Pa) for a laminar leak, m^3/(s Pa^0.5) for an orifice. `coefficients`: start
     values, which are kept for leaks without a stated mean flow. `measure(coefficients)` simulates the rig; it returns
-    the mean flow [m^3/s] of each leak per unit of its coefficient (n,), also where the coefficient is 0, and the run in
-    any form. Returns the coefficients found, and the run with them. `progress(task, fraction)` is called.
+    the mean flow [m^3/s] of each leak per unit of its coefficient (n,), also where the coefficient is 0, and the run,
+    of any type. Returns the coefficients found, and the run with them. `progress` is called with a task and a fraction.
 
     A small leak's flow is proportional to its coefficient, because friction sets the pressure difference. A large
-    leak's grows less (`next_coefficient`). Raises SimulationFailed if the search does not converge.
+    leak's flow grows less (`next_coefficient`). Raises SimulationFailed if the search does not converge.
     """
     means = np.array([leak.mean or 0.0 for leak in leaks])
     indices = np.flatnonzero(means > 0.0)
@@ -103,7 +103,7 @@ def size_leaks(
         next_coefficients = coefficients.copy()
         for k in indices:
             previous = previous_coefficients[k], previous_flows[k]
-            latest_flow = flows[k] if coefficients[k] > 0.0 else unit_flows[k]  # as `next_coefficient` takes it
+            latest_flow = flows[k] if coefficients[k] > 0.0 else unit_flows[k]  # else that of 1
             next_coefficients[k] = next_coefficient(means[k], previous, latest=(coefficients[k], latest_flow))
         previous_coefficients, previous_flows = coefficients, flows
         coefficients = next_coefficients

@@ -73,7 +73,7 @@ class Force:
         return self.signal.volts(t)  # the value of the signal, here in newtons
 
     def tables(self) -> tuple[Array, Array] | None:
-        """Build the load over position and velocity for `piecewise_linear_force`, or None if it has neither."""
+        """Build the load's tables over position and velocity for `piecewise_linear_force`; None without either."""
         if not (self.over_x or self.over_v):
             return None
         no_load: Breakpoints = ((0.0, 0.0),)
@@ -84,9 +84,9 @@ class Force:
 
 
 def loaded_rig_numbers(rig: Rig, load: Force | None) -> RigNumbers:
-    """Build a rig's parameters for the compiled model, with a load in addition to the rig's own as `pushed`, if any.
+    """Build the parameters of the compiled model for a rig with an additional `load`, if any.
 
-    Of a load that depends on time only, which is an input of the solver, `pushed` states only that there is one.
+    The result's `pushed` has the load's tables over position and velocity, or is (True,) for a load over time only.
     """
     from sealscope.physics.rig import rig_numbers
 
@@ -121,7 +121,7 @@ def breakpoints_through(s: Array, F: Array) -> Breakpoints:
 def _parse_signal(text: str, units: Mapping[str, float], what: str) -> Command:
     """Parse a signal over time that is written like a command but with units, such as "step 100 mm at 1 s".
 
-    `units`: allowed units, with factors to SI; `what` names it in the InputError for a missing unit or another form.
+    `units`: allowed units, with factors to SI; `what`: noun for messages. Raises InputError for a text in another form.
     """
     number_with_unit = re.compile(rf"({UNSIGNED})\s*\[?({_unit_pattern(units)})\b\]?")
     if not number_with_unit.search(text):
@@ -190,7 +190,7 @@ def _read_force(path: str, words: str) -> Force:
     F = to_si(table[:, 1], units["F"], "N", name="F", place=path)
     if argument == "t":
         return Force(sampled_signal(s - s[:1], F, path), words)  # s[:1], not s[0]: the table may be empty
-    if s.size > 1 and s[0] > s[-1]:  # a falling table is the same curve
+    if s.size > 1 and s[0] > s[-1]:  # x or v falls from row to row: reversed, it rises
         s, F = s[::-1], F[::-1]
     if not (2 <= s.size <= MAX_LOAD_ROWS and np.all(np.diff(s) > 0) and np.all(np.isfinite(table))):
         raise InputError(
@@ -201,8 +201,9 @@ def _read_force(path: str, words: str) -> Force:
 
 
 def _unit_pattern(units: Mapping[str, float]) -> str:
-    """Build the regular expression of any of the units, the longest first, with or without their blanks."""
-    return "|".join(re.escape(unit).replace("\\ ", r"\s*") for unit in sorted(units, key=len, reverse=True))
+    """Build a regular expression that matches any of the `units`, written with or without their blanks."""
+    longest_first = sorted(units, key=len, reverse=True)  # else "N" would match the beginning of "N/m"
+    return "|".join(re.escape(unit).replace("\\ ", r"\s*") for unit in longest_first)
 
 
 #: Units of the slope and of the start of a load over x or v.
@@ -229,7 +230,10 @@ def parse_force(text: str) -> Force:
 
 
 def _extract_terms(text: str, letter: str) -> tuple[Breakpoints, str]:
-    """Parse the terms over x or v (`letter`) in a load's text; return their `Breakpoints` and the text without them."""
+    """Parse the terms over x or v (`letter`) in the text of a load, such as "200 N/mm over x from 50 mm".
+
+    Returns the `Breakpoints` of their sum, () without a term, and the text without the terms.
+    """
     slope_units, start_units = _TERM_UNITS[letter]
     factors = {unit.replace(" ", ""): factor for unit, factor in slope_units.items()}  # the text may lack blanks
     number = rf"({UNSIGNED})\s*\[?({_unit_pattern(slope_units)})\b\]?"

@@ -20,7 +20,7 @@ IMPLICIT: Implicit = (True,)
 def step_nodes(implicit: Implicit, h: float) -> np.ndarray:
     """Compute the times (nodes,) within a step of h [s] at which a method, `IMPLICIT` or `EXPLICIT`, needs its inputs.
 
-    The first and last lie just inside the step, on the right side of an input's jump between two steps.
+    The first and last lie just inside the step, where an input that jumps between two steps has the value of this step.
     """
     nodes = np.array(IMEX_NODES if implicit else RK4_NODES)
     nodes[0], nodes[-1] = 1e-9, 1.0 - 1e-9

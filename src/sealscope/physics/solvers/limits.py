@@ -48,8 +48,7 @@ def stiffest_rate(p: RigNumbers) -> float:
     """Compute the fastest decay rate lambda [1/s] of a rig with throttles; RK4 is stable for h lambda < 2.785.
 
     lambda = K_oil (1/V_1 + 1/V) c/sqrt(dp_0): the pressures of a line volume V_1 and of a chamber V equalise through a
-    throttle, whose slope dQ/dp at dp = 0 is c/sqrt(dp_0). The smallest line and chamber volumes over the stroke and the
-    largest flow coefficient c are taken.
+    throttle, whose slope dQ/dp at dp = 0 is c/sqrt(dp_0). The smallest volumes and the largest c are taken.
     """
     c = max(p.c_A_in, p.c_A_out, p.c_B_in, p.c_B_out)
     min_chamber = min(volume for volumes in _end_volumes(p) for volume in volumes)

@@ -19,7 +19,7 @@ Nodes = tuple[float, float, float]
 @contracted
 def freeze_integral(dy: State, euler_integral: bool) -> State:
     """Set the rate of the controller's integral to 0 if `euler_integral` (`rk4_step`); return all rates of `dy`."""
-    dI = 0.0 * dy[0] if euler_integral else dy[0]  # 0.0 * dy[0]: a zero of the rate's type, a number or lanes
+    dI = 0.0 * dy[0] if euler_integral else dy[0]  # 0.0 * dy[0]: a number or a vector, as dy[0]
     return dI, dy[1], dy[2], dy[3], dy[4], dy[5], dy[6], dy[7], dy[8], dy[9], dy[10], dy[11], dy[12], dy[13]
 
 

@@ -37,7 +37,7 @@ FLOW, OPENING, MAX_TRAVEL, MIN_PRESSURE, DIVERGED = range(N_TOTALS)
 def _compile(text: str, **scope: Any) -> Any:
     """Compile the function `law` from its source `text`, which may use `load` and the names in `scope`.
 
-    It is generated because numba needs each element of a tuple written out.
+    The source is generated as text, because numba needs each element of a tuple written out.
     """
     scope["load"] = load
     exec(text, scope)
@@ -71,7 +71,7 @@ def _build_inputs_law(count: int) -> Any:
     - `t` [s]: start of the step; `nodes` (count,) [s]: the nodes, from the start of the step on.
     - `shape` (steps, count): the commands' common waveform at the nodes, followed by the load in further columns.
     - `drive`: gain and offset [V] of each run's command; `leak`: numbers of each run's leak (`LEAK_ROWS`).
-    - `p`: the runs' choices, which tell whether there is an additional load.
+    - `p`: the optional parts of the runs' model; `p.pushed` is empty without an additional load.
     """
 
     def for_nodes(text: str) -> str:
@@ -97,10 +97,10 @@ _rk4_inputs, _imex_inputs = _build_inputs_law(3), _build_inputs_law(6)
 
 @contracted
 def _add_output(z: State, leak: Leak, t: float, totals: Totals, q: RigNumbers) -> Totals:
-    """Add one output of a group of runs to the totals of these runs, which `N_TOTALS` lists; return the new totals.
+    """Add the solver's output at time `t` [s] to the totals of a group of runs; return the new totals.
 
-    `z`: states of the runs; `leak`: numbers of their leaks (`LEAK_ROWS`), of which the last two are the coefficients G
-    and C of the summed flow; `t` [s]: time of the output; `q`: numbers of the runs' rigs.
+    The totals are sums and extremes of each run, which `N_TOTALS` lists. `z`: states of the runs; `leak`: numbers of
+    their leaks (`LEAK_ROWS`), the last two of them G and C of the leak whose flow is summed; `q`: the rigs' numbers.
     """
     flow_sum, opening_sum, max_travel, min_pressure, diverged = totals
     opening = leak_opening(leak, t)
@@ -180,11 +180,11 @@ def advance(
 
 @kernel
 def advance_lanes_rk4(*run: Any) -> None:
-    """Run `advance` by the explicit Runge-Kutta method in compiled code; `run`: its arguments but `implicit`."""
+    """Run `advance` by the explicit Runge-Kutta method in compiled code; `run`: its arguments after the first."""
     advance(EXPLICIT, *run)
 
 
 @kernel
 def advance_lanes_imex(*run: Any) -> None:
-    """Run `advance` by the implicit-explicit method in compiled code; `run`: its arguments but `implicit`."""
+    """Run `advance` by the implicit-explicit method in compiled code; `run`: its arguments after the first."""
     advance(IMPLICIT, *run)

@@ -58,7 +58,10 @@ class Batch:
 
     @checked_call
     def rms_of(self, channel: str, detail: str) -> Array:
-        """Return the RMS (runs, segments) of a detail, d1 to d4 [Pa] or d3d4 [Pa^2], of p_A or p_B (`channel`)."""
+        """Return the RMS (runs, segments) of a wavelet detail of a chamber pressure.
+
+        `channel`: p_A or p_B; `detail`: d1, d2, d3 or d4 [Pa], or d3d4 [Pa^2].
+        """
         channel_index = _index_of(channel, CHAMBERS, "channel")
         detail_index = _index_of(detail, QUANTITIES, "detail")
         return np.asarray(self.rms[:, channel_index, :, detail_index])
@@ -105,7 +108,7 @@ class Batch:
 
 
 def _index_of(name: str, names: tuple[str, ...], what: str) -> int:
-    """Return the index of `name` in `names`; raise InputError for another name. `what`: noun for them in messages."""
+    """Return the index of `name` in `names`; raise InputError if it is missing. `what`: noun for the message."""
     if name not in names:
         raise InputError(f"{what} must be one of {', '.join(names)}, got {name!r}")
     return names.index(name)
@@ -120,7 +123,7 @@ def simulate_batch(
     threads: int | None = None,
     progress: Progress | None = None,
 ) -> Batch:
-    """Simulate many experiments at once, and compute the RMS of the db8 details of p_A and p_B as recorded.
+    """Simulate many experiments at once, and compute the RMS of the db8 wavelet details of the recorded p_A and p_B.
 
     All runs must have the same duration and sampling rate. Rigs, drifts, faults of the machine and loads may differ. A
     run may have one leak, which opens abruptly or linearly.
@@ -202,7 +205,7 @@ def simulate_batch(
 def _run_set(
     experiment_set: ExperimentSet, batch: Batch, error: float, threads: int, progress: Callable[[float], None]
 ) -> None:
-    """Simulate a set on `threads` threads, with a pressure error up to `error` [Pa rms]; write its rows of `batch`."""
+    """Simulate a set of experiments with a pressure error up to `error` [Pa rms]; write the results into `batch`."""
     members, stated_step = experiment_set.members, experiment_set.experiment.step
     rows = [member.row for member in members]
     coefficients = np.array([member.leak.coefficient or 0.0 for member in members])
@@ -222,8 +225,8 @@ def _run_set(
 def choose_step(experiment_set: ExperimentSet, coefficients: Array, error: float) -> float:
     """Choose the solver's step [s] for a set of experiments that are integrated together.
 
-    It is the shortest of the steps that `integrate` finds for `error` [Pa rms] in the first 4 s of up to four runs, and
-    no longer than the rigs and leaks (`coefficients` (runs,)) of all runs allow (`longest_allowed_step`).
+    `integrate` finds the step for a pressure error of `error` [Pa rms] in the first 4 s of up to four runs. The result
+    is the shortest of these steps and `longest_allowed_step`. `coefficients` (runs,): leakage coefficients of the runs.
     """
     members, steps = experiment_set.members, [longest_allowed_step(experiment_set, coefficients)]
     for k in np.unique(np.linspace(0, len(members) - 1, _N_SAMPLE_RUNS).round().astype(int)):
@@ -236,8 +239,8 @@ def choose_step(experiment_set: ExperimentSet, coefficients: Array, error: float
 def longest_allowed_step(experiment_set: ExperimentSet, coefficients: Array) -> float:
     """Compute the longest step [s] that resolves the rig and the leak of every run in a set of experiments.
 
-    `coefficients` (runs,): G [m^3/(s Pa)] or C [m^3/(s Pa^0.5)]. The result is at least the shortest
-    step that `integrate` tries.
+    `coefficients` (runs,): G [m^3/(s Pa)] of laminar leaks, C [m^3/(s Pa^0.5)] of orifices. The result is at least
+    LONGEST_STEP / MAX_STEP_REFINEMENT, the shortest step of the search in `integrate`.
     """
     from sealscope.physics.solvers.limits import longest_step
 

@@ -55,7 +55,7 @@ class Member:
 
     @cached_property
     def step_limiting_parameters(self) -> tuple[RigNumbers, ...]:
-        """The sets of parameters in the run that limit the solver's step: without changes, and at each fast change."""
+        """The model's parameters without changes and at each fast change, which limit the solver's step."""
         return step_limiting_parameters(self.effects, self.numbers)
 
 
@@ -100,7 +100,7 @@ def refuse_unbatchable(experiment: Experiment, row: int) -> None:
 
 
 def group_experiments(experiments: Sequence[Experiment]) -> list[ExperimentSet]:
-    """Group experiments into sets (`ExperimentSet`); raise InputError for any that cannot be in this batch."""
+    """Group experiments into sets for joint integration; raise InputError for any that cannot be in the batch."""
     from sealscope.physics.rig import CHOICES
 
     if not experiments:
@@ -128,7 +128,7 @@ def group_experiments(experiments: Sequence[Experiment]) -> list[ExperimentSet]:
         shape, gain, offset = experiment.voltage_command, 1.0, 0.0
         if isinstance(shape, Sine):  # sines of one frequency and phase share a waveform
             gain, offset, shape = shape.amplitude, shape.offset, replace(shape, amplitude=1.0, offset=0.0)
-        # without "pushed", the tables of the load, which `load` identifies
+        # "pushed" is left out: it has the tables of the load, which `load` identifies
         choices = tuple(getattr(numbers, name) for name in CHOICES if name != "pushed")
         method = choose_method(experiment.rig, experiment.method)
         kind = (str(identity_values(shape)), load, choices, method, experiment.step, experiment.error)
@@ -138,7 +138,7 @@ def group_experiments(experiments: Sequence[Experiment]) -> list[ExperimentSet]:
 
 
 def pack_lanes(values: Array, width: int) -> Array:
-    """Rearrange `values` (runs, ...) as (groups, ..., width) for vector registers; copies of the last run fill up."""
+    """Rearrange `values` (runs, ...) as vectors (groups, ..., width); copies of the last run fill the last vectors."""
     groups = math.ceil(len(values) / width)
     padded = np.concatenate([values, np.repeat(values[-1:], groups * width - len(values), axis=0)])
     return np.ascontiguousarray(np.moveaxis(padded.reshape(groups, width, *values.shape[1:]), 1, -1))
@@ -153,9 +153,9 @@ def unpack_lanes(lanes: Array, runs: int) -> Array:
 def build_leak_rows(members: Sequence[Member], coefficients: Array, flow_coefficients: Array) -> Array:
     """Build the table (runs, LEAK_ROWS) of the leaks' parameters that the compiled model takes.
 
-    The columns are G and C of the leak that acts in the run, from `coefficients` (runs,), start [s] and slope [1/s] of
-    its opening, and G and C of the leak whose mean flow is computed, from `flow_coefficients` (runs,). Both differ only
-    in the search for a coefficient, whose first run is without a leak.
+    The columns are G and C of the leak that acts in the run, from `coefficients` (runs,); start [s] and slope [1/s] of
+    its opening; and G and C of the leak whose mean flow is computed, from `flow_coefficients` (runs,). Both arguments
+    differ only in the first run of the search for a coefficient, which is without a leak.
     """
     rows = []
     for member, coefficient, flow_coefficient in zip(members, coefficients, flow_coefficients, strict=True):
@@ -183,7 +183,7 @@ class Cells:
     values: Array
 
     def table(self, first: int, last: int, width: int) -> Array:
-        """Build the table (groups, cells, parameters, width) of the cells first <= cell < last."""
+        """Build the table (groups, cells, parameters, width) of the parameters in the cells first <= cell < last."""
         table = np.repeat(self.base[:, None, :], last - first, axis=1)
         for k, parameter in enumerate(self.changing):
             table[:, :, parameter] = self.values[:, k, first:last]
@@ -191,7 +191,7 @@ class Cells:
 
 
 def build_cells(members: Sequence[Member], n_out: int, rate: float) -> Cells:
-    """Compute the model's parameters for runs of `n_out` outputs at `rate` [Hz] in cells where they are constant."""
+    """Compute the model's parameters for `n_out` outputs at `rate` [Hz], in time spans (cells) of constant values."""
     from sealscope.physics.rig import NUMBERS
 
     # most members share their parameters: convert each distinct object once
@@ -210,7 +210,7 @@ def build_cells(members: Sequence[Member], n_out: int, rate: float) -> Cells:
 
 
 def with_leak_coefficient(experiment: Experiment, coefficient: float) -> Experiment:
-    """Return the experiment with this coefficient of its leak, if any, in place of the stated size."""
+    """Replace the size of an experiment's leak by a leakage coefficient; without a leak, return it unchanged."""
     if not experiment.leaks:
         return experiment
     return replace(experiment, leaks=(replace(experiment.leaks[0], mean=None, coefficient=coefficient),))
@@ -237,9 +237,9 @@ def build_instrument_rows(members: Sequence[Member], first: int, last: int) -> A
 
 
 def _pressure_instruments(rig: Rig, readings: Readings, ends: Array, samples: int) -> Array:
-    """Build one run's part (2, INSTRUMENT_ROWS) of `build_instrument_rows`.
+    """Build the parameters (2, INSTRUMENT_ROWS) of one run's instruments for `build_instrument_rows`.
 
-    `readings`: changes of the instruments; `ends` (2,): start and end [s] of the `samples` samples.
+    `readings`: changes of the instruments within the run; `ends` (2,): start and end [s] of the `samples` samples.
     """
     from sealscope.simulation.batch import signals
 
@@ -286,9 +286,8 @@ class SetRun:
         """Prepare the runs of a set at standstill, to be integrated with a step of at most `step` [s].
 
         `coefficients` (runs,): leakage coefficients that act in the runs; `flow_coefficients` (runs,): those of the
-        leaks whose mean flow is computed (`build_leak_rows`); `bounds` [s]: limits of the segments over which the RMS
-        of the wavelet details is computed, None to compute mean flows only. Raises SimulationFailed if a run is
-        unresolved.
+        leaks whose mean flow is computed (`build_leak_rows`); `bounds` [s]: limits of the segments for the RMS of the
+        wavelet details, None for mean flows only. Raises SimulationFailed if the step is too long for a run.
         """
         from sealscope.physics.solvers.advance import EXPLICIT, IMPLICIT, step_nodes
         from sealscope.physics.solvers.limits import longest_step
@@ -306,7 +305,7 @@ class SetRun:
         self.n_outputs = (self.n_samples + FILTER_REACH) * self.oversampling
         self.nodes = step_nodes(IMPLICIT if self.method == "imex" else EXPLICIT, self.step)
         self.cells = build_cells(members, self.n_outputs, rate)
-        self.numbers = members[0].numbers  # only its choices are used; the runs' numbers are in the cells
+        self.numbers = members[0].numbers  # for the model's optional parts only: `cells` has the numbers
         leaks = build_leak_rows(members, coefficients, flow_coefficients)
         checked_cases = set()  # members that share parameters and leak are checked once
         for member, (G, C) in zip(members, leaks[:, :2].tolist(), strict=True):
@@ -386,9 +385,10 @@ class SetRun:
             list(pool.map(lambda groups: self._run_groups(groups, add_progress), itertools.pairwise(bounds)))
 
     def _chunks(self) -> list[tuple[int, int, int, int]]:
-        """Divide the run into chunks of whole cells up to `MAX_CHUNK_STEPS`, or of parts of a longer cell.
+        """Divide the solver's outputs into chunks of at most `MAX_CHUNK_STEPS` steps, or of a single output.
 
-        Returns the first cell, the cell after the last, the first output and the output after the last of each.
+        A chunk contains whole cells, which are spans with constant parameters, or a part of a longer cell. Returns for
+        each chunk the first cell, the cell after the last, the first output and the output after the last.
         """
         max_outputs = max(1, MAX_CHUNK_STEPS // self.steps_per_output)
         edges = self.cells.bounds
@@ -428,14 +428,15 @@ class SetRun:
         offset_drifts = np.zeros((b - a, self.channels, self.width))
         wavelet = DetailStream((self.channels, (b - a) * self.width))
         n_read = 0  # samples read so far
-        every = self.steps_per_output
+        output_steps = self.steps_per_output
         for first, last, start, stop in chunks:  # cells first <= cell < last, outputs start <= output < stop
             if cells != (first, last):
                 table, cells = self.cells.table(first, last, self.width)[a:b], (first, last)
-            cell_bounds = (np.clip(self.cells.bounds[first : last + 1], start, stop) - start) * every  # in steps
+            cell_bounds = (np.clip(self.cells.bounds[first : last + 1], start, stop) - start) * output_steps  # in steps
             advance(
-                local_groups, state, self.step, start * every, self.nodes, self._inputs_at_nodes(start, stop),
-                self.gains_and_offsets[a:b], leaks, table, cell_bounds, self.numbers, every, pressures, history, totals,
+                local_groups, state, self.step, start * output_steps, self.nodes, self._inputs_at_nodes(start, stop),
+                self.gains_and_offsets[a:b], leaks, table, cell_bounds, self.numbers, output_steps, pressures, history,
+                totals,
             )  # fmt: skip
             self._check_groups(groups, stop)
             if self.bounds is not None:
@@ -470,9 +471,9 @@ class SetRun:
         return np.ascontiguousarray(np.hstack([waveform, np.broadcast_to(load.value_at(times), times.shape)]))
 
     def _sensors(self, groups: tuple[int, int], first: int, last: int) -> Array:
-        """Build the instruments' parameters (groups, 2, INSTRUMENT_ROWS, width) by `build_instrument_rows`.
+        """Build the instruments' parameters (groups, 2, INSTRUMENT_ROWS, width) for some groups of runs.
 
-        They are those of the groups groups[0] <= g < groups[1] for the samples first <= sample < last.
+        The groups are groups[0] <= g < groups[1], the samples first <= sample < last (`build_instrument_rows`).
         """
         if self._constant_sensors is not None:
             return self._constant_sensors[groups[0] : groups[1]]
@@ -489,7 +490,7 @@ class SetRun:
     def _check_groups(self, groups: tuple[int, int], stop: int) -> None:
         """Raise SimulationFailed if a run of the groups groups[0] <= g < groups[1] has diverged before output `stop`.
 
-        Unless unresolved runs are allowed, also if it fell below vacuum, or hit an end stop too hard for the step.
+        Unless unresolved runs are allowed, a pressure below vacuum or a step too long for an end stop raises it, too.
         """
         from sealscope.physics.solvers.limits import longest_step_on_stop
         from sealscope.physics.vector.runs import DIVERGED, MAX_TRAVEL, MIN_PRESSURE
@@ -532,8 +533,8 @@ class SetRun:
     def mean_flow(self) -> Array:
         """Compute the mean flow |Q_L| (runs,) [m^3/s] of each run's leak while it is open, 0 if it never opens.
 
-        It is the sum of |Q_L| over the outputs, for the coefficients `flow_coefficients`, divided by the sum of the
-        leak's opening (0 to 1): a time at which the leak is half open counts half.
+        It is the sum of |Q_L| over the solver's outputs, divided by the sum of the leak's opening (0 to 1). A time at
+        which the leak is half open therefore counts half.
         """
         from sealscope.physics.vector.runs import FLOW, OPENING
 

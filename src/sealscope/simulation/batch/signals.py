@@ -91,7 +91,8 @@ def _add_squares(details: np.ndarray, first: int, n: int, bounds: np.ndarray, su
     """Add the squared wavelet details of n samples, and the squares of d3 d4, to the sums of their segments.
 
     `details` (LEVELS, CHUNK, WIDTH): details of the samples from `first` on; `bounds` (segments + 1,): samples at which
-    the segments begin, and the end of the last. Segment k has the QUANTITIES rows from `sums_row` + k QUANTITIES on.
+    the segments begin, and the end of the last. Segment k has the QUANTITIES rows of `sums` from
+    `sums_row` + k QUANTITIES on.
     """
     for segment in range(bounds.size - 1):
         row = sums_row + segment * QUANTITIES

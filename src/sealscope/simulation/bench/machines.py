@@ -50,7 +50,7 @@ class BenchMachine:
     controller: str = "pi"
 
     def experiment(self, **arguments: Any) -> Experiment:
-        """Make the experiment of this machine, with a start position from which its strokes are centred.
+        """Make an experiment with this machine, whose piston starts where its travel is centred (`centred_start`).
 
         `arguments`: those of `Experiment.of`, such as leak and fault; seed, duration, command, load and drifts are the
         machine's unless stated. Raises InputError as `Experiment.of` does, also if a drawn parameter is out of range.
@@ -67,9 +67,9 @@ class BenchMachine:
 
 
 def centred_start(rig: Rig, command: Command | Position | str, duration: float) -> float:
-    """Estimate the start position [m] that centres the strokes under a command over `duration` [s] at mid-stroke.
+    """Estimate the start position [m] from which the piston's travel under a command is centred at mid-stroke.
 
-    Under a position target, it is the target's first value. The result is limited to the stroke.
+    `duration` [s] of the command. With a position target, the result is its first value. It is limited to the stroke.
 
     The piston moves with the pump's flow, A v = q_b omega/(2 pi), and the motor is taken as unloaded and without
     inertia in its PI loop: (k_p + C_e) omega = k_p omega_d + K_i I, dI/dt = omega_d - omega (eqs. 4.2-4.5). Behind a
@@ -119,9 +119,10 @@ def _draw_path(random: np.random.Generator, shapes: tuple[str, ...], duration: f
 
 
 def _draw_drift(random: np.random.Generator, drift: DriftRange, oil: Wander) -> Wander:
-    """Draw the course of a drift: w oil + sqrt(1 - w^2) path, with w = `drift.oil` and an independent path.
+    """Draw the course of a drift: w oil + sqrt(1 - w^2) path, with the weight w = `drift.oil`.
 
-    It is scaled to a range (maximum minus minimum) drawn uniformly from `drift.size`.
+    `oil`: course of the oil temperature. The path is drawn independently of it. The sum is scaled to a range (maximum
+    minus minimum) that is drawn uniformly from `drift.size`.
     """
     path = _draw_path(random, drift.shapes, oil.duration)
     weight = drift.oil
@@ -160,9 +161,9 @@ def draw(
 ) -> BenchMachine:
     """Draw a healthy machine like `rig` at random from a profile; equal seeds give equal machines.
 
-    `profile`: a profile, its name or its file; `duration` [s] of the recording, over which the drifts have their sizes;
-    `family`: one of the profile's families of machines, "" for none. Raises InputError for a seed below 0, a duration
-    that is not positive and finite, or an unknown rig, profile or family.
+    `profile`: a profile, its name or its file; `duration` [s]: length of the recording, over which the parameters
+    drift; `family`: one of the profile's families of machines, "" for none. Raises InputError for a seed below 0, a
+    duration that is not positive and finite, or an unknown rig, profile or family.
     """
     from sealscope.parameters import load_rig
 

@@ -141,7 +141,7 @@ AnyNuisance = Nuisance | NuisanceChoice
 
 
 def _parse_nuisance(table: Any) -> AnyNuisance:
-    """Parse an entry of a profile's file as a difference between machines; an InputError names the entry."""
+    """Parse a profile's entry as a difference between machines; an InputError begins with the entry's name."""
     entry = _NuisanceEntry.model_validate(table)
     try:
         return _convert_to_si(entry)
@@ -194,7 +194,7 @@ def _convert_values(entry: _NuisanceEntry, choices: tuple[str, ...], si_unit: st
 
 
 def _parse_drift(entry: _DriftEntry, parameters: tuple[str, ...], si_unit: str) -> DriftRange:
-    """Convert a drift to `si_unit` or to a fraction of its parameters; raise InputError if they cannot have it."""
+    """Convert a drift of `parameters` to `si_unit`, or to a fraction of them; raise InputError for an invalid drift."""
     absolute = is_absolute_drift(parameters[0])
     for parameter in parameters:
         ParameterDrift(parameter, linear_path(0.0, 1.0), absolute)  # raises InputError if it cannot drift
@@ -209,7 +209,7 @@ def _parse_drift(entry: _DriftEntry, parameters: tuple[str, ...], si_unit: str) 
 
 
 def _check_distinct(nuisances: tuple[AnyNuisance, ...]) -> tuple[AnyNuisance, ...]:
-    """Return the nuisances; raise InputError if two of them share a parameter or a name."""
+    """Return the nuisances (differences between machines); raise InputError if two share a parameter or a name."""
     owner: dict[str, str] = {}
     for nuisance in nuisances:
         for parameter in nuisance.parameters:
@@ -271,7 +271,7 @@ class Profile:
         raise InputError(f"a family of {self.name} must be one of its own ({names}), got {name!r} ({self.place})")
 
     def of_family(self, name: str) -> Profile:
-        """Build the profile of a family, whose nuisances and duty replace those of this profile."""
+        """Build the profile of a family of machines, whose nuisances and duty replace those of this profile."""
         family = self.family(name)
         nuisances = _replace_nuisances(self.nuisances, family.nuisances)
         return replace(self, duty=family.duty or self.duty, nuisances=nuisances, families=())
@@ -280,7 +280,7 @@ class Profile:
 def _replace_nuisances(
     nuisances: tuple[AnyNuisance, ...], replacing: tuple[AnyNuisance, ...]
 ) -> tuple[AnyNuisance, ...]:
-    """Remove the parameters of `replacing` from `nuisances` (differences between machines), and append it."""
+    """Remove the parameters in `replacing` from all `nuisances` (differences between machines); append `replacing`."""
     replaced_parameters = {parameter for nuisance in replacing for parameter in nuisance.parameters}
     remaining: list[AnyNuisance] = []
     for nuisance in nuisances:
