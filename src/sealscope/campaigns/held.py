@@ -1,7 +1,6 @@
 """Plan a locked hold: the smallest piston leak that is found while valves shut the cylinder off from its pump.
 
-The cylinder is pressed against a stop and its valves are shut. A leak past the piston then brings the two pressures
-together,
+The cylinder is pressed against a stop and its valves are shut. A leak past the piston then equalises the pressures,
 
     d(p_A - p_B)/dt = -G (1/V_A + 1/V_B) K (p_A - p_B),
 
@@ -92,7 +91,7 @@ class PlannedHold(NamedTuple):
 
 
 def has_shut_off(rig: Rig) -> bool:
-    """Return True if a rig has valves, with stated openings, that shut the cylinder off from its pump."""
+    """Return True if a rig has shut-off valves between cylinder and pump, whose openings are stated, not assumed."""
     sources = [rig.entry(name).source for name in ("line.open_A", "line.open_B")]
     return rig.line.orifices == "present" and not any(source.startswith(("absent", "assumed")) for source in sources)
 
@@ -102,9 +101,9 @@ def plan_hold(
 ) -> PlannedHold:
     """Find the shortest locked hold under a load [N] that detects a leak of the conductance `find` [m^3/(s Pa)].
 
-    If no duration in `HOLD_DURATIONS` suffices, the longest is planned; if `find` is None, `DEFAULT_DURATION`. `flow`
-    [m^3/s]: mean flow of the pump under the usual duty; `false_alarm`, `detection`: probability of the verdict `leak`
-    without and with a leak. Raises InputError if the load is not > 0.
+    If no duration in `HOLD_DURATIONS` suffices, the longest is planned. If `find` is None, the hold lasts
+    `DEFAULT_DURATION`. `flow` [m^3/s]: mean flow of the pump under the usual duty; `false_alarm`, `detection`:
+    probability of the verdict `leak` without and with a leak. Raises InputError if the load is not > 0.
     """
     if not load > 0.0:
         raise InputError(f"a locked hold must be under a load > 0 N, got {load:g} N")
@@ -140,8 +139,8 @@ class _HoldDraws:
     def detects(self, conductance: float) -> bool:
         """Return True if at least the fraction `detection` of `_N_DRAWS` simulated holds detects a leak.
 
-        `conductance` [m^3/(s Pa)] of the leak. A hold detects it if, judged by the healthy holds, the probability that
-        a leak-free hold leaks as much is below the allowed false-alarm probability.
+        `conductance` [m^3/(s Pa)]: that of the leak. A hold detects it if a leak-free hold would leak as much with less
+        than the allowed false-alarm probability, as estimated from the healthy holds.
         """
         n_missed = 0
         for seed in range(N_HEALTHY, N_HEALTHY + _N_DRAWS):  # the healthy holds have the seeds before
@@ -154,7 +153,7 @@ class _HoldDraws:
     def with_smallest_leak(self) -> PlannedHold:
         """Find by bisection the smallest leak that the hold detects; return the hold with the leak's conductance.
 
-        It is inf if even the largest leak that is tried (`_TRIED_LOSSES`) is not detected.
+        The conductance is inf if even the largest leak that is tried (`_TRIED_LOSSES`) is not detected.
         """
         loss_per_conductance = _decay_per_conductance(self._rig) * self._hold.duration
         low, high = np.log(np.array(_TRIED_LOSSES) / loss_per_conductance)  # logarithms of conductances
@@ -177,10 +176,10 @@ def _decay_per_conductance(rig: Rig) -> float:
 
 
 def draw_hold(rig: Rig, hold: PlannedHold, conductance: float, flow: float, seed: int) -> RecordingSums:
-    """Simulate a locked hold with a leak past the piston and with sensor noise; measure the leak as in a recording.
+    """Simulate a locked hold with a leak past the piston and with sensor noise, and estimate the leak from it.
 
-    `conductance` [m^3/(s Pa)] of the leak; `flow` [m^3/s]: mean flow of the pump under the usual duty. Returns the
-    summary of a recording with this hold, whose Gram matrix is 0, because the piston does not move.
+    `conductance` [m^3/(s Pa)]: that of the leak; `flow` [m^3/s]: mean flow of the pump under the usual duty. Returns
+    the summary of a recording with this hold. Its Gram matrix is 0, because the piston does not move.
     """
     random = np.random.default_rng(seed)
     cylinder, sensors = rig.cylinder, rig.sensors
@@ -188,7 +187,8 @@ def draw_hold(rig: Rig, hold: PlannedHold, conductance: float, flow: float, seed
     # p_A - p_B falls exponentially once the valves are shut, at the time `BEFORE`; expm1: exp - 1
     decay_rate = conductance * _decay_per_conductance(rig)
     loss = hold.difference * -np.expm1(-decay_rate * np.maximum(t - BEFORE, 0.0))
-    fraction_A = cylinder.A_B / (cylinder.A_A + cylinder.A_B)  # A's part of the loss, inverse to the volume
+    # pressure changes are inverse to the volumes, which at mid-stroke are proportional to the areas
+    fraction_A = cylinder.A_B / (cylinder.A_A + cylinder.A_B)
     p_A, p_B = (
         pressure + np.hypot(sensor.noise, sensors.common_noise) * random.standard_normal(t.size)
         for pressure, sensor in (

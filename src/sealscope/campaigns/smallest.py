@@ -168,9 +168,10 @@ class RecordingPlan(NamedTuple):
 
 
 def duty_experiment(rig: Rig, duty: PlannedDuty, duration: float, seed: int = 0) -> Experiment:
-    """Build a leak-free experiment of `duration` [s] with a duty, the piston's motion centred in the stroke.
+    """Build a leak-free experiment of `duration` [s] with the command and load `duty`.
 
-    `seed`: seed of the sensor noise. Raises InputError if the command is a target of the position and not a voltage.
+    The piston starts where its motion is centred in the stroke. `seed`: seed of the sensor noise. Raises InputError if
+    the command is a target of the position and not a voltage.
     """
     command = command_or_target(duty.command)
     if isinstance(command, Position):
@@ -214,7 +215,7 @@ def _detectable_steps(
     balance = detector.balance(recording)
     if balance is None or balance.test is None:
         raise InputError("no balance: too short, or no block says anything of a leak")
-    # if the healthy leakage is known, a part of the false-alarm probability goes to a test of the level against it
+    # if the healthy leakage is known, a part of the false-alarm probability is reserved for a comparison with it
     level_fraction: float = DECISION.questions.within
     step_false_alarm = false_alarm * (1.0 - level_fraction if healthy_leakage(rig) > 0.0 else 1.0)
     scale = balance.size.scale  # conductances and flows of the balance are relative to the size of the machine
@@ -262,10 +263,10 @@ def plan_recording(
 ) -> RecordingPlan:
     """Find the shortest recording that detects a leak with a flow of `find` [m^3/s].
 
-    All duties are first compared in recordings of `COMPARISON_SECONDS`; the best duty is then tried for `DURATIONS`.
+    All duties (command and load) are compared in recordings of `COMPARISON_SECONDS`; the best is tried for `DURATIONS`.
 
-    - `find`: at the mean |p_A - p_B| of the `usual` duty; None to find the smallest leak in `COMPARISON_SECONDS`
-    - `duties`: other duties to try, by default all combinations of `COMMANDS` and `LOADS`
+    - `find`: flow at the mean |p_A - p_B| of the `usual` duty; None to find the smallest leak in `COMPARISON_SECONDS`
+    - `duties`: duties to compare with the usual one, by default all combinations of `COMMANDS` and `LOADS`
     - `false_alarm`, `detection`: probabilities of an alarm without the leak and with it
     - `held` [N]: force that the cylinder holds in a locked hold, with its valves shut; None for the last of `LOADS` if
       the rig has such valves, and otherwise for no hold

@@ -88,11 +88,10 @@ def normalise_arguments(arguments: Sequence[str]) -> list[str]:
 
 
 def spread_baselines(arguments: Sequence[str]) -> list[str]:
-    """Repeat the option `--baseline` of diagnose and report before each of the files after it, as typer requires.
+    """Repeat the option `--baseline` of diagnose and report before each baseline file, as typer requires.
 
     All arguments after `--baseline` up to the next option are baselines. If the call has no other files, only the first
-    file after each `--baseline` is a baseline, and the other files after it are diagnosed. Raises InputError without a
-    file.
+    file after each `--baseline` is a baseline, and the others are diagnosed. Raises InputError if no file follows.
     """
     if "--baseline" not in arguments or arguments[0] not in ("diagnose", "report"):
         return list(arguments)
@@ -132,8 +131,8 @@ def _click_command() -> Any:
 def main() -> None:
     """Run the command line, and end the process with an exit status.
 
-    It is that of the command, 0 by default; 1 for a failure; 2 for a wrong call; or 130 for an interrupt (Ctrl-C). An
-    error that the caller can act on is printed as one line on standard error.
+    The status is that of the command, by default 0; 1 for a failure; 2 for a wrong call; or 130 for an interrupt
+    (Ctrl-C). An error that the caller can act on is printed as one line on standard error.
     """
     # some versions of typer contain a copy of click: take the exception of the module in which BadParameter is defined
     wrong_call: type[Any] = sys.modules[typer.BadParameter.__module__].ClickException

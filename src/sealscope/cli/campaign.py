@@ -109,7 +109,7 @@ def report(plan: PlanArgument, folder: FolderOption = None, data: DataOption = N
 
 
 def _campaign_folder(plan: AnyPlan, stated: Path | None) -> Path:
-    """Choose the folder of a campaign: `stated`, or for None `sealscope-campaigns/NAME`.
+    """Choose the folder of a campaign: `stated` or, if that is None, `sealscope-campaigns/NAME`.
 
     Raises InputError if this default folder, or the folder that contains it, is a link.
     """
@@ -123,7 +123,7 @@ def _campaign_folder(plan: AnyPlan, stated: Path | None) -> Path:
 
 
 def _format_progress(state: CampaignProgress) -> str:
-    """Format the numbers of records done and failed, and the time of one core per record and for those not done."""
+    """Format the numbers of records done and failed, the core time per record, and that for the remaining records."""
     text = f"records: {state.done} of {state.records} done"
     if state.failed:
         text += f", {state.failed} of them failed"
@@ -137,7 +137,7 @@ def _format_progress(state: CampaignProgress) -> str:
 
 @contextmanager
 def _show_progress() -> Iterator[ProgressCallback]:
-    """Show the progress of a campaign on standard error; yield a function of (done, planned, failed) records."""
+    """Show a campaign's progress on standard error; yield a function of the numbers of records (done, all, failed)."""
     with opt.counted_progress("records") as update:
         yield lambda done, total, failures: update(done, total, f"{failures} failed" if failures else "")
 
@@ -145,8 +145,8 @@ def _show_progress() -> Iterator[ProgressCallback]:
 def _write_report(plan: AnyPlan, folder: Path, data: Path | None) -> int:
     """Write the tables and the page of a campaign, print its main table, and return the number of failed records.
 
-    The first five failed records are also printed, on standard error. `folder`: of the campaign, to which the files are
-    written; `data`: folder of the recordings, not needed for a simulated plan.
+    The first five failed records are also printed, on standard error. `folder`: the campaign's folder, into which the
+    files are written; `data`: folder of the recordings, None for a simulated plan.
     """
     from sealscope.campaigns.results import write_result
     from sealscope.reporting.campaign.page import PAGE, campaign_text, write_campaign_page

@@ -105,8 +105,7 @@ def dashboard(file: FileOption = Path("grafana.json")) -> None:
 def _serve(file: Path, *, once: bool = False) -> None:
     """Run the monitor with a file of settings until this process receives SIGTERM or SIGINT.
 
-    Without a page it also ends when all its sources of samples have ended; `once`: sources end when they have no new
-    data.
+    Without a page it also ends when all its sources of samples have ended. `once`: a source ends if it has no new data.
     """
     from sealscope.monitor.service import Service
     from sealscope.monitor.settings import read_settings

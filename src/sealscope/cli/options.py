@@ -57,7 +57,7 @@ def _rig_names() -> Sequence[str]:
 
 
 def _override_names() -> list[str]:
-    """List the dotted names of a rig's parameters, and unique last parts of them, as `NAME=`, for completion."""
+    """List each parameter's dotted name, and its symbol if that is unique, with "=" appended, for completion."""
     from sealscope.parameters import declared_names
 
     names = declared_names()
@@ -72,8 +72,7 @@ complete_rigs = make_completion(_rig_names)
 def declared_option(name: str, *, option: str = "", several: bool = False, **settings: Any) -> Any:
     """Build the command-line option for an argument of `Experiment.of`, with the help text declared in `Arguments`.
 
-    `option`: the flag, by default made from the name; `several`: the option may be repeated; `settings`: further
-    arguments of `typer.Option`.
+    `option`: flag, by default from `name`; `several`: True if repeatable; `settings`: arguments of `typer.Option`.
     """
     text = _argument_text(name) + (" Repeat for several." if several else "")
     return Option(option or f"--{name.replace('_', '-')}", help=text, **settings)
@@ -205,7 +204,7 @@ class StatedMachine:
     def read(self, file: Path) -> Recording:
         """Read the recording in a file, or on standard input for the file `-`.
 
-        A commissioned machine reads it by the map and rate in the machine's file, else the options of the call apply.
+        If the machine is commissioned, the channel map and rate in its file apply, otherwise the options of the call.
         Without `--map`, the rig's map is used for files with its columns. Raises UnreadableFile, also for a folder.
         """
         if self.commissioned is not None:
@@ -225,7 +224,7 @@ class StatedMachine:
                 raise UnreadableFile(str(error).replace(str(path), path.name)) from error
 
     def _read(self, file: Path) -> Recording:
-        """Read the recording in a file by the map of the call or, if it has the columns, by that of the rig's file."""
+        """Read the recording in a file by the call's channel map or, without one, by the rig's if it fits the file."""
         if not self._rig_map:
             from sealscope.recordings import read
 
@@ -253,8 +252,8 @@ class StatedMachine:
     def diagnose(self, recording: Recording, baseline: Sequence[Recording], file: Path, **settings: Any) -> Diagnosis:
         """Diagnose a recording of this machine, compared with the healthy recordings `baseline`, which may be empty.
 
-        A commissioned machine uses those in its own file. `file`: name in the diagnosis; `settings`: more arguments of
-        `diagnose`.
+        A commissioned machine is compared with the healthy recordings in its file instead. `file`: name in the
+        diagnosis; `settings`: more arguments of `diagnose`.
         """
         from dataclasses import replace
 
@@ -298,7 +297,7 @@ def with_experiment_options(command: Callable[..., None]) -> Callable[..., None]
 
 
 def _build_experiment(rig: str, set: Sequence[str] | None, **arguments: Any) -> Experiment:
-    """Build the simulated experiment of a call: `set` changes the `rig`, `arguments` are those of `Experiment.of`."""
+    """Build an experiment from a call's options: `rig`, changed by `set`, and other `arguments` of `Experiment.of`."""
     from sealscope.simulation.experiment import Experiment
 
     return Experiment.of(rig=load_rig_with(rig, set), **arguments)
@@ -361,11 +360,10 @@ def load_rig_with(name: str, overrides: Sequence[str] | None) -> Rig:
 
 
 def parse_channel_map(options: Sequence[str] | None) -> ChannelMap:
-    """Parse the `--map` options to a channel map, which states the columns of channels.
+    """Parse the `--map` options to a channel map, which states the column of each channel.
 
-    An option is `CHANNEL=COLUMN`, such as `p_A=PG_1[psi]`, or `auto`, by which the remaining channels are found by the
-    names of the columns; only `auto` gives "auto". Raises InputError for another form, an unknown channel, or one given
-    twice.
+    An option is `CHANNEL=COLUMN`, such as `p_A=PG_1[psi]`, or `auto`, to find other channels by their columns' names.
+    `auto` alone gives "auto". Raises InputError for another form, or for a channel that is unknown or given twice.
     """
     from sealscope.recordings import split_map_option
     from sealscope.recordings.formats.columns import REST
@@ -400,7 +398,7 @@ def complain(message: object) -> None:
 
 
 def attempt(file: Path, work: Callable[[], T]) -> T | None:
-    """Return the result of `work`, or print a message on `file` on standard error and return None if it fails."""
+    """Return the result of `work`; if it fails, print a message about `file` on standard error and return None."""
     try:
         return work()
     except SealscopeError as error:
@@ -414,7 +412,7 @@ def attempt(file: Path, work: Callable[[], T]) -> T | None:
 
 
 def check_folder(file: Path) -> None:
-    """Check that the folder of the file to write exists; also remove temporary files of stopped calls."""
+    """Check that the folder of the file to write exists; also remove temporary files that interrupted calls left."""
     from sealscope.storage import atomic
 
     atomic.check_folder(file)

@@ -145,7 +145,7 @@ def _format_diagnosis(diagnosis: Diagnosis, form: str, start_s: float | None) ->
 
 
 def _matches_fail_on(reason: str, diagnosis: Diagnosis) -> bool:
-    """Return True if a diagnosis has the verdict `reason`, or at least the level of severity `reason` (`--fail-on`)."""
+    """Return True if a diagnosis meets a `reason` to fail: a verdict, or the lowest level of severity (`--fail-on`)."""
     level = None if diagnosis.severity is None else diagnosis.severity.level
     if reason in _LEVELS:  # in rising order
         return level in _LEVELS[_LEVELS.index(reason) :]
@@ -205,16 +205,16 @@ def _iter_diagnoses(
 
 
 def _iter_dated_diagnoses(files: Sequence[Path], **options: Any) -> Iterator[DatedDiagnosis | None]:
-    """Yield (start, diagnosis) of each recording; None where `_iter_diagnoses`, which gets `options`, yields None.
+    """Yield (start, diagnosis) of each recording, or None if the file cannot be read or diagnosed.
 
-    The start is in seconds since 1970, or None if unknown.
+    The start is in seconds since 1970, or None if unknown. `options`: arguments of `_iter_diagnoses`.
     """
     for result in _iter_diagnoses(files, **options):
         yield None if result is None else (_start_seconds(result), result.diagnosis)
 
 
 def _start_seconds(result: DiagnosedRecording) -> float | None:
-    """Find the start of a recording [s since 1970]: stated in it, or by its file's name or last change; else None."""
+    """Find the start of a recording [s since 1970] from its content, file name or last change; None if unknown."""
     from sealscope.recordings.joining import file_seconds, start_seconds
 
     path = Path(result.diagnosis.file)

@@ -75,7 +75,7 @@ def reproduce(
 
 
 def _list_items(patterns: Sequence[str], sheet: Path | None) -> None:
-    """Print the ids and titles of the items that match `patterns`; mark those whose data `sheet` is not found."""
+    """Print ids and titles of the items that match `patterns`; mark those whose data file `sheet` is missing."""
     from sealscope.thesis.engine.items import load_items, select_items
     from sealscope.thesis.sheet import MISSING, find_sheet
 

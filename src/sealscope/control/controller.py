@@ -90,8 +90,8 @@ class _PythonLaw:
     def _call_voltage(self, _memory: int, measured: int) -> float:
         """Compute the controller's voltage [V] from the numbers of a `Measured` at the address `measured`.
 
-        The leakage flow that it compensates is stored in `self._memory[0]`, NaN if it reports none. If the controller
-        raises an exception, this is stored in `self.raised`, and the result is NaN.
+        The leakage flow that the controller compensates is stored in `self._memory[0]`, or NaN if it reports none. If
+        the controller raises an exception, it is stored in `self.raised`, and the result is NaN.
         """
         try:
             numbers = (ctypes.c_double * len(Measured._fields)).from_address(measured)

@@ -85,9 +85,8 @@ class _Invertible(ABC):
     def coefficients(self, rate: float, dead_volts: float = 0.0) -> Any:
         """Make the drive's parameters in the form that `drive_voltage` takes, a record (1,) `DRIVE`.
 
-        `rate` [Hz]: sampling rate of the controller; `dead_volts` [V]: largest voltage that is added to pass the
-        overlap of a servo valve's edges. A pump's drive ignores `dead_volts`; a valve, which has no filter, ignores
-        `rate`.
+        `rate` [Hz]: sampling rate of the controller, which a valve ignores; `dead_volts` [V]: largest voltage that is
+        added to pass the overlap of a servo valve's edges, which a pump's drive ignores.
         """
 
     def inverse(self, rate: float) -> Callable[[float, float], float]:

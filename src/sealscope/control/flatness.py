@@ -126,7 +126,7 @@ class Flatness:
         memory = make_record(
             _MEMORY,
             self,
-            compensated=math.nan,
+            compensated=math.nan,  # this controller compensates no leakage
             T=T,
             load_gain=1.0 - math.exp(-T / _LOAD_LAG),
             is_first=1.0,

@@ -47,8 +47,7 @@ OBSERVER = record_dtype(
 def update_observer(m: Any, theta: float, x: float, p_A: float, p_B: float) -> None:
     """Update the estimate of the leakage between the chambers with one sample of the measurements.
 
-    `m`: record `OBSERVER`, the memory; `theta` [rad]: angle of the pump; `x` [m]: position; `p_A`, `p_B` [Pa]:
-    pressures.
+    `m`: record `OBSERVER`, the memory; `theta` [rad]: angle of the pump; `x` [m]: position; `p_A`, `p_B` [Pa].
 
     A Kalman filter estimates the conductance G between the chambers from the volume balance of each block of `BLOCK`
     seconds. The chamber with the higher pressure is balanced, because a check valve may feed the other. For chamber A,
@@ -87,8 +86,7 @@ def _update_with_block(m: Any, dp_sum: float) -> None:
     - the mean of p_A - p_B is within +-`MIN_DP`;
     - p_A - p_B changes its sign, or is too small to shut a check valve;
     - its innovation (measured minus predicted leakage) exceeds `_OUTLIER_SDS` standard deviations. If the block before
-      was such an outlier with the same sign, the block is used: a leak may have opened, and the variance of the
-      conductance is increased.
+      was such an outlier with the same sign, a leak may have opened: the block is used, with a larger variance of G.
     """
     dp_integral = dp_sum / m.rate
     if abs(dp_integral) < MIN_DP * m.length / m.rate or m.min_dp * m.max_dp <= 0.0:
@@ -141,7 +139,7 @@ def _update_with_block(m: Any, dp_sum: float) -> None:
 
 @law
 def conductance(m: Any) -> tuple[float, float, float]:
-    """Return conductance and standard error [m^3/(s Pa)], and number of blocks used, of a record `OBSERVER`."""
+    """Return the conductance in an observer's memory m, its standard error [m^3/(s Pa)] and its number of blocks."""
     return m.state[0], math.sqrt(m.P[0, 0]), m.n_blocks
 
 

@@ -80,8 +80,7 @@ def open_loop(
     measurement j (x, p_A, p_B or theta) to the voltage, from its response to an impulse. P_j is that of the rig from
     the voltage to measurement j: c_j (z I - A)^-1 B, where y(k+1) = A y(k) + B u(k) is the rig linearised over one
     sample, and the row c_j picks measurement j from the state. The piston moves at `speed` [m/s] (0: standstill), under
-    a force `load` [N] in addition to the rig's own. The second result is True if the linearised rig is stable without
-    control.
+    an additional force `load` [N]. The second result is True if the linearised rig is stable without control.
     """
     A, B, state = _linearise(rig, controller.rate, speed, load)
     z = np.exp(2j * math.pi * f / controller.rate)
@@ -193,7 +192,7 @@ def _impulse_responses(controller: Controller, state: Array) -> list[tuple[int, 
 def _frequency_response(response: Array, z: NDArray[np.complex128]) -> NDArray[np.complex128]:
     """Compute the frequency response (m,) of a controller from its impulse response, by the z-transform sum_k a_k z^-k.
 
-    `response` (n,): the first n values a_k; the last one persists, as that of an integrator does; `z` (m,).
+    `response` (n,): the first n values a_k; all later values equal the last one, as for an integrator. `z` (m,).
     """
     last_value = response[-1]
     transient = response - last_value

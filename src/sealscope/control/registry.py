@@ -127,13 +127,13 @@ def _find_module_file(module: str) -> Path | None:
 
 
 def _load_module(module_or_file: str) -> Any:
-    """Import a module by name, or a Python file by path, again only if its text changes; InputError without a file."""
+    """Import a module by name, or a Python file by path; raise InputError if there is no such file."""
     if not module_or_file.endswith(".py"):
         return importlib.import_module(module_or_file)
     path = Path(module_or_file)
     if not path.is_file():
         raise InputError(f"a controller's file must exist, got {module_or_file}")
-    name = f"sealscope_controller_{sha256(path.read_bytes()).hexdigest()[:16]}"
+    name = f"sealscope_controller_{sha256(path.read_bytes()).hexdigest()[:16]}"  # an edited file gets another name
     if name in sys.modules:
         return sys.modules[name]
     spec = importlib.util.spec_from_file_location(name, path)

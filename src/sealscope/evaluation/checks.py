@@ -11,7 +11,7 @@ Array = npt.NDArray[np.float64]
 
 
 def as_numbers(values: npt.ArrayLike, what: str) -> Array:
-    """Convert `values` to an array (n,) of finite numbers, n >= 1; raise InputError, naming them `what`, if not."""
+    """Convert `values` to finite numbers (n,), n >= 1; raise InputError if they are not. `what`: name in messages."""
     try:
         array = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError):
@@ -27,7 +27,7 @@ def as_numbers(values: npt.ArrayLike, what: str) -> Array:
 
 
 def as_sizes(values: npt.ArrayLike, what: str = "leak sizes") -> Array:
-    """Convert `values` to an array (n,) of leak sizes > 0; raise InputError, which calls them `what`, for others."""
+    """Convert `values` to leak sizes (n,) > 0; raise InputError if they are not. `what`: name in messages."""
     array = as_numbers(values, what)
     wrong = np.flatnonzero(array <= 0.0)
     if wrong.size:
@@ -36,7 +36,7 @@ def as_sizes(values: npt.ArrayLike, what: str = "leak sizes") -> Array:
 
 
 def as_flags(values: npt.ArrayLike, n: int, what: str) -> npt.NDArray[np.bool_]:
-    """Convert `n` values True/False or 1/0 to an array of booleans; raise InputError for others, naming them `what`."""
+    """Convert `n` values True/False or 1/0 to booleans; raise InputError for others. `what`: name in messages."""
     array = as_numbers(np.asarray(values, dtype=np.float64), what)
     if array.size != n:
         raise InputError(f"{what} must be as many as the records, got {array.size} for {n}")
@@ -51,7 +51,7 @@ MIN_PROBABILITY = 1e-15
 
 
 def as_probability(value: float, what: str) -> float:
-    """Return `value` as a float if it is a probability from 1e-15 to below 1; raise InputError, naming `what`, else."""
+    """Convert a probability to a float; raise InputError unless it is 1e-15 to below 1. `what`: name in messages."""
     if not 0.0 < value < 1.0:
         raise InputError(f"{what} must be between 0 and 1, got {value}")
     if value < MIN_PROBABILITY:

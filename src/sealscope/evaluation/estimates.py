@@ -42,11 +42,10 @@ class EstimateErrors:
 def order_ranks(n: int, order: float, confidence: float = 0.95) -> tuple[int, int]:
     """Compute the ranks (r, s) of the two sorted sample values that enclose a quantile of the distribution.
 
-    The quantile of the given `order`, such as 0.9, lies between them with at least the probability `confidence`. Of `n`
-    values, r is the largest rank with ``P(X <= r - 1) <= alpha/2`` and s the smallest with ``P(X >= s) <= alpha/2``,
-    where X is binomial (n, order) and alpha = 1 - confidence. r = 0 and s = n + 1 mean that there is no bound. Raises
-    InputError for an impossible order or confidence. Source: Conover, Practical Nonparametric Statistics, 3rd ed.
-    (1999), section 3.2.
+    The quantile of `order`, such as 0.9, lies between them with at least the probability `confidence`. Of `n` values, r
+    is the largest rank with ``P(X <= r - 1) <= alpha/2`` and s the smallest with ``P(X >= s) <= alpha/2``, where X is
+    binomial (n, order) and alpha = 1 - confidence. r = 0 and s = n + 1 mean no bound. Raises InputError for an
+    impossible order or confidence. Source: Conover, Practical Nonparametric Statistics, 3rd ed. (1999), section 3.2.
     """
     from scipy.special import betainc
 
@@ -97,7 +96,10 @@ def estimate_mean(values: npt.ArrayLike, confidence: float = 0.95) -> IntervalEs
 
 
 def _as_matching(values: npt.ArrayLike | None, n: int, what: str) -> Array:
-    """Convert `values` to an array (n,), all nan for None; raise InputError, naming them `what`, for other shapes."""
+    """Convert `values` to an array (n,), filled with nan if they are None; raise InputError for another shape.
+
+    `what`: name of the values in messages.
+    """
     array = np.full(n, math.nan) if values is None else np.asarray(values, dtype=np.float64)
     if array.shape != (n,):
         raise InputError(f"{what} must be as many as the true values, got {array.shape} for {n}")

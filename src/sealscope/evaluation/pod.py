@@ -50,9 +50,10 @@ def detection_by_size(leaks: npt.ArrayLike, hits: npt.ArrayLike, confidence: flo
 def proven_size(rows: list[SizeDetection], detection: float = 0.9) -> float:
     """Find the smallest tested size such that this and all larger tested sizes are proven to be detected.
 
-    A size is proven if the lower confidence bound of its proportion is at least `detection`; the confidence applies to
-    each size separately. For example, 29 hits of 29 prove 90 % at 95 % confidence: this is a90/95 without a model.
-    Returns infinity if the largest size is not proven. Source: Clopper and Pearson (1934), doi 10.1093/biomet/26.4.404.
+    `rows`: proportion of detected leaks of each size. A size is proven if the lower confidence bound of its proportion
+    is at least `detection`; the confidence applies to each size separately. For example, 29 hits of 29 prove 90 % at
+    95 % confidence: this is a90/95 without a model. Returns infinity if the largest size is not proven. Source: Clopper
+    and Pearson (1934), doi 10.1093/biomet/26.4.404.
     """
     as_probability(detection, "the probability of detection")
     proven = math.inf
@@ -263,12 +264,12 @@ def _exp_size(log_size: float) -> float:
 def fit_hit_miss(leaks: npt.ArrayLike, hits: npt.ArrayLike) -> HitMiss:
     """Fit a logistic curve of the probability of detection to hits and misses over the logarithm of the leak's size.
 
-    `leaks` (n,): positive sizes in any unit; `hits` (n,): True for the detected leaks. The fit is by maximum likelihood
-    or, if size separates hits from misses so that the likelihood has no finite maximum, by Firth's penalised likelihood
-    (`HitMiss.estimator`), also for bounds of a size (`HitMiss.size_bound`). The curve goes to 0 for small leaks, as it
-    does not include the false-alarm rate. Raises InputError for a single size, only hits or only misses. Source:
-    MIL-HDBK-1823A (2009), appendix G; Firth, Biometrika 80 (1993) 27-38, doi 10.1093/biomet/80.1.27; Heinze and
-    Schemper, Stat. Med. 21 (2002) 2409-2419, doi 10.1002/sim.1047.
+    `leaks` (n,): positive sizes in any unit; `hits` (n,): True for the detected leaks. The likelihood is maximised. If
+    the size separates hits from misses, it has no finite maximum, and Firth's penalised likelihood is used, also in
+    `HitMiss.size_bound`; `HitMiss.estimator` names the method. The curve goes to 0 for small leaks, as it does not
+    include the false-alarm rate. Raises InputError for a single size, only hits or only misses. Source: MIL-HDBK-1823A
+    (2009), appendix G; Firth, Biometrika 80 (1993) 27-38, doi 10.1093/biomet/80.1.27; Heinze and Schemper, Stat. Med.
+    21 (2002) 2409-2419, doi 10.1002/sim.1047.
     """
     x = np.log(as_sizes(leaks))
     is_hit = as_flags(hits, x.size, "hits")

@@ -1,8 +1,7 @@
 """Find roots and minima of functions of one variable, for commands that must start fast.
 
-`scipy.optimize` finds the same, but its import loads 200 modules, which takes a fifth of the time of a diagnosis.
-Sources: T. R. Chandrupatla, Adv. Eng. Softw. 28 (1997) 145 (roots); J. Kiefer, Proc. Amer. Math. Soc. 4 (1953) 502
-(golden section).
+`scipy.optimize` finds the same, but its import takes a fifth of the time of a diagnosis. Sources: T. R. Chandrupatla,
+Adv. Eng. Softw. 28 (1997) 145 (roots); J. Kiefer, Proc. Amer. Math. Soc. 4 (1953) 502 (golden section).
 """
 
 from __future__ import annotations

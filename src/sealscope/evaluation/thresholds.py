@@ -53,8 +53,8 @@ class Threshold:
 def records_needed(false_alarm: float, confidence: float | None = None) -> int:
     """Compute the smallest number of leak-free records that can set a threshold for a false-alarm probability p.
 
-    Without `confidence`, p is kept on average, which takes ``ceil(1/p) - 1`` records; with it, as a bound, which takes
-    the smallest n with ``1 - (1 - p)^n >= confidence``, for example 299 for 1 % at 95 %. Raises InputError for an
+    A threshold that keeps p on average needs ``ceil(1/p) - 1`` records. One that keeps p with the probability
+    `confidence` needs n with ``1 - (1 - p)^n >= confidence``, for example 299 for 1 % at 95 %. Raises InputError for an
     impossible probability or confidence. Source: Wilks, Ann. Math. Stat. 12 (1941) 91-96, doi 10.1214/aoms/1177731788.
     """
     as_probability(false_alarm, "the false-alarm probability")

@@ -208,8 +208,7 @@ def write_fmu(
     """Write a functional mock-up unit (FMU) that simulates a rig in co-simulation.
 
     The FMU contains the compiled equations of `simulate`, and needs no Python. Its inputs are the command, a leak,
-    external leakage and a load; every parameter of the rig's equations can be tuned; its outputs are states, flows
-    and powers.
+    external leakage and a load, its outputs states, flows and powers; every parameter of the equations can be tuned.
 
     Parameters
     ----------

@@ -111,8 +111,8 @@ def _build_parameters_law(
 ) -> Callable[..., Any]:
     """Build the compiled function that computes the model's parameters `RigNumbers` from the FMU's parameter values.
 
-    Its arguments are the values (n,), in the order of `variables.VALUES`, and two conductances [m^3/(s Pa)] of external
-    leakage out of the chambers A and B, added to the rig's. Other arguments are those of `RigChoice`.
+    The built function takes the values (n,), in the order of `variables.VALUES`, and conductances [m^3/(s Pa)] of
+    external leakage out of chambers A and B, added to the rig's. `laws` and the other arguments: fields of `RigChoice`.
     """
 
     @law
@@ -154,7 +154,7 @@ def build_functions(choice: RigChoice) -> dict[str, Callable[..., Any]]:
         return stand_still(state, x_0, standstill_force(x_0, p) + input_values[_F], p)  # type: ignore[no-any-return]
 
     def report(values: Any, inputs: Any, y: Any, results: Any) -> int:
-        """Write the outputs in state `y`, and electric, hydraulic and mechanical power [W], to `results`; return 0."""
+        """Write the outputs for state `y`, and electric, hydraulic and mechanical power [W], to `results`; return 0."""
         v, input_values, state = carray(values, _N_VALUES), carray(inputs, _N_INPUTS), carray(y, _N_STATES)
         out = carray(results, _N_RESULTS)
         p, z = model_parameters(v, input_values), state_of(state)
@@ -169,7 +169,7 @@ def build_functions(choice: RigChoice) -> dict[str, Callable[..., Any]]:
 
         @law
         def step(z: Any, h: float, t: float, a: Any, b: Any, p: Any) -> Any:
-            """Compute the state at t + h [s] from the state z at t [s], with inputs a + b s and parameters p."""
+            """Compute the state at t + h [s] from the state z at t [s], with inputs a + b s at time s, parameters p."""
             u, G = _at_imex_nodes(a[_U], b[_U], t, h), _at_imex_nodes(a[_G], b[_G], t, h)
             C, F = _at_imex_nodes(a[_C], b[_C], t, h), _at_imex_nodes(a[_F], b[_F], t, h)
             return imex_step(z, h, u, G, C, F, p)
@@ -178,7 +178,7 @@ def build_functions(choice: RigChoice) -> dict[str, Callable[..., Any]]:
 
         @law
         def step(z: Any, h: float, t: float, a: Any, b: Any, p: Any) -> Any:
-            """Compute the state at t + h [s] from the state z at t [s], with inputs a + b s and parameters p."""
+            """Compute the state at t + h [s] from the state z at t [s], with inputs a + b s at time s, parameters p."""
             u, G = _at_rk4_nodes(a[_U], b[_U], t, h), _at_rk4_nodes(a[_G], b[_G], t, h)
             C, F = _at_rk4_nodes(a[_C], b[_C], t, h), _at_rk4_nodes(a[_F], b[_F], t, h)
             return rk4_step(z, h, u, G, C, F, p, euler)
@@ -212,7 +212,7 @@ def rig_code(choice: RigChoice) -> Mapping[str, str]:
 
 
 def unit_code(functions: Mapping[str, Callable[..., Any]]) -> Mapping[str, str]:
-    """Compile functions of an FMU (arguments: `ARGUMENTS`) to LLVM code by name, with symbols ``sealscope_NAME``."""
+    """Compile an FMU's functions to LLVM code, with symbols ``sealscope_NAME`` and arguments of types `ARGUMENTS`."""
     modules = {}
     for name, function in functions.items():
         text, symbol = plain_code(function, *ARGUMENTS[name])
@@ -224,8 +224,7 @@ def unit_code(functions: Mapping[str, Callable[..., Any]]) -> Mapping[str, str]:
 def object_code(module: str, triple: str | None = None) -> bytes:
     """Compile LLVM code to the bytes of an object file with position-independent machine code for a platform.
 
-    `module`: text of the code; `triple`: LLVM's name of the platform, such as "x86_64-pc-windows-gnu", None for the
-    present one.
+    `module`: text of the code; `triple`: LLVM's target, such as "x86_64-pc-windows-gnu", None for the present one.
     """
     llvm.initialize_all_targets()
     llvm.initialize_all_asmprinters()

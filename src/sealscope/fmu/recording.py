@@ -123,7 +123,7 @@ def record_fmu(
 
 
 def _check_experiment(experiment: Experiment) -> None:
-    """Check that an FMU can run an experiment: no target, fault or drift of the machine, or leak stated as a flow."""
+    """Raise InputError for an experiment with a target, a fault or drift of the machine, or a leak stated as a flow."""
     if experiment.target is not None:
         raise InputError(f"an FMU must have a command, not a target, got {experiment.command}")
     if experiment.effects():
@@ -152,9 +152,9 @@ def _read_description(path: Path) -> Any:
 def _map_variables(path: Path, variables: Mapping[str, Any], names: Mapping[str, str]) -> dict[str, str]:
     """Find the FMU's variable for each channel and input; return the variables' names by channel or input.
 
-    `path`: the FMU, for messages; `variables`: all its variables by name; `names`: by channel or input, the name of its
-    variable if the names differ. Channels and inputs without a variable are left out. Raises InputError if `names` has
-    an unknown channel or variable.
+    `path`: the FMU's file, for messages; `variables`: all its variables by name; `names`: variables of those channels
+    and inputs that have another name in the FMU. Channels and inputs without a variable are left out. Raises InputError
+    if `names` has an unknown channel or variable.
     """
     valid_names = {*_INPUT_NAMES, *_MEASURED_NAMES}
     for channel, variable in names.items():
@@ -173,8 +173,9 @@ def _build_input_table(
     """Build the table of inputs that FMPy takes, with a row for each communication point `t` [s].
 
     FMPy keeps an input constant during a step, so each row has the value in the middle of the step, for second-order
-    accuracy. `path`: the FMU, for messages; `names`: its variable by channel or input; `variables`: description of
-    each. Raises InputError for an input that the FMU lacks, or a load over position or velocity.
+    accuracy. `path`: the FMU's file, for messages; `names`: name of the FMU's variable for each channel and input;
+    `variables`: FMPy's description of each variable, by name. Raises InputError if the FMU lacks an input, or if the
+    load is a function of position or velocity.
     """
     half_step = 0.5 * (t[1] - t[0])
     # in each step, the inputs are needed at one time only, its middle

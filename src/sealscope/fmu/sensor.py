@@ -1,9 +1,8 @@
 """The code of a soft sensor, a functional mock-up unit (FMU) that estimates leakage: functions that C can call.
 
 The equations are those of the live volume balance (`diagnosis.live`, `diagnosis.inference`). Each sample adds the
-increments of the balance's terms to the unfinished rows of the weak form. The rows of a block are weighted and
-summed, and the block's leakage conductance is estimated from the sums. Only the samples within `HALF_DIFFERENCE` of
-the present one are stored.
+increments of the balance's terms to the unfinished rows of the weak form. The rows of a block are weighted and summed
+to estimate its leakage conductance. Only the samples within `HALF_DIFFERENCE` of the present one are stored.
 
 The mean conductance G of the last n blocks (at most `WINDOW`) has the interval
 
@@ -134,7 +133,7 @@ class SensorChoice(NamedTuple):
 
     @classmethod
     def from_rig(cls, rig: Rig, rate: float) -> SensorChoice:
-        """Choose the settings for a rig at `rate` [Hz]; InputError if its balance has other terms than `COLUMNS`."""
+        """Choose the settings for a rig at `rate` [Hz]; raise InputError if its balance does not fit `COLUMNS`."""
         (balance,) = live_equations(rig, INPUTS)  # these channels allow one balance only
         columns = ColumnRoles(balance)
         if columns.names != COLUMNS[:-1]:
@@ -258,8 +257,9 @@ def _build_add_sample(choice: SensorChoice) -> Callable[..., Any]:
 
     @law
     def add_sample(m: Any, displacement: float, p_A: float, p_B: float, theta: float, x: float) -> None:
-        """Add a sample to the sensor's memory m, and estimate the leakage of a block when its last row is complete.
+        """Add a sample to the sensor's memory m, and estimate the leakage when a block of rows is complete.
 
+        A row is an equation of the volume balance, integrated with the test function phi over `SPAN` strides.
         `displacement` [m^3/rad]; `p_A`, `p_B` [Pa]; `theta` [rad]: angle of the pump; `x` [m]: position.
         """
         n_samples, width = int(m.sample_count), m.ring.shape[1]
@@ -302,8 +302,8 @@ def _add_pressure_difference(m: Any, k: int, n_block: int, rate: float) -> None:
     slot = (k // n_block) % (SUPPORT + 1)  # of this block in the ring buffer `pressure_sums`
     if k % n_block == 0:
         m.pressure_sums[slot, _SUM] = m.pressure_sums[slot, _NUMBER] = 0.0
-    # increments[_LEAK]: mean of p_A - p_B over the interval, times its duration 1/rate; an interval without the
-    # pump's angle counts in no row of the balance, either
+    # increments[_LEAK]: mean of p_A - p_B over the interval, times its duration 1/rate. An interval without the pump's
+    # angle is left out here because the volume balance leaves it out, too
     if not math.isnan(m.increments[_LEAK] + m.increments[_RESPONSE]):
         m.pressure_sums[slot, _SUM] += abs(m.increments[_LEAK]) * rate
         m.pressure_sums[slot, _NUMBER] += 1.0
@@ -348,9 +348,10 @@ def _compute_increments(ring: Any, k: int, half: int, rate: float, displacement:
 
 @law
 def _find_angle_sign(m: Any, n_rows: int) -> None:
-    """Store in `m.angle_sign` the sign, 1 or -1, with which the pump's flow rises with p_A - p_B.
+    """Find the sign of the pump's recorded angle, and store it in the sensor's memory m: `m.angle_sign`, 1 or -1.
 
-    It is the sign of the covariance of both in the first `n_rows` rows of the volume balance in the sensor's memory m.
+    It is the sign of the covariance between p_A - p_B and the pump's flow in the first `n_rows` rows (equations) of the
+    volume balance: with the right sign, the flow rises with p_A - p_B.
     """
     mean, covariance = 0.0, 0.0
     for r in range(n_rows):
@@ -362,13 +363,13 @@ def _find_angle_sign(m: Any, n_rows: int) -> None:
 
 @large_law
 def _append_conductance(m: Any, size_error: float, n_rows: float, pressure: float, is_learned: bool) -> None:
-    """Estimate the leakage conductance of the block loaded in `m.model`, and append it to the history.
+    """Estimate the leakage conductance of the block of samples loaded in `m.model`, and append it to the history.
 
-    An estimate at standstill is left out if its precision (1/variance) is at most `MIN_REST_PRECISION` times the usual
-    one, and any estimate if its precision is not positive. The first `WINDOW` estimates are also added to the sums of
-    the baseline. `m`: the sensor's memory; `size_error`: relative standard error of the leakage due to the machine's
-    sizes; `n_rows`, `pressure` [Pa]: number of rows of the volume balance in the block, and its mean abs(p_A - p_B);
-    `is_learned`: True if the balance's other coefficients are updated with the block.
+    An estimate is left out if its precision (1/variance) is not positive or, at standstill, at most
+    `MIN_REST_PRECISION` times the usual one. The first `WINDOW` estimates are also added to the sums of the baseline.
+    `m`: the sensor's memory; `size_error`: relative standard error of the leakage due to the machine's sizes; `n_rows`,
+    `pressure` [Pa]: number of rows of the volume balance in the block, and its mean abs(p_A - p_B); `is_learned`: True
+    if the balance's other coefficients are updated with the block.
     """
     model = m.model
     motion = relative_motion(model.block[-1, -1], n_rows, model.numbers)  # [-1, -1]: sum of the squared response
@@ -390,11 +391,11 @@ def _append_conductance(m: Any, size_error: float, n_rows: float, pressure: floa
 
 @large_law
 def _fit_to_waiting(m: Any, size_error: float) -> None:
-    """Fit the coefficients of the volume balance to the first `LEARNED` blocks, and append the leakage of each.
+    """Fit the volume balance to the first `LEARNED` blocks of samples, and append their leakage to the history.
 
-    `m`: the sensor's memory, in which these blocks wait; afterwards no block waits. The median of the precisions of
-    their estimates becomes the usual precision. `size_error`: relative standard error of the leakage due to the
-    machine's sizes (displacement, piston area).
+    `m`: the sensor's memory, in which these blocks wait for the fit; afterwards no block waits. The median precision of
+    their estimates is stored as `usual_precision`, to which later ones are compared. `size_error`: relative standard
+    error of the leakage due to the machine's sizes (displacement, piston area).
     """
     model = m.model
     for k in range(LEARNED):
@@ -414,7 +415,7 @@ def _fit_to_waiting(m: Any, size_error: float) -> None:
 
 @law
 def _forget_standstill(m: Any) -> None:
-    """Discard coefficients and estimates in the memory m: those of a standstill are not comparable with later ones."""
+    """Discard all coefficients and estimates in memory m, as those of a standstill differ from those in motion."""
     model = m.model
     model.sums[:, :] = 0.0
     model.leak_products[:] = 0.0
@@ -426,8 +427,8 @@ def _forget_standstill(m: Any) -> None:
 def _update_with_block(m: Any, size_error: float, b: int, n_rows: float, pressure: float) -> None:
     """Estimate the leakage of block b from its Gram matrix `m.gram[b]`, and append it to the history.
 
-    Before the first fit, blocks are only stored, from the first block with motion on; the coefficients are fitted to
-    the first `LEARNED` blocks together. After `N_WAKING` successive blocks whose mean square motion is more than
+    Before the first fit, blocks are only stored, beginning with the first that has motion; the coefficients are fitted
+    to the first `LEARNED` blocks together. After `N_WAKING` successive blocks whose mean square motion is more than
     1/`STANDSTILL` times that of earlier blocks, all estimates are discarded, and the first fit is repeated.
 
     `m`: the sensor's memory; `size_error`: relative standard error of the leakage due to the machine's sizes; `n_rows`,
@@ -502,7 +503,7 @@ def _build_finish_block(choice: SensorChoice) -> Callable[..., Any]:
 
 @large_law
 def _mean(history: Any, newest: int, n: int, column: int) -> float:
-    """Compute the mean of a `column` of `history` (block k in row k modulo WINDOW) over the n blocks up to `newest`."""
+    """Compute the mean of a `column` of the ring buffer `history` over the n blocks up to block number `newest`."""
     total = 0.0
     for k in range(n):
         total += history[(newest - k) % WINDOW, column] / n
@@ -514,7 +515,7 @@ def _variance_of_mean(history: Any, newest: int, n: int) -> float:
     """Compute the variance of the mean conductance of the n >= 2 blocks up to block `newest`.
 
     It is the larger of two variances, divided by n: the sample variance of the blocks' estimates, and the mean of the
-    variances that the fit gives these estimates. `history` (WINDOW, 5): as in `_mean`.
+    variances that the fit gives these estimates. `history` (WINDOW, 5): ring buffer of the blocks' results.
     """
     mean, sample_variance = _mean(history, newest, n, _COMPARABLE_G), 0.0
     for k in range(n):

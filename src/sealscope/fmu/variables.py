@@ -45,13 +45,13 @@ class Variable(NamedTuple):
 
 
 def input_variables(rows: Mapping[str, tuple[str, str]]) -> Iterator[Variable]:
-    """Yield the input variables of an FMU, with the initial value 0, from `rows`: (unit, description) by name."""
+    """Yield the input variables of an FMU, with the initial value 0. `rows`: (unit, description) of each, by name."""
     for k, (name, (unit, description)) in enumerate(rows.items()):
         yield Variable(REFERENCES["input"] + k, name, "input", "continuous", unit, description, start=0.0)
 
 
 def output_variables(rows: Mapping[str, tuple[str, str]]) -> Iterator[Variable]:
-    """Yield the output variables of an FMU but those of a servo valve, from `rows`: (unit, description) by name."""
+    """Yield the output variables of an FMU, without a servo valve's. `rows`: (unit, description) of each, by name."""
     for k, (name, (unit, description)) in enumerate(rows.items()):
         if name not in _VALVE_OUTPUTS:
             yield Variable(REFERENCES["result"] + k, name, "output", "continuous", unit, description, start=None)

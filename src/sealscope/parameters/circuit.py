@@ -64,7 +64,7 @@ class HydraulicCircuit(NamedTuple):
 
     @property
     def size_parameters(self) -> tuple[str, ...]:
-        """Dotted names of the parameters to which flows of the volume balance are proportional (`flow_size`)."""
+        """Dotted names of the parameters that scale flows of the volume balance: piston areas or displacement."""
         return ("cylinder.A_A", "cylinder.A_B") if self.flow_size == "area" else ("pump.q_b",)
 
 

@@ -27,12 +27,12 @@ def quantity(name: str, unit: str, *, absent: float | None = None, **bounds: flo
 
 
 def conductance(name: str, *, absent: float | None = None) -> Any:
-    """Declare a conductance of 0 to 1e-6 m^3/(s Pa), of a leak or a valve, as `quantity` does."""
+    """Declare a leak's or valve's conductance of 0 to 1e-6 m^3/(s Pa); `name`, `absent`: arguments of `quantity`."""
     return quantity(name, "m^3/(s Pa)", absent=absent, ge=0, le=1e-6)
 
 
 def choice(name: str, *, absent: str | None = None) -> Any:
-    """Declare a parameter, `name` in words, with one of the options in the field's annotation, a Literal.
+    """Declare a parameter, called `name` in words, whose value is one of the options in its annotation, a Literal.
 
     `absent`: the option for a rig whose file does not state the parameter, or None if every rig must state it.
     """
@@ -63,9 +63,10 @@ def with_unit(number: float, unit: str) -> str:
 
 
 def format_broken_rule(error: ValidationError, model: type[BaseModel]) -> str:
-    """Format pydantic's error on an unknown name, else its first error, as a line "SYMBOL must be ..., got ...".
+    """Format a validation error of pydantic as a line "SYMBOL must be ..., got ...".
 
-    `model`: class of the group of parameters that could not be made. The parameter's unit follows a broken bound.
+    Of several errors, one on an unknown name is chosen, otherwise the first. `model`: class of the parameters that
+    could not be made. The parameter's unit follows a broken bound.
     """
     first = error.errors(include_url=False)[0]
     symbol = ".".join(map(str, first["loc"]))
@@ -88,7 +89,7 @@ class Part(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
     def __init__(self, **values: Any) -> None:
-        """Make the group from its values by name; raise InputError, or PartsDisagreeError if several disagree."""
+        """Make the group from its parameters' values; raise InputError, or PartsDisagreeError if values conflict."""
         try:
             super().__init__(**values)
         except ValidationError as error:
@@ -104,7 +105,7 @@ class Part(BaseModel):
 
 
 def iter_fields(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, FieldInfo]]:
-    """Yield dotted name (after `prefix`) and declaration of each parameter of a class and of its groups, in order."""
+    """Yield (dotted name, declaration) of each parameter of a class and its groups; `prefix`: start of the names."""
     for symbol, field in model.model_fields.items():
         annotation = field.annotation
         if isinstance(annotation, type) and issubclass(annotation, BaseModel):

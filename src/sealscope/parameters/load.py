@@ -146,9 +146,10 @@ class _RigFile(NamedTuple):
 def _read_layers(path: Path, place: str, visited: tuple[Path, ...]) -> _RigFile:
     """Read a rig's file together with the files that it extends.
 
-    Its parameters, and its table `[map]` as a whole, replace those of an extended file. Tables of a commissioned
-    machine that do not describe a rig (`MACHINE_TABLES`) are left out. `place`: the file in messages; `visited`: the
-    files that extend it. Raises InputError for a wrong table or key, a circle, or more than `_MAX_LAYERS` files.
+    Its parameters replace those of an extended file, and its table `[map]` replaces the whole other map. Tables of a
+    commissioned machine that do not describe a rig (`MACHINE_TABLES`) are left out. `place`: the file in messages;
+    `visited`: the files that extend it. Raises InputError for a wrong table or key, for files that extend each other in
+    a circle, or for more than `_MAX_LAYERS` files.
     """
     file = path.resolve()
     if file in visited or len(visited) >= _MAX_LAYERS:

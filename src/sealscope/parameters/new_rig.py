@@ -138,7 +138,7 @@ def _read_template(file: str) -> Template:
 
 
 def _volume_ratio(base: Rig, area_A: float, area_B: float, stroke: float) -> float:
-    """Compute a new cylinder's volume at mid-stroke, with an assumed dead volume, over V of the rig `base`."""
+    """Compute the ratio of a new cylinder's volume at mid-stroke, with assumed dead volume, to V of the rig `base`."""
     return (0.5 + _DEAD_VOLUME_RATIO) * max(area_A, area_B) * stroke / base.cylinder.V
 
 

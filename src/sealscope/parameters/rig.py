@@ -182,8 +182,7 @@ class Rig(Part):
     def _check_lines(self) -> None:
         """Raise ValueError unless shut-off valves, filters and viscosities fit together.
 
-        Valves and filters require lines, clogging and bypass a filter, and the oil must be thinner at 100 than at 40
-        deg C.
+        Valves and filters need a line; clogging and a bypass need a filter; the oil must be thinner when warm.
         """
         line, oil = self.line, self.fluid
         # `absent`: value of a parameter that describes no valve or filter
@@ -248,14 +247,14 @@ class Rig(Part):
         return rig
 
     def __getitem__(self, name: str) -> Value:
-        """Return the SI value of a parameter by its bare or dotted name."""
+        """Return the SI value of a parameter; `name`: its symbol, if that is unique, or its dotted name."""
         value: Any = self
         for symbol in resolve_name(name, declared_names()).split("."):
             value = getattr(value, symbol)
         return value  # type: ignore[no-any-return]
 
     def entry(self, name: str) -> ParameterEntry:
-        """Return a parameter, given by its bare or dotted name, as it was stated."""
+        """Return the value, unit and source stated for a parameter; `name`: its symbol or its dotted name."""
         return self._stated_entries()[resolve_name(name, declared_names())]
 
     def states(self, *names: str) -> bool:
@@ -273,7 +272,7 @@ class Rig(Part):
         return rig.with_channel_map(self.channel_map)
 
     def _stated_entries(self) -> dict[str, ParameterEntry]:
-        """Return the entries of all parameters by dotted name; raise InputError for a rig built from bare parts."""
+        """Return the entries of all parameters by dotted name; raise InputError for a rig built from values alone."""
         if not self._entries:
             raise InputError("a rig must have sources; make it with load_rig or Rig.from_entries, not from bare parts")
         return dict(self._entries)
@@ -369,8 +368,7 @@ class Rig(Part):
     def from_entries(cls, entries: Mapping[str, ParameterEntry], *, name: str, title: str = "", place: str) -> Rig:
         """Build a rig from the entries of its parameters by dotted name; `place`: where they come from, for messages.
 
-        A missing entry gets its `absent` value. Raises InputError if it has none, for an unknown name or an invalid
-        value.
+        A missing entry gets its `absent` value. Raises InputError if it has none, or for a wrong name or value.
         """
         entries = {**_absent_entries(place), **entries}
         names = declared_names()
@@ -495,8 +493,8 @@ def _make_entry(full_name: str, value: Any, source: str, place: str) -> Paramete
 def flatten_entries(tree: Iterable[tuple[str, Any]], place: str, prefix: str = "") -> dict[str, ParameterEntry]:
     """Flatten nested tables `{group: {symbol: {value, unit, source}}}` to entries by dotted name.
 
-    `tree`: pairs of key and table; `prefix`: beginning of the dotted names. Raises InputError for an unknown name, and
-    for an entry that `_parse_entry` refuses.
+    `tree`: pairs of key and table; `place`: their file, for messages; `prefix`: beginning of the dotted names. Raises
+    InputError for an unknown name or an invalid entry.
     """
     entries: dict[str, ParameterEntry] = {}
     for key, item in tree:

@@ -105,7 +105,7 @@ def _level_digests(plan: SimulatedPlan) -> dict[str, dict[str, str]]:
 def list_cases(plan: SimulatedPlan) -> list[CampaignCase]:
     """List all cases of a plan, one for each record.
 
-    Successive records of a group get successive combinations of the factors' levels, then the next `replicate`.
+    The records of a group take the combinations of the factors' levels in turn; `replicate` counts the completed turns.
     """
     combinations = itertools.product(*plan.factors.values())
     cells = [dict(zip(plan.factors, levels, strict=True)) for levels in combinations]

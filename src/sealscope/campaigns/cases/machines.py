@@ -26,7 +26,7 @@ USUAL = Sine(3.0, 4.0)
 
 
 def case_leaks(plan: SimulatedPlan, case: CampaignCase) -> tuple[Leak, ...]:
-    """Build the leaks of a case from the plan's onset on, with their planned mean flows but not yet coefficients.
+    """Build the leaks of a case, which begin at the plan's onset, with mean flows but not yet coefficients.
 
     The law `mixture` gives two leaks with half of the flow each.
     """
@@ -38,11 +38,11 @@ def case_leaks(plan: SimulatedPlan, case: CampaignCase) -> tuple[Leak, ...]:
 
 
 def experiment_with_flow_leak(plan: SimulatedPlan, case: CampaignCase, profile: Profile | None = None) -> Experiment:
-    """Build the experiment of a case, with a leak that states its mean flow but not yet its coefficient (`case_leaks`).
+    """Build the experiment of a case, whose leaks have their mean flow but not yet a coefficient (`case_leaks`).
 
-    The machine is drawn from the plan's profile with the seed of the case, or is the plan's rig without a profile. The
-    levels (values) of the plan's factors replace its parameters, command, controller and load. `profile`: the loaded
-    profile, if any.
+    The machine is drawn from the plan's profile with the seed of the case; without a profile it is the plan's rig. The
+    levels (values) of the plan's factors replace the machine's parameters, command, controller and load. `profile`: the
+    plan's profile if it is already loaded.
     """
     if plan.profile:
         family = str(case.levels.get(FAMILY, ""))
@@ -62,7 +62,7 @@ def experiment_with_flow_leak(plan: SimulatedPlan, case: CampaignCase, profile: 
         elif name == LOAD:
             machine = replace(machine, load=parse_force(str(level)))
         elif name == "closed":
-            # for a level of 0 `throttle_values` lacks `line.orifices`, which is then taken from the plan's rig
+            # closed throttles: `line.orifices` of the drawn machine must not remain, so it is set for a level of 0, too
             values |= {"line.orifices": str(plan.rig["line.orifices"])} | throttle_values(level)
         elif name != FAMILY:
             values[name] = level
@@ -80,7 +80,7 @@ def case_experiment(plan: SimulatedPlan, case: CampaignCase) -> Experiment:
 
 
 def sizing_experiment(experiment: Experiment) -> Experiment:
-    """Shorten an experiment to at most `SIZING_SECONDS`, with its leaks open from the start."""
+    """Shorten an experiment to `SIZING_SECONDS` with its leaks open from the start, to find their coefficients."""
     return replace(
         experiment,
         duration=min(experiment.duration, SIZING_SECONDS),

@@ -72,7 +72,7 @@ def expected_cause(fault: str) -> str:
 
 
 def duty_label(levels: Mapping[str, str | float]) -> str:
-    """Format a record's duty, command and stroke direction, within which scores are compared; "" if it has none."""
+    """Format the duty of a record, i.e. its command and stroke direction; return "" if `levels` has neither."""
     return ", ".join(str(levels[name]) for name in (COMMAND, STROKE) if name in levels)
 
 
@@ -89,8 +89,8 @@ def finite_or_none(value: float | None) -> float | None:
 def named_cause(evidence: Evidence | Statement) -> str:
     """Determine the cause that a detector names: a leak of `LEAKS`, another fault, "none" or "cannot tell".
 
-    For the verdict `leak` it is `evidence.cause` if `LEAKS` has it, else "piston leak"; for the others `evidence.cause`
-    if it is another fault, else "none" for `no leak`. An external leak counts as another fault.
+    With the verdict `leak` it is the evidence's cause if that is in `LEAKS`, otherwise "piston leak". With any other
+    verdict it is the fault that the evidence names, such as an external leak; without one it follows from the verdict.
     """
     if evidence.verdict == "leak":
         return evidence.cause if evidence.cause in LEAKS else PISTON_LEAK

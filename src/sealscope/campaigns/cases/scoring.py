@@ -24,11 +24,11 @@ INSPECTED = ("u", "x", "p_A", "p_B")
 def judge_record(
     recording: Recording, split_s: float | None, plan: SimulatedPlan | RecordedPlan, rig: Rig
 ) -> tuple[Scores, dict[str, Statement]]:
-    """Run each detector of a plan on a recording; return scores and statements by detector.
+    """Run each detector of a plan on a recording; return, by detector, scores and statements (stored verdicts).
 
-    A score is a pair of the detector's score and the onset [s] that it estimates; scorers, which only compute a score,
-    have no statement. `split_s` [s]: time at which scorers split the recording, None for its middle; `rig`: the rig
-    that detectors may assume. Raises InputError if the recording has a defect that rules out any verdict.
+    The scores are pairs of a detector's score and the onset [s] that it estimates. Detectors that only compute a score
+    (scorers) have no statement. `split_s` [s]: time at which scorers split the recording, None for its middle; `rig`:
+    the rig that detectors may assume. Raises InputError if the recording has a defect that rules out any verdict.
     """
     record = inspect_recording(recording, INSPECTED)  # `part`: usable samples; `share`: their fraction
     if record.defect is not None:
@@ -52,7 +52,7 @@ def judge_record(
 
 
 def _run_detector(detector: PlanDetector, examination: Examination) -> Evidence:
-    """Run one detector that states a verdict, not a scorer, on a recording; return its evidence."""
+    """Run a detector that states a verdict, i.e. any but a scorer, on a recording; return its evidence."""
     if detector.base == WATCH:
         return run_watch(examination.recording, examination.rig, examination.false_alarm_probability)
     if detector.base == DIAGNOSE:
@@ -63,10 +63,10 @@ def _run_detector(detector: PlanDetector, examination: Examination) -> Evidence:
 def score_details(
     split_rms: SplitRms, names: Sequence[str], views: Views
 ) -> dict[str, tuple[float | None, float | None]]:
-    """Compute the score of each scorer among the detectors `names`; return (score or None, None) by detector.
+    """Compute the scores of those detectors in `names` that only compute a score (scorers).
 
-    The second None stands for the onset, which no scorer estimates. `split_rms`: RMS of the wavelet details in both
-    parts of the record; `views`: sets of channels, by the name that follows "@" in a detector's name.
+    Returns (score or None, None) by detector, as scorers estimate no onset. `split_rms`: RMS of the wavelet details in
+    both parts of the record; `views`: sets of channels, by the name that follows "@" in a detector's name.
     """
     scores: dict[str, tuple[float | None, float | None]] = {}
     for name in names:
@@ -78,10 +78,10 @@ def score_details(
 
 
 def _score_over_threshold(statement: Statement) -> float | None:
-    """Compute the score of `diagnose` divided by its threshold, or minus it if the threshold is <= 0.
+    """Compute the score of `diagnose` relative to its threshold: their ratio, or difference for a threshold <= 0.
 
-    So records can be compared although different detectors, with scores of other scales, may decide them. Returns None
-    if there is no threshold or no ranking score (`ranking_score`).
+    This makes records comparable, although the verdict of each may come from another detector with another scale.
+    Returns None if there is no threshold or no score for ranking (`ranking_score`).
     """
     score, threshold = ranking_score(statement), statement.threshold
     if score is None or threshold is None:
@@ -95,6 +95,7 @@ def run_watch(recording: Recording, rig: Rig | str | os.PathLike[str], false_ala
     `false_alarm`: bound on the probability that a healthy machine raises an alarm within the recording.
     """
     alarms_per_1000_hours = false_alarm * 3.6e6 / recording.duration  # 1000 hours are 3.6e6 s
-    watch = Watch(load_rig(rig), alarms_per_1000_hours, learn_hours=1000.0)  # longer than any recording
+    # learn_hours: longer than any recording, so that no part of it becomes the healthy baseline of the rest
+    watch = Watch(load_rig(rig), alarms_per_1000_hours, learn_hours=1000.0)
     watch.update(recording)
     return watch.evidence

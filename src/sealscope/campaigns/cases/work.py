@@ -28,7 +28,7 @@ def run_case(plan: SimulatedPlan, case: CampaignCase, folder: Path | None = None
 
 
 def _simulate_and_judge(plan: SimulatedPlan, case: CampaignCase, folder: Path | None) -> CaseRow:
-    """Simulate and judge the record of a case, and return its row; the record is written into `folder` unless None."""
+    """Simulate and judge the record of a case, and return its row; `folder`: where the record is written, if any."""
     simulated = simulate_experiment(case_experiment(plan, case))
     if folder is not None:
         from sealscope.recordings import write

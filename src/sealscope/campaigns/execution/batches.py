@@ -44,7 +44,7 @@ N_SCOUT_MACHINES, SCOUT_SECONDS = 4, 4.0
 
 
 def scored_bounds(plan: SimulatedPlan) -> IntArray:
-    """Compute the usable samples (2, 2), [begin, end), before and after the planned onset (`split_bounds`)."""
+    """Compute the ranges of usable samples before and after the planned onset: (2, 2), rows [begin, end)."""
     rate = plan.rig.daq.sample_rate
     return split_bounds(round(plan.duration_s * rate), rate, round(plan.onset_s * rate))
 
@@ -144,8 +144,8 @@ def _run_batch(plan: SimulatedPlan, pairs: Sequence[tuple[CampaignCase, Experime
 def _size_leaks(experiments: Sequence[Experiment], threads: int) -> list[Experiment]:
     """Find the leak coefficients that give the planned mean flows, in short runs; return the completed experiments.
 
-    The solver's step is shortened if it is unstable with the leak. If a short run fails, the error is raised, but a
-    single experiment is first tried once more with a step that `integrate_run` chooses.
+    A solver's step that is unstable with the leak is shortened. If the short runs fail, the error is raised for several
+    experiments; a single one is tried again with a step that `integrate_run` chooses.
     """
     sized_experiments = list(experiments)
     leaky = [k for k, experiment in enumerate(experiments) if experiment.leaks]
@@ -155,7 +155,7 @@ def _size_leaks(experiments: Sequence[Experiment], threads: int) -> list[Experim
     try:
         coefficients = simulate_batch(short_runs, threads=threads).coefficients.tolist()
     except SealscopeError:
-        if len(experiments) > 1:  # `_run_batch` bisects the batch
+        if len(experiments) > 1:  # `_run_batch` then bisects the batch to find the failing experiment
             raise
         coefficients = [leak.coefficient for leak in size_leaks_on_short_run(replace(experiments[0], step=None))]
     for k, coefficient in zip(leaky, coefficients, strict=True):
@@ -174,18 +174,18 @@ def make_step_chooser(
 ) -> Callable[[CampaignCase, Experiment], float]:
     """Build the function that chooses the solver's step [s] of a case from the case and its experiment.
 
-    The cases of a cell, i.e. a combination of the factors' levels, share the search: on a short run of each of
-    `N_SCOUT_MACHINES` drawn scout machines, `integrate_run` chooses the longest step that passes its check of the
-    error. A case gets the shortest of the steps chosen with its solver, limited to the longest stable step of its
-    machine, but not refined further than by `MAX_STEP_REFINEMENT`. `profile`: by default the plan's.
+    All cases with the same levels of the factors (a cell) share the search. `N_SCOUT_MACHINES` machines are drawn for
+    the cell, and on a short run of each, `integrate_run` chooses the longest step that passes its check of the error. A
+    case gets the shortest of the steps chosen with its solver, limited to the longest stable step of its machine, but
+    not refined further than by `MAX_STEP_REFINEMENT`. `profile`: by default the plan's.
     """
     shared = digest(shared_inputs(plan))
 
     @cache
     def cell_steps(*levels: tuple[str, str | float]) -> dict[str, float]:
-        """Compute the shortest step [s] chosen on the scout machines of a cell, pairs (factor, level), by solver.
+        """Compute the shortest step [s] chosen on the machines drawn for a cell; return it for each solver.
 
-        Machines that cannot be simulated are left out, so the mapping may lack a solver or be empty.
+        `levels`: pairs (factor, level) of the cell. A solver is missing if no machine with it could be simulated.
         """
         steps: dict[str, float] = {}
         for number in range(N_SCOUT_MACHINES):
@@ -202,7 +202,7 @@ def make_step_chooser(
     def choose_step(case: CampaignCase, experiment: Experiment) -> float:
         """Choose the solver's step [s] of a case: the step of its cell, limited to the longest stable step.
 
-        If no scout machine of the cell has the case's solver, the step is chosen on the case's experiment.
+        If no machine drawn for the cell has the case's solver, the step is chosen on the case's experiment.
         """
         method = choose_method(experiment.rig, experiment.method)
         step = cell_steps(*case.levels.items()).get(method)

@@ -104,7 +104,7 @@ def _installed_version() -> str:
 
     try:
         return version("sealscope")
-    except PackageNotFoundError:  # a source tree that is not installed
+    except PackageNotFoundError:
         return "unknown"
 
 
@@ -145,9 +145,9 @@ def read_progress(plan: SimulatedPlan, folder: Path) -> CampaignProgress:
 
 
 def read_head(folder: Path) -> dict[str, Any] | None:
-    """Read the head of a campaign, the file with the inputs on which all its rows depend; None if there is none yet.
+    """Read a campaign's head, the file with the inputs on which all its rows (stored results) depend.
 
-    Raises UnreadableFile if the file is damaged.
+    Returns None if there is no such file yet. Raises UnreadableFile if it is damaged.
     """
     path = folder / HEAD
     try:

@@ -93,7 +93,7 @@ def iter_results_in_order(
 ) -> Iterator[tuple[Item, Result | None]]:
     """Run `task` on each item in `jobs` processes, and yield pairs of item and result in the order of the items.
 
-    The result is None if the process of the item died twice.
+    The result is None if the worker process died at both attempts.
     """
     results: dict[int, Result | None] = {}  # results not yet yielded, by number of the item
     next_number = 0
@@ -186,14 +186,14 @@ _task: list[Callable[[Any], Any]] = []
 
 
 def _initialise_worker(task: Callable[[Any], Any], lifeline: Connection[Any, Any]) -> None:
-    """Store the task of this worker process, ignore the keyboard interrupt, and end when the pipe `lifeline` ends."""
+    """Store this worker process's task, ignore the keyboard interrupt, and exit when the pipe `lifeline` is closed."""
     _task[:] = [task]
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends its workers
     threading.Thread(target=_exit_with_parent, args=(lifeline,), daemon=True).start()
 
 
 def _run_task(item: Any) -> Any:
-    """Run the task of this worker process, stored when it was started, on an item; return the result."""
+    """Run the task that this worker process stored at its start on an item; return the result."""
     return _task[0](item)
 
 
@@ -206,7 +206,7 @@ def _exit_with_parent(lifeline: Connection[Any, Any]) -> None:
 
 @contextmanager
 def _worker_environment() -> Iterator[None]:
-    """Set those variables of `_ENVIRONMENT` that are not set, for the processes started within the context."""
+    """Set the environment variables `_ENVIRONMENT`, unless already set, for processes started within the context."""
     added = {name: value for name, value in _ENVIRONMENT.items() if not os.environ.get(name)}
     os.environ.update(added)
     try:

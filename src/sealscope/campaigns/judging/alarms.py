@@ -29,8 +29,7 @@ class AlarmFractions:
     - `cannot_tell`: fraction with the verdict `cannot tell`, which includes the records without a result
     - `failed`: number of records without a result
     - `coverage`: of the intervals stated for the leak flow, fraction that contains the true flow
-    - `named`: fraction with an alarm that names the cause of the group's `fault`; None if the detector states no
-      verdicts
+    - `named`: fraction with an alarm that names the cause of the group's `fault`; None without stated verdicts
     - `false_alarm`, `per_hour`: fraction of leak-free records with an alarm, and false alarms per operating hour; only
       in results by size of the leak, None without leak-free records or (`per_hour`) operating time
     """
@@ -80,9 +79,9 @@ class Alarms:
     def by_size(self, hours: float | None, pooled: bool = False) -> Iterator[AlarmFractions]:
         """Yield the fractions of alarms of each detector for each size of leak; if `pooled`, for all sizes together.
 
-        The size is the planned mean flow. Records with other faults are left out. Two reference detectors, which always
-        or never raise an alarm, come last. If all records are leak-free, each detector has one result, with alarms in 0
-        of 0 records. `hours`: operating time of one record [h], None to omit the rate of false alarms.
+        The size is the planned mean flow. Records with a fault other than a leak are left out. Two reference detectors,
+        which always or never raise an alarm, come last. If all records are leak-free, each detector has one result: 0
+        alarms of 0 records. `hours`: operating time of one record [h], None to omit the rate of false alarms.
         """
         for name, records in drop_other_faults(self._with_references()).items():
             leak_free = [record for record in records if not record.size]
@@ -109,7 +108,7 @@ class Alarms:
                 yield self._summarise(name, group, leak_lpm=size, levels=dict(group[0].row.levels))
 
     def by_fault(self) -> Iterator[AlarmFractions]:
-        """Yield the fractions of alarms for each pair of a detector or reference and a fault without a piston leak."""
+        """Yield the fraction of alarms of each detector and reference detector for each fault without a piston leak."""
         for name, records in self._with_references().items():
             faulty = (record for record in records if record.row.fault and record.size == 0)
             for fault, group in group_by(faulty, lambda record: record.row.fault).items():
@@ -140,7 +139,7 @@ class Alarms:
         return proportion(sum(values), len(values), self.confidence)
 
     def _summarise(self, detector: str, group: Sequence[JudgedRow], **group_fields: Any) -> AlarmFractions:
-        """Compute the fractions of alarms of a detector on a group of records, which `group_fields` define."""
+        """Compute a detector's fractions of alarms on a group of records, which the fields `group_fields` describe."""
         statements = [(record, record.statement) for record in group if record.statement is not None]
         intervals = [(record.flow_lpm, statement.leak_interval_lpm) for record, statement in statements]
         names_cause = [

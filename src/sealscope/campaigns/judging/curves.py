@@ -49,7 +49,7 @@ class SizeRoc:
 def iter_pods(verdicts: Verdicts, confidence: float) -> Iterator[DetectorPod]:
     """Yield the probability of detection over the planned mean leak flow, for each detector with records of leaks.
 
-    It has a fitted curve, or the reason why none can be fitted.
+    Each result holds a fitted curve, or the reason why none can be fitted.
     """
     for name, records in verdicts.items():
         leaky = [record for record in records if record.size > 0]
@@ -70,7 +70,7 @@ def iter_pods(verdicts: Verdicts, confidence: float) -> Iterator[DetectorPod]:
 def iter_rocs(verdicts: Verdicts, confidence: float) -> Iterator[SizeRoc]:
     """Yield ROC curves of each detector that has scores: for all leaks together, and for each planned mean flow.
 
-    A record without a score counts as lowest. A curve needs at least two records with a leak and two without.
+    A record without a score is ranked below all others. A curve needs at least two records with a leak and two without.
     """
     for name, records in verdicts.items():
         scores = [record.row.score(name) if record.row.error is None else None for record in records]

@@ -74,7 +74,7 @@ def judge(
     onset_s: float | None = None,
     hours: float | None = None,
 ) -> Judgement:
-    """Collect the verdicts of all detectors on the rows with `use` "judge", and compute their statistics.
+    """Collect all detectors' verdicts on the rows (results of records) with `use` "judge", and compute statistics.
 
     Scorers without a fixed threshold get one from the leak-free rows of the same duty (`compute_thresholds`). Raises
     InputError if there is no row to judge, or too few leak-free rows to set a threshold.
@@ -82,7 +82,7 @@ def judge(
     - `false_alarm`: wanted false-alarm probability
     - `promise`: "average" if the thresholds keep this probability on average over sets of leak-free records, "bound" if
       they keep it with the probability `confidence` (`quantile_threshold`)
-    - `confidence`: also the confidence level of all intervals
+    - `confidence`: probability for the promise "bound", and confidence level of all intervals
     - `limits`: thresholds by detector, in place of all fixed and computed ones
     - `onset_s` [s]: true onset of the leaks, None to compute no errors of onsets
     - `hours`: operating time of a record, None to compute no false alarms per hour
@@ -117,7 +117,10 @@ def judge(
 
 
 def _achieved_flows(rows: Sequence[CaseRow]) -> dict[float, tuple[float, float]]:
-    """Compute mean and standard deviation, nan for a single record, of the simulated flows [L/min] by planned flow."""
+    """Compute mean and standard deviation of the simulated leak flows [L/min] for each planned flow.
+
+    The standard deviation is nan for a single record.
+    """
     achieved = {}
     for size, group in group_by((row for row in rows if row.leak_lpm > 0), lambda row: row.leak_lpm).items():
         flows = [row.flow_lpm for row in group if row.flow_lpm is not None]

@@ -76,9 +76,9 @@ def _iter_errors(
     estimates: Sequence[tuple[float | None, float, tuple[float, float] | None]],
     confidence: float,
 ) -> Iterator[StatedErrors]:
-    """Yield the errors of one detector's estimates on the records of one planned flow [L/min], if it states any.
+    """Yield the errors of one detector's estimates on the records of one planned leak flow [L/min].
 
-    `estimates`: for each record (estimate, true value, interval), with None for a missing estimate or interval.
+    Yields nothing without an estimate. `estimates`: (estimate, true value, interval) of each record, None if missing.
     """
     values = [math.nan if value is None else value for value, _, _ in estimates]
     if np.isfinite(values).any():
@@ -112,7 +112,7 @@ def iter_cause_confusions(verdicts: Verdicts, confidence: float) -> Iterator[Nam
 
 
 def _true_cause(record: JudgedRow) -> str:
-    """Return the true cause of a record: "piston leak", else the cause to be named for its fault, else "none"."""
+    """Return the true cause of a record: "piston leak", the cause of another fault, or "none" without either."""
     if record.size > 0:
         return PISTON_LEAK
     return expected_cause(record.row.fault) if record.row.fault else NO_CAUSE

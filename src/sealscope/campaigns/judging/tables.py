@@ -39,12 +39,12 @@ class PriorKnowledge:
 
 @cache
 def _table_layouts() -> dict[str, dict[str, str]]:
-    """Load the layouts by table: for each heading, flags and an attribute's dotted path, such as "share alarms"."""
+    """Load each table's layout: flags and an attribute's dotted path, such as "share alarms", for each column."""
     return tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 
 
 def resolve_attribute(source: Any, path: str) -> Any:
-    """Return the value at a dotted path of attributes, mapping keys and indices; None if one on the way is None."""
+    """Return the value at a dotted path of attributes, keys and indices; None if a value along the path is None."""
     for name in path.split("."):
         if source is None:
             return None
@@ -56,10 +56,10 @@ def resolve_attribute(source: Any, path: str) -> Any:
 
 
 def _build_cells(column: str, content: str, row: Any, factors: Sequence[str]) -> TableRow:
-    """Build those cells of a table's row that one entry of `tables.toml` describes, by name of the column.
+    """Build the cells of a table's row that one entry of `tables.toml` fills; return them by name of the column.
 
-    `column`: name of the entry; `content`: its text, flags and the dotted path of an attribute of `row`. The path
-    "levels" fills one column for each of the plan's `factors`. Flags:
+    `column`: name of the entry; `content`: its text, i.e. flags and the dotted path of an attribute of the result
+    `row`. The path "levels" fills one column for each of the plan's `factors`. Flags:
 
     - "share": the attribute is a proportion, which fills the five columns `_PROPORTION`; they are empty for None
     - "stated", together with "share": the columns are also empty for a proportion of no records
@@ -79,7 +79,7 @@ def _build_cells(column: str, content: str, row: Any, factors: Sequence[str]) ->
 def build_tables(
     judgement: Judgement, unit: str = "L/min", known: Mapping[str, PriorKnowledge] | None = None, part: str = ""
 ) -> dict[str, list[TableRow]]:
-    """Build the tables of a judgement, with the columns that `tables.toml` lists, by name of the table.
+    """Build the tables of a campaign's results, with the columns that `tables.toml` lists; return them by name.
 
     `unit`: unit of the leaks' sizes; `known`: by detector, the information that it was given, None to leave out these
     columns; `part`: purpose of the plan, such as development or judging.
@@ -127,7 +127,7 @@ def build_tables(
 
 
 def records_table(rows: Iterable[CaseRow], detectors: Sequence[str], unit: str = "L/min") -> list[TableRow]:
-    """Build the table of all records, with their inputs, scores and statements, in the order of their ids.
+    """Build the table of all records with inputs, scores and statements (verdict, onset, flow, cause), sorted by id.
 
     Run times are left out, because they would differ between two runs of the same campaign.
     """

@@ -33,7 +33,7 @@ class JudgedRow(NamedTuple):
 
     @property
     def flow_lpm(self) -> float:
-        """Simulated mean flow [L/min] of the true leak while open, or the planned flow without a simulation."""
+        """Simulated mean flow [L/min] of the true leak while open, or its planned flow if no flow was simulated."""
         return self.size if self.row.flow_lpm is None else self.row.flow_lpm
 
     @property
@@ -84,9 +84,9 @@ def collect_verdicts(
 ) -> dict[str, list[JudgedRow]]:
     """Collect the verdict of each detector on each row; return them by detector, in the order of `rows`.
 
-    It is the verdict that the detector states, or `leak` if its score is above its limit in `limits` or, failing that,
-    the threshold for the row's duty in `thresholds`, else `no leak`. It is `cannot tell` if the record has no result,
-    or the detector no score or no limit.
+    If a detector states a verdict, this is taken. Otherwise the verdict is `leak` if the score exceeds the detector's
+    limit, else `no leak`. The limit is in `limits`, or by detector and duty in `thresholds`. The verdict is `cannot
+    tell` without a result, a score or a limit.
     """
 
     def judge_row(row: CaseRow, detector: str) -> JudgedRow:

@@ -50,7 +50,10 @@ class PlanDetector:
 
 @cache
 def parse_detector_name(name: str) -> PlanDetector:
-    """Split a detector name, such as "diagnose @ pressures", into detector and view, of which neither need exist."""
+    """Split a detector name, such as "diagnose @ pressures", into detector and view, without checking that they exist.
+
+    A view is a set of channels that the detector may use.
+    """
     base, _, view = name.partition(_VIEW)
     return PlanDetector(name, base, view, scorer=SCORERS.get(base))
 

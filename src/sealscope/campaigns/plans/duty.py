@@ -71,7 +71,7 @@ def find_voltage_command(commands: tuple[str | float, ...]) -> str | None:
 def throttle_values(level: str | float) -> dict[str, str | float]:
     """Compute the parameters of a rig whose throttles are closed by a fraction of their area, such as 0.25 or '25 %'.
 
-    Above 0 they include `line.orifices`, as the rig must have throttles. Raises InputError for < 0 %, or >= 100 %.
+    Above 0 they include `line.orifices`, which gives the rig throttles. Raises InputError for a fraction < 0 or >= 1.
     """
     fraction = parse_quantity(level, "1") if isinstance(level, str) else float(level)
     if not 0.0 <= fraction < 1.0:

@@ -31,7 +31,7 @@ def _quantity_validator(unit: str) -> BeforeValidator:
 
 
 def _validate_file_name(name: str) -> str:
-    """Return a file name of at most 80 letters, digits, '-', '_' and '.', not at its start; else raise ValueError."""
+    """Return a file name; raise ValueError unless it has at most 80 letters, digits, '-', '_', '.' and no '.' first."""
     if not all(c.isalnum() or c in "-_." for c in name) or name.startswith(".") or len(name) > _MAX_NAME_LENGTH:
         raise ValueError(f"must be of at most {_MAX_NAME_LENGTH} letters, digits, '-', '_' and '.'")
     return name
@@ -156,9 +156,9 @@ class _JudgedPlan(_Plan):
     assume_set: Values = field(default_factory=dict)
 
     def _load_assumed(self, default: Rig | None) -> Rig | None:
-        """Load the rig `assume`, else `default`, else the rig `thesis`, with the values of `assume_set`.
+        """Load the rig that detectors assume: `assume` or, if that is None, `default`, with the values `assume_set`.
 
-        Returns None if `assume` and `default` are None and there are no values to replace.
+        If both are None, the values change the rig `thesis`; without values, None is returned.
         """
         rig = default if self.assume is None else load_rig(self.assume)
         if not self.assume_set:
@@ -206,7 +206,7 @@ class SimulatedPlan(_JudgedPlan):
     @cached_property
     def assumed(self) -> Rig:
         """The rig that detectors may assume, by default the simulated one."""
-        return self._load_assumed(self.rig) or self.rig  # never None with a default; `or` is for type checkers
+        return self._load_assumed(self.rig) or self.rig  # is never None here; `or` is for type checkers
 
     @property
     def size(self) -> int:

@@ -90,8 +90,8 @@ def read_plan(tree: Mapping[str, Any], place: str = "plan") -> AnyPlan:
 def _parse_tables(tree: Mapping[str, Any], place: str) -> AnyPlan:
     """Build a plan from the parsed tables `tree` of its file, without a check of its factors and of the files it names.
 
-    The entries of [campaign] and of [recordings] become fields of the plan, and so does each other table as a whole.
-    Raises InputError, with the name of the entry, if an entry is unknown or has a wrong value.
+    Each entry of [campaign] and [recordings] becomes a field of the plan; each other table becomes one field. `place`:
+    the file. Raises InputError, with the name of the entry, if an entry is unknown or has a wrong value.
     """
     source = next((name for name in _KINDS if name in tree), "records")  # name of the table that lists the records
     plan_class, tables, source_entries = _KINDS[source]
@@ -108,7 +108,7 @@ def _parse_tables(tree: Mapping[str, Any], place: str) -> AnyPlan:
             raise InputError(f"{table} must be a table, got {values!r} ({place})")
         for entry in values:
             is_misplaced = (entry in source_entries) != (table == source)  # it is an entry of the other table
-            if is_misplaced or entry in ("place", *tables):  # or it would replace the file's path or a table
+            if is_misplaced or entry in ("place", *tables):  # these would replace other fields of the plan
                 raise InputError(f"{table}.{entry} is not known ({place})")
             full_names[entry] = f"{table}.{entry}"
         entries |= values
@@ -124,7 +124,7 @@ def _call_for_entry(entry: str, place: str, function: Callable[[], _T]) -> _T:
 
 
 def _path_in_plan_folder(name: str, place: str) -> str:
-    """Complete the path of a TOML file relative to the plan's folder; other names, of packaged files, stay."""
+    """Join the path of a TOML file to the folder of the plan `place`; return the name of a packaged file unchanged."""
     return os.fspath(Path(place).parent / name) if name.endswith(".toml") else name
 
 
@@ -186,7 +186,7 @@ def _check_level(plan: SimulatedPlan, name: str, level: str | float) -> None:
         load_profile(plan.profile).family(str(level))
     elif name in (COMMAND, CONTROLLER, LOAD):
         check_duty(name, level, plan.rig, plan.duration_s)
-    else:
+    else:  # a parameter of the rig, or "closed", the closed fraction of its throttles; raises for an invalid value
         plan.rig.with_overrides(throttle_values(level) if name == "closed" else {name: level})
 
 

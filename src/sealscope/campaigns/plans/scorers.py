@@ -39,7 +39,7 @@ def split_bounds(n: int, rate: float, split: int) -> IntArray:
     padding, and without the machine's start: `START_SECONDS` at the sampling rate `rate` [Hz], but at most
     `START_FRACTION` of the first part. A part without usable samples has end <= begin.
     """
-    # numbers of earlier and of later samples on which a detail of the last level depends, whose filter is longest
+    # samples before and after a sample on which its wavelet details depend: the last level has the longest filter
     before, after = (int(samples) for samples in edge_samples()[-1])
     begin = max(before, int(min(START_SECONDS * rate, START_FRACTION * split)))
     return np.array([[begin, split - after], [split + before, n - after]])
@@ -60,7 +60,7 @@ class SplitRms:
         """Compute the log RMS of the pressures' wavelet details before and after the time `split_s` [s].
 
         The recording must be uniformly sampled without missing samples. A chamber whose pressure was not recorded is
-        left out, and so are both if one of the parts is too short.
+        left out. If the part before or after `split_s` is too short, both chambers are left out.
         """
         rate = recording.rate
         bounds = split_bounds(len(recording), rate, round((split_s - float(recording.t[0])) * rate))
@@ -93,9 +93,10 @@ class SplitRms:
         return SplitRms({chamber: values for chamber, values in self.log_rms.items() if chamber in visible})
 
     def value(self, chamber: str, quantity: str, statistic: str) -> float | None:
-        """Return a wavelet detail's log RMS over both parts ("level"), or its "change" from the first to the second.
+        """Return the log RMS of a wavelet detail over the whole record, or its change at the split of the record.
 
-        `quantity`: "d1" to "d4" or "d3d4". Returns None if the chamber is missing or the number is not finite.
+        `chamber`: "p_A" or "p_B"; `quantity`: the detail, "d1" to "d4" or "d3d4"; `statistic`: "level" or "change".
+        Returns None if the chamber is missing or the number is not finite.
         """
         if chamber not in self.log_rms:
             return None
