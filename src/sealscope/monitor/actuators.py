@@ -64,8 +64,8 @@ class _Actuator:
     since the last checkpoint; `n_stored`: number of all stored blocks; `last`: last estimate, with flows averaged over
     the machine's cycles; `stored_summary`: summary stored last; `oil_celsius`: oil temperature [deg C], None if
     unknown; `judged_s` [s]: end of the last judged samples; `verdict`: on the last recording, None if whole recordings
-    are not judged; `alarm_samples`: last samples during an alarm, which may become a healthy recording in the machine's
-    file; `recorder`: cuts the stream of a commissioned machine into recordings, None for files and other actuators.
+    are not judged; `alarm_samples`: last samples during an alarm, which may become a healthy recording; `recorder`:
+    cuts the stream of a commissioned machine into recordings, None for files and other actuators.
     """
 
     settings: ActuatorSettings
@@ -151,7 +151,7 @@ class _Actuator:
     def _update_alarm_samples(self, samples: Recording, *, follows: bool) -> None:
         """Keep the last `_ALARM_SAMPLES_S` seconds of samples while an alarm is open.
 
-        The kept samples start anew after a gap (not `follows`), or if the sampling rate or the units change.
+        The kept samples start anew after a gap (`follows` is False), or if the sampling rate or the units change.
         """
         first = self.alarm_samples[0] if self.alarm_samples else samples
         same_format = (first.units, first.rate) == (samples.units, samples.rate)
@@ -169,7 +169,7 @@ class _Actuator:
         return {**save_attributes(self, saved), "recorder": None if self.recorder is None else self.recorder.state()}
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Restore detector and last results from `state`, plain values of a checkpoint; the alarm stays as it is."""
+        """Restore the detector and the last results from `state`, plain values of a checkpoint; keep the alarm."""
         self.watch = Watch.from_state(state["watch"])
         self.last = None if state["last"] is None else restore(BlockEstimate, state["last"], "last")
         self.oil_celsius, self.judged_s = state.get("oil_celsius"), state.get("judged_s")
@@ -201,9 +201,8 @@ class _Actuator:
     def summary(self) -> dict[str, Any]:
         """Build the summary of the actuator for the page, the metrics and messages, as plain values by name.
 
-        Status and time are those of the last verdict on a whole recording, or of the detector's last block if there is
-        none. The flows are those of this verdict only if it decides (`RecordingVerdict.decides`). Unknown values are
-        None.
+        Status and time are those of the last verdict on a whole recording, if there is one, else of the last block. The
+        flows are those of this verdict only if it decides (`RecordingVerdict.decides`). Unknown values are None.
 
         - `blocks`: number of blocks of some seconds that the detector has processed; `counters`: its counters; `by`:
           quantity that it watches, "volumes" or "pressures"; `why_no_litres`: reason why no L/min are stated, else "";
@@ -260,7 +259,7 @@ class WatchedActuators:
         self._actuators = {name: self._restore(self.settings[name]) for name in self.settings}
 
     def _restore(self, settings: ActuatorSettings) -> _Actuator:
-        """Restore an actuator from its last checkpoint in the database and the samples since, or create a new one."""
+        """Restore an actuator from its last checkpoint in the database and the samples since then, or create it."""
         name = settings.name
         machine = load_watched(settings.rig)
         is_recorded = machine.machine is not None and settings.folder is None and settings.recording_s > 0.0
@@ -338,7 +337,7 @@ class WatchedActuators:
     def process_blocks(self, blocks: Sequence[SourceBlock]) -> None:
         """Judge blocks of samples, and store them with their estimates and alarms in one transaction.
 
-        Blocks of actuators not in the settings are only counted. After an error of the database, repeat the call.
+        Blocks of actuators not in the settings are only counted. Repeat the call after an error of the database.
         """
         with self._lock:
             known_blocks = [block for block in blocks if block.actuator in self.settings]
@@ -372,7 +371,7 @@ class WatchedActuators:
         self._notify_change()
 
     def _store_new(self, blocks: Sequence[SourceBlock]) -> None:
-        """Judge and store blocks in one transaction; raise _AlreadyStored, before judging, if one is stored."""
+        """Judge and store blocks in one transaction; raise _AlreadyStored, before judging, if one is stored already."""
         rows = StoredRows()
         with self.store.writing() as connection:
             pairs = [(block, self._actuator(block.actuator)) for block in blocks]
@@ -417,7 +416,7 @@ class WatchedActuators:
             rows.add_pending(name, number, samples, follows, verdict)
 
     def _checkpoint(self, actuator: _Actuator, rows: StoredRows) -> None:
-        """Add a checkpoint of an actuator's state to the rows to store, and mark its old rows for deletion."""
+        """Add a checkpoint of an actuator's state to the rows that will be stored, and mark old ones for deletion."""
         settings = actuator.settings
         state, recorder = actuator.state(), actuator.recorder
         first_kept = recorder.first if recorder is not None and recorder.first else actuator.n_stored + 1
@@ -496,8 +495,7 @@ class WatchedActuators:
     def summaries(self) -> dict[str, dict[str, Any]]:
         """Read the last stored summary of each actuator in the settings, by name.
 
-        An unknown state is replaced by "no data", and so is one that reports no leak if no block has come for
-        `no_data_s` seconds.
+        The state is "no data" if unknown, or if it reports no leak and no block has come for `no_data_s` seconds.
         """
         stored_summaries, now = self.store.summaries(), time.monotonic()
         summaries = {}

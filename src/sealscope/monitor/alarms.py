@@ -86,10 +86,7 @@ class Alarm:
 
     @property
     def status_word(self) -> int:
-        """Sum of the status bits of the alarm.
-
-        Bit 1 states an active warning, 2 an active error, and 4 a new alarm that is not shelved.
-        """
+        """Status as a sum of bits: 1 for an active warning, 2 for an active error, 4 for a new, unshelved alarm."""
         level_bit = ERROR_BIT if self.level == "error" else WARNING_BIT
         new_bit = NEW_BIT if self.state == "new" and not self.shelved else 0
         return (level_bit if self.active else 0) | new_bit
@@ -125,7 +122,7 @@ class AlarmJudge:
 
         The event is "raised", "error" or "warning" (a change of the level), "returned" (the cause has ended), or "" for
         none of these. Returns None if the block is not judged, or if no alarm was active and none is raised. `leak`:
-        found by the actuator's detector, or None; `baseline`: version of the healthy baseline; `settings`: thresholds
+        leak that the detector has found, or None; `baseline`: version of the healthy baseline; `settings`: thresholds
         [L/min], and number of successive blocks beyond a threshold before the alarm changes (`debounce_blocks`).
 
         An alarm is raised while a leak is found and its flow reaches the threshold of a warning or an error. It ends,

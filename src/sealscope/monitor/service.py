@@ -196,8 +196,7 @@ class Service:
         """Store blocks, or refused messages, in one transaction by the function `write`, and acknowledge them.
 
         The error of an outage of the database is raised. After any other error the blocks are stored one by one, and a
-        block that fails alone is counted, dropped and acknowledged: it would fail again, and later blocks must not
-        wait.
+        block that fails alone is counted, dropped and acknowledged: it would fail again and hold up later blocks.
         """
         if not blocks:
             return

@@ -28,8 +28,7 @@ _LongText = Annotated[str, Field(min_length=1, max_length=1000)]
 def _resolve_in_folder(place: _PathLike, info: ValidationInfo) -> _PathLike:
     """Resolve `place`, a path in the settings, relative to the folder of the settings file.
 
-    The `context` of `info` states this folder. URLs, names of packaged rigs, and all paths of settings that do not come
-    from a file are returned unchanged.
+    `info`: its `context` has this folder. URLs, names of packaged rigs, and paths not from a file are left unchanged.
     """
     is_name = isinstance(place, str) and ("://" in place or (info.field_name == "rig" and not place.endswith(".toml")))
     return place if is_name or not info.context else type(place)(Path(info.context["folder"]) / place)
@@ -121,8 +120,8 @@ class ActuatorSettings(WatchSettings):
 
         `values`: the table, whose entries take precedence; `info`: its `context` has the folder of the settings. The
         key `machine` is another name of `rig`, but must name a file written by `sealscope commission`. The limit
-        becomes `error_lpm` [L/min]. The units, those in the column headings of the machine's logs, are used only for
-        Sparkplug and OPC UA, whose values need not state units.
+        becomes `error_lpm` [L/min]. The units in the column headings of the machine's logs are used only for Sparkplug
+        and OPC UA, whose values need not state units.
         """
         if not isinstance(values, dict):  # refused later, by the check of the types
             return values
@@ -222,8 +221,7 @@ class MonitorSettings(_Table):
 
     `database`: file of SQLite or URL; `lines`: True to read blocks from standard input; `settle_s` [s]: time without
     change before a file is read; `keep_days`: days of operation whose estimates are stored;
-    `fleet_false_alarms_per_1000_h`: most false alarms of all actuators; `defaults`: settings of actuators that state no
-    others.
+    `fleet_false_alarms_per_1000_h`: most false alarms of all actuators; `defaults`: for settings that actuators omit.
     """
 
     database: Annotated[str, AfterValidator(_resolve_in_folder)] = Field(default="monitor.db", validate_default=True)
@@ -244,7 +242,7 @@ class MonitorSettings(_Table):
     def _apply_defaults(cls, values: Any) -> Any:
         """Fill the defaults into the table of each actuator, with an equal part of the fleet's false-alarm rate.
 
-        `values`: the tables of all settings. Raises ValueError if an actuator or the defaults state another rate.
+        `values`: the tables of all settings. Raises ValueError if an actuator or the defaults state a rate, too.
         """
         if not isinstance(values, dict):  # refused later, by the check of the types
             return values
@@ -342,7 +340,7 @@ def template() -> str:
 def read_secret(path: Path | None, name: str) -> str | None:
     """Read a secret, such as a password, from the first line of a file; return None if `path` is None.
 
-    Raises InputError, which calls the setting `name`, if the file cannot be read or is empty.
+    `name`: name of the setting, for the InputError that is raised if the file cannot be read or is empty.
     """
     if path is None:
         return None

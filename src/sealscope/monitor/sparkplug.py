@@ -55,7 +55,7 @@ class SparkplugMetric:
     unit: str | None = None
 
     def with_datatype(self, datatype: int) -> SparkplugMetric:
-        """Convert the value from its transmitted form to a Sparkplug data type; return the metric with value and type.
+        """Convert the value from its transmitted form to a Sparkplug data type; return the changed metric.
 
         The bytes of an array become numbers (n,), or None if the type is not supported. Integers of a signed type are
         converted from two's complement. Raises ValueError if the bytes are not a whole number of values.
@@ -89,7 +89,7 @@ class SparkplugPayload:
 def payload_class() -> Any:
     """Build the protobuf class of payloads from `sparkplug.toml`; raise MissingExtra if protobuf is not installed.
 
-    In this file each field has a number, a name and a type, and maybe roles: ``R`` (repeated), ``V`` (holds the value).
+    In this file each field has a number, a name, a type, and perhaps roles: ``R`` (repeated), ``V`` (holds the value).
     """
     try:
         from google.protobuf import descriptor_pb2, descriptor_pool, message_factory

@@ -41,8 +41,7 @@ class SupervisedPart:
     """A part of a monitor, or a service that it uses, with its outages and the pause after an error.
 
     `since` [s since 1970], `reason`: start of the present outage, None if there is none, and its reason; `count`:
-    number of outages so far; `seconds` [s]: length of those that have ended. Only one thread at a time may call
-    `attempt`.
+    number of outages so far; `seconds` [s]: length of the ended ones. Only one thread at a time may call `attempt`.
     """
 
     def __init__(self, name: str, supervisor: Supervisor) -> None:
@@ -63,7 +62,7 @@ class SupervisedPart:
         self._supervisor.on_change()
 
     def end_outage(self) -> None:
-        """End the outage of the part, if there is one, and log that; the next pause is the shortest again."""
+        """End the outage of the part, if there is one, and log this; the next pause is the shortest again."""
         with self._lock:
             self._pause = 0.0
             if self.since is None:
@@ -86,9 +85,8 @@ class SupervisedPart:
     def attempt(self, work: _Work, *, at_once: bool = False) -> bool:
         """Run the function `work` unless the part pauses after an error; return True if it ran without an error.
 
-        An error begins a pause, twice as long as the last one up to a limit. It also begins an outage of the database
-        if the error comes from there, otherwise of this part. Success ends the outage of this part. `at_once`: True to
-        run `work` even during a pause.
+        An error begins a pause, twice the last one up to a limit, and an outage of the part, or of the database if the
+        error comes from there. Success ends the outage of the part. `at_once`: True to ignore a pause.
         """
         if self.pause_s and not at_once:
             return False
@@ -140,7 +138,7 @@ class Supervisor:
         return [{"part": part.name, "since": part.since, "reason": part.reason} for part in parts if part.since]
 
     def outage_totals(self) -> dict[str, tuple[bool, int, float]]:
-        """Summarise outages by part: (True if there is none now, their number, their total length [s])."""
+        """Summarise the outages of each part, by its name: (True if there is none now, number, total length [s])."""
         parts = [*self._parts.values()]
         return {part.name: (part.since is None, part.count, part.seconds + part.outage_s) for part in parts}
 

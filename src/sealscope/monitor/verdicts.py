@@ -150,8 +150,7 @@ class RecordingVerdict:
     def restate_block(self, block: BlockEstimate) -> BlockEstimate:
         """Replace the leak in the estimate of a block by the leak of the whole recording.
 
-        If the block lies before the onset, or the recording has no leak, the block's leak becomes None, and its
-        interval becomes 0 to `bound_lpm`, or None if that is unknown.
+        Before the onset, or without a leak, the block gets no leak; its interval is 0 to `bound_lpm`, None if unknown.
         """
         is_before_onset = self.onset_s is not None and block.t < self.onset_s
         if self.leaks and not is_before_onset:
@@ -170,8 +169,8 @@ def judge_recording(
 ) -> RecordingVerdict:
     """Judge a recording by comparison with its machine's healthy recordings, like `sealscope diagnose --machine`.
 
-    `file`: its name; `shift` [s]: added to its times to give seconds since 1970; `limit_lpm` [L/min]: leak that calls
-    for a repair, None for the limit in the machine's file.
+    `file`: name of its file; `shift` [s]: added to its times to give seconds since 1970; `limit_lpm` [L/min]: leak that
+    calls for a repair, None for the limit in the machine's file.
     """
     if limit_lpm is not None:
         machine = replace(machine, limit=f"{limit_lpm:.12g} L/min")

@@ -89,9 +89,8 @@ def _sync(path: Path, flags: int) -> None:
 def remove_temporaries(folder: Path, target: str | None = None) -> None:
     """Remove the temporary files that killed processes have left in a folder.
 
-    With `target` those of the file of this name are removed, otherwise all, in subfolders, too. A file is removed if
-    its process ran on this computer and has ended, or if it was last changed more than a day ago. Links to folders are
-    not followed.
+    `target`: name of the file whose temporary files are removed; None for all files, also in subfolders, except
+    linked ones. A file is removed if its process ran on this computer and has ended, or was changed over a day ago.
     """
     paths = folder.rglob(".*.part") if target is None else folder.glob(".*.part")
     for path in paths:

@@ -53,7 +53,7 @@ def open_inner(path: str | os.PathLike[str], what: str, mode: Literal["rb", "ab+
 
 
 def _open_checked(path: str | os.PathLike[str], what: str, mode: Literal["rb", "ab+"], extra_flags: int) -> BinaryIO:
-    """Open a regular file, as `open_inner`, with `extra_flags` of `os.open`; raise InputError for any other file."""
+    """Open a regular file, like `open_inner`, with `extra_flags` of `os.open`; raise InputError for any other file."""
     flags = os.O_RDONLY if mode == "rb" else os.O_RDWR | os.O_CREAT | os.O_APPEND
     flags |= extra_flags | getattr(os, "O_BINARY", 0) | getattr(os, "O_CLOEXEC", 0)
     try:
@@ -74,7 +74,7 @@ def _open_checked(path: str | os.PathLike[str], what: str, mode: Literal["rb", "
 def raising_unreadable(what: str, place: str | os.PathLike[str]) -> Iterator[None]:
     """Convert any error that a damaged file causes in the block to an UnreadableFile with a message of one line.
 
-    `what` ("a rig") and `place` appear in it. MissingExtra is not changed; unexpected errors are also logged.
+    `what` ("a rig") and `place` appear in the message. MissingExtra is not changed; unexpected errors are also logged.
     """
     try:
         yield

@@ -29,7 +29,7 @@ def plain_array(values: NDArray[Any]) -> dict[str, Any]:
 
 
 def _as_plain_array(values: NDArray[Any]) -> NDArray[Any]:
-    """Convert a structured array of floats to a plain array whose last axis holds the columns; keep other arrays."""
+    """Convert a structured array of floats to a plain array whose last axis holds the columns; return others as is."""
     names = values.dtype.names
     return values if names is None else values.view(float).reshape(*values.shape, len(names))
 
@@ -104,7 +104,9 @@ def _to_plain_value(value: Any) -> Any:
         return plain_array(value)
     if isinstance(value, float) and not np.isfinite(value):
         return None
-    return list(value) if isinstance(value, tuple | list) else dict(value) if isinstance(value, dict) else value
+    if isinstance(value, dict):
+        return dict(value)
+    return list(value) if isinstance(value, tuple | list) else value
 
 
 def restore_attributes(

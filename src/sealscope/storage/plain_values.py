@@ -52,7 +52,7 @@ def _type_adapter(kind: Any) -> Any:
 def convert_type(kind: type[_T], value: Any, entry_name: Callable[[str], str] = str, context: Any = None) -> _T:
     """Convert plain values to the dataclass, model or other type `kind`; raise ValueError if they do not fit.
 
-    The error is one line, in which `entry_name` converts the name of an entry; `context`: for the validators of `kind`.
+    `entry_name`: converts the name of an entry for the error, which has one line; `context`: data for the validators.
     """
     from pydantic import ValidationError
 

@@ -25,7 +25,7 @@ class StoredRow(Protocol):
 
     @property
     def id(self) -> str:
-        """Name of the job that gave this result; of several rows with one name, the last is valid."""
+        """Name of the job that gave this result; of several rows with the same name, the last is valid."""
 
     def as_dict(self) -> dict[str, Any]:
         """Return the result of the job as plain values for JSON."""

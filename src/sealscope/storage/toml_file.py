@@ -71,7 +71,7 @@ def read_model(
 ) -> _T:
     """Convert the tables `tree` of a TOML file to the model or dataclass `kind`; raise InputError if they do not fit.
 
-    `entry_name`: converts the name of an entry for the message; `context`: for the validators.
+    `entry_name`: converts the name of an entry for the error; `context`: data for the validators.
     """
     try:
         return convert_type(kind, tree, entry_name, context)
@@ -111,7 +111,7 @@ def read_priors(package: str, kind: type[_T]) -> _T:
 
 
 def _parse_table(rows: Mapping[str, Any], kind: Any, place: str) -> Any:
-    """Convert a table of priors, from key to {value, unit, source}, to the type `kind`, a `PriorTable` or a mapping."""
+    """Convert a table of priors, with {value, unit, source} by key, to the type `kind`, a `PriorTable` or a mapping."""
     is_mapping = get_origin(kind) is not None  # such as Mapping[str, float]
     optional: tuple[str, ...] = ()
     if is_mapping:
@@ -147,10 +147,7 @@ def _parse_number(value: Any, kind: type, place: str) -> Any:
 
 
 def _check_keys(keys: Collection[str], names: Collection[str], optional: Collection[str], place: str) -> None:
-    """Check that a table has the keys `names` and no others; raise InputError otherwise. `optional` keys may be absent.
-
-    `keys`: those of the table; `place`: their description in the error.
-    """
+    """Check that a table has all keys in `names`, except `optional` ones, and no others; raise InputError otherwise."""
     for name in keys:
         if name not in names:
             raise InputError(f"{place} must be {', '.join(names)}, got {name!r}")

@@ -40,10 +40,7 @@ def record_mark(rig: str, alarm: Alarm, mark: str, samples: Sequence[Recording])
         outcome = "written down"
 
         def add_mark(machine: CommissionedMachine) -> CommissionedMachine:
-            """Add the marked alarm to a machine, with its samples as a healthy recording if the alarm is invalid.
-
-            Sets `outcome`, the text that states whether the machine has accepted these samples.
-            """
+            """Add the marked alarm to a machine, with its samples as a healthy recording if invalid; set `outcome`."""
             nonlocal outcome
             machine = replace(machine, alarms=(*machine.alarms, judgement))
             if mark == "invalid":

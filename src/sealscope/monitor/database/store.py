@@ -59,7 +59,7 @@ class StoredRows:
     old_estimates: dict[str, int] = field(default_factory=dict)
 
     def add_estimates(self, actuator: str, estimates: Iterable[BlockEstimate], oil_celsius: float | None) -> None:
-        """Add an actuator's leakage estimates of blocks, with the oil temperature [deg C], None if unknown."""
+        """Add the leakage estimates of an actuator's blocks, with the oil temperature [deg C], None if unknown."""
         for estimate in estimates:
             total_ends = estimate.total_interval_lpm or (None, None)
             leak_ends = estimate.leak_interval_lpm or (None, None)
@@ -71,7 +71,7 @@ class StoredRows:
     def add_pending(
         self, actuator: str, number: int, samples: Recording, follows: bool, verdict: RecordingVerdict | None = None
     ) -> None:
-        """Add a block of samples, which a monitor that restarts before the next checkpoint judges again.
+        """Add a block of samples that must be judged again if the monitor restarts before the next checkpoint.
 
         `number`: running number of the block among all blocks of the actuator; `follows`: False if there is a gap
         before these samples; `verdict`: verdict on the recording that ends with the samples, None for none.
@@ -82,8 +82,7 @@ class StoredRows:
     def add_alarm(self, alarm: Alarm, kind: str, t: float, by_whom: str = "", text: str = "") -> None:
         """Add the row of an alarm in its present state, and that of the event that changed it at the time `t` [s].
 
-        `kind`: kind of the event, "" if no event is to be stored; `by_whom`, `text`: person who caused the event, and
-        their comment, or "".
+        `kind`: kind of event, "" to store none; `by_whom`, `text`: person who caused the event, and comment, or "".
         """
         plain = json.dumps(alarm.as_dict())
         self.alarms[alarm.id] = {"actuator": alarm.actuator, "id": alarm.id, "state": alarm.state, "alarm": plain}
@@ -232,7 +231,7 @@ class MonitorStore:
     def write_rows(self, connection: sa.Connection, rows: StoredRows) -> None:
         """Write rows to their tables within the transaction of `connection`, and delete rows that are no longer needed.
 
-        Deleted are the samples before a new checkpoint, and the rows up to `rows.old_blocks` and `rows.old_estimates`.
+        These are the samples before a new checkpoint, and the rows up to `rows.old_blocks` and `rows.old_estimates`.
         """
         actuator = bindparam("name", type_=sa.String)
         if rows.actuators:  # a checkpoint replaces the samples before it
@@ -255,7 +254,7 @@ class MonitorStore:
                 connection.execute(table.delete().where(is_old), parameters)
 
     def commit_rows(self, rows: StoredRows) -> None:
-        """Write rows to their tables in a transaction of their own, and delete rows that are no longer needed."""
+        """Write rows to their tables in a separate transaction, and delete rows that are no longer needed."""
         with self.writing() as connection:
             self.write_rows(connection, rows)
 
@@ -290,8 +289,7 @@ class MonitorStore:
     def begin_decoding(self, reader: str, digest: str) -> int:
         """Store that a `reader` (MQTT client) begins to decode a message; return the number of earlier attempts.
 
-        Earlier attempts that are still stored have not ended, because the process crashed: the caller can then refuse
-        the message. `digest`: hash of the message.
+        `digest`: hash of the message. Earlier attempts never ended, as the process crashed: the caller can refuse it.
         """
         table, columns = tables.decodings, tables.decodings.c
         query = select(columns.attempts).where(columns.reader == reader, columns.digest == digest)
@@ -387,7 +385,7 @@ class MonitorStore:
         return self._value(select(tables.facts.c.value).where(tables.facts.c.name == name))
 
     def write_position(self, name: str, number: int) -> None:
-        """Store a number under `name`, such as that of the last alarm event that an output has delivered."""
+        """Store a number under `name`, such as the number of the last alarm event that an output has delivered."""
         with self.writing() as connection:
             self.upsert(connection, tables.facts, [{"name": name, "value": str(number)}])
 

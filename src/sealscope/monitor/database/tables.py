@@ -21,9 +21,8 @@ _TYPES: dict[str, TypeEngine[Any]] = {"text": Text(), "int": Integer(), "double"
 def _table(name: str, columns: str, *indexes: Index) -> Table:
     """Define a table from a text that lists its columns, separated by commas.
 
-    Each column is written as its name, its type (``text``, ``int``, ``double``, ``bytes``, or the length of a text),
-    and its roles: ``key`` (primary key), ``counted`` (a running number as the key), ``indexed``, ``null`` (may be
-    missing).
+    Each column is written as name, type (``text``, ``int``, ``double``, ``bytes``, or the length of a text), and any
+    roles: ``key`` (primary key), ``counted`` (a running number as the key), ``indexed``, ``null`` (may be missing).
     """
     table_columns: list[Column[Any]] = []
     for column, kind, *roles in map(str.split, columns.split(",")):

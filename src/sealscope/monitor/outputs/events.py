@@ -89,10 +89,7 @@ class Webhook:
     end = deliver
 
     def _send_post(self, event: dict[str, Any]) -> bool:
-        """Post an event if it is to be announced (`is_announced`), and return True.
-
-        Raises PartAway if the server does not confirm the event.
-        """
+        """Post an event, if it is to be announced, and return True; raise PartAway if the server does not confirm."""
         if not is_announced(event):
             return True
         try:

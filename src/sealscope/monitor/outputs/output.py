@@ -47,7 +47,7 @@ class Output(Protocol):
 
 
 def open_outputs(actuators: WatchedActuators, settings: MonitorSettings) -> Iterator[Output]:
-    """Build the outputs of alarms that the settings switch on, one for each table such as [webhook]; yield each."""
+    """Build and yield the outputs of alarms that the settings switch on, one for each table such as [webhook]."""
     for name in type(settings).model_fields:
         table = getattr(settings, name)
         if isinstance(table, OutputSettings):

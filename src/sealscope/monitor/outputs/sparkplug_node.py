@@ -128,10 +128,7 @@ class SparkplugNode:
         return self._topic("NDEATH"), spb.encode_payload(payload)
 
     def _on_connect(self, client: Any, userdata: Any, flags: Any, reason: Any, properties: Any) -> None:
-        """Subscribe to commands, and send birth messages soon; called by the library paho.
-
-        Only logs an error if the broker refuses the connection.
-        """
+        """Subscribe to commands, and send birth messages soon, unless the broker refuses the node; called by paho."""
         if reason.is_failure:
             _log.error("the broker %s refuses the Sparkplug node: %s", self._broker.host, reason)
             return
@@ -194,7 +191,7 @@ class SparkplugNode:
 
 @cache
 def _load_table(name: str) -> Mapping[str, Mapping[str, str]]:
-    """Load a table of `sparkplug_node.toml`: by metric, its data type, the path of its value (`at`), and any unit."""
+    """Load a table of `sparkplug_node.toml`: for each metric the data type, path of the value (`at`), and any unit."""
     file = files("sealscope.monitor.outputs") / "sparkplug_node.toml"
     table: dict[str, dict[str, str]] = tomllib.loads(file.read_text("utf-8"))[name]
     return table
@@ -218,10 +215,7 @@ def _metric_values(table: str, values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _build_metrics(table: str, values: Mapping[str, Any], timestamp: int) -> list[spb.SparkplugMetric]:
-    """Build metrics from values by name, with the `timestamp` [ms since 1970].
-
-    `table`: name of the table of the metrics' types and units (`_load_table`).
-    """
+    """Build metrics from values by name at a `timestamp` [ms since 1970]; `table` has their types (`_load_table`)."""
     rows = {name: _load_table(table)[name] for name in values}
     return [
         spb.SparkplugMetric(name, values[name], getattr(spb, row["type"]), timestamp=timestamp, unit=row.get("unit"))

@@ -53,8 +53,7 @@ class Admission:
     def admits(self, address: str, token: str, *, session: bool = False) -> bool:
         """Return True if a token is right; count wrong tokens, for each network, until it sends a right one.
 
-        `address`: IP address of the client; `session`: True if `token` is the cookie of a browser, given to it after a
-        right token.
+        `address`: IP address of the client; `session`: True if `token` is the cookie of a browser admitted before.
         """
         expected, network = self.session if session else self._token, _network(address)
         if hmac.compare_digest(token.encode("utf-8", "replace"), expected.encode()):

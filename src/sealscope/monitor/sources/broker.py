@@ -139,10 +139,7 @@ class _Connection:
         self._received.put((self._connection, None), size=0, always=True)  # None tells the decoder of a new connection
 
     def _offline_message(self) -> tuple[str, str]:
-        """Build topic and text of the last will, by which a Sparkplug primary host states that it is offline.
-
-        It has the time of the connection, which begins now.
-        """
+        """Store the present time, and build topic and text of the last will, which states that the host is offline."""
         self._connected_ms = round(1000.0 * time.time())
         return self._state_message(online=False)
 
@@ -235,7 +232,7 @@ class _Connection:
     def _note_decoding(self, message: Any) -> Iterator[None]:
         """Store in the database, until the context ends, that a large or repeated message of QoS 1 is being decoded.
 
-        Raises RefusedMessage if that began `_MAX_ATTEMPTS` times and never ended, because the process died each time.
+        Raises RefusedMessage if it began `_MAX_ATTEMPTS` times and never ended, because the process died each time.
         """
         if not message.qos or not (message.dup or len(message.payload) > _NOTED_BYTES):
             yield
@@ -257,7 +254,6 @@ class _Connection:
         """Publish the alarms of new events, and the states that have changed, as retained messages."""
         if self._settings.alarms_topic is None or not self._client.is_connected():
             return
-
         self._service.store.deliver(
             _NAME, lambda event: self._publish(event["alarm"]["actuator"], "alarm", json.dumps(event["alarm"]))
         )

@@ -91,10 +91,9 @@ class WatchedFolder:
     def blocks(self) -> Iterator[SourceBlock | RefusedMessage]:
         """Yield the blocks of all files that are complete and not stored yet, in the order of their recording.
 
-        A file is complete when it has not changed for `settle_s`. An unreadable one is tried again when it has not
-        changed for `_PATIENCE_FACTOR` times as long, and then refused. A recording older than the watched samples is
-        refused, too. For a refused file, the reason and a block without samples are yielded. Raises PartAway if the
-        folder cannot be read.
+        A file is complete when it has not changed for `settle_s`. It is refused if it is older than the watched
+        samples, or if it cannot be read and has not changed for `_PATIENCE_FACTOR` times as long: the reason and a
+        block without samples are then yielded. Raises PartAway if the folder cannot be read.
         """
         files = sorted(self._files())  # by the time of their last change
         self._first_found = {file.identity: self._first_found.get(file.identity, time.monotonic()) for file in files}
@@ -241,10 +240,7 @@ class WatchedFolder:
 
 
 def watch_folders(service: BlockReceiver, *, once: bool) -> None:
-    """Submit new files of the actuators' folders as blocks until the service stops.
-
-    `once`: True to end after the files that are there now.
-    """
+    """Submit new files of the actuators' folders as blocks until the service stops; `once`: only those found now."""
     settle_s = 0.0 if once else service.settings.settle_s
     part, summaries = service.supervisor.part, service.summaries()
     folders: dict[SupervisedPart, WatchedFolder] = {}

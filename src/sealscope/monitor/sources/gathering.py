@@ -80,10 +80,9 @@ class ValueGatherer:
         `t` [s]: time of the first sample, rounded to the sampling interval; the others follow at the sampling rate. NaN
         is an unknown value. Values without a finite time, and too many at once, are dropped. If the time jumps forward
         by more than `_AHEAD_S`, the blocks continue after the pause with each channel's last value. If it jumps back by
-        as much, all earlier values are discarded. Only the first value of a channel may be as old: the channel has then
-        been constant since `t`.
+        as much, all earlier values are discarded; only a channel's first value may be so old: it has not changed since.
         """
-        # beyond 2^52 a double cannot tell the numbers of successive samples apart reliably
+        # sample numbers up to 2^52 are exact as doubles
         if not math.isfinite(t) or abs(t * self.rate) > 2**52 or not 0 < len(values) <= MAX_SAMPLES:
             self._count("values without a clock, or too many")
             return []
@@ -126,10 +125,7 @@ class ValueGatherer:
         self._start = self._newest = None
 
     def _pop_blocks(self) -> list[Recording]:
-        """Remove and return the complete blocks, up to whose end each channel has sent values.
-
-        A channel without values for `SILENT_S` seconds is not waited for, unless all are silent.
-        """
+        """Remove and return the blocks for which all channels have values, except those silent for `SILENT_S` [s]."""
         channels = self._channels.values()
         if self._start is None:
             has_new_values = any(channel.values for channel in channels)
@@ -141,7 +137,7 @@ class ValueGatherer:
                 first_indices = [min(min(channel.values) for channel in channels if channel.values)]
             self._start = max(first_indices)
         newest_indices = [channel.newest for channel in channels if channel.arrival >= self._now() - SILENT_S]
-        if not newest_indices or None in newest_indices:  # all are silent, or one has sent nothing since the axis began
+        if not newest_indices or None in newest_indices:  # all are silent, or one has no new value
             return []
         blocks: list[Recording] = []
         known_stop = min(index for index in newest_indices if index is not None) + 1

@@ -54,7 +54,7 @@ class MessageLimit(ValueError):  # noqa: N818 (names what is exceeded)
 def check_cbor(payload: bytes) -> int:
     """Check number and depth of the items of a CBOR message; return the number of key-value pairs.
 
-    Raises MessageLimit also for an item of a type that is not allowed, or an incomplete message.
+    Raises MessageLimit above a limit, for an item of a type that is not allowed, or for an incomplete message.
     """
     code, position, n_pairs = _scan_items(np.frombuffer(payload, dtype=np.uint8))
     if code != _NO_FAULT:
@@ -87,9 +87,9 @@ def check_json_keys(values: Any, payload: bytes, n_colons: int) -> None:
 
 
 def check_keys(values: Any, n_pairs: int) -> None:
-    """Check that a decoded message has all `n_pairs` key-value pairs of its bytes; raise MessageLimit otherwise.
+    """Check that a decoded message has `n_pairs` key-value pairs, like its bytes; raise MessageLimit otherwise.
 
-    A decoder keeps only the last value of a repeated key.
+    It has fewer if a key is repeated, as a decoder keeps only the last value of the key.
     """
     if _count_shallow_pairs(values) == n_pairs:  # a quick test
         return

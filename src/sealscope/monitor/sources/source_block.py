@@ -226,7 +226,7 @@ def _abbreviate(value: Any) -> str:
 
 
 def _parse_mapping(payload: bytes) -> Mapping[str, Any]:
-    """Parse a message of JSON or CBOR, within the limits of `message_limits`, to a mapping, or raise RefusedMessage."""
+    """Parse a JSON or CBOR message to a mapping; raise RefusedMessage if it is invalid or exceeds `message_limits`."""
     try:
         if payload.lstrip()[:1] == b"{":
             import orjson
@@ -289,10 +289,7 @@ def _parse_channel(values: Any, name: str, units: Mapping[str, Any]) -> np.ndarr
 
 
 def convert_to_si(values: Any, unit: object, channel: str) -> Any:
-    """Convert values of a channel from `unit` to SI; leave them unchanged if it is None.
-
-    Raises RefusedMessage if the unit has another dimension than the channel.
-    """
+    """Convert values of a channel from `unit` (None for SI) to SI; raise RefusedMessage for the wrong dimension."""
     try:
         return values if unit is None else to_si(values, _abbreviate(unit), CHANNEL_UNITS[channel], name=channel)
     except InputError as error:

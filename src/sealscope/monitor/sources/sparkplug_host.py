@@ -81,7 +81,7 @@ class _Birth:
         return birth
 
     def complete_metric(self, metric: spb.SparkplugMetric, *, is_complete: bool) -> spb.SparkplugMetric | None:
-        """Add name, type and unit of the birth to a metric of a data message; return None if the birth lacks it.
+        """Add name, type and unit of the birth to a metric of a data message; return None if it is not in the birth.
 
         `is_complete`: True if no message since the birth is missing. Raises RefusedMessage if a message is missing and
         the metric has an alias instead of a name, or if the value does not fit its type.
@@ -211,7 +211,7 @@ class SparkplugHost:
         """Update the state of a node with the birth, death or sequence number of a message of `kind`.
 
         A birth of a node (NBIRTH) begins its session, and a death (NDEATH) ends it; both discard the births of its
-        devices. A gap in the sequence is counted and the birth requested. Raises RefusedMessage for a message without a
+        devices. A gap in the sequence is counted, and a birth requested. Raises RefusedMessage for a message without a
         sequence number or before the birth, and for the death of an earlier connection.
         """
         state = self._nodes[group, node]
