@@ -104,8 +104,7 @@ class Examination:
     def null(self) -> HealthyNull:
         """Distribution of the detectors' test results in the healthy recordings (`baseline`).
 
-        If the judged recording's volume balance shows that valves cut the pump off at rest, this is assumed for the
-        healthy recordings, too.
+        If valves cut the pump off at rest in the judged recording, the same is assumed for the healthy ones.
         """
         leak = self.report(VOLUME_BALANCE).leak if VOLUME_BALANCE in detectors() else None
         # `shut`: the valves cut the pump off at rest; `locked`: they also hold the load then

@@ -27,8 +27,8 @@ def cross_check(
 
     `judge(recording, reference)` diagnoses a recording against the healthy recordings `reference`. No recording is left
     out with `keep`, or if at least half of them seem to leak, as there is then no healthy majority. Fewer than
-    `MIN_RECORDINGS` recordings are not judged. Returns the remaining recordings, with a leak or another event that they
-    show among their problems, and a line with the reason for each recording left out.
+    `MIN_RECORDINGS` recordings are not judged. Returns the remaining recordings, and the reason for each recording left
+    out. If a remaining recording shows a leak or another event, its problems (`about["wrong"]`) state it.
     """
     problems, leaking = dict[str, str](), dict[str, str]()  # texts by the name of the recording's file
     for recording in healthy if len(healthy) >= MIN_RECORDINGS else ():

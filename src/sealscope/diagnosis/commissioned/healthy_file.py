@@ -65,9 +65,10 @@ class Line(NamedTuple):
 
 
 def table_type(extra: Literal["allow", "ignore"] = "ignore", **value_types: Any) -> Any:
-    """Make a pydantic type for a table from the type of each key's value, or (type, None) if it may be absent.
+    """Make a pydantic type for a table with known keys.
 
-    Unknown keys are kept if `extra` is "allow", and dropped if it is "ignore".
+    `value_types` has the type of each key's value, or (type, None) for a key that may be absent. Unknown keys are kept
+    if `extra` is "allow", and dropped if it is "ignore".
     """
     config = ConfigDict(strict=True, allow_inf_nan=False, extra=extra)
     # pydantic's `...` marks a value that must be present
@@ -76,7 +77,7 @@ def table_type(extra: Literal["allow", "ignore"] = "ignore", **value_types: Any)
 
 
 def uniform_table_type(value_type: Any) -> Any:
-    """Make a pydantic type for a table of any keys and one type of values; the error names the first wrong one."""
+    """Make a pydantic type for a table of any keys with values of one type; its error names the first wrong value."""
 
     def check_values(table: Any) -> Any:
         if not isinstance(table, dict):
@@ -305,7 +306,7 @@ def _format_json(value: Any) -> bytes:
 def check_summary(method: str, summary: Summary) -> None:
     """Check that the summary by the detector `method` can be stored and read back, e.g. is finite.
 
-    Raises ArithmeticError otherwise, which blames the recording and not a defect of the detector (`log_failure`).
+    Raises ArithmeticError otherwise; `log_failure` attributes this error to the recording, not to the detector.
     """
     try:
         convert_type(_BY_METHOD, parse_json(_format_json({method: summary})))

@@ -311,7 +311,7 @@ def summarise_healthy(recording: Recording, rig: Rig, file: str, checksum: str =
                     log_failure(name, distribution, error)
         if not summaries:
             raise InputError(f"a healthy recording must hold channels that a method reads, got none such ({file})")
-        if (levels := HealthyLevels().learn(part)) is not None:  # friction, drifts and spectra, beside the detectors
+        if (levels := HealthyLevels().learn(part)) is not None:  # friction, drifts and spectra
             summaries[HealthyLevels.name] = levels
         return SummarisedRecording(
             file,

@@ -131,7 +131,7 @@ def write_machine(machine: CommissionedMachine, path: str | os.PathLike[str]) ->
     Returns
     -------
     pathlib.Path
-        The file.
+        The path of the written file.
 
     Raises
     ------
@@ -206,11 +206,12 @@ def _lock(target: Path) -> AbstractContextManager[object]:
 
 
 def _write_files(machine: CommissionedMachine, target: Path) -> None:
-    """Write the files of a machine: first its summaries, then a backup of the present text, then the new text.
+    """Write the files of a machine: the summaries, then a backup of the present TOML file, then the new TOML file.
 
-    The text is the TOML file at `target`. In this order an interruption leaves a complete text with all its summaries.
-    The file of summaries contains those of the machine, those that the present text or its backup names, and other
-    present ones while the total size stays below 5 MB (`_SPARE`). Raises InputError if the text could not be read back.
+    With this order, an interruption leaves a complete TOML file at `target` and all summaries that it names. The
+    present file of summaries is extended by those of the machine. Summaries that neither the machine nor the present
+    TOML file or its backup names are kept only while the total size stays below 5 MB (`_SPARE`). Raises InputError if
+    the TOML file could not be read back.
     """
     data = _format_text(machine, target)
     _convert_tree(parse_toml(data, "a machine's file", str(target)), str(target))  # raises InputError
@@ -223,7 +224,7 @@ def _write_files(machine: CommissionedMachine, target: Path) -> None:
     lines = {checksum: present_lines[checksum] for checksum in named_checksums if checksum in present_lines}
     lines |= {line.checksum: line for line in map(format_summary, machine.healthy)}
     size = sum(len(line.data) for line in lines.values())
-    for checksum, line in present_lines.items():  # renamed or copied texts may name other summaries
+    for checksum, line in present_lines.items():  # renamed or copied TOML files may name other summaries
         if checksum not in lines:
             size += len(line.data)
             if size < _SPARE:
@@ -271,11 +272,11 @@ def _hash_parts(tree: Mapping[str, Any]) -> dict[bytes, str]:
 
 
 def _find_change(origin: Origin, present: Mapping[bytes, str], written: Mapping[bytes, str]) -> str | None:
-    """Find a change of a machine's file by another process, which writing would undo; None if there is none.
+    """Find the first change of a machine's file by another process, which writing would undo; None if there is none.
 
-    `origin` has the hashes of the file's parts at loading; `present` and `written` map those of the file now and of the
-    file to be written to the description of a change (`_hash_parts`). A part was added if it is present but in neither
-    of the others, and removed if it is in both of them but no longer present. Returns the first description.
+    `origin` has the hashes of the file's parts when it was loaded. `present` is for the file as it is now, `written`
+    for the file to be written; both map the hashes of its parts to the description of a change (`_hash_parts`). A part
+    was added if it is present but in neither of the others, and removed if it is in both of them but not present.
     """
     changes = [text for part, text in present.items() if part not in origin.parts and part not in written]
     changes += [text for part, text in written.items() if part in origin.parts and part not in present]
@@ -316,10 +317,10 @@ def _named_summaries(tree: Mapping[str, Any]) -> list[str]:
 
 
 def _summaries_path(path: Path, tree: Mapping[str, Any]) -> Path:
-    """Return the path of the file with the summaries of the healthy recordings of the machine's file at `path`.
+    """Return the path of the file with the healthy recordings' summaries that belongs to a machine's file.
 
-    It differs in the suffix, `.healthy` or, before version 0.1, `.lessons`. If neither exists, it is the file that
-    `summaries` of the table `[machine]` names. `tree` holds the tables of the machine's file.
+    `path` is that of the machine's file, and `tree` holds its tables. The other file has the same name with the suffix
+    `.healthy` or, before version 0.1, `.lessons`. If neither exists, `summaries` of the table `[machine]` names it.
     """
     machine_table = tree.get("machine")
     name = machine_table.get("summaries") if isinstance(machine_table, dict) else None
@@ -462,8 +463,7 @@ def read_machine(path: str | os.PathLike[str]) -> CommissionedMachine:
 def _convert_tree(tree: dict[str, Any], place: str) -> dict[str, Any]:
     """Check the tables of a machine's file, raising InputError with the path `place`, and convert their values.
 
-    Returns the tables `machine`, `map` (if any), `healthy` and `alarms`, with times in seconds, but not the rig's
-    tables, which are not checked.
+    Returns `machine`, `map` (if any), `healthy` and `alarms`, with times in seconds. The rig's tables are not checked.
     """
     try:
         tables: dict[str, Any] = convert_type(_FILE, tree).model_dump(exclude_unset=True)

@@ -80,12 +80,12 @@ class MachineSummary:
         noise = []
         for name, value in self.noise.items():
             unit, display_unit = units.get(name, ""), display_units.get(name, "")
-            # difference to the converted 0, as some units, such as deg C, have another zero
+            # a deviation has no offset: subtract the converted 0, which is not 0 for units such as deg C
             deviation = from_si(value, display_unit, unit) - from_si(0.0, display_unit, unit) if unit else value
             noise.append(f"{name} {deviation:.2g} {display_unit}")
         seconds = sum(recording.seconds for recording in healthy)
         n_alarms = sum(BY_OTHERS in problem for problem in self.problems)  # recordings unlike the others
-        # the highest score of n + 1 recordings is equally likely that of any of them
+        # each of n + 1 healthy recordings is equally likely to have the highest score
         rate = f"1 in {len(healthy) + 1} by the ranks of {len(healthy)} healthy recordings alone, whatever their law"
         rows = [
             ("recordings", f"{len(healthy)} healthy, {seconds:.4g} s in all{span}"),
@@ -222,8 +222,9 @@ def _estimate_terms(sums: Sequence[Array], rig: Rig, channels: frozenset[str]) -
     """Estimate the coefficients of a volume balance from all recordings together, by the name of the term.
 
     `sums` holds for each recording the Gram matrix (m, m): the products of the balance's columns (the terms and, as the
-    last one, the left side), summed over rows that are scaled to unit noise. `rig` and the recorded `channels`
-    determine the terms; those with a known coefficient are left out. The scatter is that between single recordings.
+    last one, the left side), summed over equations that are scaled to unit noise. `rig` and the recorded `channels`
+    determine the terms; those with a known coefficient are left out. The `scatter` of a result is the standard
+    deviation between estimates from single recordings.
     """
     equation = equations(rig, channels)[0]  # a rig with a servo valve has several; the first one is used
     roles = ColumnRoles(equation)
@@ -232,7 +233,7 @@ def _estimate_terms(sums: Sequence[Array], rig: Rig, channels: frozenset[str]) -
     by_recording = np.array([fit_columns(gram, roles, nuisance) for gram in sums])
     total = np.sum(sums, axis=0)
     values = fit_columns(total, roles, nuisance)
-    variance = np.diag(solve(total[np.ix_(nuisance, nuisance)], np.eye(len(nuisance))))  # rows have unit noise
+    variance = np.diag(solve(total[np.ix_(nuisance, nuisance)], np.eye(len(nuisance))))  # for unit noise
     scatter = by_recording.std(axis=0, ddof=1).tolist() if len(sums) > 1 else [None] * len(nuisance)
     return {
         name: TermEstimate(float(values[i]), float(np.sqrt(max(variance[i], 0.0))), scatter[i], units[name])
@@ -278,9 +279,10 @@ def _smallest_leak(balance: VolumeBalance, summaries: Sequence[Summary], channel
 
 
 def _collect_problems(healthy: Sequence[SummarisedRecording]) -> list[str]:
-    """List the problems of all healthy recordings, one line for each kind, i.e. equal text before the first colon.
+    """List the problems of all healthy recordings, one line for each kind of problem.
 
-    A line shows the alphabetically last text of its kind, and the recording's name or the number of recordings.
+    Problems of a kind have the same text before the first colon. A line shows the alphabetically last of their texts,
+    and the recording's name or the number of recordings.
     """
     by_kind = defaultdict[str, list[tuple[str, str]]](list)
     for recording in healthy:
@@ -308,7 +310,7 @@ def _estimate_noise(values: Array) -> float:
 
 
 def _describe_vacuum(part: Recording, name: str) -> str:
-    """Describe the zero error of a gauge pressure [Pa] of which 1 % of the samples are below vacuum; else return ""."""
+    """Describe the zero error of a gauge pressure that reads below vacuum in 1 % of its samples; else return ""."""
     if part.units[name] != "Pa" or not (low_pressure := float(np.quantile(part[name], 0.01))) < -P_ATM:
         return ""
     offset = (-P_ATM - low_pressure) / BAR

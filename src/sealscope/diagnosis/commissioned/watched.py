@@ -56,9 +56,10 @@ class WatchedMachine:
 
 
 def load_watched(rig: str) -> WatchedMachine:
-    """Load what the monitor needs of an actuator from a rig's name or file, or from a machine's file.
+    """Load sizes, log layout, repair limit and healthy leakage of an actuator for the monitor.
 
-    Only the latter states repair limit and healthy recordings. Raises InputError if it cannot be read.
+    `rig` is the name or the file of a rig, or a machine's file, which alone states repair limit and healthy recordings.
+    Raises InputError if it cannot be read.
     """
     if not rig.endswith(".toml") or "machine" not in read_toml(Path(rig), "a rig file", rig):
         named_rig = load_rig(rig)
@@ -78,7 +79,7 @@ def load_watched(rig: str) -> WatchedMachine:
 
 
 def is_remeasured(rig: Rig, rig_before: Rig) -> bool:
-    """Return True if two rigs differ at most in the pump displacement, and by 5 %, as two measurements of it may."""
+    """Return True if two rigs differ only in the pump displacement, and by 5 % at most, like repeated measurements."""
     values, values_before = rig.model_dump(), rig_before.model_dump()
     for tree in (values, values_before):
         tree.get("pump", {}).pop("q_b", None)

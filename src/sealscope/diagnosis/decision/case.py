@@ -153,8 +153,7 @@ class Case:
         """Event other than a leak that explains a rare change with sufficient probability; None if there is none.
 
         The observables are tried in the order of their p-values, as long as these are below the allowed probability of
-        naming an event by mistake. For each, single causes come first, then groups of causes that the data cannot
-        separate (`joint_causes`).
+        naming an event by mistake. For each, single causes come before groups of inseparable causes (`joint_causes`).
         """
         named_events = [event for event in load_events() if event.cause and event.name not in LEAK_EVENTS]
         candidates_of = {
@@ -181,9 +180,9 @@ class Case:
     def _probability_of_causes(self, causes: Sequence[str], data_kind: str) -> float | None:
         """Compute the probability that one of the causes changed a kind of data, against other causes and chance.
 
-        The result is None, as the causes must then not be named, unless three limits of `priors.toml` are exceeded:
-        `happened` by this probability, `named` by that against other causes only, and 1 - `sure` by that of each
-        single cause.
+        The result is None if the causes must not be named. They may be named if three limits of `priors.toml` are
+        exceeded: `happened` by this probability, `named` by the probability against other causes only, and 1 - `sure`
+        by the probability of each single cause.
         """
         limits = DECISION.explanation
         by_cause = [probability_of(self.explanations, causes=[cause], data_kind=data_kind) for cause in causes]
@@ -204,14 +203,14 @@ class Case:
 
 
 def _leak_tests(case: Case, leak: LeakMeasure) -> tuple[LeakTest, ...]:
-    """Make the tests for a leak from the measured leakage: at most two of three, as far as `leak` allows.
+    """Make the tests for a leak that the measured leakage `leak` allows, at most two of the following three.
 
     - WITHIN: a step (a sudden increase) within the recording.
     - AGAINST: a rise over healthy recordings.
     - LEVEL: without healthy recordings, a level above the limit in the rig's file.
 
-    Of the allowed false-alarm probability, the fraction `questions.within` of `priors.toml` goes to WITHIN if the other
-    test is AGAINST, and to LEVEL if that is the other test. The rest goes to the other test of the two.
+    Two tests share the allowed false-alarm probability. A fraction of it (`questions.within` in `priors.toml`) goes to
+    WITHIN if the other test is AGAINST, or to LEVEL if the other test is WITHIN. The rest goes to the other test.
     """
     from scipy.special import ndtr, ndtri  # standard normal distribution and its inverse
 
@@ -247,9 +246,9 @@ def _change_tests(case: Case) -> tuple[LeakTest, ...]:
     """Make the test for a leak from the report of a detector that does not measure leakage.
 
     Of the test results that a leak changes, the one with the smallest p-value gives the score and the calibrated
-    p-value (`HealthyNull.chance`). The result is empty if a leak changes none. As the detector states no threshold, it
-    is the score at which the calibrated p-value equals the allowed false-alarm probability, if scores are proportional
-    to the logarithm of the p-value that the detector states.
+    p-value (`HealthyNull.chance`). If a leak changes none, the result is empty. The detector states no threshold. It is
+    computed as the score with a calibrated p-value equal to the allowed false-alarm probability, assuming that scores
+    are proportional to the logarithm of the detector's p-value.
     """
     leak = next(event for event in load_events() if event.name == LEAK_EVENTS[0])
     affected = [observable for observable in case.judge.observables if leak.affects(observable)]

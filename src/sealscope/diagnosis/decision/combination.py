@@ -45,8 +45,8 @@ def combine(decisions: Sequence[Evidence], refusal: str | None) -> Evidence:
     """Combine the decisions of several detectors into the decision of the first one, by rank, that decides.
 
     All decisions become the `parts` of the result. The change of RMS decides only if no detector that measures the leak
-    can use the recording. The verdict is `cannot tell` if none decides, and instead of `no leak` if the recording's end
-    is not judged or there is a `refusal`: a measuring detector failed, or no recording of the baseline is comparable.
+    can use the recording. If none decides, the verdict is `cannot tell`. It also replaces `no leak` if the recording's
+    end is not judged, or for a reason `refusal`: a measuring detector failed, or no baseline recording is comparable.
     """
     ranked = sorted(decisions, key=lambda decision: rank(decision.detector))
     usable = [decision for decision in ranked if decision.usable]
@@ -72,11 +72,11 @@ def combine(decisions: Sequence[Evidence], refusal: str | None) -> Evidence:
 
 
 def _explain_undecided(ranked: Sequence[Evidence], usable: Sequence[Evidence]) -> Evidence:
-    """Make the verdict `cannot tell` with a reason, as no detector decides.
+    """Make the verdict `cannot tell` with a reason, from the decisions of detectors if none of them decides.
 
-    The reason is that of the first `usable` detector; if this is the change of RMS, it follows the reason why the
-    volume balance cannot be used. If none is usable, it is that of the last built-in detector in `ranked`, which needs
-    the fewest channels.
+    `ranked` are all decisions by rank, and `usable` those of detectors that could use the recording. The reason is that
+    of the first usable detector. For the change of RMS it is preceded by the reason why the volume balance cannot be
+    used. If no detector is usable, it is the reason of the last built-in one, which needs the fewest channels.
     """
     if usable:
         undecided = usable[0]

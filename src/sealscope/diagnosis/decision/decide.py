@@ -13,13 +13,11 @@ The verdict is `leak` if both conditions hold for one test of the leakage:
 
 A detector that measures no leakage has a single test, with the whole probability of a false alarm.
 
-The numbers 0.01, a quarter and 0.5 are `[false_alarm] probability`, `[questions] within` and `[explanation] leak` of
-`priors.toml`.
+0.01, a quarter and 0.5 are `[false_alarm] probability`, `[questions] within` and `[explanation] leak` in `priors.toml`.
 
 Otherwise the verdict is `no leak` if the 95 % upper bound of a leak is small enough, i.e. at most the fraction `[worth]
 share` of the pump's flow (`_bound_and_limit`). It is `cannot tell` if the bound is larger, and the reason states the
-bound and the most probable other explanation. No other module states a verdict; `combination.combine` chooses among the
-decisions of several detectors.
+bound and the most probable other explanation. No other module states a verdict, but `combination.combine` chooses one.
 """
 
 from __future__ import annotations
@@ -191,7 +189,7 @@ def _bound_and_limit(case: Case, bound: float) -> tuple[float, float]:
 
 
 def _findable_step(case: Case) -> float | None:
-    """Compute the mean flow [m^3/s] of the smallest step of a leak that would be detected; None without a test."""
+    """Compute the mean flow [m^3/s] of the smallest detectable step of a leak; None if no step is tested."""
     test = next((test for test in case.tests if test.name == WITHIN), None)
     if test is None or case.leak is None or case.leak.step is None:
         return None
@@ -203,8 +201,8 @@ def _findable_step(case: Case) -> float | None:
 def _add_tests(case: Case, evidence: Evidence, judging: LeakTest | None) -> Evidence:
     """Add to `evidence` figures of the judging detector's report, and the results of its tests.
 
-    Score, threshold and p-value are those of the test `judging`; if it is None, no results are added. Several tests are
-    also listed in `parts`.
+    Score, threshold and p-value are those of the test `judging`. If it is None, no results are added. If there are
+    several tests, `parts` lists the results of each.
     """
     judge = case.judge
     evidence = replace(evidence, detector=judge.provider, share=judge.share, judged_until=judge.judged_until)

@@ -29,11 +29,11 @@ class Event:
         return self.cause is not None
 
     def affects(self, observable: Observable) -> bool:
-        """Return True if the event changes the quantity of an observable: one of the patterns `affected` matches."""
+        """Return True if the patterns `affected` state that the event changes an observable."""
         return _matches(f"{observable.data}: {observable.name}", self.affected)
 
     def may_disturb(self, observable: Observable) -> bool:
-        """Return True if the event may change the quantity of an observable as a side effect (patterns `disturbed`)."""
+        """Return True if the patterns `disturbed` state that the event may change an observable as a side effect."""
         return _matches(f"{observable.data}: {observable.name}", self.disturbed)
 
 

@@ -94,11 +94,11 @@ def explain(
 
 
 def _compare_by_likelihood(log_factors: Sequence[tuple[Observable, float]]) -> list[tuple[Observable, float]]:
-    """Reduce the log Bayes factors of terms of the volume balance that describe a change worse than the best term.
+    """Reduce the log Bayes factors of those terms of the volume balance that do not describe a change best.
 
-    The terms are alternative descriptions of the same residual. With a term's log likelihood l, which is the log Bayes
-    factor of its uncalibrated p-value, that of the best term L, the calibrated log Bayes factor B of the best term, and
-    the relative misfit m of models (`explanation.misfit` in `priors.toml`), each term gets
+    The terms are alternative descriptions of the same residual. A term's log likelihood l is the log Bayes factor of
+    its uncalibrated p-value. The best term has the log likelihood L and the calibrated log Bayes factor B. With the
+    relative misfit m of models (`explanation.misfit` in `priors.toml`), each term gets
 
         log factor = max(B - (L - l) / (1 + 2 m L), 0).
 
@@ -175,10 +175,11 @@ def _possible_gains(
 def _gains_at_onset(event: Event, factors: Sequence[tuple[Observable, float]]) -> dict[str, float]:
     """Compute the log Bayes factors (at least 0) of an event that begins within the recording, by kind of data.
 
-    `factors` are observables with the log Bayes factors of a change, which are increased by the log odds by the prior
-    on its size. Of those that the event affects, the largest gives the time of the event; the others count if they may
-    have changed then. Side effects on further data count only if an affected observable supports the event. Their
-    factors are limited to the largest one: a much clearer side effect has another cause.
+    `factors` are test results (observables) with the log Bayes factors of a change. To these the log odds are added
+    that follow from the prior on the event's size. Of the observables that the event affects, the one with the largest
+    factor gives the time of the event; others count if they may have changed then. Side effects on other kinds of data
+    count only if an affected observable supports the event. Their factors are limited to the largest one of the
+    affected observables: a much clearer side effect has another cause.
     """
     affected = [(observable, gain) for observable, gain in factors if event.affects(observable)]
     if not affected:
@@ -193,7 +194,7 @@ def _gains_at_onset(event: Event, factors: Sequence[tuple[Observable, float]]) -
     gains: dict[str, float] = {}
     for observable, gain in affected + side_effects:
         if _coincide(observable, best_explained):
-            # advantage: twice the log odds by the prior on the event's size
+            # advantage: twice the log odds that follow from the prior on the event's size
             size_log_odds = 0.5 * observable.advantage if event.is_sized else 0.0
             gains[observable.data] = max(gain + size_log_odds, gains.get(observable.data, 0.0))
     return gains
@@ -202,9 +203,9 @@ def _gains_at_onset(event: Event, factors: Sequence[tuple[Observable, float]]) -
 def _log_factor(observable: Observable, chance: float, rise: LeakRise | None) -> float:
     """Compute the log Bayes factor of a change of an observable from its p-value `chance`.
 
-    If the leakage rises above that of healthy recordings (`rise`), a quantity that describes the same change, such as
-    an external leakage, seems to rise as well. Its observable states the log likelihood ratio of its description to
-    that by a leak, and its log factor is at most that of the rise plus this ratio.
+    A quantity such as an external leakage may describe the same change as a leak. It then seems to rise if the leakage
+    rises above that of healthy recordings (`rise`). Its observable states `log_ratio_to_leak`, the log likelihood ratio
+    of this description to that by a leak. Its log factor is at most that of the rise plus this ratio.
     """
     factor = log_bayes_factor(chance)
     if observable.log_ratio_to_leak is None or rise is None:
@@ -237,7 +238,7 @@ def probability_of(
 ) -> float:
     """Compute the probability of an event with one of the `names` or `causes`; 0 without `explanations`.
 
-    With `data_kind`, only explanations of this kind of data (`Observable.data`) count, scaled to a sum of 1.
+    With `data_kind`, only explanations of this kind of data (`Observable.data`) count, as if no others were possible.
     """
     relevant = [explanation for explanation in explanations if data_kind is None or data_kind in explanation.data]
     total = sum(explanation.probability for explanation in relevant)
@@ -248,9 +249,9 @@ def probability_of(
 
 
 def probability_against_chance(explanations: Sequence[Explanation], causes: Sequence[str], data_kind: str) -> float:
-    """Compute the probability that an event with one of the `causes` changed a kind of data, against all else.
+    """Compute the probability that an event with one of the `causes` changed a kind of data.
 
-    All else is other causes, and chance. Over the `explanations` of this kind of data, with odds against no event,
+    The alternatives are other causes, and chance. With the odds of the `explanations` of this kind against no event,
 
         probability = sum of the odds of sets that contain such an event / (1 + sum of all odds).
     """

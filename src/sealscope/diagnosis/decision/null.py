@@ -46,10 +46,11 @@ class HealthyNull:
         return min(float(weights @ np.exp(-observable.surprisal / inflations)), 1.0)
 
     def calibrate(self, key: str, chance: float) -> float:
-        """Correct the p-value `chance` that a detector states for a test, by those it stated for healthy recordings.
+        """Correct a detector's p-value `chance` by the p-values that it stated for healthy recordings.
 
-        The result is the sum over k of w_k chance^(1/lambda_k). lambda_k (`inflations`) are possible mean surprisals of
-        healthy recordings, and w_k their posterior weights, given the `surprisals` by the test's `key`.
+        The result is the sum over k of w_k chance^(1/lambda_k). lambda_k (`inflations`) are possible means of the
+        surprisals -log(p-value) in healthy recordings. w_k are their posterior probabilities, given the `surprisals`
+        that are stored under the test's `key`.
         """
         weights, inflations = self._inflation(key)
         log_chance = np.log(max(chance, np.finfo(float).tiny))
@@ -73,9 +74,8 @@ class HealthyNull:
 def _inflation_posterior(surprisals: Sequence[float]) -> tuple[Array, Array]:
     """Compute posterior weights and values of lambda, the mean of exponentially distributed surprisals -log(p-value).
 
-    Both have the shape (NODES + 1,). The first value is 1, for p-values that are stated correctly; the prior of the
-    others is exponential in log lambda. n surprisals have the likelihood lambda^-n exp(-their sum / lambda). Without
-    surprisals both arrays are [1].
+    Both have the shape (NODES + 1,), or are [1] without surprisals. The first value is 1, for right p-values; the prior
+    of the others is exponential in log lambda. n surprisals have the likelihood lambda^-n exp(-their sum / lambda).
     """
     priors = DECISION.null
     if not len(surprisals):

@@ -136,7 +136,7 @@ def _ringing_text(evidence: Evidence, ringing: Ringing | None, provider: str) ->
 
 
 def _changed_ringing_text(case: Case, ringing: Ringing) -> str:
-    """Describe the rarest change of the ringing (RMS of the pressures' details), and the probability of a leak."""
+    """Describe the rarest change of the pressures' ringing (RMS of wavelet details), and the probability of a leak."""
     rarest = case.rarest_observable
     percent = 100.0 * abs(np.expm1(rarest.size))  # `size`: change of the logarithm of the RMS
     where = _onset_text(rarest) or _against_text(ringing)
@@ -158,9 +158,9 @@ def _against_text(ringing: Ringing | None) -> str:
 def _rivals_text(case: Case, alarm: LeakTest) -> str:
     """Describe the most probable explanation of an `alarm` other than a leak, and how to tell it from a leak.
 
-    The stated probability is that of all explanations without a leak. Of several events, the first one is described; of
-    a change of the operating point, only its time: the onset of the step that looks like a leak. The text is "" if that
-    time is unknown, or if there is no explanation without a leak.
+    The stated probability is that of all explanations without a leak. If the explanation has several events, only the
+    first one is described. If this is a change of the operating point, the text states only its time, the onset of the
+    step that looks like a leak. It is "" if that time is unknown, or if there is no explanation without a leak.
     """
     leak_probability = case.leak_probability(alarm)
     best = next((explanation for explanation in case.explanations if not explanation.has(*LEAK_EVENTS)), None)

@@ -74,25 +74,25 @@ def make_observable(
     name : str
         Name of the change, in plain words.
     chance : float
-        Probability that a healthy recording changes as much. If several changes are tested, the smallest of their
-        probabilities times their number.
+        Probability that a healthy recording changes as much. If several changes are tested, state the smallest of
+        their probabilities times their number.
     size : float
         The change, in the detector's own unit; negative for a fall.
     onset : tuple of float, optional
         Time of the change with its 95 % interval [s]: (value, low, high).
     """
-    # 2: as scores are twice a log likelihood ratio; tiny: so that a chance of 0 has a finite score
+    # scores are twice a log likelihood ratio; the lower limit of the p-value makes the score finite
     score = -2.0 * float(np.log(max(chance, np.finfo(float).tiny)))
     interval = None if onset is None else Interval(*onset)
     return Observable(name=name, data=PLUG_IN, score=score, chance=float(chance), onset=interval, size=float(size))
 
 
 def validate_report(report: Any, name: str) -> Observed:
-    """Check what the detector called `name` has returned, and return it as a report by this detector.
+    """Check the report that the detector called `name` has returned, and mark it with this name.
 
-    `report` may also be a single observable. Raises TypeError for wrong types, ArithmeticError for a score that is not
-    finite, and ValueError for a chance outside 0 to 1, or if `Observed.lack`, the reason why nothing could be observed,
-    has several lines.
+    `report` is an `Observed` or a single observable. Raises TypeError for other types, ArithmeticError for a score that
+    is not finite, and ValueError for a p-value (chance) outside 0 to 1, or if `Observed.lack`, the reason why nothing
+    could be observed, has several lines.
     """
     if isinstance(report, Observable):
         report = Observed(name, (report,))

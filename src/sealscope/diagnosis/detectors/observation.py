@@ -65,8 +65,8 @@ def _thread_pools(n_modules: int) -> Any:
 def observe_rivals(recording: Recording, baseline: Sequence[Healthy], distrust: str | None = None) -> Observed:
     """Test a recording for changes of duty, noise, mains hum and mean pressures, which may be mistaken for a leak.
 
-    Changes within the recording, and against `baseline`, are tested. A reason to `distrust` the pressures is reported
-    instead.
+    Changes within the recording and against `baseline` are tested. If there is a reason to `distrust` the pressures, it
+    is reported instead.
     """
     if distrust:
         return Observed(SIGNALS, lack=distrust)
@@ -175,9 +175,9 @@ def healthy_null(baseline: Sequence[Healthy], rig: Rig, *, shut: bool = False) -
     """Collect the surprisals -log(chance) of all tests in healthy recordings, as the null distributions of the tests.
 
     `chance` is the p-value that a detector states, assuming `rig`. A test for a change within a recording has one value
-    from each recording. Comparisons share one list for each kind of data (`Observable.data`): each recording is
-    compared with all others, and the largest surprisal counts. With `shut`, the volume balance assumes that valves cut
-    the pump off at rest.
+    from each recording. Comparisons between recordings share one list for each kind of data (`Observable.data`): each
+    recording is compared with all others, and the largest surprisal counts. With `shut`, the volume balance assumes
+    that valves cut the pump off at rest.
     """
     surprisals_by_key = defaultdict[str, list[float]](list)
     for healthy in baseline:

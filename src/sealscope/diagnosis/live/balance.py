@@ -131,8 +131,7 @@ class LiveBalance:
     """Estimate the leakage conductance of a running machine block by block, from the balance of volumes.
 
     `names` are the channels of the samples; InputError is raised if they allow no balance. The estimates do not depend
-    on how the samples are divided into calls. `pressures.PressureEstimator`, which has the same interface, explains
-    the attributes of the class.
+    on how the samples are divided into calls. `pressures.PressureEstimator` explains the attributes of the class.
     """
 
     method = "volumes"
@@ -190,7 +189,7 @@ class LiveBalance:
             if stream is None or run.rate != self._rate:
                 self._rate = run.rate
                 new_stream = self._make_stream()
-                if stream is not None:  # keep offsets, signs and weights of the rows, drop samples at the old rate
+                if stream is not None:  # keep offsets, signs and weights of the equations, drop samples at the old rate
                     new_stream.load_state({**stream.state(), "samples": {}, "first": 0, "done": 0})
                 self._stream = stream = new_stream
             stream.restart(float(run.t[0]))
@@ -242,7 +241,7 @@ class LiveBalance:
         return self._estimate_first_blocks(first_blocks) or NotJudged(end, "at standstill")
 
     def _estimate_first_blocks(self, blocks: Blocks) -> list[BlockConductance]:
-        """Fit coefficients and usual precision to the first blocks; return the conductances of those in motion."""
+        """Fit the balances to the first blocks; return the leakage conductances of the blocks in motion."""
         for number, (model, column_order) in enumerate(zip(self._models, self._column_orders, strict=True)):
             grams = np.ascontiguousarray(blocks.gram[:, number])  # products of one balance in each block
             _fit_to_blocks(model, grams, column_order, blocks.rows)
@@ -253,7 +252,7 @@ class LiveBalance:
 
     @property
     def _half_stride(self) -> float:
-        """Half the time between equations [s], by which a block's samples extend beyond the first and the last."""
+        """Half the time between equations [s]; a block's samples extend this far beyond its first and last equation."""
         return 0.5 * stride_samples(self._rate) / self._rate
 
     def _sample_times(self, block: Blocks) -> tuple[float, float]:
@@ -261,17 +260,18 @@ class LiveBalance:
         return float(block.start[0]) - self._half_stride, float(block.end[0]) + self._half_stride
 
     def _relative_motion(self, block: Blocks) -> float:
-        """Compute how much the machine moves in a block: the mean square of its volume over that of earlier blocks.
+        """Compute the mean square of the volume that the machine moves in a block, relative to earlier blocks.
 
-        The volume is the left side of the balance, such as what the pump delivers; its mean square in the earlier
-        blocks is part of the first model's `numbers`.
+        The volume, such as that delivered by the pump, is the left side of the first volume balance. The `numbers` of
+        its model contain the mean square in the earlier blocks.
         """
         return relative_motion(_volume_square(block), float(block.rows[0]), self._models[0].numbers)
 
     def _solve_block(self, block: Blocks, updates_model: bool = True) -> tuple[float, ...]:
-        """Sum the results of the function `_estimate_leak` in a block (w, w g, w s, w^2 V) over all volume balances.
+        """Estimate the leak's coefficient in a block by each volume balance, and sum the weighted results.
 
-        With `updates_model`, the block also updates the other coefficients of the balances.
+        Returns the sums of w, w g, w s and w^2 V, which `_estimate_leak` explains. With `updates_model`, the block also
+        updates the other coefficients of the balances.
         """
         n_equations = float(block.rows[0])
         results = [
@@ -284,8 +284,7 @@ class LiveBalance:
         """Estimate the leakage conductance in a block from the volume balance.
 
         `sd` of the result is the part of the standard error that is due to this block alone. Returns a `NotJudged` if
-        the machine stands still and the estimate is therefore too uncertain. With `updates_model`, the block also
-        updates the other coefficients.
+        the estimate is too uncertain at standstill. With `updates_model`, the block updates the other coefficients.
         """
         begin, end = self._sample_times(block)
         at_standstill = self._relative_motion(block) < STANDSTILL
@@ -341,7 +340,7 @@ class LiveBalance:
         }
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Restore, to the last bit, what `state` saved; raise InputError if it does not fit rig and channels."""
+        """Restore, to the last bit, the values that `state` saved; raise InputError for another rig or channels."""
         restore_attributes(self, _SAVED, state)
         saved_models = require_part(state, "known", list)
         if len(saved_models) != len(self._models):

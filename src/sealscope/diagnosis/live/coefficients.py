@@ -210,12 +210,12 @@ def _learn_block(model: Any, rows: float, g: float) -> float:
 
 @large_law
 def estimate_leak(model: Any, rows: float, is_learned: bool) -> tuple[float, float, float, float]:
-    """Estimate the leak's coefficient in one block; with `is_learned`, also add the block to the earlier ones.
+    """Estimate the leak's coefficient in one block of a volume balance.
 
-    `model` is a `Coefficients`, whose `block` holds the products of the block, and `rows` is its number of equations.
-    Returns (w, w g, w s, w^2 V) with the estimate g, its precision w, the shift s that is subtracted from g to keep the
-    series of estimates continuous while the other coefficients (nuisances) improve, and the variance V of g due to
-    their errors.
+    `model` is a `Coefficients`, whose `block` holds the products of the block's columns, and `rows` is the block's
+    number of equations. With `is_learned`, the block is also added to the sums over earlier blocks in `model`. Returns
+    (w, w g, w s, w^2 V) with the estimate g, its precision w, the shift s that is subtracted from g to keep the series
+    continuous while the other coefficients (nuisances) improve, and the variance V of g due to their errors.
     """
     block, n, numbers = model.block, len(model.matrix), model.numbers
     # C: normal matrix of the n nuisances c; b: products of the leak's column (index n) with theirs in this block; b_u:

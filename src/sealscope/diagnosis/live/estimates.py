@@ -30,8 +30,7 @@ GROUP: int = LIVE.watch.group
 class BlockEstimate:
     """Leakage of a running machine in one block.
 
-    Flows and their 95 % intervals are None if unknown. After an alarm, the interval of the increase allows for colder
-    and warmer oil.
+    Flows and 95 % intervals are None if unknown. After an alarm, that of the increase allows for colder or warmer oil.
 
     Attributes
     ----------
@@ -111,7 +110,7 @@ class WatchedLeak:
 
     @property
     def rarity(self) -> float:
-        """Probability that a healthy machine scores as high, divided by the `allowed` one, but within 1e-9 to 1."""
+        """Ratio of the test's p-value to the `allowed` false-alarm probability, limited to 1e-9 to 1."""
         log_ratio = self.estimate.log_chance - LiveRise(self.test, self.threshold).log_chance
         return math.exp(min(0.0, max(log_ratio, math.log(1e-9))))
 
@@ -196,7 +195,8 @@ def level_before_leak(leak: WatchedLeak, t: float) -> HealthyLevel:
     """Return the conductance before a leak began, and its range at time `t` [s] if only the oil's warmth had changed.
 
     The range, `low` to `high` of the result, is from 1/r to r times the conductance, where r = warmest^(h / shift). h
-    is the time since the onset [h], but at most `shift`; `warmest` and `shift` are in the table `oil` of `priors.toml`.
+    is the time since the onset [h], but at most `shift`. By the table `oil` of `priors.toml`, warming of the oil raises
+    a conductance at most by the factor `warmest`, within the time `shift` [h].
     """
     oil, before = INFERENCE.oil, leak.conductance_before
     hours = max(0.0, t - leak.onset_s) / 3600.0

@@ -1,8 +1,7 @@
 """Explain an increase of the leakage of a running machine by a leak or by another event.
 
 The e-detector (`sequential`) detects the increase at its rate of false alarms. The probability that a leak, a sensor or
-the duty (motion and load) caused it is computed as for a recording, from the same observables and the same table of
-events.
+the duty (motion and load) caused it is computed as for a recording, from the same observables and events.
 """
 
 from __future__ import annotations

@@ -30,12 +30,13 @@ _MIN_STEP, _MAX_STEP = _PRIORS.follows
 
 def ways_to_watch(rig: Rig) -> tuple[tuple[str, ...], ...]:
     """Return the sets of channels by which an actuator can be watched, the best first; some need no position x."""
+    # the response of the pressures to the command needs no position
     has_response = rig.circuit.pump_feeds_chambers and not rig.cylinder.single_rod
     return (*rig.circuit.watched_by, ("p_A", "p_B", "u")) if has_response else rig.circuit.watched_by
 
 
 def format_ways(ways: Sequence[Sequence[str]]) -> str:
-    """Format sets of channels (`ways_to_watch`) as words for a message, such as "p_A, p_B and u"."""
+    """Format alternative sets of channels, the `ways` to watch a machine, as a text such as "p_A, p_B and u"."""
     return ", or ".join(f"{', '.join(way[:-1])} and {way[-1]}" for way in ways)
 
 
@@ -159,7 +160,7 @@ _SAVED = ("is_final", "names", "rate", "newest", "changed", "counters")
 
 
 def _find_lack(samples: Recording, names: Sequence[str]) -> str:
-    """Describe why samples do not suffice to watch an actuator by the channels `names`, if any; "" if they suffice."""
+    """Describe why samples do not suffice to watch an actuator by the channels `names`; return "" if they suffice."""
     for name in names:
         if name not in samples:
             return f"samples without {name}"

@@ -79,7 +79,7 @@ class PressureEstimator:
         self._end = math.nan  # end of the last block to which the model was fitted [s]
         self._settling = _SETTLING  # number of next blocks in which the simulated states still depend on their start
         self._misfits = 0  # number of successive blocks that the model does not describe
-        self._rows = np.empty((0, 0))  # sums of the last blocks, one block in a row
+        self._rows = np.empty((0, 0))  # one row per block: sums from which the leakage of the last blocks is estimated
         self._signals = SignalWindow()
 
     @property
@@ -155,7 +155,7 @@ class PressureEstimator:
         pressure = float(np.mean(np.abs(block["p_A"] - block["p_B"])))
         speed = self._rig.motor.omega_per_volt * float(np.mean(np.abs(block["u"])))
         pump_flow = speed * self._rig.pump.q_b / (2.0 * math.pi)
-        # `offset`: deviation of the error that all blocks share, that of the prior: only changes of g are known
+        # `offset`: deviation of the error that all blocks share; as large as the prior's, as only changes are measured
         return [BlockConductance(begin, end, g, sd, total=g, offset=_MAX_SD, pressure=pressure, pump_flow=pump_flow)]
 
     def _reject(self, follower: Follower, end: float, is_settling: bool, restarts: bool) -> NotJudged:
@@ -236,12 +236,12 @@ class PressureEstimator:
         return (*response, *self._signals.observables(since))
 
     def relearn(self, since: float = math.inf) -> None:
-        """Make the learned parameters uncertain again, e.g. after a repair; `since`, for `LiveBalance`, is ignored."""
+        """Make the learned parameters uncertain again, e.g. after a repair; only `LiveBalance.relearn` uses `since`."""
         if self._follower is not None:
             self._follower.interrupt(math.inf)
 
     def state(self) -> dict[str, Any]:
-        """Return fit and stored blocks, without the rig, as plain values for JSON, which `load_state` restores."""
+        """Return the fit and the stored blocks as plain values for JSON, which `load_state` restores; not the rig."""
         state = save_attributes(self, _SAVED)
         if (follower := self._follower) is None:
             return state | {"follower": None}
@@ -249,7 +249,7 @@ class PressureEstimator:
         return state | {"follower": save_attributes(follower, _FOLLOWER_ATTRIBUTES) | machine}
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Restore, to the last bit, what `state` saved; raise InputError if a part is missing or not valid."""
+        """Restore, to the last bit, the values that `state` saved; raise InputError if one is missing or not valid."""
         restore_attributes(self, _SAVED, state)
         if (saved := require_part(state, "follower", (Mapping, type(None)))) is None:
             return

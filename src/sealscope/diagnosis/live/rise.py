@@ -115,10 +115,7 @@ class LiveLeak:
 
 
 def decide_on_stream(leak: LiveLeak | None, false_alarm_probability: float, lack: str = "") -> Evidence:
-    """Decide if a watched machine leaks, from the estimated `leak` or the reason (`lack`) why there is no estimate.
-
-    Other explanations of a rise are weighed before a test raises the alarm (module `explanation`).
-    """
+    """Decide if a watched machine leaks, from the estimated `leak` or the reason (`lack`) why there is no estimate."""
     report = Observed(WATCH, lack=lack, leak=leak)
-    # neither reports of other detectors, nor healthy recordings
+    # no other reports or healthy recordings; other causes were weighed before the alarm (module `explanation`)
     return decide(report, (), HealthyNull(), false_alarm_probability, weigh_rivals=False)

@@ -103,9 +103,8 @@ class StepDetector:
     def take(self, begin: float, end: float, g: float, deviation: float) -> None:
         """Update the evidence of a step by the estimate `g` of the coefficient in the block from `begin` to `end` [s].
 
-        `deviation` is the standard error of `g`. With the innovation e, i.e. g minus its prediction by the Kalman
-        filter for a random walk, its variance S, and the effect f of a unit step on e, the sums for each walk and each
-        possible onset are updated by
+        `deviation` is the standard error of `g`. The innovation e is g minus its prediction by a random walk's Kalman
+        filter, S its variance, and f the effect of a unit step on e. For each walk and each possible onset,
 
             a += f e / S,    b += f^2 / S,    T += e^2 / S.
 
@@ -139,11 +138,11 @@ class StepDetector:
         self._level_variance = gain * variance
 
     def _update_walks(self, variance: Array, square: Array) -> None:
-        """Update what a block tells of the noise, and of which of the q random walks in `WALKS` the estimates follow.
+        """Update the scale of the noise and the probability of each of the q random walks by the data of a block.
 
-        Updated are the scale of the noise, `_squares` / `_count`, the log probability of each walk, and the sum of the
-        log variances. `variance` (q, 1) is S, the variance of the innovation e (measured minus predicted estimate)
-        under each walk, and `square` (q, 1) is e^2 / S.
+        The walks have the variances `WALKS`. The scale is `_squares` / `_count`; the sum of the log variances is also
+        updated. `variance` (q, 1) is S, the variance of the innovation e (measured minus predicted estimate) under each
+        walk, and `square` (q, 1) is e^2 / S.
         """
         square = np.maximum(square, _MIN_SQUARE)
         if self._count >= _N_WARM:
@@ -158,12 +157,8 @@ class StepDetector:
         self._log_variances = self._log_variances + np.log(variance)
 
     def _add_onsets(self, begin: float, end: float) -> None:
-        """Add possible onsets of a step in the block from `begin` to `end` [s], one for each of `PARTS`.
-
-        Every `_SELECT_EVERY` blocks, old onsets are thinned out.
-        """
-        # at each block the variance of the coefficient's random walk changes with a small probability; after a change
-        # all `WALKS` are equally likely
+        """Add possible onsets of a step, one for each of `PARTS`, in the block from `begin` to `end` [s]."""
+        # the random walk's variance may change at each block; after a change all `WALKS` are equally likely
         log_prior = np.logaddexp(np.log1p(-_PRIORS.changes) + self._log_weights, np.log(_PRIORS.changes / len(WALKS)))
         # T begins with its value before the onset; the log likelihood until then is subtracted from the log prior, so
         # that only later innovations count in `_log_likelihoods`
@@ -182,9 +177,8 @@ class StepDetector:
         """Compute log M, the evidence that the coefficient has risen.
 
         M is the sum, over the blocks in which the rise may begin, of the likelihood ratio of a step to no step,
-        averaged over `WALKS`, `SIZES` and `PARTS`. In a healthy machine the mean number of blocks until M exceeds a
-        number A is at least A. The result is minus infinity if no rise can have begun yet, or if a quick upper bound of
-        log M is at most `min_log_e`.
+        averaged over `WALKS`, `SIZES` and `PARTS`. In a healthy machine the mean number of blocks until M > A is at
+        least A. The result is -inf if no rise can have begun yet, or if a quick bound of log M is at most `min_log_e`.
         """
         if not len(self._onsets):
             return -np.inf
@@ -200,9 +194,9 @@ class StepDetector:
     def _log_likelihoods(self) -> Array:
         """Compute the log likelihood (q, j) of each random walk q, given no step since each onset j.
 
-        With the variances S of n innovations and the sum T of their squares, each divided by S, the log likelihood is
-        -(n log T + sum of log S) / 2. The value at the onset is subtracted, and the log prior of the walk is added
-        (`_add_onsets`). A constant equal for all q is left out.
+        With the variances S of the n innovations e and T = sum of e^2 / S, the log likelihood of all innovations is
+        -(n log T + sum of log S) / 2, up to a constant equal for all q. From it, the log likelihood of those before the
+        onset is subtracted, and the log prior of the walk is added; `_add_onsets` has stored the sum of both.
         """
         n, log_T = self._onsets[:, _N], np.log(self._sums[_T])
         return np.asarray(self._sums[_LOG_PRIOR] - 0.5 * (n * log_T + self._log_variances))
@@ -223,8 +217,9 @@ class StepDetector:
     def _log_terms(self) -> Array:
         """Compute the logarithms (v, q, j) of the terms whose sum is the evidence that the coefficient has risen.
 
-        A term is a likelihood ratio (`_step_log_ratios`) times the posterior probability of the walk q without a step,
-        over the numbers of `SIZES` and `PARTS`, which are equally likely. For a step down it is 0, its logarithm -inf.
+        A term is a likelihood ratio (`_step_log_ratios`) times the posterior probability of the walk q without a step.
+        It is divided by the numbers of `SIZES` and of `PARTS`, which are equally likely. For a step down the term is 0
+        and its logarithm minus infinity.
         """
         likelihoods = self._log_likelihoods()
         total = np.logaddexp.reduce(likelihoods, axis=0) + np.log(len(SIZES) * len(PARTS))
@@ -255,15 +250,16 @@ class StepDetector:
         sorted_times = times[order]
         earliest, latest = sorted_times[low_index], sorted_times[min(high_index, len(order) - 1)]
         # the last onsets (one for each of `PARTS`) are in one block; the latest of them comes first
-        latest_in_block = float((times - block_begins)[-len(PARTS)])  # time after the begin of the block [s]
+        latest_in_block = float((times - block_begins)[-len(PARTS)])  # time after the beginning of the block [s]
         resolution = latest_in_block / len(PARTS)  # about the distance between neighbouring onsets
         interval = Interval(mean_time, float(earliest) - resolution, float(latest) + resolution)
         return LiveRise(STEP, 2.0 * log_evidence, interval, self._unit * size, self._unit * deviation)
 
     def bound(self, probability: float = BOUND_PROBABILITY) -> float:
-        """Compute the quantile, at `probability`, of an undetected rise > 0 of the coefficient, in its unit.
+        """Compute an upper bound of an undetected rise of the coefficient, in the coefficient's unit.
 
-        It is infinite until there have been enough blocks in which a rise may begin.
+        It is the quantile at `probability` of the posterior of the rise, limited to rises > 0. It is infinite until
+        there have been enough blocks to test for a rise.
         """
         if not len(self._onsets):
             return np.inf
@@ -273,6 +269,7 @@ class StepDetector:
         sizes = a / b
         residual_squares = np.maximum(T - a * sizes, np.finfo(float).tiny)
         deviations = np.sqrt(residual_squares / self._onsets[:, _N] / b)
+        # weight of each walk and onset: probability of the walk times the likelihood ratio of the step
         likelihoods = self._log_likelihoods()
         log_walk_probabilities = likelihoods - np.logaddexp.reduce(likelihoods, axis=0)
         log_weights = log_walk_probabilities + np.logaddexp.reduce(self._step_log_ratios(), axis=0)
@@ -283,8 +280,8 @@ class StepDetector:
     def noise(self) -> float:
         """Ratio of the actual to the predicted variance of the innovations (a Kalman filter's prediction errors).
 
-        The average forgets old blocks gradually; a prior of `step.stated` (`priors.toml`) blocks draws it to 1. The
-        filter assumes a random walk whose variance grows in each block by a tenth of the first estimate's variance.
+        It is averaged over the blocks with fading memory, together with `step.stated` (`priors.toml`) imagined blocks
+        of the ratio 1. The filter's random walk gains a tenth of the first estimate's variance in each block.
         """
         walk = 3  # index of this walk, 0.1, in `WALKS`
         return float((self._squares[walk, 0] + _PRIORS.stated) / (self._count + _PRIORS.stated))
@@ -304,8 +301,7 @@ def _select_onsets(block: int, onsets: Array) -> NDArray[np.bool_]:
     """Select the possible onsets of a step to keep: all of the last `RECENT` blocks, and fewer of older blocks.
 
     Returns flags (j,). Older onsets are kept only at the start of a block, on a grid of blocks that becomes coarser
-    with age, up to the age `HORIZON`. `block` is the number of the present block, and `onsets` (j, 4) has the columns
-    `_N` to `_BLOCK_BEGIN`.
+    with age, up to the age `HORIZON`. `block` is the present block's number; `onsets` (j, 4) is as in `StepDetector`.
     """
     _, onset_block, time, block_begin = onsets.T
     age = block - onset_block

@@ -62,8 +62,7 @@ _ESTIMATORS: dict[str, type[Estimator]] = {kind.method: kind for kind in (LiveBa
 class Watch:
     """Watch one running actuator for leaks; created by the function `watch`, with a state that can be saved.
 
-    If the position is recorded, the leakage is estimated from the balance of volumes, otherwise from the response of
-    the pressures to the command.
+    If a position is recorded, the leakage is estimated from the balance of volumes, else from the pressures' response.
 
     Parameters
     ----------
@@ -110,7 +109,9 @@ class Watch:
         if not 0.0 < learn_hours <= 1000.0:
             raise InputError(f"learn_hours must be > 0 and at most 1000 h, got {learn_hours:g}")
         self._rig, self.healthy = rig, healthy
-        self._litres = {way: kind.states_flow(rig) for way, kind in _ESTIMATORS.items()} if litres is None else litres
+        if litres is None:
+            litres = {method: estimator.states_flow(rig) for method, estimator in _ESTIMATORS.items()}
+        self._litres = litres
         self._samples = SampleJoiner(ways_to_watch(rig))
         self._estimator: Estimator | None = None
         self.baseline: WatchBaseline | None = None
@@ -120,13 +121,12 @@ class Watch:
         self._compared = np.empty(0, _BLOCK)  # the last blocks with which the next is compared, at most `RECENT`
         self._grouped = 0  # number of these that await the test of their mean
         self._is_known = True  # True if the last block's duty (pressure and flow) was in the baseline's range
-        self._since = math.nan  # begin of the first block since the tests restarted [s]
+        self._since = math.nan  # beginning of the first block since the tests restarted [s]
 
     def _false_alarm_probability(self, test: str, seconds: float) -> float:
         """Compute the false-alarm probability of a test, `STEP` or `LEVEL`, that is made once in `seconds`.
 
-        It is `seconds` times the part of the stated rate of false alarms that the test gets. Raises InputError unless
-        it is 1e-12 to 0.05.
+        It is `seconds` times the test's part of the false-alarm rate. Raises InputError unless it is 1e-12 to 0.05.
         """
         rate: float = self.false_alarms_per_1000_h
         fraction_of_alarms = getattr(_PRIORS, test)
@@ -143,12 +143,15 @@ class Watch:
 
     @property
     def learned_with(self) -> tuple[Rig, Mapping[str, bool], float]:
-        """Rig, whether each method states L/min, and time to learn [h], with which the baseline is learned."""
+        """Settings with which the baseline is learned.
+
+        These are the rig, the methods with a flag that is True if they state L/min, and the time to learn [h].
+        """
         return self._rig, self._litres, self.learn_hours
 
     @property
     def method(self) -> str:
-        """Way in which the machine is watched, "pressures" if samples have come without a position, else "volumes"."""
+        """Method of watching the machine, "pressures" if samples have come without a position, else "volumes"."""
         return "volumes" if "x" in self._samples.names or not self._samples.names else "pressures"
 
     @property
@@ -191,7 +194,7 @@ class Watch:
         Without a leak (None) the result has the present score of the test for a step, limited to below the threshold,
         and the 95 % upper bound of an undetected leak. `estimator` states the uncertainty of flows.
         """
-        if leak is not None:  # it needs neither a bound nor the pump's flow
+        if leak is not None:  # the verdict on a detected leak uses neither a bound nor the pump's flow
             test, cause, pressure, bound, pump_flow = leak.estimate, leak.cause, leak.pressure, math.inf, 0.0
         else:
             # a step may exceed the threshold before it is explained: it must not be reported as a leak yet
@@ -258,7 +261,7 @@ class Watch:
         return LiveBalance(self._rig, self._samples.names, litres)
 
     def continue_from(self, blocks: int, baseline_version: int) -> None:
-        """Continue to count from the `blocks` and the `baseline_version` of an earlier watch with other settings."""
+        """Continue the counts of an earlier watch with other settings; its next baseline gets the next version."""
         self.blocks, self.baseline_version = blocks, baseline_version + 1
 
     def relearn(self) -> None:
@@ -282,8 +285,7 @@ class Watch:
     def judge(self, result: BlockResult) -> BlockEstimate:
         """Test the conductances of a block for a leak, and return the estimate of the block.
 
-        The first blocks, to which the volume balance is fitted together, come as a single result; the estimate is then
-        that of the last of them.
+        The first blocks, to which the volume balance is fitted together, come as one result; the last estimate counts.
         """
         self.blocks += 1
         if isinstance(result, NotJudged):
@@ -358,7 +360,7 @@ class Watch:
         """Test for a step of the conductance up to `block`, and raise the alarm if a leak explains the step.
 
         For `RECENT` blocks after the alarm, a step with a higher score replaces onset and size of the leak. Returns
-        True if a step was found and a leak does not explain it, or not yet.
+        True if a step was found that a leak does not explain, or that cannot be explained yet.
         """
         leak = self.leak
         if leak is not None and (leak.test != STEP or block.end - leak.raised_s > RECENT * self.block_seconds):
@@ -382,8 +384,8 @@ class Watch:
         """Find the cause of the increase `rise` of the conductance, from changes of other quantities up to `block`.
 
         The cause is unknown if too few blocks have followed the onset, or if the machine had started shortly before; in
-        the latter case the tests restart. It is a leak if the blocks around the onset are no longer stored, else that
-        of `explain_rise`. If that is not a leak and enough blocks have followed, tests and `estimator` restart.
+        the latter case the tests restart. If the blocks around the onset are no longer stored, the cause is a leak.
+        Otherwise `explain_rise` finds it; if it is no leak after enough blocks, tests and `estimator` restart.
         """
         n_since = int(np.count_nonzero(self._compared["end"] > rise.interval.high))  # blocks since the onset
         if n_since < _EXPLANATION.shows:
@@ -451,9 +453,9 @@ class Watch:
     ) -> None:
         """Set the leak alarm, `self.leak`, from a significant increase `rise` of the conductance up to `block`.
 
-        `reason` is the text of the alarm, and `threshold` that of the test. `before` is the conductance before the
-        onset, by default the mean of up to `GROUP` blocks; `cause` is by default the estimator's. An earlier alarm
-        keeps its time and its conductance before the onset.
+        `reason` is the text of the alarm, and `threshold` the test's threshold. `before` is the conductance before the
+        onset, by default its mean over the last blocks before the onset, at most `GROUP`. `cause` is by default the
+        estimator's. An earlier alarm keeps its time and its conductance before the onset.
         """
         raised_s = block.end
         if self.leak is not None:
@@ -501,8 +503,9 @@ class Watch:
     def _add_flows(self, estimate: BlockEstimate, estimator: Estimator, blocks: NDArray[Any]) -> BlockEstimate:
         """Add the mean total flow and leak of `blocks` [L/min], with 95 % intervals, to an estimate.
 
-        The leak is the flow above that of the baseline or, after an alarm, above that before the onset; it is left out
-        without either. The total is left out if the `estimator` states only changes, and both if it states no L/min.
+        The leak is the flow above that of the baseline or, after an alarm, above that before the onset. It is left out
+        if there is neither a baseline nor an alarm. The total is left out if the `estimator` states only changes, and
+        both flows are left out if it states no L/min.
         """
         if not estimator.litres:
             return estimate

@@ -116,8 +116,7 @@ class StepSize(PriorTable):
     """Log-normal prior on the size of a change other than a leak past the piston, or on the volume of an accumulator.
 
     - `size`: median size. It is in [m^3/s] for an external leak, [Pa] for free air (its volume fraction times the
-      atmospheric pressure), [Pa/s] for a drift, [m^3] for an accumulator, and relative for a scale or a zero of the
-      flow.
+      atmospheric pressure), [Pa/s] for a drift, [m^3] for an accumulator, and relative for a scale or a flow's zero.
     - `spread`: standard deviation of the logarithm of the size.
     """
 

@@ -98,9 +98,8 @@ def measure_levels(recording: Recording) -> tuple[Array, Array]:
 def _measure_blocks(recording: Recording, transformed: list[Details], bounds: IntArray) -> tuple[Array, Array]:
     """Compute the log RMS of wavelet details (n, 5 per chamber) and features of the duty (n, 4) of n blocks.
 
-    Both are described for `RmsBlocks`. `transformed` holds the wavelet details of each chamber, and `bounds` (n + 1,)
-    the sample indices of the blocks' ends. The load is p_A - p_B or, if only one chamber is recorded, its pressure
-    minus the mean.
+    `RmsBlocks` describes both. `transformed` are the wavelet details of each chamber, and `bounds` (n + 1,) the sample
+    indices of the blocks' ends. The load is p_A - p_B or, for a single chamber, its pressure minus the mean.
     """
     chambers = chambers_of(recording)
     if len(chambers) == len(CHAMBERS):

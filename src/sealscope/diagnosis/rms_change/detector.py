@@ -161,7 +161,7 @@ def compare_summaries(
 
     `judged` and `summaries` are summaries (`RmsChange.learn`) of the judged and the leak-free recordings, and
     `chambers` the pressures to compare. Returns an observable for each detail and chamber, and the 95 % upper bound of
-    an undetected change of the log RMS, the smallest of the judged details d2 to d4.
+    an undetected change of the log RMS: the smallest of the bounds by the judged details d2 to d4.
     """
     starts = [*(summary.get("start_s") for summary in summaries), judged.get("start_s")]
     times = None if None in starts else np.array(starts, dtype=float)

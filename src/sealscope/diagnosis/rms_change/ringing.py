@@ -26,11 +26,12 @@ from sealscope.signals.details import QUANTITIES
 
 
 def subtract_noise(log_rms: Array, healthy: Array) -> tuple[Array, Array]:
-    """Compute the change of the log RMS of wavelet details without noise, and the fraction of energy that is not noise.
+    """Compute the change of the log RMS of wavelet details relative to healthy values, with the noise removed.
 
-    `log_rms` (n, 5 per chamber) are values of n blocks or recordings, and `healthy` (k, 5 per chamber) those from which
-    the machine's mean energy S_j in each detail d_j is estimated, as the energy of d_j minus that of d1. The noise E_1
-    is the energy of d1 in the same row of `log_rms`. The changes y and the fractions w (n, 5 per chamber) are
+    `log_rms` (n, 5 per chamber) are values of n blocks or recordings, for the details d1 to d4 and the product d3d4.
+    From `healthy` (k, 5 per chamber), the machine's mean energy S_j in each detail d_j is estimated as the energy of
+    d_j minus that of d1. The noise E_1 is the energy of d1 in the same row of `log_rms`. Returns the changes y and the
+    fractions w of the energy that is not noise, both (n, 5 per chamber):
 
         d2, d3, d4:   y = log RMS - log sqrt(S_j + E_1),    w = S_j / (S_j + E_1)
         d1:           y = log RMS,    w = 1
@@ -60,12 +61,12 @@ def change_information(blocks: RmsBlocks) -> tuple[list[Information], Array]:
     """
     changes, weight = subtract_noise(blocks.log_rms, blocks.log_rms)
     variances = np.mean(np.diff(changes, axis=0) ** 2, axis=0) / 2.0  # a difference has twice the variance
-    features = DUTY[:-1]  # without the direction, as the mean differences between phases are already removed
+    features = DUTY[:-1]  # no direction: the mean differences between the phases of a cycle are removed already
     duty = (blocks.duty - blocks.duty.mean(axis=0))[:, : len(features)]
     exponent_sd = np.array([getattr(RMS_PRIORS.duty, name) for name in features])
     time = blocks.edges[:-1] + 0.5 * blocks.seconds
     walks = RMS_PRIORS.walk
-    # scales are stated for the time `walk.time`; the deviation of a random walk grows with the root of the time
+    # convert scales for the time `walk.time` to the recording's length: a random walk grows with the root of the time
     walk_scale = float(np.sqrt(len(time) * blocks.seconds / walks.time))
     machine_walk = walks.duty if blocks.cycle is None else walks.machine
     results = list[Information]()
@@ -86,9 +87,9 @@ def estimate_rises(
     """Estimate the change g of the log RMS of wavelet details (ringing) relative to n leak-free recordings.
 
     `log_rms` (5 per chamber,) and `duty` (4,), the features `DUTY`, are those of the judged recording, `healthy` (n, 5
-    per chamber) and `healthy_duty` (n, 4) those of the leak-free ones. `times` (n + 1,) are the start times, the judged
-    recording's last [s], None if unknown. Returns the change of each wavelet quantity, and the fractions of energy that
-    are not noise, (5 per chamber,).
+    per chamber) and `healthy_duty` (n, 4) those of the leak-free ones. `times` (n + 1,) are the start times [s], with
+    that of the judged recording at the end; None if unknown. Returns the change of each wavelet quantity, and the
+    fractions of energy that are not noise, (5 per chamber,).
 
     The model is the sum of a common mean, an effect of the duty, independent scatter, and an Ornstein-Uhlenbeck process
     over time, independent between sessions, which are separated by pauses. Its variance is stated in `priors.toml`

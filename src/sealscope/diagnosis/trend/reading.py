@@ -192,9 +192,10 @@ def _balance_fields(solution: RecordedBalance, machine: AssumedMachine) -> dict[
 
 
 def scatter_prior(basis: Basis, usual: float) -> ScatterPrior:
-    """Make the prior on the standard deviation between recordings of `LeakReading.level`, for the method `basis`.
+    """Make the prior on the standard deviation of a healthy machine's leakage level between recordings.
 
-    It is proportional to the typical level `usual` for the volume balance, and constant for other methods.
+    The level (`LeakReading.level`) is estimated by the method `basis`. The scale of the prior is proportional to the
+    typical level `usual` for the volume balance, and constant for other methods.
     """
     between = TREND.between
     if basis == "pressure response":

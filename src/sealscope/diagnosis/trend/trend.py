@@ -323,8 +323,7 @@ def trend(
 def _add_episodes(trend: Trend) -> Trend:
     """Add to a trend the leakage in each comparable recording, the episodes between repairs, and the decision.
 
-    If there are very many recordings, averages of neighbours are compared instead, and `rows` become the recordings
-    nearest to these averages.
+    Instead of very many recordings, averages of neighbours are compared; `rows` become the recordings nearest to them.
     """
     levels, trend_units_per_level = _convert_levels(trend)
     points, findings = _add_values(trend, levels)
@@ -346,7 +345,7 @@ def _add_episodes(trend: Trend) -> Trend:
 
 
 def _add_values(trend: Trend, levels: Levels) -> tuple[tuple[TrendPoint, ...], tuple[Finding, ...]]:
-    """Return a trend's points, with values from the `levels` of the compared ones, and its findings, with outliers."""
+    """Return a trend's points with values from the converted `levels` added, and its findings with outliers added."""
     points, findings = [*trend.points], [*trend.findings]
     _, excess = outlier_excess(levels)  # part of each level beyond the limit of outliers
     outliers = np.flatnonzero(excess)

@@ -64,7 +64,7 @@ class TrendLeak:
 
     @property
     def step_rise(self) -> LeakRise | None:
-        """The whole increase of the leakage, as no step within a recording is tested; None if nothing increased."""
+        """Increase of the leakage over that of the healthy recordings; None if it has not increased."""
         return None if self.rise is None else LeakRise(self.rise)
 
     def relative(self, flow: Flow) -> None:
@@ -184,9 +184,10 @@ def _report_ringing(points: Sequence[TrendPoint], wear: Wear, chance: float) -> 
 
 
 def _split_at_onset(points: Sequence[TrendPoint], wear: Wear) -> tuple[list[TrendPoint], list[TrendPoint]]:
-    """Split the recordings that can be compared with the last one into those before the onset of the leak and the rest.
+    """Split recordings into those before the onset of the leak and those since the onset.
 
-    `points` are in the order of time. Without an onset, the rest is the last recording only.
+    `points` are in the order of time. Those that cannot be compared with the last one are left out. Without an onset,
+    the second list is the last recording only.
     """
     onset = points[-1].day if wear.onset is None else wear.onset.value
     comparable = [point for point in points if point.group == points[-1].group]

@@ -167,8 +167,8 @@ class _Changes(NamedTuple):
         """Build the hypotheses of all steps and growths that may begin after the first `n_healthy` recordings.
 
         Each step or growth is combined with several prior scales of its size. Those of a step are multiples of the
-        scatter tau (`change.steps` in `priors.toml`). The size of a growth is its rise per month, with the scales tau
-        over several times (`change.intervals`, multiples of the median interval of recordings).
+        scatter tau (`change.steps` in `priors.toml`). The size of a growth is its rise per month. Its scales are tau
+        divided by several times, which are multiples of the median interval of recordings (`change.intervals`).
         """
         scales = TREND.change
         begin = np.arange(max(n_healthy, 1), len(levels))  # first recording after each change
@@ -190,7 +190,10 @@ class _Changes(NamedTuple):
 
     @classmethod
     def from_profile(cls, profile: Array, scale: float) -> _Changes:
-        """Build the hypothesis of a growth, with the effect `profile` (n,) per unit size, from the first recording."""
+        """Build the single hypothesis of a growth since the first recording.
+
+        `profile` (n,) is its effect on each recording for unit size, and `scale` the prior scale of the size.
+        """
         first = np.zeros(1, dtype=np.int64)
         return cls(
             profile[:, None], first, np.array([scale]), first, grows=np.ones(1, dtype=bool), log_weight=np.zeros(1)
@@ -215,7 +218,7 @@ class _Node(NamedTuple):
 
 
 def _evaluate_grid(levels: Levels, profiles: Array, *, may_grow: bool = False) -> list[_Node]:
-    """Compute the likelihoods of leakage levels with and without a change, at all points of a grid of tau and r.
+    """Compute the likelihoods of leakage levels with and without a change, at each point of a grid of tau and r.
 
     tau is the standard deviation between recordings, and r the fraction of its variance that is correlated over time.
     `profiles` (n, m) are the effects of m changes of unit size on each of n recordings. With `may_grow`, the level may
@@ -225,14 +228,14 @@ def _evaluate_grid(levels: Levels, profiles: Array, *, may_grow: bool = False) -
 
     Here `shared` is due to the priors on the level of each group, the growth and the covariate's coefficient, and C is
     the correlation over time. Multiplied by L^-1, the levels without their outlying parts (`outlier_excess`) become z,
-    the profiles G, and the covariances of the levels with the mean level of the last group u.
+    the profiles become G, and the covariances of the levels with the last group's mean level become u.
     """
     from scipy.linalg import solve_triangular
 
     between, prior = TREND.between, levels.prior
     # outlying part of each level: while its recording is the last one, and in the whole series
     outlying_as_last, outlying = outlier_excess(levels)
-    values = levels.value - levels.value[0] - outlying  # the first level is added again below
+    values = levels.value - levels.value[0] - outlying  # relative to the first level, which is added again below
     # 0.3 of the range is about the standard deviation of ten normal values
     max_scatter = max(prior.scale, 0.3 * float(np.ptp(levels.value)))
     wide_variance = (_WIDE * max_scatter) ** 2
@@ -307,12 +310,13 @@ def score_changes(levels: Levels, n_healthy: int = 1, *, falls: bool = False, ma
     if falls:
         levels = replace(levels, value=-levels.value)
     n, changes = len(levels), _Changes.enumerate(levels, n_healthy, steps_only=falls)
-    # sums of prior times likelihood with each change, and without a change, over the grid of tau and r
+    # logarithms of prior times likelihood with each change, and without one, summed over the grid of tau and r
     log_terms, log_null = np.full((n, changes.begin.size), -np.inf), np.full(n, -np.inf)
     if not changes.begin.size:  # no change can begin: R = 0
         return ChangeScores(log_null, np.zeros(n, dtype=np.int64))
     for node in _evaluate_grid(levels, changes.profiles, may_grow=may_grow):
         log_null = np.logaddexp(log_null, node.log_null)
+        # terms of the likelihood ratio exp(b delta - a delta^2/2) of a change of size delta
         a, b = node.a[:, changes.profile_index], node.b[:, changes.profile_index]
         log_terms = np.logaddexp(log_terms, node.log_null[:, None] + _log_mean_ratio(a, b, changes.scale * node.tau))
     # weighted likelihood ratio w_j LR_j(n) of each change; changes that begin after recording n do not count yet
@@ -331,15 +335,16 @@ class _Draws(NamedTuple):
 
     @classmethod
     def sample(cls, levels: Levels, changes: _Changes, *, signed: bool = False) -> _Draws:
-        """Draw scatter, change (one of `changes`), its size and the mean before it, given `levels`.
+        """Draw random samples of the model's parameters from their posterior, given the leakage `levels`.
 
-        The size of a change has a half-normal prior or, with `signed`, a normal prior. The seed is fixed.
+        A draw has the scatter, a change (one of `changes`), the size of the change and the mean level before it. The
+        size has a half-normal prior or, with `signed`, a normal prior. The seed is fixed.
         """
         from scipy.special import ndtr, ndtri
 
         random = np.random.default_rng(20)  # a fixed seed, so that results repeat
         nodes = _evaluate_grid(levels, changes.profiles)
-        # [-1]: after the last recording
+        # [-1]: given all recordings, up to the last one
         a, b = (np.stack([getattr(node, name)[-1][changes.profile_index] for node in nodes]) for name in ("a", "b"))
         scale = changes.scale * np.array([[node.tau] for node in nodes])
         v = 1.0 / (a + scale**-2)  # variance of the size, before any truncation to > 0; its mean is b v
@@ -468,9 +473,10 @@ def _estimate_healthy_range(levels: Levels) -> tuple[Interval, float]:
 
     The interval of the mean contains 95 % of the levels of single recordings, with their scatter and standard errors.
     """
-    no_change = _Changes.from_profile(np.zeros(len(levels)), scale=1.0)  # without an effect, whatever the scale
+    no_change = _Changes.from_profile(np.zeros(len(levels)), scale=1.0)  # a change without effect on any recording
     draws = _Draws.sample(levels, no_change)
     error_variance = float(np.mean(levels.error[levels.group == levels.group[-1]] ** 2))
+    # level of a single recording: mean plus scatter between recordings (tau) plus its error
     noise = np.random.default_rng(21).standard_normal(draws.tau.size)  # a fixed seed, so that results repeat
     interval = _interval_of_draws(draws.mean_before + np.sqrt(draws.tau**2 + error_variance) * noise)
     return interval._replace(value=float(draws.mean_before.mean())), math.sqrt(float(np.mean(draws.tau**2)))

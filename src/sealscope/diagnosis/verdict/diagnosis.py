@@ -181,7 +181,7 @@ class Diagnosis(Evidence):
 
     @property
     def named_cause(self) -> str | None:
-        """The `cause`; None if it does not fit the verdict, as `leak` needs one of `LEAKS`, and others need another."""
+        """The `cause`; None if it contradicts the verdict, as a leak has a cause in `LEAKS`, and nothing else has."""
         return self.cause if (self.verdict == LEAK) == (self.cause in LEAKS) else None
 
     @property

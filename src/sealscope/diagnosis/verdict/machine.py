@@ -75,9 +75,8 @@ def assumed_rig(rig: Rig | str | os.PathLike[str] | None, recording: Recording) 
     """Choose the rig that detectors assume for a recording, and tell who stated its areas and displacement.
 
     A given `rig` counts as stated by the caller if it defines a whole machine, else by nobody. Without a rig, the
-    thesis's rig is used. It counts as stated by the recording if the recording names a rig of the same areas and
-    displacement. Otherwise nobody stated it, and all its values are marked as assumptions. Raises InputError if `rig`
-    cannot be read.
+    thesis's rig is used. It counts as stated by the recording if this names a rig of the same areas and displacement.
+    Otherwise nobody stated it, and all values are marked as assumptions. Raises InputError if `rig` cannot be read.
     """
     used_rig = load_rig(_DEFAULT if rig is None else rig)
     stated_by: StatedBy

@@ -67,8 +67,7 @@ def state_of(
     """Return the state of a machine for a condition of `states.toml`; raise KeyError for an unknown condition.
 
     A `cause` that `states.toml` lists determines the action and, unless the condition is a leak past piston or pump
-    (`LEAKING`), also the state. `since_s` is the time at which the state began [s]. `action` replaces that of
-    `states.toml`.
+    (`LEAKING`), also the state. `since_s` is the time at which the state began [s]. `action` replaces the usual action.
     """
     tables = _tables()
     name = tables["conditions"][condition]["state"]
