@@ -54,7 +54,9 @@ def alarmed(folder: Path, file: Path, recording: ss.Recording = WORN) -> Service
 
 
 def replaced(settings, rig):
-    return settings.model_copy(update={"rig": str(rig)}) if settings.name == NAME else settings
+    """The settings with a machine that is watched by blocks alone, which raise an alarm within seconds."""
+    changes = {"rig": str(rig), "recording_s": 0.0}
+    return settings.model_copy(update=changes) if settings.name == NAME else settings
 
 
 def said_by(actuators: WatchedActuators) -> str:

@@ -213,7 +213,7 @@ def test_a_state_of_another_version_begins_a_new_baseline(taken, caplog):
     learned_with, state, _ = service.store.checkpoint("press 1")
     state["watch"] = {"version": 1, "baseline_version": 3, "what it was": []}
     rows = StoredRows()
-    rows.add_checkpoint("press 1", learned_with, state)
+    rows.add_checkpoint("press 1", learned_with, state, first_kept=10_000)
     with service.store.writing() as connection:
         service.store.write_rows(connection, rows)
     again = Service(taken, once=True)

@@ -14,7 +14,7 @@ from sealscope.diagnosis.verdict.states import state_of
 from sealscope.monitor.alarms import AlarmJudge
 from sealscope.monitor.service import Service
 from sealscope.monitor.settings import WatchSettings, read_settings
-from sealscope.monitor.stream_recordings import StreamRecorder
+from sealscope.monitor.sources.stream_recordings import StreamRecorder
 from sealscope.monitor.verdicts import RecordingVerdict
 from sealscope.recordings.recording import Recording
 
@@ -39,10 +39,10 @@ def settings_of(folder: Path, machine_file: Path, more: str = ""):
 
 
 def stream(seed: int, start: float, *, leaks: bool) -> Recording:
-    """Two minutes of the machine, which leaks from the first sample on or never."""
+    """Three minutes of the machine, which leaks from the first sample on or never."""
     leak = step(0.0, LEAK, at=0.0) if leaks else None
     options = {} if leak is None else {"G": leak}
-    return moved(machine(seed, rate=100.0, duration=130.0, **options).only(CHANNELS), APRIL + start)
+    return moved(machine(seed, rate=100.0, duration=190.0, **options).only(CHANNELS), APRIL + start)
 
 
 def lines_in(recordings: Sequence[Recording]) -> bytes:
@@ -65,7 +65,7 @@ def test_a_leak_from_the_first_sample_on_is_what_diagnose_says(commissioned, tmp
     assert (diagnosis.verdict, diagnosis.onset_s) == ("leak", None)
     assert [json.loads(line)["event"] for line in out.splitlines()] == ["raised"]
     (alarm,) = service.store.alarms(open_only=True)
-    assert alarm["evidence"].startswith("stream from 2026-03-31 23:34:2")
+    assert alarm["evidence"].startswith("stream from 2026-03-31 23:3")
     assert alarm["leak_lpm"] == pytest.approx(diagnosis.leak_lpm, rel=0.1)
     summary = service.summaries()["press"]
     assert (summary["recording"]["verdict"], summary["state"]["condition"]) == ("leak", "leak")
@@ -79,7 +79,7 @@ def test_the_verdict_on_a_healthy_recording_ends_the_alarm(commissioned, tmp_pat
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("n_lines", [40, 75])
+@pytest.mark.parametrize("n_lines", [40, 130])
 def test_a_monitor_that_restarts_within_a_recording_has_the_rows_of_one_that_did_not(
     commissioned, tmp_path, leak_lines, n_lines
 ):
@@ -106,7 +106,7 @@ def test_only_the_samples_of_a_recording_that_has_not_ended_are_stored(commissio
     again = Service(service.settings, once=True)
     again.close()
     restored = again.actuators._actuator("press").recorder
-    assert (restored.first, restored.follows) == (recorder.first, recorder.follows)
+    assert restored.state() == recorder.state()
     assert [len(block) for block in restored.blocks] == [len(block) for block in recorder.blocks]
 
 
@@ -116,7 +116,7 @@ def test_a_mark_that_ends_an_alarm_forgets_the_samples_before_it(commissioned, t
     actuator = service.actuators._actuator("press")
     assert actuator.recorder.blocks
     leak = {"start_s": 0.0, "end_s": 60.0, "chance": None}
-    actuator.judge.update_from_verdict(verdict("leak", **leak), None, 1, WatchSettings(), is_stream=True)
+    actuator.judge.update_from_verdict(verdict("leak", **leak), None, 1, WatchSettings())
     service.actuators.apply_mark("press", "repaired")
     assert (actuator.recorder.blocks, actuator.recorder.first) == ([], 0)
     assert service.store.checkpoint("press").pending == []
@@ -169,7 +169,7 @@ def test_another_rate_or_channel_ends_a_recording():
 
 
 def test_a_recorder_holds_no_more_samples_than_it_may(monkeypatch):
-    monkeypatch.setattr("sealscope.monitor.stream_recordings._MAX_BYTES", 20_000)
+    monkeypatch.setattr("sealscope.monitor.sources.stream_recordings._MAX_BYTES", 20_000)
     recorder = StreamRecorder("press", 600.0)
     for number, block in enumerate(pieces(2000.0), 1):
         recorder.take(number, block)
@@ -185,17 +185,13 @@ def verdict(word: str = "leak", chance: float | None = 1e-3, **more) -> Recordin
 
 
 def test_the_alarms_of_a_stream_keep_the_stated_rate():
-    """One healthy recording of 3 min in 1000 is 20 an hour's thousand: two in turn are needed, each rare enough."""
-    settings = WatchSettings(false_alarms_per_1000_h=1.0)  # half of it for recordings: 2.5e-5 each
-    once = AlarmJudge("press").update_from_verdict(verdict(chance=1e-9), None, 1, settings, is_stream=True)
-    assert once is None  # rarer than 1e-4 is not known
-    for chance, is_alarm in ((1e-3, True), (9e-3, False)):
-        change = AlarmJudge("press").update_from_verdict(
-            verdict(chance=chance), verdict(chance=chance), 1, settings, is_stream=True
-        )
-        assert (change is not None) == is_alarm
-    many = WatchSettings(false_alarms_per_1000_h=20.0)
-    assert AlarmJudge("press").update_from_verdict(verdict(chance=1e-4), None, 1, many, is_stream=True)
+    """One healthy recording of 3 min in 1000 is 20 in 1000 h: two in turn are needed, each rare enough."""
+    settings = WatchSettings(false_alarms_per_1000_h=1.0)  # 5e-5 for a recording
+    for chance, is_alarm in ((1e-9, True), (1e-3, True), (9e-3, False)):
+        judge, found = AlarmJudge("press"), verdict(chance=chance)
+        assert judge.update_from_verdict(found, None, 1, settings, is_stream=True) is None
+        assert judge.update_from_verdict(found, verdict("no leak"), 1, settings, is_stream=True) is None
+        assert (judge.update_from_verdict(found, found, 1, settings, is_stream=True) is not None) == is_alarm
 
 
 @pytest.mark.parametrize(("bound", "ends"), [(0.001, True), (0.02, False), (None, True)])
@@ -210,7 +206,6 @@ def test_no_leak_ends_only_the_alarm_of_a_leak_that_it_excludes(commissioned, tm
     _, events = actuator.judge_samples(block, follows=True, settings=settings, verdict=cleared)
     assert [event for _, event, _ in events] == (["returned"] if ends else [])
     assert actuator.judge.alarm is None or actuator.judge.alarm.active != ends
-    assert (actuator.verdict is None) != ends
 
 
 def test_the_length_of_a_recording_is_none_or_a_minute_to_ten(commissioned, tmp_path):

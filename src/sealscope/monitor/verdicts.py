@@ -1,4 +1,4 @@
-"""Verdicts on whole recordings: the files of a watched folder are compared with their machine's healthy recordings.
+"""Verdicts on whole recordings of a watched folder or stream, compared with their machine's healthy recordings.
 
 The verdict is the one that `sealscope diagnose --machine` gives. The page, metrics and messages state it as the
 result of the actuator; the chart shows the single blocks. The comparison with healthy recordings finds leaks that are
@@ -8,24 +8,23 @@ present from the first sample on, which a watch that learns from the same sample
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from sealscope.diagnosis.commissioned.machine import CommissionedMachine
+from sealscope.diagnosis.commissioned.watched import load_watched
 from sealscope.diagnosis.live.estimates import BlockEstimate, Interval
 from sealscope.diagnosis.priors.decision import DECISION
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.evidence import CANNOT_TELL, LEAK, NO_LEAK
 from sealscope.diagnosis.verdict.states import state_of
+from sealscope.recordings.formats.timebase import clock_text
 from sealscope.recordings.recording import Recording
 from sealscope.reporting.messages import how_much
 
 _FALSE_ALARM = DECISION.false_alarm
-#: Fraction of an actuator's allowed false alarms that the recordings of its stream get; its detector gets the others.
-STREAM_SHARE = 0.5
 
 
 @dataclass(frozen=True)
@@ -107,10 +106,9 @@ class RecordingVerdict:
         """True if the verdict is "no leak"."""
         return bool(self.verdict == NO_LEAK)
 
-    def excludes(self, leak_flows: Iterable[float | None]) -> bool:
-        """Return True unless a leak of one of these flows [L/min] may be there; None stands for an unknown flow."""
-        bound = self.bound_lpm
-        return bound is None or all(flow is None or bound < flow for flow in leak_flows)
+    def excludes(self, leak_lpm: float | None) -> bool:
+        """Return True if a leak of this flow [L/min] is above `bound_lpm`, or if one of both is not known."""
+        return self.bound_lpm is None or leak_lpm is None or self.bound_lpm < leak_lpm
 
     @property
     def decides(self) -> bool:
@@ -123,14 +121,16 @@ class RecordingVerdict:
     def is_rare(self, false_alarms_per_1000_h: float, earlier: RecordingVerdict | None, *, is_stream: bool) -> bool:
         """Return True if leak-free recordings get such a verdict so rarely that it may raise an alarm.
 
-        The probability of this verdict, and of that on the `earlier` recording if that was `leak`, too, must not exceed
-        `false_alarms_per_1000_h` times the length of the recording in units of 1000 h, or `STREAM_SHARE` of that for a
-        stream (`is_stream`), whose detector raises alarms, too. `chance` counts as at least `rarest` of `priors.toml`,
-        the smallest probability that can be known, and so does the limit for files, which are fewer than recordings of
-        a stream. A `chance` of None is rare.
+        A recording of a stream (`is_stream`) needs an `earlier` one that was `leak`, too, as the far tail of a
+        probability is poorly known. The probability of both verdicts, or of the only one, must not exceed
+        `false_alarms_per_1000_h` times the length of the recording in units of 1000 h. `chance` counts as at least
+        `rarest` of `priors.toml`, the smallest probability that can be known; the limit for a file is at least that,
+        too. A `chance` of None is rare.
         """
+        if is_stream and (earlier is None or not earlier.leaks):
+            return False
         allowed_chance = false_alarms_per_1000_h * (self.end_s - self.start_s) / 3.6e6  # [s] in 1000 h
-        allowed_chance = STREAM_SHARE * allowed_chance if is_stream else max(_FALSE_ALARM.rarest, allowed_chance)
+        allowed_chance = allowed_chance if is_stream else max(_FALSE_ALARM.rarest, allowed_chance)
         verdicts = [self] if earlier is None or not earlier.leaks else [self, earlier]
         chances = [max(_FALSE_ALARM.rarest, verdict.chance) for verdict in verdicts if verdict.chance is not None]
         return self.chance is None or math.prod(chances) <= allowed_chance * (1.0 + 1e-9)  # rounding
@@ -178,3 +178,18 @@ def judge_recording(
     times = recording.t[np.isfinite(recording.t)]
     start_s, end_s = (float(times[0]), float(times[-1])) if times.size else (0.0, 0.0)
     return RecordingVerdict.from_diagnosis(diagnosis, start_s + shift, end_s + shift, shift)
+
+
+def judge_stream(rig: str, recording: Recording, *, limit_lpm: float | None = None) -> RecordingVerdict | None:
+    """Judge a recording of an actuator's stream by its machine's healthy recordings; `rig`: the machine's file.
+
+    `limit_lpm` [L/min]: leak that calls for a repair, None for the limit in the machine's file. Returns None if that
+    file has no healthy recordings; raises InputError if it cannot be read.
+    """
+    watched = load_watched(rig)  # read anew, as the file may have changed
+    if watched.machine is None:
+        return None
+    start, end = (float(recording.t[k]) for k in (0, -1))
+    name = f"stream from {clock_text(start)} to {clock_text(end)}"
+    limit_lpm = None if limit_lpm == watched.limit_lpm else limit_lpm
+    return judge_recording(watched.machine, replace(recording, t=recording.t - start), name, start, limit_lpm=limit_lpm)

@@ -6,24 +6,16 @@ comparison with healthy recordings. So the monitor also judges the last minutes 
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from hashlib import blake2b
 from typing import Any
 
 import numpy as np
 
-from sealscope.diagnosis.commissioned.watched import load_watched
-from sealscope.monitor.settings import ActuatorSettings
 from sealscope.monitor.sources.source_block import count_bytes
-from sealscope.monitor.supervisor import describe_error
-from sealscope.monitor.verdicts import RecordingVerdict, judge_recording
-from sealscope.recordings.formats.timebase import clock_text
 from sealscope.recordings.recording import Recording
 from sealscope.storage.plain_state import restore_attributes, save_attributes
-
-_log = logging.getLogger(__name__)
 
 #: Longest gap within a recording [s]. A file may have such gaps, too.
 _MAX_GAP_S = 10.0
@@ -31,6 +23,7 @@ _MAX_GAP_S = 10.0
 _MIN_DURATION_S = 60.0
 #: Largest recording [bytes]: 180 s of eight channels at 2.5 kHz.
 _MAX_BYTES = 32_000_000
+_SAVED = ("first", "follows", "has_dropped")
 
 
 @dataclass
@@ -47,12 +40,15 @@ class StreamRecorder:
         Running number of the first collected block, 0 if none is collected.
     follows : bool
         True if the collected blocks follow a recording that ended at its full length.
+    has_dropped : bool
+        True if the last recording was dropped because it was too short.
     """
 
     actuator: str
     duration_s: float
     first: int = 0
     follows: bool = False
+    has_dropped: bool = False
     blocks: list[Recording] = field(default_factory=list)
 
     def take(self, number: int, samples: Recording) -> Recording | None:
@@ -80,8 +76,8 @@ class StreamRecorder:
         """
         blocks, duration = self.blocks, self._duration()
         self.clear()
-        self.follows = follows
-        if duration < _MIN_DURATION_S:
+        self.follows, self.has_dropped = follows, duration < _MIN_DURATION_S
+        if self.has_dropped:
             return None
         first = blocks[0]
         channels = {name: np.concatenate([block[name] for block in blocks]) for name in first.channels}
@@ -102,36 +98,17 @@ class StreamRecorder:
         self.first, self.follows, self.blocks = 0, False, []
 
     def state(self) -> dict[str, Any]:
-        """Return what the collected blocks do not tell as plain values; `refill` returns the blocks themselves."""
-        return save_attributes(self, ("first", "follows"))
+        """Return all attributes but the blocks as plain values; `refill` restores the blocks."""
+        return save_attributes(self, _SAVED)
 
     def load_state(self, state: Mapping[str, Any]) -> None:
         """Restore the values that `state` saved."""
-        restore_attributes(self, ("first", "follows"), state)
+        restore_attributes(self, _SAVED, state)
 
     def refill(self, number: int, samples: Recording) -> None:
         """Collect a stored block again after `load_state`, if it belongs to the present recording."""
         if 0 < self.first <= number and len(samples):
             self.blocks.append(samples)
-
-
-def judge_stream(settings: ActuatorSettings, recording: Recording) -> RecordingVerdict | None:
-    """Judge a recording of an actuator's stream by its machine's healthy recordings.
-
-    Returns None, and logs why, if the machine's file cannot be read or the recording cannot be judged.
-    """
-    start = float(recording.t[0])
-    name = f"stream from {clock_text(start)} to {clock_text(float(recording.t[-1]))}"
-    try:
-        watched = load_watched(settings.rig)  # read anew, as the file may have changed
-        if watched.machine is None:
-            return None
-        limit_lpm = None if settings.error_lpm == watched.limit_lpm else settings.error_lpm
-        relative = replace(recording, t=recording.t - start)
-        return judge_recording(watched.machine, relative, name, start, limit_lpm=limit_lpm)
-    except Exception as error:
-        _log.warning("%s: the %s is not judged as a whole: %s", settings.name, name, describe_error(error))
-        return None
 
 
 def _continues(earlier: Recording, samples: Recording) -> bool:
