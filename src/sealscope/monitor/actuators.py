@@ -134,6 +134,8 @@ class _Actuator:
         earlier_verdict, self.verdict = self.verdict, verdict
         is_stream, alarm = self.recorder is not None, self.judge.alarm
         self.is_undecided = verdict is None or not verdict.decides
+        if is_stream and verdict is not None:
+            self.judge.add_evidence(verdict)
         if verdict is None or not verdict.decides:
             if is_stream and self.last is not None:  # the blocks of the stream tell more
                 self.verdict = None

@@ -28,6 +28,8 @@ DIAGNOSTIC_NUMBERS: dict[Level, int] = {"warning": 4101, "error": 4102}
 _CONDITIONS: dict[Level, str] = {"warning": "leak", "error": "leak over the limit"}
 #: Bits of the status word.
 WARNING_BIT, ERROR_BIT, NEW_BIT = 1, 2, 4
+#: Largest evidence that is stored, beyond that of any threshold.
+_MAX_EVIDENCE = 1e15
 #: Marks that a person may give an alarm.
 MARKS = ("acknowledged", "comment", "shelved", *JUDGEMENTS)
 
@@ -104,7 +106,8 @@ class AlarmJudge:
 
     `alarm`: the open alarm, None if there is none; `raised`: number of alarms so far; `above`, `error`, `below`:
     numbers of successive blocks above the thresholds of a warning and of an error, and below the threshold at which the
-    alarm ends; `over_s` [s]: time at which the last alarm ended (`Alarm.active`), or changed after its end.
+    alarm ends; `over_s` [s]: time at which the last alarm ended (`Alarm.active`), or changed after its end; `evidence`:
+    evidence of a leak from the recordings of a stream, 0 without any.
     """
 
     actuator: str
@@ -114,6 +117,7 @@ class AlarmJudge:
     error: int = 0
     below: int = 0
     over_s: float | None = None
+    evidence: float = 0.0
 
     def update(
         self, estimate: BlockEstimate, leak: WatchedLeak | None, baseline: int, settings: WatchSettings
@@ -193,6 +197,14 @@ class AlarmJudge:
         self.alarm = Alarm(alarm_id, self.actuator, state="new", shelved_until_s=shelved_until_s, **findings)
         return self.alarm
 
+    def add_evidence(self, verdict: RecordingVerdict) -> None:
+        """Add the verdict on a recording of a stream to the `evidence` M of a leak: M <- (1 + M) e, with its e-value e.
+
+        M sums the products of e-values since each recording (Shiryaev-Roberts; J. Shin, A. Ramdas, A. Rinaldo, arXiv
+        2203.03532). Without a leak it exceeds 1/alpha at most once in 1/alpha recordings on average.
+        """
+        self.evidence = min((1.0 + self.evidence) * verdict.e_value, _MAX_EVIDENCE)
+
     def update_from_verdict(
         self,
         verdict: RecordingVerdict,
@@ -204,10 +216,11 @@ class AlarmJudge:
     ) -> tuple[Alarm, str] | None:
         """Update the alarm with the verdict on a whole recording; return the alarm and the name of the event.
 
-        A leak at or above the warning threshold raises an alarm if leak-free recordings get this verdict, together with
-        that on the `earlier` recording (None for none), seldom enough for the allowed rate of false alarms. The verdict
-        `no leak`, or a leak below the warning threshold, ends the alarm. `baseline`: version of the healthy baseline;
-        `settings`: thresholds and the allowed rate; `is_stream`: True for recordings of a stream. The event is
+        A leak at or above the warning threshold raises an alarm if the verdict on the `earlier` recording (None for
+        none) was `leak`, too, or if leak-free recordings get such a verdict seldom enough for the allowed rate of false
+        alarms; of a stream (`is_stream`), if the `evidence` of its recordings is enough. The verdict `no leak`, or a
+        leak below the warning threshold, ends the alarm. `baseline`: version of the healthy baseline; `settings`:
+        thresholds and the allowed rate. The event is
         "raised", "error" or "warning" (a change of the level), "returned" (the leak has ended), or "" for none of
         these. Returns None for the verdict `cannot tell`, or if no alarm was active and none is raised.
         """
@@ -218,7 +231,7 @@ class AlarmJudge:
             if alarm is None or not is_active or not (verdict.clears or verdict.leaks):
                 return None
             end_state: AlarmState = "new" if alarm.state == "new" else "closed"
-            end_s = verdict.end_s
+            end_s, self.evidence = verdict.end_s, 0.0
             return self._set_alarm(replace(alarm, state=end_state, returned_s=end_s, updated_s=end_s)), "returned"
         level: Level = "error" if verdict.state["condition"] == _CONDITIONS["error"] else "warning"
         findings: dict[str, Any] = {
@@ -228,14 +241,21 @@ class AlarmJudge:
             "leak_interval_lpm": verdict.leak_interval_lpm,
             "evidence": f"{verdict.file}: {verdict.reason}",
             "next_check": verdict.state["action"],
-            "by_chance_per_1000_h": verdict.by_chance_per_1000_h,
+            "by_chance_per_1000_h": 1.0 / (verdict.allowed_chance(1.0) * self.evidence)
+            if is_stream
+            else verdict.by_chance_per_1000_h,
         }
         if alarm is not None and is_active:
             # a person must acknowledge the higher level again, unless the leak is confirmed
             is_worse = level == "error" and alarm.level == "warning"
             state: AlarmState = "new" if is_worse and alarm.state != "valid" else alarm.state
             return self._set_alarm(replace(alarm, **findings, state=state)), "" if level == alarm.level else level
-        if not verdict.is_rare(settings.false_alarms_per_1000_h, earlier, is_stream=is_stream):
+        if is_stream:
+            is_enough = self.evidence * verdict.allowed_chance(settings.false_alarms_per_1000_h) >= 1.0
+        else:
+            is_repeated = earlier is not None and earlier.leaks
+            is_enough = is_repeated or verdict.is_rare(settings.false_alarms_per_1000_h)
+        if not is_enough:
             return None
         onset_s = verdict.start_s if verdict.onset_s is None else verdict.onset_s
         # a leak present from the first sample on began after the last recording without a leak
@@ -282,6 +302,8 @@ class AlarmJudge:
             "acknowledged": {"state": open_state if alarm.active else "closed"},
         }
         self.above = self.error = self.below = 0
+        if mark in ("invalid", "repaired"):
+            self.evidence = 0.0
         return self._set_alarm(replace(alarm, updated_s=t, **changes[mark]))
 
     def state(self) -> dict[str, Any]:

@@ -118,22 +118,33 @@ class RecordingVerdict:
         """
         return self.leaks or self.clears or self.mark != ""
 
-    def is_rare(self, false_alarms_per_1000_h: float, earlier: RecordingVerdict | None, *, is_stream: bool) -> bool:
-        """Return True if leak-free recordings get such a verdict so rarely that it may raise an alarm.
+    def allowed_chance(self, false_alarms_per_1000_h: float) -> float:
+        """Compute the probability of a false alarm per recording of this length that this rate allows."""
+        return false_alarms_per_1000_h * (self.end_s - self.start_s) / 3.6e6  # [s] in 1000 h
 
-        A recording of a stream (`is_stream`) needs an `earlier` one that was `leak`, too, as the far tail of a
-        probability is poorly known. The probability of both verdicts, or of the only one, must not exceed
-        `false_alarms_per_1000_h` times the length of the recording in units of 1000 h. `chance` counts as at least
-        `rarest` of `priors.toml`, the smallest probability that can be known; the limit for a file is at least that,
-        too. A `chance` of None is rare.
+    def is_rare(self, false_alarms_per_1000_h: float) -> bool:
+        """Return True if leak-free recordings get such a verdict so rarely that it may raise an alarm by itself.
+
+        `chance`, unless it is None, must not exceed the `allowed_chance`, or `rarest` of `priors.toml`, the smallest
+        probability that can be known, if that is larger.
         """
-        if is_stream and (earlier is None or not earlier.leaks):
-            return False
-        allowed_chance = false_alarms_per_1000_h * (self.end_s - self.start_s) / 3.6e6  # [s] in 1000 h
-        allowed_chance = allowed_chance if is_stream else max(_FALSE_ALARM.rarest, allowed_chance)
-        verdicts = [self] if earlier is None or not earlier.leaks else [self, earlier]
-        chances = [max(_FALSE_ALARM.rarest, verdict.chance) for verdict in verdicts if verdict.chance is not None]
-        return self.chance is None or math.prod(chances) <= allowed_chance * (1.0 + 1e-9)  # rounding
+        allowed_chance = self.allowed_chance(false_alarms_per_1000_h)
+        return self.chance is None or self.chance <= max(_FALSE_ALARM.rarest, allowed_chance)
+
+    @property
+    def e_value(self) -> float:
+        """Evidence of a leak whose mean over leak-free recordings is at most 1; multiplied over recordings.
+
+        With p = `chance` of a leak, at least `rarest` of `priors.toml`, it is (1 - p + p ln p)/(p (ln p)^2), the mean
+        of kappa p^(kappa - 1) over kappa from 0 to 1 (V. Vovk, R. Wang, Ann. Statist. 49 (2021) 1736). Without a leak p
+        is 1, which gives 1/2; for the verdict `cannot tell` and for an unknown p it is 1.
+        """
+        if self.clears:
+            return 0.5
+        if not self.leaks or self.chance is None:
+            return 1.0
+        p = min(max(_FALSE_ALARM.rarest, self.chance), 0.99)  # 0.99: where both terms of the fraction are not yet 0
+        return (1.0 - p + p * math.log(p)) / (p * math.log(p) ** 2)
 
     @property
     def by_chance_per_1000_h(self) -> float | None:
