@@ -10,6 +10,7 @@ import pytest
 from sealscope.diagnosis.live.balance import BLOCK_SECONDS, BlockConductance, LiveBalance
 from sealscope.diagnosis.live.explanation import UNKNOWN
 from sealscope.diagnosis.live.joining import SampleRun
+from sealscope.diagnosis.live.null import WINDOW, StepNull
 from sealscope.diagnosis.live.sequential import StepDetector
 from sealscope.diagnosis.live.watch import Watch
 from sealscope.diagnosis.verdict.evidence import RAREST
@@ -117,6 +118,65 @@ def test_a_step_of_ten_deviations_is_found_at_once(q: float):
         values = walk(random, 160, q)
         values[120:] += 12.0
         assert run_length(values, np.log(1e6)) in (120, 121, 122)
+
+
+def highest(values: np.ndarray, window: int) -> list[float]:
+    """The largest log M of the detector in each window of values."""
+    detector, evidence = StepDetector(), []
+    for k, value in enumerate(values):
+        detector.take(3.0 * k, 3.0 * k + 3.0, value, 1.0)
+        evidence.append(detector.log_e())
+    return [max(evidence[k : k + window]) for k in range(0, len(evidence) - window + 1, window)]
+
+
+def starts(random: np.random.Generator, count: int) -> np.ndarray:
+    """A conductance that stands out by 28 deviations in each fourteenth block, as a clamp's after its rest."""
+    values = walk(random, count, 0.0)
+    values[7::14] += 28.0
+    return values
+
+
+def test_what_a_healthy_machine_shows_is_no_step():
+    """The start of each cycle gave alarms after two cycles; learned over half an hour, it gives none."""
+    random, null, probability = np.random.default_rng(8), StepNull(), 1e-6
+    assert null.log_threshold(probability) == pytest.approx(-np.log(probability))
+    for evidence in highest(starts(random, 600), WINDOW):
+        null.add_window(evidence)
+    assert max(highest(starts(random, 4000), WINDOW)) < null.log_threshold(probability)
+
+
+def test_a_random_walk_leaves_the_threshold_as_it_is():
+    random, null = np.random.default_rng(9), StepNull()
+    for evidence in highest(walk(random, 1200, 0.1), WINDOW):
+        null.add_window(evidence)
+    for probability in (1e-4, 1e-6):
+        assert null.log_threshold(probability) == pytest.approx(-np.log(probability), abs=0.5)
+
+
+def test_windows_are_counted_block_by_block_and_restored():
+    null, random = StepNull(), np.random.default_rng(10)
+    evidence = random.exponential(6.0, 10 * WINDOW + 7)
+    for k, value in enumerate(evidence):
+        if k == 5 * WINDOW + 3:
+            restored = StepNull()
+            restored.load_state(json.loads(json.dumps(null.state())))
+            null = restored
+        null.add(value)
+    at_once = StepNull()
+    for k in range(10):
+        at_once.add_window(evidence[k * WINDOW : (k + 1) * WINDOW].max())
+    assert null.log_threshold(1e-6) == at_once.log_threshold(1e-6) > -np.log(1e-6)
+
+
+@pytest.mark.slow
+def test_a_step_that_was_no_leak_raises_the_threshold():
+    watch = Watch(RIG, 1000.0, 1000.0)
+    watch.update(WORN)
+    before = watch._null.state()["count"]
+    watch.dismiss()
+    assert watch._null.state()["count"] == before + 1
+    watch.relearn()
+    assert watch._null.state()["count"] == 0
 
 
 def test_a_step_has_its_size_and_its_onset_within_their_intervals():

@@ -208,7 +208,7 @@ def test_an_alarm_of_a_stream_needs_several_recordings():
     assert alarms_of(AlarmJudge("press"), [sure, unknown, sure, sure]) == [4]
     assert alarms_of(AlarmJudge("press"), [sure, cleared, sure]) == []
     assert alarms_of(AlarmJudge("press"), [likely] * 8) == [7]
-    assert alarms_of(AlarmJudge("press"), [likely, cleared] * 50) == []
+    assert alarms_of(AlarmJudge("press"), [likely, cleared, cleared, cleared] * 50) == []
     assert alarms_of(AlarmJudge("press"), [sure, sure], rate=20.0) == [2]
 
 

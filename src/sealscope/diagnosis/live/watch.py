@@ -31,6 +31,7 @@ from sealscope.diagnosis.live.estimates import (
 )
 from sealscope.diagnosis.live.explanation import OUTSIDE, UNKNOWN, RiseExplanation, explain_rise
 from sealscope.diagnosis.live.joining import SampleJoiner, ways_to_watch
+from sealscope.diagnosis.live.null import StepNull
 from sealscope.diagnosis.live.pressures import PressureEstimator
 from sealscope.diagnosis.live.rise import LEVEL, STEP, LiveLeak, LiveRise, decide_on_stream
 from sealscope.diagnosis.live.sequential import RECENT, StepDetector
@@ -48,7 +49,7 @@ if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
 #: Version of the format of the saved state.
-STATE_VERSION = 16
+STATE_VERSION = 17
 _PRIORS, _EXPLANATION = LIVE.watch, LIVE.explanation
 #: Type of a stored block, with the fields of `BlockConductance`.
 _BLOCK = np.dtype([(name, float) for name in BlockConductance._fields])
@@ -117,7 +118,7 @@ class Watch:
         self.baseline: WatchBaseline | None = None
         self.leak: WatchedLeak | None = None
         self.blocks, self.baseline_version = 0, 1
-        self._learning, self._detector = BaselineLearning(), StepDetector()
+        self._learning, self._detector, self._null = BaselineLearning(), StepDetector(), StepNull()
         self._compared = np.empty(0, _BLOCK)  # the last blocks with which the next is compared, at most `RECENT`
         self._grouped = 0  # number of these that await the test of their mean
         self._is_known = True  # True if the last block's duty (pressure and flow) was in the baseline's range
@@ -271,9 +272,15 @@ class Watch:
         if self._estimator is not None:
             self._estimator.relearn()
         self.dismiss()
+        self._null = StepNull()
 
     def dismiss(self) -> None:
-        """Withdraw the alarm and the level of healthy recordings; restart the tests, but keep the learned baseline."""
+        """Withdraw the alarm and the level of healthy recordings; restart the tests, but keep the learned baseline.
+
+        A step that was no leak raises the threshold of later steps (`null`).
+        """
+        if self.leak is not None and self.leak.test == STEP:
+            self._null.add_window(0.5 * self.leak.score)
         self.leak = self.healthy = None
         self._forget()
 
@@ -365,15 +372,21 @@ class Watch:
         leak = self.leak
         if leak is not None and (leak.test != STEP or block.end - leak.raised_s > RECENT * self.block_seconds):
             return False
-        log_threshold = -math.log(self._false_alarm_probability(STEP, block.end - block.begin))
+        log_threshold = self._null.log_threshold(self._false_alarm_probability(STEP, block.end - block.begin))
         min_log_e = log_threshold if leak is None else 0.5 * leak.score  # a score is twice the log e-value
-        if not self._detector.log_e(min_log_e) > min_log_e:
+        is_learning = leak is None and self.baseline is None
+        log_e = self._detector.log_e(-math.inf if is_learning else min_log_e)
+        if not log_e > min_log_e:
+            if is_learning:
+                self._null.add(log_e)
             return False
         rise = self._detector.rise()
         cause = None if leak is None else leak.cause
         if leak is None:
             explanation = self._explain(estimator, rise, block)
             if not explanation.is_leak:
+                if is_learning and explanation == UNKNOWN and len(self._compared):  # the tests did not restart
+                    self._null.add(log_e)
                 return True
             cause = OUTSIDE if explanation.is_outside else None
         reason = f"the leakage conductance rises at {clock_text(rise.interval.value)} beyond its random walk"
@@ -409,7 +422,8 @@ class Watch:
     def _test_level(self, estimator: Estimator, block: BlockConductance) -> None:
         """Test the mean conductance of the last `GROUP` blocks, up to `block`, and raise the alarm if it is too high.
 
-        It is compared with the baseline or, before there is one, with healthy recordings if `estimator` states levels.
+        The blocks are weighted by their precisions. The mean is compared with the baseline or, before there is one,
+        with healthy recordings if `estimator` states levels.
         """
         has_baseline = self.baseline is not None
         healthy: HealthyLevel | None = self.baseline if has_baseline or not estimator.states_level else self.healthy
@@ -418,14 +432,15 @@ class Watch:
         blocks = self._compared[-GROUP:]
         first_s = float(self._compared["end"][0])
         max_ratio = INFERENCE.oil.warmest
-        offset = float(blocks["offset"].mean())
-        sd = math.sqrt(float(np.sum(blocks["sd"] ** 2))) / GROUP
+        weights = blocks["sd"] ** -2.0 / np.sum(blocks["sd"] ** -2.0)  # a block that shows little counts little
+        g, total, offset = (float(weights @ blocks[name]) for name in ("g", "total", "offset"))
+        sd = float(np.sum(blocks["sd"] ** -2.0)) ** -0.5
         if has_baseline:
-            name, mean, onset_s = "baseline", float(blocks["g"].mean()), float(blocks["end"].mean())
+            name, mean, onset_s = "baseline", g, float(blocks["end"].mean())
             # the mean is compared with `max_ratio` times the baseline, and both contain the same error `offset`
             deviation = math.hypot(sd, offset * (max_ratio - 1.0))
         else:
-            name, mean, onset_s = "healthy recordings", float(blocks["total"].mean()), first_s
+            name, mean, onset_s = "healthy recordings", total, first_s
             deviation = math.hypot(sd, offset)
         # the leak began after the machine was known to be healthy, if that time is on the clock of the blocks
         has_same_clock = has_baseline or counts_from_1970(block.end)
@@ -560,7 +575,7 @@ class Watch:
 
 #: Attributes saved in addition to rig, litres and estimator; below, the types of those that may be None.
 _SAVED = (
-    *("false_alarms_per_1000_h", "learn_hours", "blocks", "baseline_version", "_samples", "_detector"),
+    *("false_alarms_per_1000_h", "learn_hours", "blocks", "baseline_version", "_samples", "_detector", "_null"),
     *("_learning", "baseline", "leak", "healthy", "_compared", "_grouped", "_since", "_is_known"),
 )
 _SAVED_TYPES = {"baseline": WatchBaseline, "leak": WatchedLeak, "healthy": HealthyLevel}

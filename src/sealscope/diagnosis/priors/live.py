@@ -43,6 +43,7 @@ class StepPriors(PriorTable):
     recent: int  # [blocks] age up to which all possible onsets are kept; of older ones only some are
     horizon: int  # [blocks] largest age of an onset
     stated: float  # [blocks] number whose observed variance weighs as much as the variance that an estimate states
+    windows: int  # number of windows of blocks from which on they raise the threshold of the evidence
 
 
 class WatchPriors(PriorTable):

@@ -1,0 +1,75 @@
+"""How high the evidence of a step rises in a healthy machine, by which the threshold of the alarm is set.
+
+The detector of steps (`sequential`) assumes that a healthy conductance follows a random walk. Starts after a rest, oil
+that warms and other duties depart from it, and raise the evidence M of a step. While the baseline is learned, the
+largest M of each `WINDOW` blocks is therefore stored, as the statistics of healthy recordings are, and the same
+posterior of an inflation (`decision.null`) turns them into the chance that M rises as high once more.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from typing import Any
+
+from sealscope.diagnosis.decision.null import HealthyNull
+from sealscope.diagnosis.priors.live import LIVE
+from sealscope.storage.plain_state import restore_attributes, save_attributes
+
+#: Number of blocks in a window.
+WINDOW: int = LIVE.explanation.window
+_MIN_WINDOWS: int = LIVE.step.windows
+_LOG_WINDOW = math.log(WINDOW)
+_STEP = "step"
+_SAVED = ("_count", "_surprisal", "_highest", "_blocks")
+
+
+class StepNull:
+    """Largest evidence of a step in each window of a healthy machine, and the threshold of the alarm that follows.
+
+    In a window, P(max M > A) <= `WINDOW` / A if the random walk is right, so that the surprisal of a window is
+    u = log max M - log `WINDOW`, or 0 if that is negative.
+    """
+
+    def __init__(self) -> None:
+        self._count, self._surprisal = 0, 0.0  # number of windows, and sum of their surprisals
+        self._highest, self._blocks = 0.0, 0  # largest log M and number of blocks in the present window
+
+    def add(self, log_e: float) -> None:
+        """Add the evidence log M after a block of a healthy machine."""
+        self._highest = max(self._highest, log_e)
+        self._blocks += 1
+        if self._blocks == WINDOW:
+            self.add_window(self._highest)
+            self._highest, self._blocks = 0.0, 0
+
+    def add_window(self, log_e: float) -> None:
+        """Add a window whose largest evidence was log M, such as that of an alarm that was withdrawn."""
+        self._count += 1
+        self._surprisal += max(log_e - _LOG_WINDOW, 0.0)
+
+    def log_threshold(self, probability: float) -> float:
+        """Compute the threshold of log M for a false-alarm `probability` per block.
+
+        A window has `WINDOW` times this probability. The threshold is -log(probability) for fewer than `_MIN_WINDOWS`
+        windows, and at least that for more.
+        """
+        return _find_threshold(self._count, self._surprisal, probability)
+
+    def state(self) -> dict[str, Any]:
+        """Return the sums over windows as plain values for JSON, which `load_state` restores."""
+        return save_attributes(self, _SAVED)
+
+    def load_state(self, state: Any) -> None:
+        """Restore the sums that `state` returned; raise InputError if they are not valid."""
+        restore_attributes(self, _SAVED, state)
+
+
+@lru_cache(maxsize=1024)
+def _find_threshold(count: int, surprisal: float, probability: float) -> float:
+    """Compute the threshold of log M from the number of windows and the sum of their surprisals (`log_threshold`)."""
+    if count < _MIN_WINDOWS:
+        return -math.log(probability)
+    null = HealthyNull({_STEP: [surprisal / count] * count})
+    chance = null.uncalibrated_chance(_STEP, min(WINDOW * probability, 0.5))
+    return max(_LOG_WINDOW - math.log(chance), -math.log(probability))
