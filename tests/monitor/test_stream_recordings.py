@@ -14,6 +14,7 @@ from sealscope.diagnosis.verdict.states import state_of
 from sealscope.monitor.alarms import AlarmJudge
 from sealscope.monitor.service import Service
 from sealscope.monitor.settings import WatchSettings, read_settings
+from sealscope.monitor.sources.source_block import decode_message
 from sealscope.monitor.sources.stream_recordings import StreamRecorder
 from sealscope.monitor.verdicts import RecordingVerdict
 from sealscope.recordings.recording import Recording
@@ -27,12 +28,12 @@ APRIL = 1.775e9
 FULL_S = 60.0
 
 
-def settings_of(folder: Path, machine_file: Path, more: str = ""):
+def settings_of(folder: Path, machine_file: Path, more: str = "", recording_s: float = FULL_S):
     """Settings of one machine whose samples come as lines, in recordings of a minute."""
     file = folder / "watch.toml"
     file.write_text(
         f'database = "monitor.db"\nlines = true\n[[actuator]]\nname = "press"\nmachine = "{machine_file}"\n'
-        f"recording_s = {FULL_S}\nfalse_alarms_per_1000_h = 20.0\n{more}",
+        f"recording_s = {recording_s}\nfalse_alarms_per_1000_h = 20.0\n{more}",
         encoding="utf-8",
     )
     return read_settings(file)
@@ -240,3 +241,15 @@ def test_the_length_of_a_recording_is_none_or_a_minute_to_ten(commissioned, tmp_
     for seconds in ("30", "601", "nan"):
         with refusal("recording_s", seconds):
             settings_of(tmp_path, commissioned, f"[defaults]\nrecording_s = {seconds}\n")
+
+
+def test_a_boom_without_a_pump_is_watched_by_its_recordings(commissioned, tmp_path):
+    """No balance of blocks has a flow meter; the recordings of a stream have."""
+    nodes = ", ".join(f'{name} = "ns=2;s={name}"' for name in ("p_A", "p_B", "x", "q_pump"))
+    opcua = '[opcua]\nurl = "opc.tcp://localhost:4840"\n'
+    (actuator,) = settings_of(tmp_path, commissioned, f"rate = 100.0\nnodes = {{ {nodes} }}\n{opcua}").actuator
+    assert "q_pump" in actuator.nodes
+    with refusal("nodes", "theta"):
+        settings_of(tmp_path, commissioned, f"rate = 100.0\nnodes = {{ {nodes} }}\n{opcua}", recording_s=0.0)
+    block = decode_message(b'{"t": 0.0, "rate": 10.0, "p_A": [1, 2], "p_B": [1, 2], "q_pump": [0, 0]}', "press")
+    assert block.samples is not None and "q_pump" in block.samples

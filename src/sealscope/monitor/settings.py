@@ -302,10 +302,13 @@ def _check_channels(actuator: ActuatorSettings, *, has_opcua: bool) -> None:
         to_si(0.0, unit, CHANNEL_UNITS[channel], name=f"units.{channel}", place=actuator.name)
     if actuator.units and actuator.folder is not None:
         raise ValueError(f"units of files stand in their headings, got units of {actuator.name!r}, a folder")
-    # the sets of channels that suffice to watch the actuator
-    ways = ways_to_watch(load_watched(actuator.rig).rig) if actuator.nodes else ()
-    if actuator.nodes and not any(actuator.nodes.keys() >= {*way} for way in ways):
-        raise ValueError(f"nodes of {actuator.name!r} must give {format_ways(ways)}, got {', '.join(actuator.nodes)}")
+    if not actuator.nodes:
+        return
+    watched, nodes = load_watched(actuator.rig), actuator.nodes.keys()
+    is_recorded = watched.machine is not None and actuator.recording_s > 0.0  # its recordings may need other channels
+    ways = ways_to_watch(watched.rig)  # the sets of channels that suffice to watch the actuator by blocks
+    if not (is_recorded and nodes >= {"p_A", "p_B"}) and not any(nodes >= {*way} for way in ways):
+        raise ValueError(f"nodes of {actuator.name!r} must give {format_ways(ways)}, got {', '.join(nodes)}")
 
 
 def _column_unit(channel: str, column: str) -> str | None:

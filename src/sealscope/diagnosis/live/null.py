@@ -1,4 +1,4 @@
-"""How high the evidence of a step rises in a healthy machine, by which the threshold of the alarm is set.
+"""Distribution of the evidence of a step in a healthy machine, by which the threshold of the alarm is set.
 
 The detector of steps (`sequential`) assumes that a healthy conductance follows a random walk. Starts after a rest, oil
 that warms and other duties depart from it, and raise the evidence M of a step. While the baseline is learned, the

@@ -1,7 +1,7 @@
-"""Cut the samples of a running actuator into recordings, which are judged as whole as the files of a folder are.
+"""Cut the samples of a running actuator into recordings, to be judged like the files of a folder.
 
-A test of single blocks of some seconds cannot use what only minutes show, such as holds, other laws of the leak, or the
-comparison with healthy recordings. So the monitor also judges the last minutes of a commissioned machine's stream.
+Holds, the law of a leak, and the comparison with healthy recordings show in minutes, not in single blocks of some
+seconds. So the monitor also judges the last minutes of a commissioned machine's stream.
 """
 
 from __future__ import annotations
