@@ -44,7 +44,7 @@ class StepNull:
             self._highest, self._blocks = 0.0, 0
 
     def add_window(self, log_e: float) -> None:
-        """Add a window whose largest evidence was log M, such as that of an alarm that was withdrawn."""
+        """Add a window with the largest evidence log M, such as the window of an alarm that was withdrawn."""
         self._count += 1
         self._surprisal += max(log_e - _LOG_WINDOW, 0.0)
 

@@ -98,7 +98,7 @@ class StreamRecorder:
         self.first, self.follows, self.blocks = 0, False, []
 
     def state(self) -> dict[str, Any]:
-        """Return all attributes but the blocks as plain values; `refill` restores the blocks."""
+        """Return all attributes but the blocks as plain values."""
         return save_attributes(self, _SAVED)
 
     def load_state(self, state: Mapping[str, Any]) -> None:
