@@ -98,7 +98,7 @@ class StreamRecorder:
         self.first, self.follows, self.blocks = 0, False, []
 
     def state(self) -> dict[str, Any]:
-        """Return all attributes but the blocks as plain values."""
+        """Convert the attributes, without the blocks, to plain values."""
         return save_attributes(self, _SAVED)
 
     def load_state(self, state: Mapping[str, Any]) -> None:
