@@ -37,8 +37,8 @@ BEFORE = 1.0
 #: Number of simulated holds with a leak, and of bisections of the leak's conductance.
 _N_DRAWS, _N_BISECTIONS = 5, 8
 #: Smallest and largest leak that are tried, given as the natural logarithm of the factor by which p_A - p_B falls in
-#: the hold. It is the leak's conductance times `_decay_per_conductance` times the duration.
-_TRIED_LOSSES = (1e-4, 10.0)
+#: the hold. It is the leak's conductance times `_decay_rate_per_conductance` times the duration.
+_TRIED_DECAYS = (1e-4, 10.0)
 
 
 class PlannedHold(NamedTuple):
@@ -153,10 +153,11 @@ class _HoldDraws:
     def with_smallest_leak(self) -> PlannedHold:
         """Find by bisection the smallest leak that the hold detects; return the hold with the leak's conductance.
 
-        The conductance is inf if even the largest leak that is tried (`_TRIED_LOSSES`) is not detected.
+        If even the largest leak that is tried (`_TRIED_DECAYS`) is not detected, the hold is returned with the
+        conductance inf.
         """
-        loss_per_conductance = _decay_per_conductance(self._rig) * self._hold.duration
-        low, high = np.log(np.array(_TRIED_LOSSES) / loss_per_conductance)  # logarithms of conductances
+        decay_per_conductance = _decay_rate_per_conductance(self._rig) * self._hold.duration
+        low, high = np.log(np.array(_TRIED_DECAYS) / decay_per_conductance)  # logarithms of conductances
         if not self.detects(float(np.exp(high))):
             return self._hold
         for _ in range(_N_BISECTIONS):
@@ -165,7 +166,7 @@ class _HoldDraws:
         return self._hold._replace(conductance=float(np.exp(high)))
 
 
-def _decay_per_conductance(rig: Rig) -> float:
+def _decay_rate_per_conductance(rig: Rig) -> float:
     """Compute the decay rate of p_A - p_B [1/s] per unit of leak conductance, in Pa/m^3, for a piston at mid-stroke.
 
     It is K (1/V_A + 1/V_B), with the oil's usual bulk modulus K and the chambers' volumes V, dead volume included.
@@ -185,7 +186,7 @@ def draw_hold(rig: Rig, hold: PlannedHold, conductance: float, flow: float, seed
     cylinder, sensors = rig.cylinder, rig.sensors
     t = np.arange(round((BEFORE + hold.duration) * MAX_RATE)) / MAX_RATE
     # p_A - p_B falls exponentially once the valves are shut, at the time `BEFORE`; expm1: exp - 1
-    decay_rate = conductance * _decay_per_conductance(rig)
+    decay_rate = conductance * _decay_rate_per_conductance(rig)
     loss = hold.difference * -np.expm1(-decay_rate * np.maximum(t - BEFORE, 0.0))
     # pressure changes are inverse to the volumes, which at mid-stroke are proportional to the areas
     fraction_A = cylinder.A_B / (cylinder.A_A + cylinder.A_B)

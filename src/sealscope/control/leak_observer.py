@@ -165,7 +165,10 @@ class Balance:
 
 
 def make_observer(balance: Balance, rate: float) -> Any:
-    """Make the initial memory of a leak observer, a record (1,) `OBSERVER`; `rate` [Hz]: sampling rate."""
+    """Make the memory of a leak observer before its first sample, a record (1,) of the type `OBSERVER`.
+
+    `balance`: model of the machine, whose parameters the memory contains; `rate` [Hz]: sampling rate.
+    """
     return make_record(
         OBSERVER,
         balance,

@@ -133,14 +133,17 @@ class SensorChoice(NamedTuple):
 
     @classmethod
     def from_rig(cls, rig: Rig, rate: float) -> SensorChoice:
-        """Choose the settings for a rig at `rate` [Hz]; raise InputError if its balance does not fit `COLUMNS`."""
+        """Choose the settings of a soft sensor for a rig and the sampling rate `rate` [Hz].
+
+        Raises InputError if the terms of the rig's volume balance are not those of `COLUMNS`.
+        """
         (balance,) = live_equations(rig, INPUTS)  # these channels allow one balance only
         columns = ColumnRoles(balance)
         if columns.names != COLUMNS[:-1]:
             raise InputError(f"a soft sensor's terms must be {', '.join(COLUMNS[:-1])}, got {', '.join(columns.names)}")
         fast = columns.fast
         column_order = (*fast, *columns.slow, columns.left)  # left: the response, the balance's left side
-        return cls(rate, size_error(rig), column_order, n_fast=len(fast))
+        return cls(rate, size_error=size_error(rig), column_order=column_order, n_fast=len(fast))
 
 
 def _count_samples(rate: float) -> tuple[int, int, int]:

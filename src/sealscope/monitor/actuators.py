@@ -89,11 +89,11 @@ class _Actuator:
     ) -> tuple[list[BlockEstimate], list[_AlarmEvent]]:
         """Judge new samples; return the leakage estimates of blocks of some seconds, and the changes of the alarm.
 
-        `follows`: False after a gap; `settings`: thresholds of the alarm; `verdict`: verdict on the recording that ends
-        with these samples, None for none. Of a file, that recording is these samples; if its verdict decides
-        (`RecordingVerdict.decides`), the estimates state its leak. Of a stream, it is the last minutes. Only verdicts
-        that decide update the alarm; each estimate does if the last verdict does not decide, or if the last recording
-        of a stream was too short for a verdict.
+        `follows`: False after a gap; `settings`: thresholds of the alarm; `verdict`: on the whole file, or on the last
+        minutes of a stream, None if there is none. A verdict that decides (`RecordingVerdict.decides`) updates the
+        alarm, and for a file replaces the leak in the estimates. Without one, the estimates update the alarm block by
+        block; for a stream, they do if its last verdict does not decide, or if its last recording was too short for a
+        verdict.
         """
         estimates: list[BlockEstimate] = []
         events: list[_AlarmEvent] = []

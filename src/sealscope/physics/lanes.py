@@ -64,6 +64,7 @@ class _LanesModel(models.PrimitiveModel):  # type: ignore[misc]
     """The representation of lanes in machine code: one LLVM vector of numbers."""
 
     def __init__(self, manager: Any, lanes: Any) -> None:
+        """Set the LLVM type for `lanes`, the numba type of a vector of numbers; `manager`: numba's data models."""
         super().__init__(manager, lanes, _vector_type(lanes))
 
 
@@ -72,6 +73,7 @@ class _MaskModel(models.PrimitiveModel):  # type: ignore[misc]
     """The representation of a mask in machine code: one LLVM vector of single bits."""
 
     def __init__(self, manager: Any, mask: Any) -> None:
+        """Set the LLVM type for `mask`, the numba type of a mask; `manager`: numba's data models."""
         super().__init__(manager, mask, ir.VectorType(ir.IntType(1), mask.lanes.width))
 
 
@@ -291,11 +293,16 @@ def _lower_power_of_two(context: Any, builder: Any, arg_types: Any, values: Any)
     return builder.bitcast(builder.shl(exponent, shift), n.type)
 
 
+#: Type of the vector in a row of an array, by the numba type of the array's numbers.
 _LANES_OF_DTYPE = {types.float64: LANES, types.float32: SINGLES}
 
 
 def _row_address(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
-    """Build the LLVM instructions for the address of an array's row; the first two `values` are array and row."""
+    """Build the LLVM instructions for a pointer to one row of an array, as a pointer to a vector of lanes.
+
+    The first two `values` are the array and the index of the row, counted over all axes but the last. The row has as
+    many numbers as the vector, `lanes.width`.
+    """
     data = context.make_array(arg_types[0])(context, builder, values[0]).data
     row = context.cast(builder, values[1], arg_types[1], types.intp)
     lanes = _LANES_OF_DTYPE[arg_types[0].dtype]
@@ -306,8 +313,8 @@ def _row_address(context: Any, builder: Any, arg_types: Any, values: Any) -> Any
 def load(array: Any, row: int) -> Any:
     """Load one row of a C-ordered array as lanes, a vector of numbers, in compiled code that `_lower_load` builds.
 
-    `array`: (..., WIDTH) doubles, or (..., SINGLE_WIDTH) in single precision; `row`: number of the row,
-    counted over all axes but the last.
+    `array`: (..., WIDTH) doubles, or (..., SINGLE_WIDTH) in single precision; `row`: index of the row, counted over
+    all axes but the last.
     """
 
 
@@ -325,7 +332,7 @@ def _lower_load(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
 
 
 def store(array: Any, row: int, value: Any) -> None:
-    """Write lanes to one row of an array, numbered as in `load`, in compiled code that `_lower_store` builds."""
+    """Write lanes to one row of an array, indexed as in `load`, in compiled code that `_lower_store` builds."""
 
 
 def _stored_type(arg_types: Any) -> Any:

@@ -245,7 +245,7 @@ class Experiment:
         return replace(self.command, signal=self._with_duty_changes(self.command.signal))
 
     def _with_duty_changes(self, command: Command) -> Command:
-        """Return the command with the changes of its amplitude and frequency by faults."""
+        """Return the command after each fault has changed its amplitude or frequency."""
         for fault in self.faults:
             command = fault.change_command(command)
         return command

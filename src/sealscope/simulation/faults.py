@@ -280,14 +280,17 @@ class ChangedDuty:
 
 
 def _shut_off_effects(fault: Fault, rig: Rig) -> tuple[Effect, ...]:
-    """Build the changes of a line's flow coefficients by its shut-off valve; raise InputError without throttles."""
+    """Build the changes of the flow coefficients of one line's throttle by the shut-off valve in series with it.
+
+    The throttle has a coefficient for each direction of flow. Raises InputError if the rig's lines have no throttles.
+    """
     from sealscope.physics.restrictors import orifice_coefficient, series_coefficient
     from sealscope.physics.rig import throttle_coefficients
 
     line = rig.line
     if line.orifices == "absent":
         raise InputError(f"a shut-off valve must be in a line (line.orifices = present), got absent ({fault})")
-    c_line = orifice_coefficient(line.C_d, math.pi / 4.0 * line.d_line**2, rig.fluid.rho)  # free line
+    c_line = orifice_coefficient(line.C_d, math.pi / 4.0 * line.d_line**2, rig.fluid.rho)  # line without throttle
     open_coefficients = throttle_coefficients(rig.with_overrides({"line.open_A": 1.0, "line.open_B": 1.0}))
     initial_opening = line.open_A if fault.at == "A" else line.open_B
 
@@ -300,7 +303,7 @@ def _shut_off_effects(fault: Fault, rig: Rig) -> tuple[Effect, ...]:
             opening = initial_opening + (fault.value - initial_opening) * fault.opening.value_at(t)
             return np.asarray(np.where(opening >= 1.0, c_open, series_coefficient(c_open, c_line, opening)) - c_initial)
 
-        max_change = 1e-6 * c_open  # so small that the parameters change with each solver output
+        max_change = 1e-6 * c_open  # so small that the coefficient of a moving valve changes at each solver output
         return Effect(
             name, change, max_change, additive=True, breakpoints=fault.opening.breakpoints(), min_block=_VALVE_BLOCK
         )

@@ -181,9 +181,10 @@ def begin_campaign(folder: Path, row_inputs: Mapping[str, Any]) -> None:
 def _check_same_inputs(
     folder: Path, existing: Mapping[str, Any], row_inputs: Mapping[str, Any], ignored: Collection[str] = ()
 ) -> None:
-    """Check that the head `existing` of a stored campaign has the same inputs as new rows; raise InputError otherwise.
+    """Check that new rows of a campaign have the same inputs as its stored rows; raise InputError otherwise.
 
-    `ignored`: names of the entries that may differ.
+    `existing`: the campaign's head, i.e. the inputs of the stored rows (`read_head`); `row_inputs`: inputs of the new
+    rows; `ignored`: names of the inputs that may differ.
     """
     for key, name in _SHARED_ENTRIES.items():
         if key not in ignored and existing.get(key) != row_inputs[key]:

@@ -238,7 +238,8 @@ def probability_of(
 ) -> float:
     """Compute the probability of an event with one of the `names` or `causes`; 0 without `explanations`.
 
-    With `data_kind`, only explanations of this kind of data (`Observable.data`) count, as if no others were possible.
+    With `data_kind`, only explanations (sets of events) of a change in this kind of data (`Observable.data`) count, as
+    if no others were possible.
     """
     relevant = [explanation for explanation in explanations if data_kind is None or data_kind in explanation.data]
     total = sum(explanation.probability for explanation in relevant)
@@ -249,11 +250,12 @@ def probability_of(
 
 
 def probability_against_chance(explanations: Sequence[Explanation], causes: Sequence[str], data_kind: str) -> float:
-    """Compute the probability that an event with one of the `causes` changed a kind of data.
+    """Compute the probability that an event with one of the `causes` changed a kind of data, `data_kind`.
 
-    The alternatives are other causes, and chance. With the odds of the `explanations` of this kind against no event,
+    The alternatives are events with other causes, and chance. Only `explanations` (sets of events) that explain a
+    change in these data count. With their odds against no event,
 
-        probability = sum of the odds of sets that contain such an event / (1 + sum of all odds).
+        probability = sum of the odds of sets with such an event / (1 + sum of the odds of all these sets).
     """
     relevant = [explanation for explanation in explanations if data_kind in explanation.data]
     matching = sum(explanation.odds for explanation in relevant if explanation.has_cause(*causes))

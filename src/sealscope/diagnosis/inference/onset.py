@@ -353,10 +353,11 @@ def step_sizes(
 
 
 class _StepFits(NamedTuple):
-    """Least-squares fits of a step up to whitened values z (n,), for each of o onsets and w random walks (`WALKS`).
+    """Least-squares fits of a step up to whitened values z (n,), for each of o onsets and w variances of the walk.
 
-    `weight` (w, n): variance of the noise over that of each z; `total` (w,): weighted sum of squares of z; `moments`,
-    `energies` (w, o): products of the steps with z and themselves; `residual_squares` (w, o): after the fit.
+    The variances are those of `WALKS`. `weight` (w, n): variance of the noise over that of each z; `total` (w,):
+    weighted sum of squares of z; `moments`, `energies` (w, o): products of the steps with z and themselves;
+    `residual_squares` (w, o): sum of squares that remains after the fit.
     """
 
     weight: Array
@@ -385,7 +386,12 @@ def _fit_steps(z: Array, steps: Array, eigen: Array) -> _StepFits:
 
 
 def _residual_squares(total: Array, moments: Array, energies: Array) -> Array:
-    """Compute `_StepFits.residual_squares`, the sums of squares after the fit, limited to at least 1e-12 of `total`."""
+    """Compute the sums of squares (w, o) that remain of whitened values after the fit of a step up.
+
+    `total` (w,): sums of squares before the fit; `moments`, `energies` (w, o): products of the steps with the values
+    and with themselves. A negative moment would give a step down, which is not fitted: it counts as 0. The result is at
+    least 1e-12 of `total`, since its logarithm is used.
+    """
     return np.asarray(np.maximum(total[:, None] - np.maximum(moments, 0.0) ** 2 / energies, 1e-12 * total[:, None]))
 
 
@@ -538,19 +544,20 @@ def _onset_times(time: Array, positions: Array) -> Array:
 def _test_step_up(whitening: _Whitening, onsets: Array, steps: Array, fits: _StepFits) -> StepTest:
     """Test whitened values of a coefficient for a step up at any of o `onsets` [s], by the likelihood ratio to no step.
 
-    `steps` (n, o): whitened unit steps; `fits`: their fits to the values z for each of w walks, or to -z to test for a
-    step down. Both likelihoods are maximised over the variances of walk and noise, with the prior on the walk.
+    `steps` (n, o): whitened unit steps; `fits`: their fits to the values z, for each of w candidate variances of the
+    random walk (`WALKS`). Fits to -z test for a step down, which is a step up of -z. Both likelihoods are maximised
+    over the variances of walk and noise, with the prior on the walk.
     """
     n, walk_log_priors, unit = len(whitening.eigen), whitening.walk_log_priors, whitening.unit
     weight, total, moments, energies, residual_squares = fits
-    # for each walk, twice the log of (square root of the determinant of the weights, times the prior)
+    # for each variance of the walk, twice the log of (square root of the determinant of the weights, times the prior)
     twice_log_factor = np.log(weight).sum(axis=1) + 2.0 * walk_log_priors
     log_likelihood = 0.5 * twice_log_factor - 0.5 * n * np.log(total / n)
     log_likelihood_with_step = 0.5 * twice_log_factor[:, None] - 0.5 * n * np.log(residual_squares / n)
     walk_without_step = int(log_likelihood.argmax())
     walk, best = np.unravel_index(int(log_likelihood_with_step.argmax()), log_likelihood_with_step.shape)
     score = 2.0 * float(log_likelihood_with_step[walk, best] - log_likelihood[walk_without_step])
-    # walks that the data alone, without the prior, allow: with or without a step
+    # variances of the walk that the data alone, without the prior, allow: with or without a step
     data_likelihoods = np.array([log_likelihood, log_likelihood_with_step.max(axis=1)]) - walk_log_priors
     allowed = (data_likelihoods > data_likelihoods.max(axis=1, keepdims=True) - ALLOWED).any(axis=0)
     # length of the curve of whitened steps on the unit sphere, from the angles between neighbouring onsets

@@ -255,11 +255,11 @@ class Watch:
             self._samples.is_final = self._estimator.has_begun
 
     def _make_estimator(self) -> Estimator:
-        """Create the estimator of the conductance for the channels in use."""
-        litres = self._litres.get(self.method, False)
+        """Create the estimator of the conductance for the channels in use, which also tells if L/min can be stated."""
+        states_litres = self._litres.get(self.method, False)
         if self.method == PressureEstimator.method:
-            return PressureEstimator(self._rig, litres)
-        return LiveBalance(self._rig, self._samples.names, litres)
+            return PressureEstimator(self._rig, states_litres)
+        return LiveBalance(self._rig, self._samples.names, states_litres)
 
     def continue_from(self, blocks: int, baseline_version: int) -> None:
         """Continue the counts of an earlier watch with other settings; its next baseline gets the next version."""

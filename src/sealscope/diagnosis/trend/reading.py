@@ -135,10 +135,12 @@ def estimate_reading(
 
 
 def _estimate_level(part: Recording, rig: Rig, machine: AssumedMachine) -> dict[str, Any]:
-    """Estimate the leakage by the best method that the channels of a recording without defects allow.
+    """Estimate the leakage of a recording by the most specific of three methods that its channels allow.
 
-    These are the volume balance, the pressure response and the damping of the pressures' ringing, with the assumed
-    sizes. Returns the fields of `LeakReading` that depend on the method; only `problem` if no method is possible.
+    These are the volume balance, the pressure response and the damping of the pressures' ringing, in this order.
+    `part`: corrected samples of the recording that can be used; `rig`: a rig with the sizes of the machine; `machine`:
+    these sizes, and who stated them. Returns the fields of `LeakReading` that depend on the method; only `problem` if
+    no method is possible.
     """
     balance, response, details = VolumeBalance(rig), PressureResponse(rig), RmsChange()
     balance_lack, response_lack = unusable_reason(balance, part), unusable_reason(response, part)

@@ -391,7 +391,8 @@ class Wear(NamedTuple):
     onset : Interval or None
         Time of the change [days], None if nothing changed.
     healthy, scatter : Interval, float
-        Mean level before the change, with the range of 95 % of the recordings then, and their standard deviation.
+        Mean level before the change, with the range of 95 % of the recordings then, and the standard deviation between
+        these, without their errors.
     limit : float or None
         Level at which a repair is due, None if there is no limit.
     reach : Interval or None
@@ -469,9 +470,11 @@ def estimate_wear(levels: Levels, allowed_rise: float | None, change_begin: int 
 
 
 def _estimate_healthy_range(levels: Levels) -> tuple[Interval, float]:
-    """Estimate the mean leakage level of recordings without a change, and their standard deviation.
+    """Estimate the mean leakage level of recordings without a change, and their scatter tau.
 
-    The interval of the mean contains 95 % of the levels of single recordings, with their scatter and standard errors.
+    The interval with the mean is a prediction interval: it contains 95 % of the levels of single recordings, with their
+    scatter tau and standard errors. These errors are those of the last group of comparable recordings, to which the
+    mean belongs. tau is the standard deviation between recordings, without their errors.
     """
     no_change = _Changes.from_profile(np.zeros(len(levels)), scale=1.0)  # a change without effect on any recording
     draws = _Draws.sample(levels, no_change)

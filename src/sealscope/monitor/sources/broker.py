@@ -185,7 +185,8 @@ class _Connection:
     def _submit_received(self) -> None:
         """Decode and submit the queued messages in their order until the service stops.
 
-        A connection with unacknowledged messages is closed once the queue is empty; the broker then sends them again.
+        A connection whose messages were left unacknowledged because the queue was full (`_on_message`) is closed once
+        the queue is empty, since the broker sends them again only on a new connection.
         """
         while not (self._service.stopping.is_set() or self._ended.is_set()):
             queue_entries = self._received.pop(max_items=1, timeout=0.5)

@@ -281,12 +281,13 @@ class SparkplugHost:
     def _sample_times(self, actuator: str, t: float, size: int, rate: float) -> Array:
         """Compute the times [s] of `size` samples at `rate` [Hz], the first at or near its stated time `t` [s].
 
-        `t` is truncated or rounded to whole milliseconds. If it is near the expected start, one sampling interval after
-        the actuator's previous sample, the times begin there. If rounding cannot explain the difference, they are
-        shifted towards `t`, by at most `_MAX_SHIFT` samples.
+        `t` is truncated or rounded to whole milliseconds. The expected start is one sampling interval after the
+        actuator's previous sample. If rounding explains its distance from `t`, the times begin there. If the distance
+        is larger, they are shifted from there towards `t`, by at most `_MAX_SHIFT` samples. From three times `_LATE_S`
+        on, and for the first samples, they begin at `t`: samples are missing, or the clock was set.
         """
         start, expected_start = t, self._next_starts.get(actuator, math.nan)
-        # rounding explains up to `_LATE_S`; three times as much means missing samples, or that the clock was set
+        # rounding explains up to `_LATE_S`
         if abs(expected_start - t) < 3.0 * _LATE_S:
             # the true start lies within [t - _EARLY_S, t + _LATE_S]: take the time nearest to the expected start
             possible_start = min(max(expected_start, t - _EARLY_S), t + _LATE_S)

@@ -394,6 +394,6 @@ def _expand_sample_prefixes(line: str) -> str:
 
 
 def _iter_splits(lines: Sequence[str]) -> Iterator[list[list[str]]]:
-    """Yield the cells of all `lines` once for each usual delimiter; yield nothing if no number has letters after it."""
-    if any(map(_QUANTITY.search, lines)):  # most logs have no such numbers, and need not be split
+    """Yield the cells of all `lines` once for each usual delimiter; nothing if no number has a unit or SI prefix."""
+    if any(map(_QUANTITY.search, lines)):  # most logs have no such number, and need not be split
         yield from ([split_cells(line, delimiter) for line in lines] for delimiter in "\t;|,")

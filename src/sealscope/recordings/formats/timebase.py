@@ -85,7 +85,7 @@ class TimeState:
     head: Array | None = None  # numbers in the first part, if the column has no unit
     rate: float | None = None  # sampling rate [Hz]
     resolution: float | None = None  # step [s] of coarse times that several samples share
-    last_time: Any = None  # as in the file
+    last_time: Any = None  # last known time, as in the file
     last_seconds: float = 0.0  # the same time in seconds
 
 
@@ -435,7 +435,7 @@ def time_base(
 
     - `name`: the column in messages.
     - `stated_rate` [Hz]: rate in the file, with which samples that share stamps are spaced.
-    - `state`: of the time column after the previous part of the log, which is updated; None for a log read as a whole.
+    - `state`: state of the column after the previous part of the log, which is updated; None for a log read as a whole.
 
     Raises InputError for a column that is empty, counts rows, does not increase or has no unit of time.
     """
@@ -460,11 +460,12 @@ def time_base(
 
 
 def _space_shared_times(t: Array, state: TimeState) -> tuple[float, Array] | None:
-    """Space samples evenly that share their times because the clock of the log has coarse steps.
+    """Replace the times of samples that share each reading of a coarse clock by evenly spaced times.
 
-    Returns (clock step [s], new times (n,)) for the times `t` (n,) [s]; None if a time is missing or steps back, or if
-    the clock steps do not have about equally many samples, at least two. If the log is read in parts, one that is too
-    short to show this gets the clock step and the sampling rate of the earlier parts from `state`.
+    Returns (clock step [s], new times (n,)) for the times `t` (n,) [s]. Returns None if a time is missing or steps
+    back, if there are fewer than two samples per clock step on average, or if a step's number of samples differs from
+    this average by more than one. A part of a log that is too short to show this gets the clock step and the sampling
+    rate of the earlier parts from `state`.
     """
     steps = np.diff(t)
     changes = np.flatnonzero(steps)  # indices of the last samples before the time changes

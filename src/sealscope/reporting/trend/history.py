@@ -38,15 +38,17 @@ def write_history_page(
 ) -> Path:
     """Write the page of a machine as .html, .htm or .pdf, and return its path; raise InputError if that fails.
 
-    `title`: name of the machine; `left_out`: number of files that could not be read.
+    `judged`: the machine's diagnosed recordings, in any order; `title`: name of the machine; `left_out`: number of
+    files that could not be read.
     """
     return template.write(template.parse_page_path(path, card=False), render_history_page(judged, title, left_out))
 
 
 def render_history_page(judged: Sequence[Judged], title: str, left_out: int = 0) -> str:
-    """Render the page of a machine from its recordings, in any order; raise InputError if there are none.
+    """Render the page of a machine as HTML; raise InputError if there are no recordings.
 
-    `title`: name of the machine; `left_out`: number of files that could not be read.
+    `judged`: the machine's diagnosed recordings, in any order; `title`: name of the machine; `left_out`: number of
+    files that could not be read.
     """
     if not judged:
         raise InputError("the page of a machine must have at least 1 recording, got 0")

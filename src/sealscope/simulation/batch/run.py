@@ -269,7 +269,7 @@ MAX_CHUNK_STEPS = 4096
 
 
 class SetRun:
-    """The simulation of all runs of an `ExperimentSet` on several threads: `run_all`, then `rms`, `mean_flow`."""
+    """The simulation of all runs of an `ExperimentSet` on several threads: call `run_all`, then `rms`, `mean_flow`."""
 
     #: Runs of a group.
     width: ClassVar[int] = 8
@@ -369,11 +369,12 @@ class SetRun:
         `progress`, if any, is called with the completed fraction of the set.
         """
         # a thread simulates the groups between two successive bounds
-        bounds = np.unique(np.linspace(0, self.n_groups, min(threads, self.n_groups) + 1).round().astype(int)).tolist()
+        n_threads = min(threads, self.n_groups)
+        group_bounds = np.unique(np.linspace(0, self.n_groups, n_threads + 1).round().astype(int)).tolist()
         lock, completed = threading.Lock(), 0.0
 
         def add_progress(fraction: float) -> None:
-            """Add `fraction` to the completed fraction of the set, and report the sum; for all threads."""
+            """Add `fraction` to the completed fraction of the set, and report the sum; called by all threads."""
             nonlocal completed
             if progress is not None:
                 with lock:
@@ -382,7 +383,7 @@ class SetRun:
 
         with ThreadPoolExecutor(threads) as pool:
             # `list` waits for all threads, and raises an exception of any of them
-            list(pool.map(lambda groups: self._run_groups(groups, add_progress), itertools.pairwise(bounds)))
+            list(pool.map(lambda groups: self._run_groups(groups, add_progress), itertools.pairwise(group_bounds)))
 
     def _chunks(self) -> list[tuple[int, int, int, int]]:
         """Divide the solver's outputs into chunks of at most `MAX_CHUNK_STEPS` steps, or of a single output.
@@ -408,8 +409,9 @@ class SetRun:
     def _run_groups(self, groups: tuple[int, int], add_progress: Callable[[float], None]) -> None:
         """Simulate the groups of runs groups[0] <= g < groups[1], chunk by chunk from standstill to the end.
 
-        A group of runs fills a vector register. If there are segments, the readings' squared wavelet details are added
-        to the sums after each chunk. `add_progress` is called with a chunk's fraction of the set.
+        A group of runs fills a vector register. If segments of time are defined (`bounds`), the pressures are sampled
+        after each chunk as the sensors read them, and the squares of their wavelet details are added to the sums of the
+        segments. `add_progress` is called after each chunk with the fraction of all the work of the set that it was.
         """
         from sealscope.physics.vector.runs import advance_lanes_imex, advance_lanes_rk4
         from sealscope.signals.streams import DetailStream

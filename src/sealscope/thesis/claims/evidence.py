@@ -138,7 +138,10 @@ def is_correlated(r: float, n: int, controls: int = 0) -> bool:
 
 
 def condition_design() -> Array:
-    """Build the design matrix (tests, commands + 1): indicators of the commands, and the closed fraction."""
+    """Build the design matrix (tests, commands + 1) of the tests' operating conditions, i.e. command and throttles.
+
+    The columns are indicators of the commands, and last the fraction by which both throttles are closed.
+    """
     commands = sorted({row.command for row in APPENDIX_C})
     indicators = [[float(row.command == command) for command in commands] for row in APPENDIX_C]
     return np.column_stack([np.array(indicators), [row.closed_pct / 100.0 for row in APPENDIX_C]])

@@ -118,8 +118,8 @@ def _rate_claim(rule: Rule, where: str) -> SheetClaim:
 def _test_opposite_moves(sheet: DataSheet) -> Iterator[Finding]:
     """Test claim 5.5.7: d3, d4 and d3d4 of p_A rise with the leak, and those of p_B fall, in most tests.
 
-    All other sentences of section 5.6 state the opposite (`DIRECTION`). Yields for each detail the number of tests as
-    text, and whether it is more than half.
+    All other sentences of section 5.6 state the opposite (`DIRECTION`). Yields for each detail of each chamber the
+    number of tests with the claimed change as text, and whether it is more than half.
     """
     for chamber in CHAMBERS:
         for name in SENSITIVE:
@@ -303,9 +303,10 @@ def _test_p_B_rises(sheet: DataSheet) -> Iterator[Finding]:
 
 
 def _test_printed_rows(sheet: DataSheet) -> Iterator[Finding]:
-    """Test claim 5.3.1: in all tests that chapter 5 shows, the RMS of d3, d4 and d3d4 falls in p_A and rises in p_B.
+    """Test claim 5.3.1: with the leak, the RMS of d3, d4 and d3d4 falls in p_A and rises in p_B, compared with no leak.
 
-    Yields for each detail the number of tests in which it does so as text, and whether these are all.
+    This must hold in all tests that chapter 5 shows. Yields for each detail of each chamber the number of tests with
+    the claimed change as text, and whether these are all.
     """
     for chamber, verb in (("p_A", "falls"), ("p_B", "rises")):
         for name in SENSITIVE:
@@ -313,7 +314,7 @@ def _test_printed_rows(sheet: DataSheet) -> Iterator[Finding]:
             yield f"{name} of {chamber} {verb} in {int(moves.sum())}", [bool(np.all(moves))]
 
 
-#: Rows of the sheet that chapter 5 shows.
+#: Indices of the sheet's rows whose tests chapter 5 shows.
 _PRINTED_ROWS = sorted({test.condition.number - 1 for test in TESTS.values()})
 _SMALLEST = f"the {mean_leaks().min():g} L/min test: "
 _CORRELATION = "correlation of the change with the mean leak: "

@@ -41,7 +41,8 @@ def duty_tests(recording: Recording) -> list[StepTest]:
     """
     length, cycle = len(recording) // BLOCKS, find_cycle(recording)
     if "x" in recording and cycle is not None:
-        # blocks of whole cycles need a position: without it the motion is the drive's, which a leak changes in a cycle
+        # Blocks have whole cycles only with a position. Without it, command and motion are both the drive's, so that a
+        # leak, which changes the drive's motion within a cycle, could change both.
         cycle_samples = cycle * recording.rate
         length = round(max(1, math.ceil(length / cycle_samples)) * cycle_samples)
     time, blocks = _split_blocks(recording, length)

@@ -147,9 +147,10 @@ def _step_hypotheses(
     """Yield the steps to test: of each term's coefficient, of leaks that are not laminar, and of the motion's scale.
 
     `centred`: blocks of the recording after removal of the sensor offset of p_A - p_B, for tests of laminar leaks;
-    `recorded`: blocks with the pressures as recorded, for all other tests; `has_accumulator`: true if the accumulator's
-    volume shows external leaks. Yields for each step its name, the signs to test (1 up, -1 down), the likelihood of the
-    coefficient in K blocks, and the change (K,) of the coefficient by a unit step, None if it is 1 in every block.
+    `recorded`: blocks with the pressures as recorded, for all other tests; `columns`: roles of the columns of each
+    equation; `has_accumulator`: true if the accumulator's volume shows external leaks. Yields for each step its name,
+    the signs to test (1 up, -1 down), the likelihood of the coefficient in K blocks, and the change (K,) of the
+    coefficient by a unit step, None if it is 1 in every block.
     """
     first = columns[0]
     for term in terms:
@@ -202,10 +203,11 @@ def _accumulator_support(balance_test: StepTest, accumulator_test: StepTest) -> 
 
 
 def _insert_fitted_motion(blocks: Blocks, columns: Sequence[ColumnRoles], index: int) -> Blocks:
-    """Return the blocks with column `index` replaced by the fitted volume of the piston's motion.
+    """Replace column `index` of the Gram matrices by the volume of the piston's motion; return the new blocks.
 
-    This volume is the sum of the columns of motion, each times its fitted coefficient. The coefficient of the new
-    column shows a change of the scale of position or speed: a relative change by s is a step by s.
+    This volume is the sum of the columns of motion, each times its coefficient fitted to the whole recording. If the
+    scale of position or speed changes by the fraction s, the coefficient of the new column changes by s. `columns`:
+    roles of the columns of each equation.
     """
     gram = blocks.gram.copy()
     for equation, (roles, total) in enumerate(zip(columns, sum_blocks(blocks, columns), strict=True)):

@@ -24,7 +24,8 @@ def coefficient_level(gram: Array, columns: Sequence[ColumnRoles]) -> tuple[floa
     """Estimate the leak coefficient, at least 0, and its standard error from Gram matrices of the volume balance.
 
     `gram` (E, m, m): Gram matrices of E equations, with the coefficients that recordings do not share already
-    eliminated (`eliminate_unshared`). Both results are 0 without information on the leak.
+    eliminated (`eliminate_unshared`); `columns`: roles of their columns. Both results are 0 without information on the
+    leak.
     """
     precision, moment = 0.0, 0.0
     for e, roles in enumerate(columns):
@@ -37,11 +38,11 @@ def coefficient_level(gram: Array, columns: Sequence[ColumnRoles]) -> tuple[floa
 def reduce_to_tested(
     gram: Array, products: Array, tested: int, nuisance: list[int], prior: Array | None = None
 ) -> tuple[float, float]:
-    """Compute precision and moment of a tested coefficient, with the others eliminated (Schur complement).
+    """Compute precision and moment of a tested coefficient, with other coefficients eliminated (Schur complement).
 
     The estimate of the coefficient is moment / precision. `gram` (m, m): Gram matrix of the columns; `products` (m,):
-    their products with the left side, or with a residual; `tested`, `nuisance`: columns of the tested and of the other
-    coefficients; `prior`: precisions of the priors on the latter.
+    their products with the left side, or with a residual; `tested`, `nuisance`: columns of the tested coefficient and
+    of the eliminated ones; `prior`: precisions of the priors on the latter.
     """
     cross = gram[nuisance, tested]
     matrix = gram[np.ix_(nuisance, nuisance)]
@@ -87,7 +88,8 @@ def eliminate_unshared(gram: Array, columns: Sequence[ColumnRoles]) -> Array:
 
     These have no prior on differences between recordings. The leakage of a pump that holds the load, which counts only
     within a recording, is not eliminated but set to zero first (`ColumnRoles.hold_leak`). `gram` (E, m, m): Gram
-    matrices of E equations. In the result, the Schur complement, their rows and columns are zero.
+    matrices of E equations; `columns`: roles of their columns. In the result, the Schur complement, the rows and
+    columns of these coefficients are zero.
     """
     reduced = gram.copy()
     for e, roles in enumerate(columns):
@@ -103,12 +105,13 @@ def eliminate_unshared(gram: Array, columns: Sequence[ColumnRoles]) -> Array:
 def residual_products(
     gram: Array, reference: Array, roles: ColumnRoles, *, has_leak: bool = False
 ) -> tuple[Array, list[int], Array]:
-    """Compute the residual of a recording under the coefficients fitted to other recordings.
+    """Compute the residual of a recording under the coefficients fitted to reference recordings.
 
-    `gram`, `reference` (m, m): Gram matrices of the recording and of the sum of the others. Returns the products (m,)
-    of the residual with each column, and last with itself; the indices of the c columns whose coefficients may differ
-    between recordings; and the precisions (c,) of the priors on these differences. `has_leak`: true if the coefficient
-    of the leak is among the c coefficients, with the prior `between.pump` (`priors.toml`).
+    `gram`, `reference` (m, m): Gram matrices of the recording and of the sum of the reference recordings; `roles`:
+    roles of their columns. Returns the products (m,) of the residual with each column, and last with itself; the
+    indices of the c columns whose coefficients may differ between recordings; and the precisions (c,) of the priors on
+    these differences. `has_leak`: true if the coefficient of the leak is among the c coefficients, with the prior
+    `between.pump` (`priors.toml`).
     """
     compared = [k for k in roles.compared if k == roles.leak or np.isfinite(roles.between_deviation[k])]
     coefficients = np.zeros(len(gram))
@@ -126,14 +129,15 @@ def residual_products(
 def estimate_leak_excess(
     gram: Array, reference: Array, columns: Sequence[ColumnRoles], widths: Array
 ) -> tuple[Array, Array]:
-    """Estimate by how much a recording's leak coefficient exceeds that of other recordings, and the standard errors.
+    """Estimate the excess of a recording's leak coefficient over that of reference recordings, and the standard errors.
 
-    `gram`, `reference` (E, m, m): Gram matrices of the recording, and of the sum of the others, for E equations;
-    `widths` (s,): factors on the prior standard deviations by which the coefficients of the other terms differ between
-    recordings. Both results (s,) are 0 where there is no information.
+    `gram`, `reference` (E, m, m): Gram matrices of the recording, and of the sum of the reference recordings, for E
+    equations; `columns`: roles of their columns; `widths` (s,): factors on the prior standard deviations of the
+    differences between recordings in the coefficients of all terms but the leak. Both results (s,) are 0 where there is
+    no information.
 
-    The excess is fitted to the residual under the coefficients of the others (`residual_products`), with the other
-    coefficients eliminated. The precisions and moments of the equations are added up.
+    The excess is fitted to the residual under the coefficients of the reference recordings (`residual_products`). The
+    coefficients of all other terms are eliminated. The precisions and moments of the equations are added up.
     """
     precision, moment = np.zeros((2, len(widths)))
     for e, roles in enumerate(columns):

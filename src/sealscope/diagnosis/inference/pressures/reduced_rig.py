@@ -208,15 +208,16 @@ def simulate_response(
 def response_priors(rig: Rig, law: str = STRIBECK) -> Priors:
     """Compute the priors on the parameters `PARAMETERS` of the pressure response from the parameters of a rig.
 
-    The table `[response]` of `priors.toml` states the prior of a parameter relative to the rig's value, or absolutely
-    if the rig has none; the Coulomb friction is that at the charge pressure. `law`: law of friction, one of `LAWS`.
+    A prior has a centre, a width and a wander (`Priors`), by the table `[response]` of `priors.toml`; that of the
+    contact's compliance, "give", depends on the `law` of friction, one of `LAWS`. They are relative to the rig's value,
+    or absolute if the rig has none. The Coulomb friction is that at the charge pressure. The bias, a speed, has a prior
+    in volts of the command, which are multiplied by the gain.
     """
     friction, gain = rig.friction, rig.motor.omega_per_volt
     p_charge, of_difference = rig.fluid.p_charge, friction.coulomb_pressure == "difference"
     coulomb = coulomb_friction(p_charge, p_charge, friction.F_pr, friction.F_cfr, of_difference)
     rig_values = {"gain": gain, "bias": gain, "K": rig.fluid.K_oil, "F_C": coulomb}
     rig_values |= {name: getattr(friction, name) for name in ("F_v", "K_brk", "C_c")}
-    # centre, width and wander of each parameter, relative to the rig's value if the rig has the parameter
     relative = {str(name): row for name, row in PRESSURE.response.items()} | {"give": _FRICTION[law].give}
     return Priors(*np.array([rig_values.get(name, 1.0) * np.array(relative[name]) for name in PARAMETERS]).T)
 
@@ -224,7 +225,8 @@ def response_priors(rig: Rig, law: str = STRIBECK) -> Priors:
 class Machine(NamedTuple):
     """Simulator of the reduced rig.
 
-    `rate`: sampling rate [Hz]; `n_substeps`: integration steps per sample; `law`: law of friction, one of `LAWS`.
+    `numbers`: sizes of the rig; `rate`: sampling rate [Hz]; `n_substeps`: integration steps per sample; `law`: law of
+    friction, one of `LAWS`.
     """
 
     numbers: Reduced

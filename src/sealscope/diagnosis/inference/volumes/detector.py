@@ -151,7 +151,10 @@ class VolumeBalance:
         return compute_once(recording, (self.name, self.rig), lambda samples: recorded_blocks(samples, self.rig), READ)
 
     def _build_balance(self, recording: Recording, regime: RegimeBlocks) -> RecordedBalance:
-        """Build the volume balance of a recording from its blocks for one assumption on the valves at rest."""
+        """Build the volume balance of a recording from its blocks under one assumption on the valves at rest.
+
+        `regime`: these blocks, with the assumption whether valves are open or shut while the piston rests.
+        """
         offset = float(regime.blocks.zero[0])  # sensor offset that was removed from p_A - p_B [Pa]
         oil_loss = compute_once(
             recording, ("lost oil", self.rig), lambda samples: recorded_oil_loss_tests(samples, self.rig, offset), READ

@@ -80,10 +80,11 @@ def combine_time_parts(base: NDArray[Any], parts: Mapping[str, Array], unit: str
 
 
 def _restarts_each_second(base: NDArray[Any], offset: Array) -> bool:
-    """Test whether parts of a second grow within each second and fall at the next second, as they should.
+    """Test whether the parts of a second grow from sample to sample and restart when the next second begins.
 
-    `base` (n,): whole seconds or stamps; `offset` (n,): the parts of a second. A tenth of the steps may differ. False
-    if fewer than half of the steps are within a second, because the parts then show no order.
+    `base` (n,): times without parts of a second, in s or datetime64; `offset` (n,): the parts of a second [ns]. A
+    tenth of the steps may differ. False if fewer than half of the steps are within a second, because the parts then
+    show no order.
     """
     steps = np.diff(base) / (np.timedelta64(1, "s") if base.dtype.kind == "M" else 1.0)
     is_same_second, is_next_second, change = steps == 0, steps == 1, np.diff(offset)

@@ -195,33 +195,35 @@ def count_passed(tests: Mapping[Reading, tuple[bool, ...]]) -> str:
 
 
 def _judge_runs(
-    number: int,
-    numbers: Mapping[Solver, Mapping[Reading, _T]],
+    claim_number: int,
+    results: Mapping[Solver, Mapping[Reading, _T]],
     test: Callable[[_T], Iterable[bool]],
-    format_numbers: Callable[[list[_T]], str],
+    format_results: Callable[[list[_T]], str],
 ) -> Claim:
-    """Judge claim 4.`number` by the runs with the converged solver, under both readings of the throttles' equations.
+    """Judge claim 4.`claim_number` by the runs with the converged solver, under both interpretations of the equations.
 
-    `numbers`: results of the runs by solver and interpretation; `test`: yields True or False for each test on the
-    results under one interpretation; `format_numbers`: formats the results under all interpretations. The claim's text
-    states the results of both solvers.
+    `results`: results of the runs by solver and interpretation (`Reading`); `test`: yields True or False for each test
+    on the results under one interpretation; `format_results`: formats the results under all interpretations. The
+    claim's text states the results of both solvers.
     """
     tests = {
-        solver: {reading: tuple(test(values)) for reading, values in numbers[solver].items()} for solver in SOLVERS
+        solver: {reading: tuple(test(values)) for reading, values in results[solver].items()} for solver in SOLVERS
     }
     simulation = "; ".join(
-        f"{cases.SOLVER_TEXT[solver]}: {format_numbers(list(numbers[solver].values()))}, {count_passed(tests[solver])}"
+        f"{cases.SOLVER_TEXT[solver]}: {format_results(list(results[solver].values()))}, {count_passed(tests[solver])}"
         for solver in SOLVERS
     )
-    results = [passed for row in tests["converged"].values() for passed in row]
-    return judge_claim(f"4.{number}", results, simulation=simulation, noise=cases.visible_pressure() * 1e-3)
+    passed = [test_passed for row in tests["converged"].values() for test_passed in row]
+    noise = cases.visible_pressure() * 1e-3  # [kPa]; many texts state this limit of a visible change
+    return judge_claim(f"4.{claim_number}", passed, simulation=simulation, noise=noise)
 
 
 def _range_text(head: str, values: Callable[[Rows], Iterable[float]]) -> Callable[[list[Rows]], str]:
     """Build a function that formats the smallest and the largest of some numbers [kPa] over several runs.
 
     The built function takes a list with the summaries of the runs (`summarise_run`) under each interpretation of the
-    throttles' equations. `values`: computes numbers [Pa] from the summaries under one; `head`: text before the numbers.
+    throttles' equations. `values`: computes numbers [Pa] from the summaries under one interpretation; `head`: text
+    before the numbers.
     """
     return lambda all_rows: f"{head} {format_range((v for rows in all_rows for v in values(rows)), 'kPa', 1e-3)}"
 
@@ -263,6 +265,7 @@ def _judge_opening(context: Context) -> Iterator[Claim]:
     - 4.12: the mean of p_2 is visibly above the mean of p_B.
     """
     min_visible = cases.visible_pressure()
+    # by interpretation: rows[0] is the run with open orifices, rows[1] that with orifices that are 25 % closed
     opening = _run_cases(context, (COMMANDS[0], 0.0), (COMMANDS[0], 25.0))
     p_1, p_2, flows = "mean of p_1 - p_A", "mean of p_2 - p_B", "flows differ"  # keys of a run's summary
 
@@ -270,9 +273,9 @@ def _judge_opening(context: Context) -> Iterator[Claim]:
         """Compute the changes of all pressures' peaks and ranges [Pa] from open orifices to 25 % closed."""
         return _changes(rows, "peak") + _changes(rows, "range")
 
-    def format_flow_difference(rows_of_readings: list[Rows]) -> str:
-        """Format the largest rms(Q_A - Q_B) / rms(Q_A) of the runs with orifices that are 25 % closed."""
-        largest = max(rows[1][flows] for rows in rows_of_readings)
+    def format_flow_difference(all_rows: list[Rows]) -> str:
+        """Format the largest rms(Q_A - Q_B) / rms(Q_A) with orifices that are 25 % closed, over all interpretations."""
+        largest = max(rows[1][flows] for rows in all_rows)
         return f"rms of Q_A - Q_B over rms of Q_A at most {100 * largest:.2f} %"
 
     changes = _range_text("25 % against open, peaks and ranges", peak_and_range_changes)
@@ -364,7 +367,7 @@ def _judge_drift(context: Context) -> Iterator[Claim]:
     yield _judge_runs(19, drifts, grows, partial(format_drifts, head))
 
 
-#: Keys of a run's summary that the table of readings shows, and the factor from SI units to the table's units.
+#: Keys of a run's summary that the table of runs shows, and the factor from SI units to the table's units.
 _TABLE_FACTORS: dict[str, float] = {
     **{f"range of {name}": 1e-6 for name in PRESSURES},
     "least pressure": 1e-6,

@@ -38,7 +38,7 @@ def stribeck_force(v: Array, F_C: float, *, literal_bracket: bool = False) -> Ar
 
 
 def friction_at_threshold(F_C: float) -> dict[str, tuple[float, float]]:
-    """Compute the friction [N] at the threshold velocity v_th and just above it, for both forms of eq. (4.22).
+    """Compute the friction [N] at the threshold velocity v_th and just above it, by each interpretation of eq. (4.22).
 
     The keys are "continuous", and "literal" for the unbalanced bracket closed at its end. `F_C`: Coulomb force [N].
     """
@@ -87,7 +87,11 @@ def friction_models_figure(context: Context, item: Item) -> tuple[Figure, ...]:
 
 
 def stribeck_figure(context: Context, item: Item) -> tuple[Figure, ...]:
-    """Draw Fig. 4.3: friction over velocity, its slope, and both ways to close the bracket of eq. (4.22)."""
+    """Draw Fig. 4.3: friction over velocity, its slope, and both interpretations of eq. (4.22).
+
+    The equation's closing bracket can stand in two places; one of them makes friction continuous at v_th. `context` is
+    not used.
+    """
     rig = thesis_rig()
     f = rig.friction
     # Coulomb force with both chambers at charge pressure; F_cfr multiplies the sum of the pressures, eq. (4.20)

@@ -173,9 +173,10 @@ class HeldChambers:
     ) -> UnitLeak:
         """Compute the flow past the piston in each hold for a leak with a coefficient of 1, in Pa^e.
 
-        The flow is sign(dp) |dp|^e, with the exponent e of the `law` and dp = p_A - p_B - z, times the growth of the
-        leak since its onset. The sensor offset z in a hold may differ from the recording's `offset` [Pa]
-        (`LockedHold.driving_pressure`). The flow of a side counts as 0 while a check valve refills it (`refilled`).
+        With the exponent e of the `law` and dp = p_A - p_B - z, the flow out of A is sign(dp) |dp|^e times the law's
+        growth factor, which is 1 until the law's onset (`LeakLaw.growth_factor`). The flow out of B is its negative.
+        The sensor offset z in a hold may differ from the recording's `offset` [Pa] (`LockedHold.driving_pressure`). The
+        flow of a side counts as 0 while a check valve refills it (`refilled`).
         """
         flows = []
         for hold in self.holds:

@@ -88,16 +88,19 @@ def _oil_factors(changes: Array) -> tuple[float, float, Array]:
 
 
 def _oil_deviations() -> Array:
-    """Return prior standard deviations (4,) of the changes of the oil's properties (`OilRegression`)."""
+    """Return prior standard deviations (4,) of the changes of compressibility, dead volumes A and B, and free air."""
     prior = INFERENCE.held_oil
     return np.array([prior.deviation, prior.dead_deviation, prior.dead_deviation, prior.air_deviation])
 
 
 def _lowest_changes() -> Array:
-    """Return the lower limits (4,) of the changes of the oil's properties (`OilRegression`)."""
+    """Return lower limits (4,) of the changes of compressibility, dead volumes A and B, and free air.
+
+    Only the dead volumes are limited; the other changes are logarithms (`OilRegression`).
+    """
     prior = INFERENCE.held_oil
-    lowest_dead = prior.least_dead / prior.dead - 1.0
-    return np.array([-np.inf, lowest_dead, lowest_dead, -np.inf])
+    lowest_volume_change = prior.least_dead / prior.dead - 1.0
+    return np.array([-np.inf, lowest_volume_change, lowest_volume_change, -np.inf])
 
 
 class LeakRegression(NamedTuple):
