@@ -198,7 +198,7 @@ def alarms_of(judge: AlarmJudge, verdicts: Sequence[RecordingVerdict], rate: flo
 
 
 def test_an_alarm_of_a_stream_needs_several_recordings():
-    """At one false alarm in 1000 h, a recording of 3 min has 5e-5: less than is known of a single probability."""
+    """At one false alarm in 1000 h, half of it for recordings, one of 3 min has 2.5e-5: less than a chance is known."""
     sure, likely, cleared, unknown = (
         verdict(chance=1e-9),
         verdict(chance=9e-3),

@@ -34,7 +34,7 @@ from sealscope.monitor.settings import ActuatorSettings, WatchSettings
 from sealscope.monitor.sources.source_block import SourceBlock, count_bytes
 from sealscope.monitor.sources.stream_recordings import StreamRecorder
 from sealscope.monitor.supervisor import Supervisor, describe_error
-from sealscope.monitor.verdicts import RecordingVerdict, judge_stream
+from sealscope.monitor.verdicts import STREAM_SHARE, RecordingVerdict, judge_stream
 from sealscope.recordings.oil import measured_oil_temperature
 from sealscope.recordings.recording import Recording
 from sealscope.storage.plain_state import require_part, restore, save_attributes
@@ -64,7 +64,7 @@ class _Actuator:
     since the last checkpoint; `n_stored`: number of all stored blocks; `last`: last estimate, with flows averaged over
     the machine's cycles; `stored_summary`: summary stored last; `oil_celsius`: oil temperature [deg C], None if
     unknown; `judged_s` [s]: end of the last judged samples; `verdict`: on the last recording, None if whole recordings
-    are not judged; `is_undecided`: True if the last verdict does not decide; `alarm_samples`: last samples during an
+    are not judged; `alarm_samples`: last samples during an
     alarm, which may become a healthy recording; `recorder`: cuts the stream of a commissioned machine into recordings,
     None for files and other actuators.
     """
@@ -80,7 +80,6 @@ class _Actuator:
     oil_celsius: float | None = None
     judged_s: float | None = None
     verdict: RecordingVerdict | None = None
-    is_undecided: bool = False
     alarm_samples: list[Recording] = field(default_factory=list)
     recorder: StreamRecorder | None = None
 
@@ -89,18 +88,14 @@ class _Actuator:
     ) -> tuple[list[BlockEstimate], list[_AlarmEvent]]:
         """Judge new samples; return the leakage estimates of blocks of some seconds, and the changes of the alarm.
 
-        `follows`: False after a gap; `settings`: thresholds of the alarm; `verdict`: on the whole file, or on the last
-        minutes of a stream, None if there is none. A verdict that decides (`RecordingVerdict.decides`) updates the
-        alarm, and for a file replaces the leak in the estimates. Without one, the estimates update the alarm block by
-        block; for a stream, they do if its last verdict does not decide, or if its last recording was too short for a
-        verdict.
+        `follows`: False after a gap; `settings`: thresholds of the alarm; `verdict`: verdict on the recording that ends
+        with these samples, None for none. For a file, that recording is these samples: a verdict that decides
+        (`RecordingVerdict.decides`) replaces the leak in the estimates, and alone updates the alarm. For a stream, it
+        is the last minutes, and the estimates update the alarm, too.
         """
         estimates: list[BlockEstimate] = []
         events: list[_AlarmEvent] = []
         deciding_verdict = verdict if verdict is not None and verdict.decides else None
-        is_decided = deciding_verdict is not None
-        if self.recorder is not None:
-            is_decided = not (self.is_undecided or self.recorder.has_dropped)
         self.pending += 1  # blocks of samples since the last checkpoint
         self.bytes += count_bytes(samples)
         if (oil_celsius := measured_oil_temperature(samples)) is not None:
@@ -111,13 +106,13 @@ class _Actuator:
                 self.judged_s = estimate.t
             if deciding_verdict is not None and self.recorder is None:
                 estimates.append(deciding_verdict.restate_block(estimate))
-            else:
-                estimates.append(estimate)
-            if is_decided:
                 continue
+            estimates.append(estimate)
             change = self.judge.update(self.last, leak, self._baseline_version(), settings)
             if change is not None:
                 events.append((*change, estimate.t))
+                if change[1] == "raised":  # newer than the verdict on an earlier recording
+                    self.verdict = None
         if verdict is not None or self.recorder is None:
             events.extend(self._apply_verdict(verdict, settings))
         elif self.verdict is not None and len(samples):
@@ -129,11 +124,10 @@ class _Actuator:
     def _apply_verdict(self, verdict: RecordingVerdict | None, settings: WatchSettings) -> list[_AlarmEvent]:
         """Keep the verdict on a recording and, if it decides, update the alarm; return the changes of the alarm.
 
-        For a stream, the verdict `no leak` does not end the alarm of a leak that is below its bound.
+        For a stream, the verdict `no leak` is dropped if the leak of the alarm is below its bound.
         """
         earlier_verdict, self.verdict = self.verdict, verdict
         is_stream, alarm = self.recorder is not None, self.judge.alarm
-        self.is_undecided = verdict is None or not verdict.decides
         if is_stream and verdict is not None:
             self.judge.add_evidence(verdict)
         if verdict is None or not verdict.decides:
@@ -142,6 +136,7 @@ class _Actuator:
             return []
         if verdict.clears:
             if is_stream and alarm is not None and not verdict.excludes(alarm.leak_lpm):
+                self.verdict = None
                 return []
             if self.watch.leak is not None:  # the detector withdraws its leak
                 self.watch.dismiss()
@@ -170,7 +165,7 @@ class _Actuator:
 
     def state(self) -> dict[str, Any]:
         """Convert the detector, the alarm and the last results to plain values, for a checkpoint in the database."""
-        saved = ("watch", "judge", "last", "oil_celsius", "judged_s", "verdict", "n_stored", "is_undecided")
+        saved = ("watch", "judge", "last", "oil_celsius", "judged_s", "verdict", "n_stored")
         return {**save_attributes(self, saved), "recorder": None if self.recorder is None else self.recorder.state()}
 
     def load_state(self, state: Mapping[str, Any]) -> None:
@@ -178,7 +173,6 @@ class _Actuator:
         self.watch = Watch.from_state(state["watch"])
         self.last = None if state["last"] is None else restore(BlockEstimate, state["last"], "last")
         self.oil_celsius, self.judged_s = state.get("oil_celsius"), state.get("judged_s")
-        self.is_undecided = state.get("is_undecided", False)
         if state.get("verdict") is not None:
             self.verdict = restore(RecordingVerdict, state["verdict"], "verdict")
         if self.recorder is not None and state.get("recorder") is not None:
@@ -271,7 +265,7 @@ class WatchedActuators:
         is_recorded = machine.machine is not None and settings.folder is None and settings.recording_s > 0.0
         fresh = watch(
             machine.rig,
-            false_alarms_per_1000_h=settings.false_alarms_per_1000_h,
+            false_alarms_per_1000_h=settings.false_alarms_per_1000_h * (1.0 - STREAM_SHARE if is_recorded else 1.0),
             learn_hours=settings.learn_hours,
             healthy=machine.healthy,
         )
@@ -315,7 +309,7 @@ class WatchedActuators:
                 actuator.recorder.take(number, samples)
             # with the settings of the first time, if readable
             actuator.judge_samples(samples, follows=follows, settings=stored_settings or settings, verdict=verdict)
-        actuator.watch.false_alarms_per_1000_h = settings.false_alarms_per_1000_h  # may change without a new baseline
+        actuator.watch.false_alarms_per_1000_h = fresh.false_alarms_per_1000_h  # may change without a new baseline
         if actuator.watch.healthy is not None:  # None after a person has marked a repair
             actuator.watch.healthy = fresh.healthy
         rig, *learning_settings = fresh.learned_with

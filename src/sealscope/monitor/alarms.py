@@ -17,7 +17,7 @@ from sealscope.diagnosis.live.estimates import BlockEstimate, Interval, WatchedL
 from sealscope.diagnosis.verdict.states import state_of
 from sealscope.errors import InputError
 from sealscope.monitor.settings import WatchSettings
-from sealscope.monitor.verdicts import RecordingVerdict
+from sealscope.monitor.verdicts import STREAM_SHARE, RecordingVerdict
 from sealscope.storage.plain_state import save_attributes
 
 Level = Literal["warning", "error"]
@@ -251,7 +251,7 @@ class AlarmJudge:
             state: AlarmState = "new" if is_worse and alarm.state != "valid" else alarm.state
             return self._set_alarm(replace(alarm, **findings, state=state)), "" if level == alarm.level else level
         if is_stream:
-            is_enough = self.evidence * verdict.allowed_chance(settings.false_alarms_per_1000_h) >= 1.0
+            is_enough = self.evidence * verdict.allowed_chance(STREAM_SHARE * settings.false_alarms_per_1000_h) >= 1.0
         else:
             is_repeated = earlier is not None and earlier.leaks
             is_enough = is_repeated or verdict.is_rare(settings.false_alarms_per_1000_h)

@@ -25,6 +25,8 @@ from sealscope.recordings.recording import Recording
 from sealscope.reporting.messages import how_much
 
 _FALSE_ALARM = DECISION.false_alarm
+#: Fraction of an actuator's allowed false alarms that the recordings of its stream get; its blocks get the others.
+STREAM_SHARE = 0.5
 
 
 @dataclass(frozen=True)

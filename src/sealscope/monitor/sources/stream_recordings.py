@@ -23,7 +23,7 @@ _MAX_GAP_S = 10.0
 _MIN_DURATION_S = 60.0
 #: Largest recording [bytes]: 180 s of eight channels at 2.5 kHz.
 _MAX_BYTES = 32_000_000
-_SAVED = ("first", "follows", "has_dropped")
+_SAVED = ("first", "follows")
 
 
 @dataclass
@@ -40,15 +40,12 @@ class StreamRecorder:
         Running number of the first collected block, 0 if none is collected.
     follows : bool
         True if the collected blocks follow a recording that ended at its full length.
-    has_dropped : bool
-        True if the last recording was dropped because it was too short.
     """
 
     actuator: str
     duration_s: float
     first: int = 0
     follows: bool = False
-    has_dropped: bool = False
     blocks: list[Recording] = field(default_factory=list)
 
     def take(self, number: int, samples: Recording) -> Recording | None:
@@ -76,8 +73,8 @@ class StreamRecorder:
         """
         blocks, duration = self.blocks, self._duration()
         self.clear()
-        self.follows, self.has_dropped = follows, duration < _MIN_DURATION_S
-        if self.has_dropped:
+        self.follows = follows
+        if duration < _MIN_DURATION_S:
             return None
         first = blocks[0]
         channels = {name: np.concatenate([block[name] for block in blocks]) for name in first.channels}
