@@ -70,7 +70,8 @@ def inspect_recording(recording: Recording, channels: Iterable[str] | None = Non
 def _inspect(recording: Recording, names: Sequence[str]) -> Inspection:
     """Correct the samples of a recording, find the defects of the channels `names`, and test if it can be trusted.
 
-    It cannot if a chamber pressure is constant or stuck, or if all are mostly clipped or implausible for hydraulics.
+    It cannot if a chamber pressure is constant or stuck, or if all are mostly clipped, mostly beyond what any sensor
+    reads, or implausible for hydraulics.
     """
     chambers = chambers_of(recording)
     part, corrections, stuck, share = correct_samples(recording)  # `stuck`: names of channels that repeat one value
@@ -78,10 +79,10 @@ def _inspect(recording: Recording, names: Sequence[str]) -> Inspection:
     chamber_findings = [finding for finding in findings if finding.channel in chambers]
     defects = [finding for finding in chamber_findings if finding.code == "constant"]
     defects += [finding for finding in findings if finding.channel in stuck and finding.code == "stuck"]
-    clipped = [finding for finding in chamber_findings if finding.code == "clipped"]
-    mostly_clipped = [finding for finding in clipped if finding.count > len(part) / 2]
-    if len(mostly_clipped) == len(chambers):  # one clipped chamber is no obstacle: the other chamber is judged
-        defects += mostly_clipped
+    for code in ("clipped", "impossible"):
+        mostly = [finding for finding in chamber_findings if finding.code == code and finding.count > len(part) / 2]
+        if len(mostly) == len(chambers):  # one such chamber is no obstacle: the other chamber is judged
+            defects += mostly
     distrust = f"the pressures cannot be trusted: {defects[0].text}" if defects else None
     if distrust is None and len(part) >= SHORTEST and (reason := find_implausibility(part)):
         distrust = f"this is no recording of a hydraulic machine: {reason}"

@@ -19,8 +19,9 @@ def find_implausibility(recording: Recording) -> str | None:
     """Find a reason, in words, why the channels cannot come from one hydraulic machine; None if there is none.
 
     They cannot if p_B is a copy of p_A, if the motor speed differs from the rate of the motor angle by a constant
-    factor, or if p_A - p_B (or the only chamber pressure that varies) is nothing but noise. Unit, offset and range of
-    the pressures do not matter. Constant and absent channels are ignored, as a chamber may rest at charge pressure.
+    factor, if p_A - p_B (or the only chamber pressure that varies) is nothing but noise, or if pressures in Pa stay
+    below `readings.pressure` of `priors.toml`, as those of another unit would. Raw counts may have any offset and
+    range. Constant and absent channels are ignored, as a chamber may rest at charge pressure.
     """
     # the third difference of `_is_noise` needs four samples
     names = [name for name in chambers_of(recording) if len(recording) > 3 and not is_constant(recording[name])]
@@ -31,6 +32,9 @@ def find_implausibility(recording: Recording) -> str | None:
             return "p_B is a copy of p_A, but chambers on either side of a piston move against each other"
     if reason := _describe_speed_mismatch(recording):
         return reason
+    pressures = [np.abs(recording[name]).max() for name in names if recording.units[name] == "Pa"]
+    if pressures and max(pressures) < _PRIORS.pressure:
+        return f"the pressures stay below {max(pressures):.3g} Pa: is their unit right?"
     noise_tested = "p_A - p_B" if len(names) == 2 else next(iter(names), "")
     if noise_tested and _is_noise(signals[noise_tested]):
         return f"{noise_tested} is noise: the machine's motion does not show in it"

@@ -155,6 +155,7 @@ class ReadingPriors(PriorTable):
     """Limits beyond which pressures and speeds cannot come from one hydraulic machine.
 
     - `noise` [share of the variance]: white noise in a pressure, above which the pressure is taken for mere noise.
+    - `pressure` [Pa]: pressures that stay below it are in another unit.
 
     The motor speed is compared with the rate of the motor angle:
 
@@ -168,6 +169,7 @@ class ReadingPriors(PriorTable):
     rate: float
     samples: int
     correlation: float
+    pressure: float
     misfit: float
 
 
