@@ -3,6 +3,11 @@
 An alarm is new until a person acknowledges it. A person marks it as valid or, with a reason, as invalid. It closes when
 its cause has ended and a person has seen it, or when a person marks a repair; an invalid alarm ends at once. (A new
 alarm whose cause has ended is "returned to normal, unacknowledged" in the standard ISA-18.2.)
+
+Two ways lead to an alarm, both in `AlarmJudge`: `update`, from the blocks of a stream, once their detector (`Watch`)
+has found a leak; and `update_from_verdict`, from whole recordings. A file's verdict decides alone. The recordings of a
+commissioned machine's stream add up their evidence, and share the rate `false_alarms_per_1000_h` with its blocks
+(`verdicts.STREAM_SHARE`), whose two tests divide theirs by `step` and `level` of `diagnosis/live/priors.toml`.
 """
 
 from __future__ import annotations

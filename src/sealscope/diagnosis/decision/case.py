@@ -211,6 +211,11 @@ def _leak_tests(case: Case, leak: LeakMeasure) -> tuple[LeakTest, ...]:
 
     Two tests share the allowed false-alarm probability. A fraction of it (`questions.within` in `priors.toml`) goes to
     WITHIN if the other test is AGAINST, or to LEVEL if the other test is WITHIN. The rest goes to the other test.
+
+    A chance is compared with the test's part. That of a step is `StepTest.chance` (`inference/onset.py`), divided by
+    the fraction that the law of the leak has (`inference/leak_law.py`), and calibrated (`null.py`) by the chances that
+    the same test gave in the healthy recordings (`healthy_null` of `detectors/observation.py`). That of a rise is
+    `Rise.chance`; of a level, that of the normal distribution.
     """
     from scipy.special import ndtr, ndtri  # standard normal distribution and its inverse
 
