@@ -28,6 +28,7 @@ from sealscope.errors import InputError
 from sealscope.parameters import Rig
 from sealscope.units import LITRE_PER_MINUTE, P_ATM
 
+_FALSE_ALARM: float = DECISION.false_alarm.probability
 #: Durations that are tried [s], and the duration that is planned if no leak to detect is stated.
 HOLD_DURATIONS, DEFAULT_DURATION = (3.0, 10.0, 30.0, 60.0, 120.0), 30.0
 #: Number of healthy days, with a hold each, with which a hold is compared.
@@ -97,7 +98,13 @@ def has_shut_off(rig: Rig) -> bool:
 
 
 def plan_hold(
-    rig: Rig, load: float, flow: float, find: float | None = None, *, false_alarm: float = 0.01, detection: float = 0.9
+    rig: Rig,
+    load: float,
+    flow: float,
+    find: float | None = None,
+    *,
+    false_alarm: float = _FALSE_ALARM,
+    detection: float = 0.9,
 ) -> PlannedHold:
     """Find the shortest locked hold under a load [N] that detects a leak of the conductance `find` [m^3/(s Pa)].
 

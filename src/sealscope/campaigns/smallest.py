@@ -34,6 +34,7 @@ from sealscope.simulation.simulate import simulate_experiment
 from sealscope.simulation.targets_and_loads import Position, command_or_target, parse_force
 from sealscope.units import LITRE_PER_MINUTE, parse_quantity
 
+_FALSE_ALARM: float = DECISION.false_alarm.probability
 #: Commands and constant loads that are tried in addition to the machine's usual duty.
 COMMANDS, LOADS = ("3 sin(4t)", "5 sin(2t)", "7 sin(4t)", "8 sin(t)"), ("", "100 N", "2 kN")
 #: Durations [s] that are tried, and the duration at which duties are compared.
@@ -182,7 +183,7 @@ def duty_experiment(rig: Rig, duty: PlannedDuty, duration: float, seed: int = 0)
 
 
 def detectable_leak(
-    rig: Rig, duty: PlannedDuty, duration: float, *, false_alarm: float = 0.01, detection: float = 0.9
+    rig: Rig, duty: PlannedDuty, duration: float, *, false_alarm: float = _FALSE_ALARM, detection: float = 0.9
 ) -> DetectableLeak:
     """Compute the smallest leak that is detected in recordings with the command and load `duty`, of `duration` [s].
 
@@ -256,7 +257,7 @@ def plan_recording(
     *,
     usual: PlannedDuty = USUAL,
     duties: Iterable[PlannedDuty] | None = None,
-    false_alarm: float = 0.01,
+    false_alarm: float = _FALSE_ALARM,
     detection: float = 0.9,
     held: float | None = None,
     progress: Callable[[str, float], None] = lambda label, fraction: None,

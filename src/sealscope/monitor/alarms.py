@@ -5,9 +5,10 @@ its cause has ended and a person has seen it, or when a person marks a repair; a
 alarm whose cause has ended is "returned to normal, unacknowledged" in the standard ISA-18.2.)
 
 Two ways lead to an alarm, both in `AlarmJudge`: `update`, from the blocks of a stream, once their detector (`Watch`)
-has found a leak; and `update_from_verdict`, from whole recordings. A file's verdict decides alone. The recordings of a
-commissioned machine's stream add up their evidence, and share the rate `false_alarms_per_1000_h` with its blocks
-(`verdicts.STREAM_SHARE`), whose two tests divide theirs by `step` and `level` of `diagnosis/live/priors.toml`.
+has found a leak; and `update_from_verdict`, from whole recordings. Of a file, a verdict that decides leaves the blocks
+no say. The recordings of a commissioned machine's stream add up their evidence; they and the blocks have half the rate
+`false_alarms_per_1000_h` each (`verdicts.STREAM_SHARE`), and other streams' blocks all of it. Nine tenths of the
+blocks' part go to their test for a step, one tenth to that against the baseline (`diagnosis/live/priors.toml`).
 """
 
 from __future__ import annotations
