@@ -209,7 +209,8 @@ class AlarmJudge:
         M sums the products of e-values since each recording (Shiryaev-Roberts; J. Shin, A. Ramdas, A. Rinaldo, arXiv
         2203.03532). Without a leak it exceeds 1/alpha at most once in 1/alpha recordings on average.
         """
-        self.evidence = min((1.0 + self.evidence) * verdict.e_value, _MAX_EVIDENCE)
+        if verdict.decides:  # of another, neither its evidence nor its chance of a false alarm is known
+            self.evidence = min((1.0 + self.evidence) * verdict.e_value, _MAX_EVIDENCE)
 
     def update_from_verdict(
         self,

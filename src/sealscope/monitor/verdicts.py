@@ -139,11 +139,11 @@ class RecordingVerdict:
 
         With p = `chance` of a leak, at least `rarest` of `priors.toml`, it is (1 - p + p ln p)/(p (ln p)^2), the mean
         of kappa p^(kappa - 1) over kappa from 0 to 1 (V. Vovk, R. Wang, Ann. Statist. 49 (2021) 1736). Without a leak p
-        is 1, which gives 1/2; for the verdict `cannot tell` and for an unknown p it is 1.
+        is 1, which gives 1/2; for an unknown p it is 1.
         """
-        if self.clears:
+        if not self.leaks:
             return 0.5
-        if not self.leaks or self.chance is None:
+        if self.chance is None:
             return 1.0
         p = min(max(_FALSE_ALARM.rarest, self.chance), 0.99)  # 0.99: where both terms of the fraction are not yet 0
         return (1.0 - p + p * math.log(p)) / (p * math.log(p) ** 2)
