@@ -227,9 +227,9 @@ class AlarmJudge:
         none) was `leak`, too, or if leak-free recordings get such a verdict seldom enough for the allowed rate of false
         alarms; of a stream (`is_stream`), if the `evidence` of its recordings is enough. The verdict `no leak`, or a
         leak below the warning threshold, ends the alarm. `baseline`: version of the healthy baseline; `settings`:
-        thresholds and the allowed rate. The event is
-        "raised", "error" or "warning" (a change of the level), "returned" (the leak has ended), or "" for none of
-        these. Returns None for the verdict `cannot tell`, or if no alarm was active and none is raised.
+        thresholds and the allowed rate. The event is "raised", "error" or "warning" (a change of the level), "returned"
+        (the leak has ended), or "" for none of these. Returns None for the verdict `cannot tell`, or if no alarm was
+        active and none is raised.
         """
         alarm, lpm = self.alarm, verdict.leak_lpm
         is_active = alarm is not None and alarm.active
@@ -241,6 +241,9 @@ class AlarmJudge:
             end_s, self.evidence = verdict.end_s, 0.0
             return self._set_alarm(replace(alarm, state=end_state, returned_s=end_s, updated_s=end_s)), "returned"
         level: Level = "error" if verdict.state["condition"] == _CONDITIONS["error"] else "warning"
+        by_chance = verdict.by_chance_per_1000_h
+        if is_stream:
+            by_chance = 1.0 / (verdict.allowed_chance(1.0) * self.evidence)
         findings: dict[str, Any] = {
             "level": level,
             "updated_s": verdict.end_s,
@@ -248,9 +251,7 @@ class AlarmJudge:
             "leak_interval_lpm": verdict.leak_interval_lpm,
             "evidence": f"{verdict.file}: {verdict.reason}",
             "next_check": verdict.state["action"],
-            "by_chance_per_1000_h": 1.0 / (verdict.allowed_chance(1.0) * self.evidence)
-            if is_stream
-            else verdict.by_chance_per_1000_h,
+            "by_chance_per_1000_h": by_chance,
         }
         if alarm is not None and is_active:
             # a person must acknowledge the higher level again, unless the leak is confirmed

@@ -12,6 +12,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, IPvAnyAddress
 
 from sealscope.diagnosis.commissioned.watched import load_watched
 from sealscope.diagnosis.live.joining import CHANNELS, format_ways, ways_to_watch
+from sealscope.diagnosis.priors.live import LIVE
 from sealscope.errors import InputError
 from sealscope.recordings.channels import CHANNEL_UNITS
 from sealscope.recordings.formats.headings.labels import Label
@@ -38,9 +39,10 @@ _File = Annotated[Path, AfterValidator(_resolve_in_folder)]
 
 
 def _check_recording_length(seconds: float) -> float:
-    """Return the length of the recordings of a stream [s]; raise ValueError unless it is 0 or 60 to 600."""
-    if seconds != 0.0 and not 60.0 <= seconds <= 600.0:
-        raise ValueError(f"must be 0 or 60 to 600 s, got {seconds:g}")
+    """Return the length of a stream's recordings [s]; raise ValueError unless it is 0 or in `recording.lengths`."""
+    shortest, longest = LIVE.recording.lengths
+    if seconds != 0.0 and not shortest <= seconds <= longest:
+        raise ValueError(f"must be 0 or {shortest:g} to {longest:g} s, got {seconds:g}")
     return seconds
 
 

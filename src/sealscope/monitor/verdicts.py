@@ -17,6 +17,7 @@ from sealscope.diagnosis.commissioned.machine import CommissionedMachine
 from sealscope.diagnosis.commissioned.watched import load_watched
 from sealscope.diagnosis.live.estimates import BlockEstimate, Interval
 from sealscope.diagnosis.priors.decision import DECISION
+from sealscope.diagnosis.priors.live import LIVE
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.evidence import CANNOT_TELL, LEAK, NO_LEAK
 from sealscope.diagnosis.verdict.states import state_of
@@ -26,7 +27,7 @@ from sealscope.reporting.messages import how_much
 
 _FALSE_ALARM = DECISION.false_alarm
 #: Fraction of an actuator's allowed false alarms that the recordings of its stream get; its blocks get the others.
-STREAM_SHARE = 0.5
+STREAM_SHARE: float = LIVE.recording.share
 
 
 @dataclass(frozen=True)

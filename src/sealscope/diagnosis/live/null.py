@@ -13,14 +13,13 @@ from functools import lru_cache
 from typing import Any
 
 from sealscope.diagnosis.decision.null import HealthyNull
+from sealscope.diagnosis.live.rise import STEP
+from sealscope.diagnosis.live.signals import WINDOW
 from sealscope.diagnosis.priors.live import LIVE
 from sealscope.storage.plain_state import restore_attributes, save_attributes
 
-#: Number of blocks in a window.
-WINDOW: int = LIVE.explanation.window
 _MIN_WINDOWS: int = LIVE.step.windows
 _LOG_WINDOW = math.log(WINDOW)
-_STEP = "step"
 _SAVED = ("_count", "_surprisal", "_highest", "_blocks")
 
 
@@ -70,6 +69,6 @@ def _find_threshold(count: int, surprisal: float, probability: float) -> float:
     """Compute the threshold of log M from the number of windows and the sum of their surprisals (`log_threshold`)."""
     if count < _MIN_WINDOWS:
         return -math.log(probability)
-    null = HealthyNull({_STEP: [surprisal / count] * count})
-    chance = null.uncalibrated_chance(_STEP, min(WINDOW * probability, 0.5))
+    null = HealthyNull({STEP: [surprisal / count] * count})
+    chance = null.uncalibrated_chance(STEP, min(WINDOW * probability, 0.5))
     return max(_LOG_WINDOW - math.log(chance), -math.log(probability))

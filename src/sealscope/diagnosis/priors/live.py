@@ -59,6 +59,14 @@ class WatchPriors(PriorTable):
     level: float  # fraction of the false alarms for the test against the baseline
 
 
+class StreamRecordingPriors(PriorTable):
+    """Recordings into which the stream of a commissioned machine is cut, to be judged as a whole."""
+
+    gap: float  # [s] longest gap within a recording
+    lengths: tuple[float, float]  # [s] shortest recording that is judged, and longest that may be asked for
+    share: float  # fraction of the false alarms for the recordings; the blocks of the stream get the others
+
+
 class RiseExplanationPriors(PriorTable):
     """Search for the cause of an increase of the leakage in the blocks around it."""
 
@@ -91,6 +99,7 @@ class LivePriors(PriorTable):
     step: StepPriors
     explanation: RiseExplanationPriors
     watch: WatchPriors
+    recording: StreamRecordingPriors
     response: LiveResponse
 
 

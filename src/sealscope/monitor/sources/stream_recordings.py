@@ -13,14 +13,13 @@ from typing import Any
 
 import numpy as np
 
+from sealscope.diagnosis.priors.live import LIVE
 from sealscope.monitor.sources.source_block import count_bytes
 from sealscope.recordings.recording import Recording
 from sealscope.storage.plain_state import restore_attributes, save_attributes
 
-#: Longest gap within a recording [s]. A file may have such gaps, too.
-_MAX_GAP_S = 10.0
-#: Shortest recording that is judged [s]; it is also the shortest file of a folder.
-_MIN_DURATION_S = 60.0
+_PRIORS = LIVE.recording
+_MIN_DURATION_S, _ = _PRIORS.lengths
 #: Largest recording [bytes]: 180 s of eight channels at 2.5 kHz.
 _MAX_BYTES = 32_000_000
 _SAVED = ("first", "follows")
@@ -31,8 +30,9 @@ class StreamRecorder:
     """Collect the blocks of one actuator's stream, and cut them into recordings of `duration_s`.
 
     A recording also ends before a gap, a clock set back, or a change of channels, units or rate, and at `_MAX_BYTES`.
-    Those shorter than `_MIN_DURATION_S` are dropped. The first after such an end is shorter than `duration_s`, by up to
-    a half that depends on the `actuator`'s name: recordings of many actuators then do not end at the same moment.
+    Those shorter than the first of `recording.lengths` (`priors.toml`) are dropped. The first after such an end is
+    shorter than `duration_s`, by up to a half that depends on the `actuator`'s name: recordings of many actuators then
+    do not end at the same moment.
 
     Attributes
     ----------
@@ -115,4 +115,4 @@ def _continues(earlier: Recording, samples: Recording) -> bool:
     """
     has_same_format = (samples.units, samples.rate) == (earlier.units, earlier.rate)
     gap = float(samples.t[0] - earlier.t[-1])
-    return has_same_format and 0.0 < gap <= _MAX_GAP_S
+    return has_same_format and 0.0 < gap <= _PRIORS.gap
