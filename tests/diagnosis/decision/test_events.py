@@ -88,9 +88,9 @@ def known_names() -> frozenset[str]:
 @pytest.mark.parametrize("name", ROWS)
 def test_every_row_is_complete(name: str) -> None:
     row = ROWS[name]
-    assert KEYS <= set(row) <= KEYS | {"disturbs"}
+    assert KEYS <= set(row) <= KEYS | {"disturbs", "scales"}
     assert row["cause"] in (*CAUSES, "")
-    assert row["moves"] and row["words"]
+    assert (row["moves"] or row["scales"]) and row["words"]
     assert set(row["probability"]) == {"value", "unit", "source"}
     assert 0.0 < row["probability"]["value"] < 1.0
     assert row["probability"]["unit"] == "1" and row["probability"]["source"]
@@ -98,7 +98,7 @@ def test_every_row_is_complete(name: str) -> None:
 
 @pytest.mark.parametrize("name", ROWS)
 def test_every_pattern_matches_what_some_provider_makes(name: str) -> None:
-    patterns = ROWS[name]["moves"] + ROWS[name].get("disturbs", [])
+    patterns = ROWS[name]["moves"] + ROWS[name].get("disturbs", []) + ROWS[name].get("scales", [])
     dead = [pattern for pattern in patterns if not any(fnmatchcase(known, pattern) for known in known_names())]
     assert dead == []
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from sealscope.diagnosis.decision.explanations import (
 )
 from sealscope.diagnosis.decision.null import HealthyNull
 from sealscope.diagnosis.inference.comparison.rise import Rise
-from sealscope.diagnosis.inference.observable import LeakRise, Observed
+from sealscope.diagnosis.inference.observable import LeakRise, LogScale, Observable, Observed
 from sealscope.diagnosis.priors.decision import DECISION
 from sealscope.diagnosis.verdict.states import state_of
 
@@ -74,6 +75,25 @@ def test_one_observable_by_hand() -> None:
     alone = next(row for row in explained if [event.name for event in row.events] == ["piston leak"])
     assert alone.probability == pytest.approx(factor * EVENTS["piston leak"].probability / total, rel=1e-9)
     assert sum(row.probability for row in explained) == pytest.approx(1.0)
+
+
+def scaled(key: str, log_scale: float) -> Observable:
+    return replace(observable(key, 1e-12), pressure_scale=LogScale(log_scale, 0.05))
+
+
+@pytest.mark.parametrize(("log_scales", "is_scale"), [((-0.7, -0.7, -0.7), True), ((-0.7, -2.5, 0.9), False)])
+def test_one_scale_of_the_pressures_explains_sizes_that_agree(
+    log_scales: tuple[float, float, float], is_scale: bool
+) -> None:
+    """The same evidence is one faulty supply of the sensors, or a leak, another friction and another noise."""
+    keys = ("volumes: leak", "levels: friction", "noise: noise of the pressures")
+    changes = [scaled(key, log_scale) for key, log_scale in zip(keys, log_scales, strict=True)]
+    assert (probability_of(explain(changes), "gain of the pressures") > 0.9) == is_scale
+    assert (leak_probability(*changes) > 0.9) != is_scale
+
+
+def test_a_leak_alone_is_no_scale_of_the_pressures() -> None:
+    assert leak_probability(scaled("volumes: leak", -0.7)) == pytest.approx(leak_probability(LEAK), abs=0.02)
 
 
 def test_a_noise_step_beside_a_leak_leaves_the_leak() -> None:

@@ -20,6 +20,7 @@ class Event:
     cause: str | None  # heading under which a verdict names the event, None if a verdict never does
     probability: float  # prior probability that it begins within a recording
     affected: tuple[str, ...]  # patterns "data: name" of the observables that it changes
+    scaled: tuple[str, ...]  # patterns of those that it changes by the factor on both pressures
     disturbed: tuple[str, ...]  # patterns of those that it may change as a side effect
     description: str  # what it changes in the words of a reason, such as "the external leakage on side A"
 
@@ -31,6 +32,10 @@ class Event:
     def affects(self, observable: Observable) -> bool:
         """Return True if the patterns `affected` state that the event changes an observable."""
         return _matches(f"{observable.data}: {observable.name}", self.affected)
+
+    def scales(self, observable: Observable) -> bool:
+        """Return True if the patterns `scaled` state that the event changes an observable by a factor on pressures."""
+        return _matches(f"{observable.data}: {observable.name}", self.scaled)
 
     def may_disturb(self, observable: Observable) -> bool:
         """Return True if the patterns `disturbed` state that the event may change an observable as a side effect."""
@@ -53,6 +58,7 @@ def load_events() -> Sequence[Event]:
             cause=row["cause"] or None,
             probability=row["probability"]["value"],
             affected=tuple(row["moves"]),
+            scaled=tuple(row.get("scales", ())),
             disturbed=tuple(row.get("disturbs", ())),
             description=row["words"],
         )

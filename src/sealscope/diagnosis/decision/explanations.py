@@ -182,6 +182,7 @@ def _gains_at_onset(event: Event, factors: Sequence[tuple[Observable, float]]) -
     affected observables: a much clearer side effect has another cause.
     """
     affected = [(observable, gain) for observable, gain in factors if event.affects(observable)]
+    affected += _agree_on_scale([(observable, gain) for observable, gain in factors if event.scales(observable)])
     if not affected:
         return {}
     best_explained, best_gain = max(affected, key=lambda pair: pair[1])
@@ -198,6 +199,30 @@ def _gains_at_onset(event: Event, factors: Sequence[tuple[Observable, float]]) -
             size_log_odds = 0.5 * observable.advantage if event.is_sized else 0.0
             gains[observable.data] = max(gain + size_log_odds, gains.get(observable.data, 0.0))
     return gains
+
+
+def _agree_on_scale(factors: Sequence[tuple[Observable, float]]) -> list[tuple[Observable, float]]:
+    """Reduce the log Bayes factors of changes that one scale of both pressures explains less well than they require.
+
+    An observable states the logarithm v of the scale that would cause its change. If k is the logarithm of the scale,
+    its log factor is reduced by ((v - k) / s)^2 / 2, to 0 at least. Its deviation s includes the error of such a law,
+    `explanation.scale` in `priors.toml`. Of all v, k is the one that explains most. Observables without a stated scale
+    are left out.
+    """
+    best: list[tuple[Observable, float]] = []
+    best_sum, misfit = 0.0, DECISION.explanation.scale
+    scales = [(observable, gain, scale) for observable, gain in factors if (scale := observable.pressure_scale)]
+    for _, _, candidate in scales:
+        reduced = [
+            (observable, max(gain - 0.5 * (scale.value - candidate.value) ** 2 / (scale.deviation**2 + misfit**2), 0.0))
+            for observable, gain, scale in scales
+        ]
+        largest: dict[str, float] = {}
+        for observable, gain in reduced:
+            largest[observable.data] = max(gain, largest.get(observable.data, 0.0))
+        if sum(largest.values()) > best_sum:
+            best, best_sum = reduced, sum(largest.values())
+    return best
 
 
 def _log_factor(observable: Observable, chance: float, rise: LeakRise | None) -> float:

@@ -18,6 +18,13 @@ from sealscope.diagnosis.inference.onset import Interval, StepTest
 from sealscope.diagnosis.verdict.evidence import Cause, LeakCourse, RelativeLeak, TotalLeakage
 
 
+class LogScale(NamedTuple):
+    """Logarithm of the factor by which both pressures would have to be scaled to cause a change, and its deviation."""
+
+    value: float
+    deviation: float
+
+
 @dataclass(frozen=True, kw_only=True)
 class Observable:
     """Result of a test whether one quantity that a detector estimates has changed.
@@ -43,6 +50,8 @@ class Observable:
         prior on its size.
     log_ratio_to_leak : float, optional
         Log likelihood ratio of two explanations of a difference from healthy recordings: this change, and a leak.
+    pressure_scale : LogScale, optional
+        Scale of both pressures that would cause this change by itself; None if it is unknown, or if none would.
     """
 
     name: str
@@ -53,6 +62,7 @@ class Observable:
     size: float = 0.0
     advantage: float = 0.0
     log_ratio_to_leak: float | None = None
+    pressure_scale: LogScale | None = None
 
     @property
     def surprisal(self) -> float:
@@ -61,12 +71,19 @@ class Observable:
 
     @classmethod
     def from_test(
-        cls, name: str, data: str, test: StepTest, *, n_tests: float = 1.0, sign: float = 1.0, advantage: float = 0.0
+        cls,
+        name: str,
+        data: str,
+        test: StepTest,
+        *,
+        n_tests: float = 1.0,
+        advantage: float = 0.0,
+        pressure_scale: LogScale | None = None,
     ) -> Observable:
         """Make an observable from a test for a step, a sudden lasting change, within the recording.
 
-        `test`: the best of `n_tests` tests, whose p-value is therefore multiplied by their number (Bonferroni); `sign`:
-        1 for a step up, -1 for a step down, whose size the test states as positive. The others are fields of the class.
+        `test`: the best of `n_tests` tests, whose p-value is therefore multiplied by their number (Bonferroni). The
+        others are fields of the class.
         """
         return cls(
             name=name,
@@ -74,8 +91,9 @@ class Observable:
             score=test.score,
             chance=min(1.0, n_tests * test.chance),
             onset=test.onset(),
-            size=sign * test.fitted.size,
+            size=test.sign * test.fitted.size,
             advantage=advantage,
+            pressure_scale=pressure_scale,
         )
 
 

@@ -138,6 +138,8 @@ class StepTest:
         Variance q of the walk and variance kappa of the noise, each without a step and with the best one.
     law : NullLaw
         Distribution of the score under the null.
+    sign : float
+        1 for a step up; -1 for a step down, whose sizes are stated as positive.
     """
 
     score: float
@@ -152,6 +154,7 @@ class StepTest:
     walk: tuple[float, float]
     noise: tuple[float, float]
     law: NullLaw
+    sign: float = 1.0
 
     @cached_property
     def weights(self) -> Array:
@@ -323,7 +326,8 @@ def step_tests(information: Information, signs: Sequence[float], shape: Array | 
     whitening, z, onsets = whitened
     steps = whitening.transform_steps(whitening.positions, shape)
     fits = _fit_steps(z, steps, whitening.eigen)
-    return [_test_step_up(whitening, onsets, steps, fits if sign > 0.0 else fits.upside_down()) for sign in signs]
+    tests = [_test_step_up(whitening, onsets, steps, fits if sign > 0.0 else fits.upside_down()) for sign in signs]
+    return [replace(test, sign=sign) for test, sign in zip(tests, signs, strict=True)]
 
 
 def step_sizes(

@@ -40,6 +40,7 @@ class ExplanationPriors(PriorTable):
     sure: float  # a leak is excluded if its probability is below 1 - `sure`
     combined: float  # smallest logarithm of the Bayes factor with which an event is combined with others
     misfit: float  # smallest relative error with which a term of the model is assumed to describe the data
+    scale: float  # relative error of a common factor on the pressures, as leakage, friction and noise state it
 
 
 class WorthPriors(PriorTable):

@@ -138,10 +138,12 @@ def _split_blocks(recording: Recording, length: int) -> tuple[Array, dict[str, A
     return recording.t[0] + (np.arange(count) + 0.5) * length / recording.rate, blocks
 
 
+#: Name of the noise of both pressures together.
+NOISE = "noise of the pressures"
 #: Names of all that `sensor_features` yields, of which a running machine's blocks keep one number each.
 SENSOR_FEATURES = (
     "sense of p_A - p_B",
-    "noise of the pressures",
+    NOISE,
     "noise of p_A beside that of p_B",
     *(f"hum of {hertz:g} Hz" for hertz in _PRIORS.mains),
 )
@@ -168,7 +170,7 @@ def sensor_features(blocks: Mapping[str, Array], rate: float) -> Iterator[tuple[
     noise_A, noise_B = (
         np.log(_row_statistic(np.median, np.nanmedian, np.diff(p, ORDER, axis=1) ** 2)) for p in (p_A, p_B)
     )
-    yield "noise of the pressures", noise_A + noise_B
+    yield NOISE, noise_A + noise_B
     yield "noise of p_A beside that of p_B", noise_A - noise_B
     bin_width = rate / (p_A.shape[1] // 2)  # [Hz], of the spectra of half a block
     for hertz in _PRIORS.mains:

@@ -27,6 +27,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sealscope.diagnosis.inference.observable import LogScale
 from sealscope.diagnosis.inference.onset import RANK_TOLERANCE, Information, step_test
 from sealscope.diagnosis.inference.terms import HALF_DIFFERENCE, central_difference
 from sealscope.diagnosis.priors.changes import CHANGES
@@ -38,13 +39,15 @@ _TINY = float(np.finfo(float).tiny)
 A, B, HALF_A, HALF_B = np.eye(4)
 #: Names of a fall of both levels, by a loss of oil, and of a rise, which has many causes.
 CHARGE, SUPPLY = "a loss of oil", "what feeds both chambers"
+#: Name of a change of the friction, which changes with the direction of motion.
+FRICTION = "friction"
 #: Name of each pattern, and bases of its subspace. If the subspace contains simpler patterns, each of them supplies the
 #: first vectors of one basis.
 PATTERNS: tuple[tuple[str, list[list[Array]]], ...] = (
     (CHARGE, [[A + B]]),
-    ("friction", [[A + B, HALF_A, HALF_B]]),
-    ("friction", [[HALF_A - HALF_B]]),
-    ("friction", [[A, B, HALF_A, HALF_B]]),
+    (FRICTION, [[A + B, HALF_A, HALF_B]]),
+    (FRICTION, [[HALF_A - HALF_B]]),
+    (FRICTION, [[A, B, HALF_A, HALF_B]]),
     (SUPPLY, [[A + B, HALF_A + HALF_B]]),
     ("load", [[A, B], [B, A], [A + B, A]]),
     ("zero of p_A", [[A]]),
@@ -69,7 +72,7 @@ class LevelChange(NamedTuple):
     `name`: cause that changes these levels, such as "friction"; `rank`: the score minus log(number of blocks) for each
     coefficient of the pattern after the first, by which patterns are compared; `score`: twice the log likelihood ratio
     of a step to no step; `chance`: probability that a healthy recording scores as high; `onset`: time of the step [s];
-    `block`: length of a block [s].
+    `block`: length of a block [s]; `pressure_scale`: scale of both pressures that would cause the change, if known.
     """
 
     name: str
@@ -78,6 +81,7 @@ class LevelChange(NamedTuple):
     chance: float
     onset: float
     block: float
+    pressure_scale: LogScale | None = None
 
 
 def motion_columns(channels: Mapping[str, Array], rate: float) -> Array | None:
@@ -208,8 +212,26 @@ def pattern_tests(time: Array, values: Array) -> tuple[LevelChange, ...]:
         # only a fall of the sum of both levels can be a loss of oil
         after = time > change.onset
         is_falling = after.any() and not after.all() and sum_of_levels[after].mean() <= sum_of_levels[~after].mean()
+        if name == FRICTION:
+            change = change._replace(pressure_scale=_pressure_scale(values[~after], values[after]))
         changes.append(change._replace(name=SUPPLY) if name == CHARGE and not is_falling else change)
     return tuple(sorted(changes, key=lambda change: -change.rank))
+
+
+def _pressure_scale(before: Array, after: Array) -> LogScale | None:
+    """Compute the scale of both pressures that would change the friction from the blocks `before` to those `after`.
+
+    `before`, `after` (k, 4) [Pa]: `PressureLevels.values`. The friction shows in the difference of half_A and half_B.
+    Return None if it is not known in two blocks of each, or has no positive mean.
+    """
+    frictions = [values @ (HALF_A - HALF_B) for values in (before, after)]
+    if min(len(friction) for friction in frictions) < 2:
+        return None
+    means = np.array([friction.mean() for friction in frictions])
+    if not means.min() > 0.0:
+        return None
+    errors = [friction.std(ddof=1) / np.sqrt(len(friction)) for friction in frictions]
+    return LogScale(math.log(means[1] / means[0]), math.hypot(*(errors / means)))
 
 
 def _whitening_matrix(values: Array) -> Array:

@@ -9,12 +9,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
+from dataclasses import replace
 
 import numpy as np
 
-from sealscope.diagnosis.inference.changes.features import BLOCKS, ORDER, duty_tests, sensor_tests
+from sealscope.diagnosis.inference.changes.features import BLOCKS, NOISE, ORDER, duty_tests, sensor_tests
 from sealscope.diagnosis.inference.changes.levels import LevelChange, level_tests
-from sealscope.diagnosis.inference.observable import Observable, Observed
+from sealscope.diagnosis.inference.observable import LogScale, Observable, Observed
 from sealscope.diagnosis.inference.onset import Interval, StepTest
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.recording import Recording, compute_once
@@ -83,7 +84,11 @@ def sensor_observables(tests: Iterable[tuple[str, StepTest]]) -> Iterator[Observ
     each test is the better of two, for a step up and a step down.
     """
     for name, test in tests:
-        yield Observable.from_test(name, name.split()[0], test, n_tests=2.0)
+        observable = Observable.from_test(name, name.split()[0], test, n_tests=2.0)
+        if name == NOISE:  # the sum of the logarithms of two variances, i.e. four times that of a scale
+            scale = LogScale(0.25 * observable.size, 0.25 * test.fitted.deviation)
+            observable = replace(observable, pressure_scale=scale)
+        yield observable
 
 
 #: Largest exponent whose exponential fits into a float.
@@ -102,4 +107,11 @@ def level_observables(changes: Sequence[LevelChange]) -> Iterator[Observable]:
         onset = Interval(change.onset, change.onset - change.block, change.onset + change.block)
         deficit = min(changes[0].rank - change.rank, _MAX_EXPONENT)
         chance = min(1.0, changes[0].chance * float(np.exp(deficit)))
-        yield Observable(name=change.name, data="levels", score=change.rank, chance=chance, onset=onset)
+        yield Observable(
+            name=change.name,
+            data="levels",
+            score=change.rank,
+            chance=chance,
+            onset=onset,
+            pressure_scale=change.pressure_scale,
+        )

@@ -6,6 +6,7 @@ their scores (twice the log likelihood ratios) can be compared directly.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
@@ -23,8 +24,8 @@ from sealscope.diagnosis.inference.blocks import (
 from sealscope.diagnosis.inference.changes.charge_pressure import ChargeTrend
 from sealscope.diagnosis.inference.differences import size_penalty
 from sealscope.diagnosis.inference.leak_law import EXPONENTS, apparent_conductances, law_priors
-from sealscope.diagnosis.inference.observable import Observable
-from sealscope.diagnosis.inference.onset import Information, StepTest, step_tests
+from sealscope.diagnosis.inference.observable import LogScale, Observable
+from sealscope.diagnosis.inference.onset import WITHIN_95, Information, StepTest, fit_history, step_tests
 from sealscope.diagnosis.inference.terms import (
     AIR,
     BIAS,
@@ -89,7 +90,10 @@ def volume_observables(
         steps = step_tests(coefficient, signs, shape)
         if not steps:
             continue
-        step, sign = max(zip(steps, signs, strict=True), key=lambda pair: pair[0].score)
+        step = max(steps, key=lambda test: test.score)
+        pressure_scale = None
+        if name in (PUMP, *_LEAK_EXPONENTS):
+            pressure_scale = _pressure_scale(coefficient, step)
         if name in (LEAK, PUMP):
             advantage = -leak_disadvantage
         else:
@@ -105,9 +109,34 @@ def volume_observables(
             flow = step.fitted.size * unit_flow * flow_scale
             advantage += charge.loss_support(flow, float(step.onsets[step.best]))
         observables.append(
-            Observable.from_test(name, VOLUMES, step, n_tests=len(steps), sign=sign, advantage=advantage)
+            Observable.from_test(
+                name,
+                VOLUMES,
+                step,
+                n_tests=len(steps),
+                advantage=advantage,
+                pressure_scale=pressure_scale,
+            )
         )
     return tuple(sorted(observables, key=lambda observable: -observable.score))
+
+
+def _pressure_scale(conductance: Information, step: StepTest) -> LogScale | None:
+    """Compute the scale of both pressures that would make a leak's conductance appear to rise by a step.
+
+    The leakage stays the same, so that scaled pressures change the apparent conductance from G_1 to G_2 = G_1 / scale.
+    `conductance`: its likelihood in the blocks of the recording; `step`: test for the step. Return None if a mean
+    before or after the onset is not positive.
+    """
+    history = fit_history(conductance, step, with_step=True)
+    is_after = np.asarray(conductance.time > step.onsets[step.best])
+    if is_after.all() or not is_after.any():
+        return None
+    before, after = (history.average(flags / np.count_nonzero(flags)) for flags in (~is_after, is_after))
+    if not min(before.value, after.value) > 0.0:
+        return None
+    relative_errors = [(mean.high - mean.value) / (WITHIN_95 * mean.value) for mean in (before, after)]
+    return LogScale(math.log(before.value / after.value), math.hypot(*relative_errors))
 
 
 def _size_penalty(

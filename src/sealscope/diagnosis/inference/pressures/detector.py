@@ -75,6 +75,6 @@ def score_response_steps(information: Mapping[str, Information]) -> tuple[Observ
         signs = (1.0,) if name == "G" else (1.0, -1.0)
         tests = step_tests(likelihood, signs)
         if tests:
-            test, sign = max(zip(tests, signs, strict=True), key=lambda test_and_sign: test_and_sign[0].score)
-            observables.append(Observable.from_test(name, RESPONSE, test, n_tests=float(len(signs)), sign=sign))
+            test = max(tests, key=lambda test: test.score)
+            observables.append(Observable.from_test(name, RESPONSE, test, n_tests=float(len(signs))))
     return tuple(sorted(observables, key=lambda observable: -observable.score))
