@@ -23,6 +23,8 @@ class PressureLevelPriors(PriorTable):
     blocks: tuple[int, ...]  # numbers of blocks that a recording may be divided into, tried from the largest on
     least: float  # smallest fraction of a block's time that the machine must move in each direction
     slowest: float  # lowest speed that counts as motion, over the highest one
+    freedom: float  # degrees of freedom of the t distribution of the differences between blocks
+    misfit: float  # relative error with which a pattern describes a step of the levels
 
 
 class HealthyLevelPriors(PriorTable):

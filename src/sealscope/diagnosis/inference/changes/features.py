@@ -83,14 +83,15 @@ def _find_moving_blocks(recording: Recording, length: int) -> NDArray[np.bool_]:
 def log_amplitudes(blocks: Mapping[str, Array]) -> Iterator[tuple[str, Array]]:
     """Yield the names "command" and "motion", each with the log amplitude (K,) of its channel in K blocks.
 
-    The amplitude is the range from the 2 % to the 98 % quantile, NaN for a block without samples. `blocks`: samples (K,
-    length) by channel. "command" or "motion" is left out if none of its channels is recorded.
+    The amplitude is the range from the 10 % to the 90 % quantile, which neither a short transient nor a short rest
+    changes much; NaN for a block without samples. `blocks`: samples (K, length) by channel. "command" or "motion" is
+    left out if none of its channels is recorded.
     """
     for name, candidates in (("command", COMMANDS), ("motion", MOTIONS)):
         if channel := next((candidate for candidate in candidates if candidate in blocks), None):
             low, high = (
                 _row_statistic(partial(np.percentile, q=q), partial(np.nanpercentile, q=q), blocks[channel])
-                for q in (2.0, 98.0)
+                for q in (10.0, 90.0)
             )
             yield name, np.log(high - low)
 

@@ -8,13 +8,20 @@ same way throughout a recording,
 
 A leak between the chambers changes none of the four: the force that the piston needs determines the difference of the
 pressures, the enclosed oil their mean. Another cause changes some of the four at one instant in a known pattern, a
-subspace of the four dimensions. Each pattern is a hypothesis. Let S be the covariance of the differences between
+subspace of the four dimensions. Each pattern is a hypothesis. Let S be the scatter of the differences between
 neighbouring blocks, which contain little of slow drifts. Multiplied by S^(-1/2), the four numbers have white noise, and
 each pattern has an orthonormal basis of m directions. In n blocks, score_j is twice the log likelihood ratio of a step
 in direction j, without steps in the other directions. F_j is the ratio of the residual sums of squares without and with
 that step, minus 1:
 
-    F_j = exp(score_j / n) - 1,    rank = max over onsets of n log(1 + sum_j F_j) - (m - 1) log n.
+    F_j = exp(score_j / n) - 1,    score = max over onsets of n log(1 + sum_j F_j).
+
+A pattern explains nothing of the other directions. Patterns are therefore compared by the likelihood of all c numbers
+together, with one variance v: the sum over directions of the residual variance, with the step in those of the pattern
+only. In c n numbers, with the largest log likelihood ratio L = c n / 2 log(v without a step / v) over all onsets and
+the relative misfit e of a pattern (`levels.misfit` in `priors.toml`),
+
+    rank = 2 L / (1 + 2 e L) - (m - 1) log n.
 
 Each further coefficient costs log n (G. Schwarz, Ann. Statist. 6 (1978) 461).
 """
@@ -35,6 +42,8 @@ from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.recording import Array, Recording
 
 _PRIORS = CHANGES.levels
+#: Iterations of the scatter of differences between blocks.
+_SCATTER_ITERATIONS = 20
 _TINY = float(np.finfo(float).tiny)
 A, B, HALF_A, HALF_B = np.eye(4)
 #: Names of a fall of both levels, by a loss of oil, and of a rise, which has many causes.
@@ -69,10 +78,10 @@ class PressureLevels(NamedTuple):
 class LevelChange(NamedTuple):
     """Result of the test for a step of the pressure levels in one pattern, i.e. one combination of levels.
 
-    `name`: cause that changes these levels, such as "friction"; `rank`: the score minus log(number of blocks) for each
-    coefficient of the pattern after the first, by which patterns are compared; `score`: twice the log likelihood ratio
-    of a step to no step; `chance`: probability that a healthy recording scores as high; `onset`: time of the step [s];
-    `block`: length of a block [s]; `pressure_scale`: scale of both pressures that would cause the change, if known.
+    `name`: cause that changes these levels, such as "friction"; `rank`: by which patterns are compared (see the
+    module); `score`: twice the log likelihood ratio of a step to no step in these levels alone; `chance`: probability
+    that a healthy recording scores as high; `onset`: time of the step [s]; `block`: length of a block [s];
+    `pressure_scale`: scale of both pressures that would cause the change, if known.
     """
 
     name: str
@@ -237,16 +246,23 @@ def _pressure_scale(before: Array, after: Array) -> LogScale | None:
 def _whitening_matrix(values: Array) -> Array:
     """Compute the matrix (c, 4) that transforms pressure levels to c numbers with independent errors of equal variance.
 
-    The matrix W is a root of the inverse of S, W' W = S^-1, where S is the covariance of the differences between
-    neighbouring blocks. `values` (K, 4): `PressureLevels.values`; c of its columns are not constant.
+    The matrix W is a root of the inverse of S, W' W = S^-1, where S is the scatter of the differences between
+    neighbouring blocks. They follow a multivariate t distribution, so that the large differences at a step hardly
+    count. S is its likeliest value (K. L. Lange et al., J. Am. Statist. Assoc. 84 (1989) 881). `values` (K, 4):
+    `PressureLevels.values`; c of its columns are not constant.
     """
     varying = np.flatnonzero(np.ptp(values, axis=0) > 0.0)  # half differences are constant without a motion
     differences = np.diff(values[:, varying], axis=0)
-    covariance = differences.T @ differences / len(differences)
-    deviations = np.sqrt(np.diag(covariance))
-    eigen, basis = np.linalg.eigh(covariance / np.outer(deviations, deviations))
+    deviations = np.sqrt((differences**2).mean(axis=0))
+    differences = differences / deviations
+    scatter = differences.T @ differences / len(differences)
+    for _ in range(_SCATTER_ITERATIONS):
+        squares = ((differences @ np.linalg.pinv(scatter, hermitian=True)) * differences).sum(axis=1)
+        weights = (_PRIORS.freedom + len(varying)) / (_PRIORS.freedom + squares)
+        scatter = (differences * weights[:, None]).T @ differences / len(differences)
+    eigen, basis = np.linalg.eigh(scatter)
     matrix = np.zeros((len(varying), 4))
-    matrix[:, varying] = (basis / np.sqrt(np.maximum(eigen, RANK_TOLERANCE))) @ basis.T / deviations
+    matrix[:, varying] = (basis / np.sqrt(np.maximum(eigen, RANK_TOLERANCE * eigen[-1]))) @ basis.T / deviations
     return matrix
 
 
@@ -254,23 +270,33 @@ def _test_pattern(name: str, rows: Array, whitened: Array, time: Array) -> Level
     """Test the pressure levels for a step in one pattern, i.e. within a subspace of their possible changes.
 
     `rows` (m, c): vectors that span the subspace; `whitened` (K, c): levels in K blocks, both multiplied by the
-    `_whitening_matrix`; `time` (K,): times of the blocks [s]. Return None if no direction can be tested.
+    `_whitening_matrix`; `time` (K,): times of the blocks [s]. Return None if a direction cannot be tested.
     """
     basis, triangle = np.linalg.qr(rows.T)
     # orthonormal directions, without those of vectors that depend on earlier ones
     basis = basis[:, np.abs(np.diag(triangle)) > RANK_TOLERANCE * np.abs(triangle).max()]
-    components = [Information(time, np.eye(len(time)), whitened @ direction) for direction in basis.T]
-    tests = [test for component in components if (test := step_test(component, signs=(1.0, -1.0))) is not None]
-    if not tests:
+    n_blocks, n_directions = len(time), basis.shape[1]
+    if not n_directions:
         return None
-    n_blocks, n_directions = len(time), len(tests)
-    # log likelihood ratio of a step in each direction at each onset; then log(1 + sum_j F_j) at each onset, where F_j
-    # is the residual sum of squares without a step over that with a step in direction j, minus 1
-    log_ratios = np.array([test.likelihood - test.likelihood.max() + 0.5 * test.score for test in tests])
-    gains = np.log1p(np.expm1(np.maximum(log_ratios, 0.0) / (0.5 * n_blocks)).sum(axis=0))
-    best = int(np.argmax(gains))
-    score = n_blocks * float(gains[best])
-    chance = 2.0 * n_directions * min(test.law.chance(score) for test in tests)  # up or down in each direction
-    rank = score - (n_directions - 1) * float(np.log(n_blocks))
+    directions = np.column_stack([basis, np.linalg.qr(basis, mode="complete")[0][:, n_directions:]])
+    components = [Information(time, np.eye(n_blocks), whitened @ direction) for direction in directions.T]
+    tests = [test for component in components if (test := step_test(component, signs=(1.0, -1.0))) is not None]
+    if len(tests) < len(components):
+        return None
+    # variance of each direction without a step, and with a step at each onset: v for the log likelihood -n log(v) / 2
+    likelihood = np.array([test.likelihood for test in tests])
+    likelihood_without = likelihood.max(axis=1) - 0.5 * np.array([test.score for test in tests])
+    variance_without = np.exp(-2.0 / n_blocks * likelihood_without)
+    variance = np.minimum(np.exp(-2.0 / n_blocks * likelihood), variance_without[:, None])[:n_directions]
+    unexplained = variance_without[n_directions:].sum()
+    log_ratios = 0.5 * len(tests) * n_blocks * np.log(variance_without.sum() / (variance.sum(axis=0) + unexplained))
+    best = int(np.argmax(log_ratios))
+    log_ratio = float(log_ratios[best])
+    # a pattern describes the levels only approximately
+    rank = 2.0 * log_ratio / (1.0 + 2.0 * _PRIORS.misfit * log_ratio) - (n_directions - 1) * math.log(n_blocks)
+    # sum_j F_j over the directions of the pattern, each with its own variance
+    gains = np.log1p((variance_without[:n_directions, None] / variance - 1.0).sum(axis=0))
+    score = n_blocks * float(gains.max())
+    chance = 2.0 * n_directions * min(test.law.chance(score) for test in tests[:n_directions])  # up or down in each
     onset, block = float(tests[0].onsets[best]), float(time[1] - time[0])
     return LevelChange(name, rank, score, min(1.0, chance), onset, block)

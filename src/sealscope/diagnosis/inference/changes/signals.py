@@ -99,14 +99,15 @@ def level_observables(changes: Sequence[LevelChange]) -> Iterator[Observable]:
     """Convert tests for steps of the pressure levels to observables (test results).
 
     `changes`: a test for each pattern, the combination of levels that a cause changes, with the highest rank first. The
-    rank (`LevelChange`) becomes the score. The p-value of change k is chance_k = min(1, chance_1 exp(rank_1 - rank_k)).
+    rank (`LevelChange`) becomes the score. The first is the best of n patterns, so that its p-value is n chance_1
+    (Bonferroni). That of change k is min(1, n chance_1 exp(rank_1 - rank_k)).
     Half of the exponent is the log Bayes factor of change 1 over change k (Schwarz's approximation), the other half a
     prior against patterns that need further coefficients. The interval of an onset is one block to either side.
     """
     for change in changes:
         onset = Interval(change.onset, change.onset - change.block, change.onset + change.block)
         deficit = min(changes[0].rank - change.rank, _MAX_EXPONENT)
-        chance = min(1.0, changes[0].chance * float(np.exp(deficit)))
+        chance = min(1.0, len(changes) * changes[0].chance * float(np.exp(deficit)))
         yield Observable(
             name=change.name,
             data="levels",
