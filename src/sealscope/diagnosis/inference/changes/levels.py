@@ -35,7 +35,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sealscope.diagnosis.inference.observable import LogScale
-from sealscope.diagnosis.inference.onset import RANK_TOLERANCE, Information, step_test
+from sealscope.diagnosis.inference.onset import MIN_BLOCKS, RANK_TOLERANCE, Information, step_test
 from sealscope.diagnosis.inference.terms import HALF_DIFFERENCE, central_difference
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.cycle import find_cycle
@@ -205,26 +205,47 @@ def pattern_tests(time: Array, values: Array) -> tuple[LevelChange, ...]:
 
     A pattern (`PATTERNS`) is the combination of levels that one cause changes, such as friction or a sensor's offset.
     Those that cannot be tested are left out. `time` (K,), `values` (K, 4): times [s] and levels of `PressureLevels`.
+
+    A step takes time, so that the levels of the block in which it begins are those of neither before nor after it.
+    Without the blocks on both sides of the most likely onset the patterns are compared again: these ranks count. The
+    p-values are those of all blocks.
     """
+    tests = _test_patterns(time, values)
+    changes = [test for test in tests if test is not None]
+    if changes and len(time) >= MIN_BLOCKS + 2:
+        onset = max(changes, key=lambda change: change.rank).onset
+        near_onset = np.argsort(np.abs(time - onset), kind="stable")[:2]
+        settled = _test_patterns(np.delete(time, near_onset), np.delete(values, near_onset, axis=0))
+        changes = [
+            test._replace(rank=settled_test.rank)
+            for test, settled_test in zip(tests, settled, strict=True)
+            if test is not None and settled_test is not None
+        ]
+    return tuple(sorted(changes, key=lambda change: -change.rank))
+
+
+def _test_patterns(time: Array, values: Array) -> list[LevelChange | None]:
+    """Test pressure levels for a step in each pattern (`pattern_tests`); None for a pattern that cannot be tested."""
     whitening = _whitening_matrix(values)
     mean = values.mean(axis=0)
     sum_of_levels = values[:, :2].sum(axis=1)
     # a step of a sensor's scale changes level and half difference of that pressure in proportion to their means
     scales = (("scale of p_A", [[mean * (A + HALF_A)]]), ("scale of p_B", [[mean * (B + HALF_B)]]))
-    changes = list[LevelChange]()
+    changes = list[LevelChange | None]()
     for name, bases in (*PATTERNS, *scales):
         tests = [_test_pattern(name, np.array(rows) @ whitening.T, values @ whitening.T, time) for rows in bases]
         # of several bases of one pattern the lowest rank counts
         change = min((test for test in tests if test is not None), key=lambda test: test.rank, default=None)
-        if change is None:
-            continue
-        # only a fall of the sum of both levels can be a loss of oil
-        after = time > change.onset
-        is_falling = after.any() and not after.all() and sum_of_levels[after].mean() <= sum_of_levels[~after].mean()
-        if name == FRICTION:
-            change = change._replace(pressure_scale=_pressure_scale(values[~after], values[after]))
-        changes.append(change._replace(name=SUPPLY) if name == CHARGE and not is_falling else change)
-    return tuple(sorted(changes, key=lambda change: -change.rank))
+        if change is not None:
+            # only a fall of the sum of both levels can be a loss of oil
+            after = time > change.onset
+            is_falling = after.any() and not after.all() and sum_of_levels[after].mean() <= sum_of_levels[~after].mean()
+            if name == CHARGE and not is_falling:
+                change = change._replace(name=SUPPLY)
+            if name == FRICTION:
+                change = change._replace(pressure_scale=_pressure_scale(values[~after], values[after]))
+        changes.append(change)
+    return changes
 
 
 def _pressure_scale(before: Array, after: Array) -> LogScale | None:
