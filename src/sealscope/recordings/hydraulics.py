@@ -36,7 +36,7 @@ def find_implausibility(recording: Recording) -> str | None:
     if pressures and max(pressures) < _PRIORS.pressure:
         return f"the pressures stay below {max(pressures):.3g} Pa: is their unit right?"
     noise_tested = "p_A - p_B" if len(names) == 2 else next(iter(names), "")
-    if noise_tested and _is_noise(signals[noise_tested]):
+    if noise_tested and _is_noise(signals[noise_tested], is_zero_known=len(names) == 2):
         return f"{noise_tested} is noise: the machine's motion does not show in it"
     return None
 
@@ -63,14 +63,16 @@ def _describe_speed_mismatch(recording: Recording) -> str | None:
     return f"the speed is {ratio:.3g} times that at which the angle turns: is the unit of the time right?"
 
 
-def _is_noise(values: Array) -> bool:
+def _is_noise(values: Array, is_zero_known: bool) -> bool:
     """Test whether a signal (n,) is mostly white noise, or has missing samples.
 
-    White noise must have more than the fraction `readings.noise` (`priors.toml`) of the signal's variance. The mean
-    square of the third difference of white noise is 20 times its variance.
+    White noise must have more than the fraction `readings.noise` (`priors.toml`) of the signal's variance, or of its
+    mean square with `is_zero_known`: zero then means no load, so that a constant load is a signal. The mean square of
+    the third difference of white noise is 20 times its variance.
     """
+    power = np.mean(values**2) if is_zero_known else np.var(values)
     # `not <=`, so that missing samples count as noise
-    return not np.mean(np.diff(values, 3) ** 2) <= 20.0 * _PRIORS.noise * np.var(values)
+    return not np.mean(np.diff(values, 3) ** 2) <= 20.0 * _PRIORS.noise * power
 
 
 def describe_missing_chambers(recording: Recording) -> str | None:

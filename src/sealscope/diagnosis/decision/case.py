@@ -15,6 +15,7 @@ from sealscope.diagnosis.decision.explanations import (
     Explanation,
     explain,
     log_bayes_factor,
+    older_leak_gain,
     probability_against_chance,
     probability_of,
 )
@@ -137,16 +138,18 @@ class Case:
     def _has_onset_within(self) -> bool:
         """True if a leak that began within the recording is a better explanation than an older leak.
 
-        An older leak explains only the rise over healthy recordings. One that began within the recording explains a
-        step (a sudden increase) and the rise that this step causes. The result is True without measured leakage or
-        healthy recordings, or if the times in which valves hold the load show when the rise began (`rise_onset`).
+        An older leak explains the rise over healthy recordings and, by its law, some changes with the pressure. One
+        that began within the recording explains a step (a sudden increase) and the rise that this step causes. The
+        result is True without measured leakage or healthy recordings, or if the times in which valves hold the load
+        show when the rise began (`rise_onset`).
         """
         leak = self.leak
         if leak is None or leak.step_rise is None or leak.rise_onset is not None:
             return True
-        rise, step_log_ratio = leak.step_rise  # log likelihood ratio: the step caused the rise, against no rise
-        within_factor = sum(log_bayes_factor(test.chance) for test in self.tests if test.name == WITHIN)  # 0 or 1 test
-        return within_factor + step_log_ratio > log_bayes_factor(rise.chance)
+        rise = leak.step_rise
+        step_gain = sum(log_bayes_factor(test.chance) for test in self.tests if test.name == WITHIN)  # 0 or 1 test
+        older_gain = older_leak_gain(step_gain, rise) + log_bayes_factor(rise.rise.chance)
+        return step_gain + rise.step_log_ratio > older_gain
 
     @cached_property
     def other_event(self) -> OtherEvent | None:

@@ -161,15 +161,27 @@ def _possible_gains(
     """Compute an event's log Bayes factors by kind of data, in one mapping for each possible time of its onset.
 
     `factors` are observables with the log Bayes factors of a change. The first mapping is for an onset within the
-    recording. A leak gets a second one if `rise` is given, for an onset before the recording: such a leak explains only
-    the leakage above that of healthy recordings (the rise).
+    recording. A leak gets a second one if `rise` is given, for an onset before the recording: such a leak explains the
+    leakage above that of healthy recordings (the rise) and, unless its flow is laminar, some changes with the pressure.
     """
     gains = _gains_at_onset(event, factors)
     if rise is None or event.name not in LEAK_EVENTS:
         return [gains]
-    if gains.get(VOLUMES, 0.0) > 0.0:
+    older_gains = {RISE: log_bayes_factor(rise.rise.chance)}
+    if (volume_gain := gains.get(VOLUMES, 0.0)) > 0.0:
         gains[RISE] = rise.step_log_ratio  # a leak that began within the recording explains the rise by its step
-    return [gains, {RISE: log_bayes_factor(rise.rise.chance)}]
+        older_gains[VOLUMES] = older_leak_gain(volume_gain, rise)
+    return [gains, older_gains]
+
+
+def older_leak_gain(step_gain: float, rise: LeakRise) -> float:
+    """Compute the log Bayes factor, for changes of the leakage within a recording, of a leak that was there before.
+
+    `step_gain`: that of a leak that begins within the recording, of which the log likelihood ratio of both is
+    subtracted (`LeakRise.onset_log_ratio`). Models describe the data only approximately (`_correct_for_misfit`).
+    """
+    misfit_divisor = 1.0 + 2.0 * DECISION.explanation.misfit * step_gain
+    return max(step_gain - rise.onset_log_ratio / misfit_divisor, 0.0)
 
 
 def _gains_at_onset(event: Event, factors: Sequence[tuple[Observable, float]]) -> dict[str, float]:

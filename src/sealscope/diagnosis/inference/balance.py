@@ -204,19 +204,19 @@ class BlockStream:
         odds are the sum over three symptoms of correct wiring, each with a z score (`_sign_log_odds`):
 
         - Oil leaks from high to low pressure.
-        - p_A - p_B correlates with the flow into A, since friction dissipates energy. A constant load also does work in
-          strokes that do not return; its mean p_A - p_B, weighted by abs(flow), is subtracted.
+        - The force of the pressures on the piston correlates with the flow into A, since friction dissipates energy. A
+          constant load also does work in strokes that do not return; its mean, weighted by abs(flow), is subtracted.
         - The position x grows with the flow into A. A negative correlation does not count, since x may be reversed.
         """
         odds_by_balance = []
         for balance, columns, values in zip(self._balances, self.columns, rows, strict=True):
-            pressure, left = values[:, columns.leak], balance.flow_sign * values[:, columns.left]
+            left = balance.flow_sign * values[:, columns.left]
             motion = values[:, [k for k in columns.motion if columns.names[k].startswith("motion")]].sum(axis=1)
             leak_z = _leak_z_score(values.T @ values, columns, len(values))
             log_odds = _sign_log_odds(leak_z, other_cause=INFERENCE.sense.leak)
             if (flow := np.abs(left)).any():
-                constant_load = np.average(pressure, weights=flow)
-                work_z = _z_score((pressure - constant_load) * left)
+                load = _load_pressure(values, columns, balance.area_ratio)
+                work_z = _z_score((load - np.average(load, weights=flow)) * left)
                 log_odds += _sign_log_odds(work_z, other_cause=INFERENCE.sense.work)
             motion_z = _z_score(motion * left)
             if motion_z > 0.0:  # else either x or the flow may be reversed
@@ -321,6 +321,19 @@ def _z_score(products: Array) -> float:
     """
     standard_deviation = float(np.linalg.norm(products) * np.sqrt(OVERLAP))
     return float(products.sum()) / max(standard_deviation, float(np.finfo(float).tiny))
+
+
+def _load_pressure(rows: Array, columns: ColumnRoles, area_ratio: float) -> Array:
+    """Compute p_A - `area_ratio` p_B in each row (r,) of a regression, i.e. the pressures' force over the area of A.
+
+    `area_ratio`: area of the piston on side B over that on side A. It is p_A - p_B in a balance without the columns of
+    both pressures, those of the external leaks.
+    """
+    names = [f"external leak {side}" for side in "AB"]
+    if area_ratio == 1.0 or not set(names) <= set(columns.names):
+        return np.asarray(rows[:, columns.leak])
+    p_A, negative_p_B = (rows[:, columns.names.index(name)] for name in names)
+    return np.asarray(p_A + area_ratio * negative_p_B)
 
 
 def _sign_log_odds(z: float, other_cause: float) -> float:

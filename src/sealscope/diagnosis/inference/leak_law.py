@@ -22,7 +22,14 @@ import numpy as np
 
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles
 from sealscope.diagnosis.inference.observable import Flow
-from sealscope.diagnosis.inference.onset import Information, StepTest, step_shapes, step_sizes, step_test
+from sealscope.diagnosis.inference.onset import (
+    Information,
+    StepTest,
+    constant_log_ratio,
+    step_shapes,
+    step_sizes,
+    step_test,
+)
 from sealscope.diagnosis.inference.terms import ORIFICE
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Array
@@ -92,6 +99,24 @@ def find_leak_step(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Informa
         if test is not None:
             tests.append(test.share_alarms(float(prior)))
     return min(tests, key=lambda test: (test.chance, -test.score), default=None)
+
+
+def step_to_constant_log_ratio(
+    blocks: Blocks, columns: Sequence[ColumnRoles], leak: Information, test: StepTest
+) -> float:
+    """Compute the log likelihood ratio of a leak that begins within a recording to one that was there before.
+
+    The leak that begins is the step of `test`. A leak that was there before changes its apparent conductance with the
+    pressure, unless its flow is laminar: it is averaged over the exponents of `EXPONENTS` with their prior
+    probabilities. `leak`: likelihood of the leak's coefficient in the blocks.
+    """
+    shapes = apparent_conductances(blocks, columns)
+    log_ratios = [
+        np.log(prior) + constant_log_ratio(leak, shapes[exponent] / max(float(shapes[exponent].mean()), _TINY))
+        for exponent, prior in zip(EXPONENTS, law_priors(), strict=True)
+    ]
+    step_log_ratio = 0.5 * test.score + float(np.log(test.law.share))  # with the prior probability of its law
+    return step_log_ratio - float(np.logaddexp.reduce(log_ratios))
 
 
 def growth_priors() -> list[tuple[float, float]]:

@@ -7,6 +7,7 @@ and `decision.decide` weighs the reports.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
@@ -117,12 +118,15 @@ class Remark(NamedTuple):
 class LeakRise(NamedTuple):
     """Leakage of a recording above that of healthy recordings (`rise`), and its agreement with a step.
 
-    `step_log_ratio`: log likelihood ratio, for the estimated rise, of a step of the leakage that was found within the
-    recording to no rise. It is positive if the rise agrees with the step.
+    - `step_log_ratio`: log likelihood ratio, for the estimated rise, of a step of the leakage that was found within the
+      recording to no rise. It is positive if the rise agrees with the step.
+    - `onset_log_ratio`: log likelihood ratio, for the changes of the leakage within the recording, of this step to a
+      leak that was there before; infinite if an older leak explains none of them.
     """
 
     rise: Rise
     step_log_ratio: float = 0.0
+    onset_log_ratio: float = math.inf
 
 
 class RiseTest(Protocol):

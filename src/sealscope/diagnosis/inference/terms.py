@@ -264,6 +264,8 @@ class Equation(NamedTuple):
         (`balance.derive_drive_signals`).
     flow_sign : float
         1 if a flow into A is positive on the left side, -1 if it is negative.
+    area_ratio : float
+        Area of the piston on side B over that on side A; 1 in a balance of one chamber.
     """
 
     name: str
@@ -272,6 +274,7 @@ class Equation(NamedTuple):
     healthy: float = float("inf")
     by_command: bool = False
     flow_sign: float = 1.0
+    area_ratio: float = 1.0
 
 
 #: Names of terms: first the leak past the piston or in the pump, laminar (the tested term) and through an orifice.
@@ -507,7 +510,9 @@ def equations(rig: Rig, channels: frozenset[str]) -> tuple[Equation, ...]:
     # both chambers count alike, but on a single rod only the loaded chamber counts
     single_rod = rig.cylinder.single_rod
     air = _free_air_term(rig, weight_A=lambda s: _interval_means(s.carried_by_A) if single_rod else 0.5)
-    balance = _insert_before_leaks(Equation(CYLINDER, left, tuple(terms), by_command=source == "u"), air)
+    area_ratio = rig.cylinder.A_B / rig.cylinder.A_A
+    equation = Equation(CYLINDER, left, tuple(terms), by_command=source == "u", area_ratio=area_ratio)
+    balance = _insert_before_leaks(equation, air)
     return (_select_recorded_terms(balance, channels | {START}),)  # START is derived, not recorded
 
 

@@ -21,6 +21,7 @@ from sealscope.diagnosis.inference.leak_law import (
     estimate_step_flow,
     law_priors,
     mixture_flow,
+    step_to_constant_log_ratio,
 )
 from sealscope.diagnosis.inference.observable import Flow, LeakRise, Remark
 from sealscope.diagnosis.inference.onset import BOUND_PROBABILITY, UPPER_95, WITHIN_95, Interval, StepTest, fit_history
@@ -360,17 +361,19 @@ class BalanceLeak:
             return None
         if step is None or motion_rise is None:
             return LeakRise(total_rise)
-        chambers = self.balance.chambers
+        balance, chambers = self.balance, self.balance.chambers
         leaks = None if self._hold_rise is None or chambers is None else chambers.leaks_since(step.onset().value)
-        sums = self.balance.recording_sums._replace(held=leaks)
+        sums = balance.recording_sums._replace(held=leaks)
         rise_after = None if leaks is None else held_rise(sums, self.healthy)
+        onset_log_ratio = step_to_constant_log_ratio(balance.running_blocks, balance.columns, balance.leak, step)
         if rise_after is None:
-            fraction = self.balance.compared_leak.fraction_after(step.onset().value)
+            fraction = balance.compared_leak.fraction_after(step.onset().value)
             mean_rise = step.fitted.size * fraction  # mean over the recording
-            return LeakRise(total_rise, motion_rise.log_ratio_within(mean_rise, tail=INFERENCE.scatter.tail))
+            step_log_ratio = motion_rise.log_ratio_within(mean_rise, tail=INFERENCE.scatter.tail)
+            return LeakRise(total_rise, step_log_ratio, onset_log_ratio)
         log_deviation: float = INFERENCE.held_oil.agrees  # standard deviation of log(rise / step)
         whole_rise = rise_after._replace(may_be_partial=False)  # after the onset the holds show the whole step
-        return LeakRise(total_rise, whole_rise.log_ratio(step.fitted.size, log_deviation))
+        return LeakRise(total_rise, whole_rise.log_ratio(step.fitted.size, log_deviation), onset_log_ratio)
 
     @property
     def lpm_per_flow(self) -> float | None:
