@@ -21,7 +21,7 @@ from sealscope.diagnosis.decision.explanations import (
 )
 from sealscope.diagnosis.decision.null import HealthyNull, null_key
 from sealscope.diagnosis.inference.comparison.rise import RISE
-from sealscope.diagnosis.inference.observable import LeakMeasure, Observable, Observed
+from sealscope.diagnosis.inference.observable import Flow, LeakMeasure, Observable, Observed
 from sealscope.diagnosis.priors.decision import DECISION
 from sealscope.diagnosis.verdict.evidence import AGAINST, WITHIN
 from sealscope.diagnosis.verdict.states import joint_causes
@@ -132,10 +132,10 @@ class Case:
         They have the order of `tests`, WITHIN first, which is reversed if the leak seems older than the recording.
         """
         alarms = [test for test in self.tests if test.chance < test.probability]
-        return tuple(alarms if self._has_onset_within else reversed(alarms))
+        return tuple(alarms if self.has_onset_within else reversed(alarms))
 
     @property
-    def _has_onset_within(self) -> bool:
+    def has_onset_within(self) -> bool:
         """True if a leak that began within the recording is a better explanation than an older leak.
 
         An older leak explains the rise over healthy recordings and, by its law, some changes with the pressure. One
@@ -148,8 +148,20 @@ class Case:
             return True
         rise = leak.step_rise
         step_gain = sum(log_bayes_factor(test.chance) for test in self.tests if test.name == WITHIN)  # 0 or 1 test
-        older_gain = older_leak_gain(step_gain, rise) + log_bayes_factor(rise.rise.chance)
-        return step_gain + rise.step_log_ratio > older_gain
+        older_gain = older_leak_gain(step_gain, rise) + rise.older_log_ratio
+        return step_gain + rise.step_log_ratio > max(older_gain, log_bayes_factor(rise.rise.chance))
+
+    def leak_flow(self, alarm: LeakTest) -> Flow | None:
+        """Return the mean flow of the leak that raised an `alarm`; None if it is unknown.
+
+        It is that of a leak that began within the recording, or that was there before, as the recording shows.
+        """
+        leak = self.leak
+        if leak is None:
+            return None
+        if not self.has_onset_within and leak.step_rise is not None and leak.step_rise.older_flow is not None:
+            return leak.step_rise.older_flow
+        return leak.step_flow if alarm.name == WITHIN and self.has_onset_within else leak.rise_flow
 
     @cached_property
     def other_event(self) -> OtherEvent | None:

@@ -105,7 +105,9 @@ def _leak_evidence(case: Case, alarm: LeakTest) -> Evidence:
         fields: dict[str, Any] = {"cause": "piston leak"}
         onset = case.rarest_observable.onset
     else:
-        if alarm.name == WITHIN and leak.step is not None:
+        if not case.has_onset_within:
+            onset = None
+        elif alarm.name == WITHIN and leak.step is not None:
             onset = leak.step.onset()
         else:
             onset = leak.rise_onset if alarm.name == AGAINST else None
@@ -113,7 +115,7 @@ def _leak_evidence(case: Case, alarm: LeakTest) -> Evidence:
             "cause": _leak_cause(case, leak, alarm),
             "total_leakage": leak.total(detectable_flow=None),  # no detectable flow is stated beside a leak
             "course": leak.history(None if onset is None else onset.value),
-            **_size_fields(leak, leak.step_flow if alarm.name == WITHIN else leak.rise_flow),
+            **_size_fields(leak, case.leak_flow(alarm)),
         }
     if onset is not None:
         fields |= {"onset_s": onset.value, "onset_interval_s": (onset.low, onset.high)}
@@ -165,7 +167,7 @@ def _leak_bound(case: Case, alarm: LeakTest | None) -> float:
     bound = leak.bound_flow
     mean_pump_flow, _ = leak.pump_flow  # mean over the whole recording
     if alarm is not None and case.leak_probability(alarm) > 1.0 - DECISION.explanation.sure:
-        flow = leak.step_flow if alarm.name == WITHIN else leak.rise_flow
+        flow = case.leak_flow(alarm)
         if flow is not None:
             deviation = np.hypot(flow.deviation, flow.value * leak.size_deviation)
             bound = max(bound, flow.value + WITHIN_95 * float(deviation))
@@ -213,7 +215,7 @@ def _add_tests(case: Case, evidence: Evidence, judging: LeakTest | None) -> Evid
         return evidence
     parts = tuple(
         Evidence(
-            LEAK if evidence.verdict == LEAK and test is judging else NO_LEAK,
+            LEAK if evidence.verdict == LEAK and test.chance < test.probability else NO_LEAK,
             reason=test.name,
             score=test.score,
             threshold=test.threshold,

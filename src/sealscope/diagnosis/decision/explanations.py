@@ -162,16 +162,20 @@ def _possible_gains(
 
     `factors` are observables with the log Bayes factors of a change. The first mapping is for an onset within the
     recording. A leak gets a second one if `rise` is given, for an onset before the recording: such a leak explains the
-    leakage above that of healthy recordings (the rise) and, unless its flow is laminar, some changes with the pressure.
+    leakage above that of healthy recordings (the rise). A third one is for an older leak that is not laminar: changes
+    with the pressure show its size, which must then agree with the rise.
     """
     gains = _gains_at_onset(event, factors)
     if rise is None or event.name not in LEAK_EVENTS:
         return [gains]
     older_gains = {RISE: log_bayes_factor(rise.rise.chance)}
-    if (volume_gain := gains.get(VOLUMES, 0.0)) > 0.0:
-        gains[RISE] = rise.step_log_ratio  # a leak that began within the recording explains the rise by its step
-        older_gains[VOLUMES] = older_leak_gain(volume_gain, rise)
-    return [gains, older_gains]
+    volume_gain = gains.get(VOLUMES, 0.0)
+    if not volume_gain > 0.0:
+        return [gains, older_gains]
+    gains[RISE] = rise.step_log_ratio  # a leak that began within the recording explains the rise by its step
+    # healthy recordings calibrate the step only, so that its factor is the largest
+    bending_gains = {RISE: rise.older_log_ratio, VOLUMES: min(older_leak_gain(volume_gain, rise), volume_gain)}
+    return [gains, older_gains, bending_gains]
 
 
 def older_leak_gain(step_gain: float, rise: LeakRise) -> float:

@@ -76,10 +76,12 @@ def _leak_text(case: Case, evidence: Evidence, alarm: LeakTest | None) -> str:
         return text_of("leak", "details", what=f"RMS: {rarest.name}", percent=percent, where=where)
     test_name = alarm.name if alarm else ""
     key = {WITHIN: "within", AGAINST: "against"}.get(test_name, "level")
+    if key == "within" and not case.has_onset_within:
+        key = "older"
     total = evidence.total_leakage
     if key == "level" and total is not None and total.lpm is not None and total.healthy_lpm is not None:
         return text_of("leak", "level_flow", lpm=total.lpm, healthy=total.healthy_lpm)
-    if key != "level" and case.leak.provider == PRESSURE_RESPONSE:
+    if key in ("within", "against") and case.leak.provider == PRESSURE_RESPONSE:
         key = f"conductance_{key}"
     text = text_of("leak", key)
     return f"{text}; {text_of('leak', 'no_size')}" if "leak_lpm" in evidence.refuses else text

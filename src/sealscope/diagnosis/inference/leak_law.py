@@ -16,11 +16,12 @@ after the onset, the step is g / s.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
 
-from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles
+from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, information
 from sealscope.diagnosis.inference.observable import Flow
 from sealscope.diagnosis.inference.onset import (
     Information,
@@ -101,22 +102,63 @@ def find_leak_step(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Informa
     return min(tests, key=lambda test: (test.chance, -test.score), default=None)
 
 
-def step_to_constant_log_ratio(
-    blocks: Blocks, columns: Sequence[ColumnRoles], leak: Information, test: StepTest
-) -> float:
-    """Compute the log likelihood ratio of a leak that begins within a recording to one that was there before.
+def older_log_weights(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Information) -> Array:
+    """Compute how well a leak that was there before the recording explains the changes of the leakage within it.
 
-    The leak that begins is the step of `test`. A leak that was there before changes its apparent conductance with the
-    pressure, unless its flow is laminar: it is averaged over the exponents of `EXPONENTS` with their prior
-    probabilities. `leak`: likelihood of the leak's coefficient in the blocks.
+    Unless its flow is laminar, its apparent conductance changes with the pressure. The result has, for each exponent of
+    `EXPONENTS`, the log likelihood ratio of such a leak to none (`constant_log_ratio`) plus the log prior of the
+    exponent. `leak`: likelihood of the leak's coefficient in the blocks.
     """
     shapes = apparent_conductances(blocks, columns)
     log_ratios = [
-        np.log(prior) + constant_log_ratio(leak, shapes[exponent] / max(float(shapes[exponent].mean()), _TINY))
-        for exponent, prior in zip(EXPONENTS, law_priors(), strict=True)
+        constant_log_ratio(leak, shapes[exponent] / max(float(shapes[exponent].mean()), _TINY))
+        for exponent in EXPONENTS
     ]
-    step_log_ratio = 0.5 * test.score + float(np.log(test.law.share))  # with the prior probability of its law
-    return step_log_ratio - float(np.logaddexp.reduce(log_ratios))
+    return np.asarray(log_ratios + np.log(law_priors()))
+
+
+def estimate_bend_flows(blocks: Blocks, columns: Sequence[ColumnRoles], noise: float) -> list[Flow | None]:
+    """Estimate the mean flow [m^3/s] of a leak that was there before the recording, from its bend over the pressure.
+
+    The healthy leakage is laminar and does not bend. To the second order, c |dp|^e bends as an orifice with the
+    coefficient a does if their second derivatives agree, e (e - 1) c |dp|^e = -a |dp|^(1/2) / 4, so that
+
+        flow = a |dp|^(1/2) / (4 e (1 - e)).
+
+    The result has a flow for each exponent of `EXPONENTS`, None for laminar flow or if a is unknown. `noise`: variance
+    of the coefficients over the one that the rows of the balance state.
+    """
+    bend = information(blocks, columns, columns[0].names.index(ORIFICE))
+    precision = float(bend.precision.sum()) / noise
+    if not precision > 0.0:
+        return [None] * len(EXPONENTS)
+    coefficient = float(bend.vector.sum()) / noise / precision
+    root = float(blocks.rows @ blocks.mean_root()) / max(float(blocks.rows.sum()), _TINY)
+    factors = [None if exponent == 1.0 else root / (4.0 * exponent * (1.0 - exponent)) for exponent in EXPONENTS]
+    return [None if factor is None else Flow(coefficient * factor, factor / math.sqrt(precision)) for factor in factors]
+
+
+def estimate_older_flow(log_weights: Array, rise_flows: Sequence[Flow], bend_flows: Sequence[Flow | None]) -> Flow:
+    """Estimate the mean flow [m^3/s] of a leak that was there before the recording, averaged over its exponents.
+
+    `log_weights`: those of `older_log_weights`, which tell whether the flow is laminar, but hardly the exponents below
+    1 from each other; `rise_flows`, `bend_flows`: for each exponent the flow by the rise over healthy recordings, and
+    by its bend over the pressure (`estimate_bend_flows`). The two are averaged with their precisions.
+    """
+    log_priors = np.log(law_priors())
+    log_ratio = float((log_weights - log_priors).max())
+    weights, flows = list[float](), list[Flow]()
+    for log_prior, by_rise, by_bend in zip(log_priors, rise_flows, bend_flows, strict=True):
+        flow, weight = by_rise, float(log_prior)
+        if by_bend is not None:
+            variances = np.maximum(np.square([by_rise.deviation, by_bend.deviation]), _TINY)
+            weight += log_ratio - 0.5 * (by_rise.value - by_bend.value) ** 2 / float(variances.sum())
+            value = float(np.average([by_rise.value, by_bend.value], weights=1.0 / variances))
+            flow = Flow(value, float(1.0 / np.sqrt((1.0 / variances).sum())))
+        weights.append(weight)
+        flows.append(flow)
+    values, deviations = np.array(flows).T
+    return mixture_flow(np.exp(np.array(weights) - max(weights)), values, deviations)
 
 
 def growth_priors() -> list[tuple[float, float]]:

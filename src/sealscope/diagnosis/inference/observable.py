@@ -122,11 +122,16 @@ class LeakRise(NamedTuple):
       recording to no rise. It is positive if the rise agrees with the step.
     - `onset_log_ratio`: log likelihood ratio, for the changes of the leakage within the recording, of this step to a
       leak that was there before; infinite if an older leak explains none of them.
+    - `older_log_ratio`: log likelihood ratio, for the estimated rise, of such an older leak, as large as those changes
+      show it, to no rise.
+    - `older_flow`: mean flow of the older leak, None if only the rise tells it.
     """
 
     rise: Rise
     step_log_ratio: float = 0.0
     onset_log_ratio: float = math.inf
+    older_log_ratio: float = 0.0
+    older_flow: Flow | None = None
 
 
 class RiseTest(Protocol):

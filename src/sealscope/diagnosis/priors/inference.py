@@ -83,6 +83,7 @@ class OilPriors(PriorTable):
     friction_session: float
     friction_changes: float
     drop_tells: float  # probability that a change of this drop is due to the oil, not to load and speed
+    drop_misleads: float  # probability that something else than the oil changed the drop of the judged recording alone
 
 
 class SizePriors(PriorTable):

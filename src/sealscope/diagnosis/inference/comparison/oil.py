@@ -76,6 +76,9 @@ def _oils_by_drop(recordings: Sequence[RecordingSums], unknown_deviation: float)
     makes these drops scatter more. With an unknown scatter, their density is proportional to S^(-(n - 1) / 2), where S
     is the sum of the squares of their logarithms about the mean and of their relative errors.
 
+    In each there is a small probability, `oil.drop_misleads` of `priors.toml`, that something else, such as a swollen
+    seal, changed the judged drop, which then tells nothing of the oil.
+
     A drop below its standard error is replaced by this error. A recording without a drop gets the mean drop, and the
     error of unknown oil: `unknown_deviation`, the standard deviation of the logarithm of the leakage. The list is empty
     if the judged recording or all healthy ones have no drop.
@@ -109,9 +112,20 @@ def _oils_by_drop(recordings: Sequence[RecordingSums], unknown_deviation: float)
         shown_drops, healthy_logs.mean(axis=1).tolist(), log_probabilities.tolist(), strict=True
     ):
         error_variance = (prior.per_drop * drop_error / shown) ** 2
-        # variance of the true drop over that of the measured one
-        reliability = np.where(is_known, variance / (variance + error_variance), 0.0)
-        thinning = -prior.per_drop * reliability * np.where(is_known, np.log(shown) - mean, 0.0)
-        deviation = prior.per_drop_deviation / prior.per_drop
-        oils.append(OilHypothesis(thinning, (1.0 - reliability) * variance, log_probability, slope_deviation=deviation))
+        slope_deviation = prior.per_drop_deviation / prior.per_drop
+        is_judged = np.arange(len(recordings)) == len(recordings) - 1
+        for tells, probability in (
+            (is_known, 1.0 - prior.drop_misleads),
+            (is_known & ~is_judged, prior.drop_misleads),
+        ):
+            # variance of the true drop over that of the measured one
+            reliability = np.where(tells, variance / (variance + error_variance), 0.0)
+            oils.append(
+                OilHypothesis(
+                    thinning=-prior.per_drop * reliability * np.where(tells, np.log(shown) - mean, 0.0),
+                    variances=(1.0 - reliability) * variance,
+                    log_probability=log_probability + float(np.log(probability)),
+                    slope_deviation=slope_deviation,
+                )
+            )
     return oils

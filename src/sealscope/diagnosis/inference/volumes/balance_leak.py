@@ -17,11 +17,13 @@ from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSum
 from sealscope.diagnosis.inference.comparison.rise import Mixture, Rise
 from sealscope.diagnosis.inference.leak_law import (
     EXPONENTS,
+    estimate_bend_flows,
+    estimate_older_flow,
     estimate_rise_flow,
     estimate_step_flow,
     law_priors,
     mixture_flow,
-    step_to_constant_log_ratio,
+    older_log_weights,
 )
 from sealscope.diagnosis.inference.observable import Flow, LeakRise, Remark
 from sealscope.diagnosis.inference.onset import BOUND_PROBABILITY, UPPER_95, WITHIN_95, Interval, StepTest, fit_history
@@ -365,15 +367,42 @@ class BalanceLeak:
         leaks = None if self._hold_rise is None or chambers is None else chambers.leaks_since(step.onset().value)
         sums = balance.recording_sums._replace(held=leaks)
         rise_after = None if leaks is None else held_rise(sums, self.healthy)
-        onset_log_ratio = step_to_constant_log_ratio(balance.running_blocks, balance.columns, balance.leak, step)
+        older = older_log_weights(balance.running_blocks, balance.columns, balance.leak)
+        # both with the prior probability of the leak's law
+        onset_log_ratio = 0.5 * step.score + float(np.log(step.law.share) - np.logaddexp.reduce(older))
+        older_log_ratio, older_flow = self._compare_older_leak(older, step.noise[False], motion_rise)
         if rise_after is None:
             fraction = balance.compared_leak.fraction_after(step.onset().value)
             mean_rise = step.fitted.size * fraction  # mean over the recording
             step_log_ratio = motion_rise.log_ratio_within(mean_rise, tail=INFERENCE.scatter.tail)
-            return LeakRise(total_rise, step_log_ratio, onset_log_ratio)
+            return LeakRise(total_rise, step_log_ratio, onset_log_ratio, older_log_ratio, older_flow)
         log_deviation: float = INFERENCE.held_oil.agrees  # standard deviation of log(rise / step)
         whole_rise = rise_after._replace(may_be_partial=False)  # after the onset the holds show the whole step
-        return LeakRise(total_rise, whole_rise.log_ratio(step.fitted.size, log_deviation), onset_log_ratio)
+        step_log_ratio = whole_rise.log_ratio(step.fitted.size, log_deviation)
+        return LeakRise(total_rise, step_log_ratio, onset_log_ratio, older_log_ratio, older_flow)
+
+    def _compare_older_leak(self, log_weights: Array, noise: float, motion_rise: Rise) -> tuple[float, Flow | None]:
+        """Compute `older_log_ratio` and `older_flow` of `LeakRise`, for a leak that was there before the recording.
+
+        `log_weights`: those of `older_log_weights`; `noise`: as in `estimate_bend_flows`; `motion_rise`: rise over
+        healthy recordings in the whole recording. The flow is None if holds measure it, which do so better.
+        """
+        balance, total_rise = self.balance, self.rise
+        assert total_rise is not None
+        low, high = motion_rise.interval()
+        deviation = (high - low) / (2.0 * WITHIN_95)
+        units = [unit for unit, _ in self._rise_laws()]  # mean flow for a rise of 1
+        bend_flows = estimate_bend_flows(balance.running_blocks, balance.columns, noise)
+        rises = [flow.value / unit for flow, unit in zip(bend_flows, units, strict=True) if flow is not None]
+        if not rises:
+            return 0.0, None
+        log_deviation: float = INFERENCE.held_oil.agrees
+        log_ratios = [total_rise.log_ratio(rise, log_deviation) if rise > 0.0 else -np.inf for rise in rises]
+        log_ratio = float(np.logaddexp.reduce(log_ratios) - np.log(len(rises)))
+        if self._hold_rise is not None:
+            return log_ratio, None
+        rise_flows = [Flow(motion_rise.value * unit, deviation * unit) for unit in units]
+        return log_ratio, self._add_law_uncertainty(estimate_older_flow(log_weights, rise_flows, bend_flows))
 
     @property
     def lpm_per_flow(self) -> float | None:
