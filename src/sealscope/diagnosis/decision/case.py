@@ -154,14 +154,16 @@ class Case:
     def leak_flow(self, alarm: LeakTest) -> Flow | None:
         """Return the mean flow of the leak that raised an `alarm`; None if it is unknown.
 
-        It is that of a leak that began within the recording, or that was there before, as the recording shows.
+        That of a step within the recording is the step's flow if the leak began there. If it was there before, changes
+        with the pressure show its flow, together with the rise over healthy recordings.
         """
         leak = self.leak
         if leak is None:
             return None
-        if not self.has_onset_within and leak.step_rise is not None and leak.step_rise.older_flow is not None:
-            return leak.step_rise.older_flow
-        return leak.step_flow if alarm.name == WITHIN and self.has_onset_within else leak.rise_flow
+        if alarm.name != WITHIN:
+            return leak.rise_flow
+        older_flow = None if self.has_onset_within or leak.step_rise is None else leak.step_rise.older_flow
+        return leak.step_flow if older_flow is None else older_flow
 
     @cached_property
     def other_event(self) -> OtherEvent | None:
