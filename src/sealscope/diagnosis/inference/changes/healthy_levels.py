@@ -36,7 +36,13 @@ from sealscope.diagnosis.inference.changes.motion_fit import (
 )
 from sealscope.diagnosis.inference.changes.pressure_bands import PAIRS, Octaves, compare_spectra, compute_octaves
 from sealscope.diagnosis.inference.changes.signals import SIGNALS
-from sealscope.diagnosis.inference.differences import MIN_HEALTHY, Estimate, PriorScatter, compare_estimates
+from sealscope.diagnosis.inference.differences import (
+    MIN_HEALTHY,
+    Estimate,
+    PriorScatter,
+    compare_estimates,
+    size_penalty,
+)
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.chambers import CHAMBERS
@@ -86,7 +92,7 @@ class HealthyLevels:
             yield spectra
         if (friction := _compare_friction(judged, healthy)) is not None:
             yield friction
-        yield from _compare_drifts(judged, healthy)
+        yield from _compare_drifts(judged, healthy, recording.duration)
 
 
 def _read_octaves(summary: Summary) -> dict[str, Octaves]:
@@ -152,8 +158,8 @@ def _log_frictions(
     return log_friction(judged), [friction for summary in known if (friction := log_friction(summary)) is not None]
 
 
-def _compare_drifts(judged: Summary, healthy: Sequence[Summary]) -> Iterator[Observable]:
-    """Compare the drifts of p_A and p_B during motion with those of healthy recordings.
+def _compare_drifts(judged: Summary, healthy: Sequence[Summary], duration: float) -> Iterator[Observable]:
+    """Compare the drifts of p_A and p_B during motion, over the `duration` [s], with those of healthy recordings.
 
     Yields a test for each of three alternative explanations: p_A drifts, p_B drifts, or both drift alike. Yields
     nothing unless the judged recording and enough healthy ones have both drifts. If both drift alike, p_A - p_B does
@@ -173,8 +179,8 @@ def _compare_drifts(judged: Summary, healthy: Sequence[Summary]) -> Iterator[Obs
     )
     if drift_A is None or drift_B is None or difference is None:
         return
-    yield drift_A
-    yield drift_B
+    for drift in (drift_A, drift_B):  # a load drifts faster than the offset of a sensor
+        yield replace(drift, advantage=-size_penalty(CHANGES.zero_drift, drift.size / duration, above=True))
     chance = drift_A.chance * drift_B.chance / max(difference.chance, TINY)
     score = max(drift_A.score + drift_B.score - difference.score, 0.0)
     yield replace(difference, chance=min(chance, 1.0), score=score)  # named DRIFTS[2], "drift of both"

@@ -438,16 +438,18 @@ class BalanceLeak:
     def total(self, detectable_flow: float | None) -> TotalLeakage:
         """Return the total leakage of pump and piston, with its interval and the limit for a healthy machine.
 
-        Behind a servo valve the flow is not stated, since the valve's edges leak as well. `detectable_flow`: flow
-        [m^3/s], by the assumed sizes, of the smallest leak that would be detected if it began within the recording;
-        None if that was not tested. The result states it as `findable_lpm` and `findable_share`.
+        The flow is not stated behind a servo valve, since the valve's edges leak as well, nor if it may exceed that of
+        the pump. `detectable_flow`: flow [m^3/s], by the assumed sizes, of the smallest leak that would be detected if
+        it began within the recording; None if that was not tested. The result states it as `findable_lpm` and
+        `findable_share`.
         """
         balance = self.balance
         size, pressure, pump_flow = balance.size, balance.mean_pressure(), balance.mean_flow
         value, low, high = balance.conductance
         limit, lpm_per_flow = healthy_leakage(balance.rig), size.scale / LITRE_PER_MINUTE
         is_single = len(balance.columns) == 1  # one balance for both chambers, so not behind a servo valve
-        is_stated = size.stated and is_single
+        # a leak that may exceed what the pump delivers is not known at all
+        is_stated = size.stated and is_single and high * pressure <= balance.blocks.moving_flow
         # the uncertain factor from computed to true flows (`size.scale`) widens the interval at both ends
         widening = 1.0 + WITHIN_95 * size.deviation
         low = low * pressure * lpm_per_flow * (1.0 / widening if low > 0.0 else widening)

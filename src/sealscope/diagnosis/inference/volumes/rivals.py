@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import compress
 
 import numpy as np
 
@@ -77,6 +78,8 @@ def rival_rises(
         change, error = _estimate_change(judged.sums, healthy_gram, columns, k)
         # change of each healthy recording relative to the other healthy ones
         changes = [_estimate_change(recording.sums, healthy_gram - recording.sums, columns, k) for recording in healthy]
+        is_known = [np.isfinite(healthy_error) for _, healthy_error in changes]
+        changes = list(compress(changes, is_known))  # in the others no pressure drives the flow of this term
         is_air = names[k] == AIR
         values = np.array([*(healthy_change for healthy_change, _ in changes), change])
         error = excess_error(error, [healthy_error for _, healthy_error in changes])
@@ -84,7 +87,7 @@ def rival_rises(
             turning_columns = [roles.replace_leak(TURNING) for roles in columns]
             level, _ = coefficient_level(healthy_gram, turning_columns)
             # levels instead of changes, since the oil scales the whole leakage
-            values = _without_oil(level + values, predict_thinning([*healthy, judged]))
+            values = _without_oil(level + values, predict_thinning([*compress(healthy, is_known), judged]))
         *healthy_values, value = values.tolist()
         observable = compare_with_healthy(
             names[k],
