@@ -163,6 +163,7 @@ class HeldOilPriors(PriorTable):
     from_start: float  # fraction of the leaks that exist from the start of a recording
     gain: float  # relative difference between the gains of two pressure sensors
     charge: float  # relative margin above the charge pressure from which no check valve feeds a side
+    tank: float  # back pressure of a line to the tank, a standard deviation
     resolved: float  # margin in addition, below which a sensor does not tell a pressure from the charge pressure
     steady: float  # [s] time over which a pressure is averaged before it is compared with the charge pressure
     # volume fraction of free air in the oil, and the standard deviation of its logarithm

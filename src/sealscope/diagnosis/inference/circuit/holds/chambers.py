@@ -136,6 +136,16 @@ class HeldChambers:
         area_A, area_B = abs(self.sides.area_A), abs(self.sides.area_B)
         return area_A > area_B, area_B > area_A
 
+    def _refill_log_prior(self, refilled: tuple[bool, bool]) -> float:
+        """Compute the log prior of the sides that are refilled, relative to that of no refilling.
+
+        The side that gains oil from the piston is refilled, or gives the oil away, only where it is open to the tank.
+        The charge pressure is then the back pressure of the tank's line, a gauge pressure that is normal with the
+        standard deviation `held_oil.tank` (`priors.toml`).
+        """
+        back_pressure: float = INFERENCE.held_oil.tank
+        return -0.5 * ((self.charge - P_ATM) / back_pressure) ** 2 if refilled == BOTH else 0.0
+
     def _is_closed(self, hold: LockedHold, p: Array) -> NDArray[np.bool_]:
         """Flag the samples (n,) of a hold in which no check valve refills a chamber.
 
@@ -234,11 +244,12 @@ class HeldChambers:
     def fit_piston_leak(self, conditions: PistonFit, law: LeakLaw = LAMINAR) -> LeakFit:
         """Fit the coefficient of a leak past the piston, given onset, sensor offset and refilled sides (`conditions`).
 
-        The likelihood includes the prior on the sensor offset.
+        The likelihood includes the priors on the sensor offset and on the refilled sides.
         """
         unit_leak = self._unit_piston_leak(conditions.offset, conditions.refilled, law)
         fit = self._fit_leak(unit_leak, conditions.onset)
-        return fit._replace(log_likelihood=fit.log_likelihood - 0.5 * self._offset_cost(conditions.offset))
+        log_prior = self._refill_log_prior(conditions.refilled) - 0.5 * self._offset_cost(conditions.offset)
+        return fit._replace(log_likelihood=fit.log_likelihood + log_prior)
 
     def start_error(self, conditions: PistonFit, law: LeakLaw) -> float:
         """Estimate the relative standard error of a piston leak's coefficient due to the uncertain start of each hold.
@@ -382,7 +393,7 @@ class HeldChambers:
         """Find the most probable onset, sensor offset and refilled sides for a leak past the piston.
 
         They have the highest joint posterior probability, on a grid of onsets and a grid of offsets that is refined
-        once, with and without check valves that refill a side (equally probable). `exponent`: as in `LeakLaw`.
+        once, with and without check valves that refill a side (`_refill_log_prior`). `exponent`: as in `LeakLaw`.
         """
         grid, fits = self._offset_grid, list[tuple[float, PistonFit]]()
         options = [NEITHER, self._refillable_sides, BOTH]
@@ -441,7 +452,7 @@ class HeldChambers:
         """
         posteriors = self._onset_posteriors(self._unit_piston_leak(offset, refilled, LeakLaw(exponent)))
         index = int(posteriors.argmax())
-        log_posterior = float(posteriors[index]) - 0.5 * self._offset_cost(offset)
+        log_posterior = float(posteriors[index]) - 0.5 * self._offset_cost(offset) + self._refill_log_prior(refilled)
         # readings during a refill lower the variance without any information: this is compensated
         log_posterior += 0.5 * self.n_readings * float(np.log(self._closed_share(refilled)))
         return log_posterior, PistonFit(float(self.onsets[index]), offset, refilled)
