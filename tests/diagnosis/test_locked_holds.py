@@ -11,7 +11,7 @@ from scipy.optimize import lsq_linear
 
 from sealscope.diagnosis.inference.circuit.holds.chambers import HeldChambers
 from sealscope.diagnosis.inference.circuit.holds.hold import extend_rests, find_charge_pressure, find_locked_holds
-from sealscope.diagnosis.inference.circuit.holds.leaks import NEITHER, LeakLaw, PistonFit
+from sealscope.diagnosis.inference.circuit.holds.leaks import BOTH, NEITHER, LeakLaw, PistonFit
 from sealscope.diagnosis.inference.circuit.holds.oil import CylinderSides, OilRegression, residual_squares
 from sealscope.diagnosis.inference.volumes.recorded import log_area_ratio
 from sealscope.diagnosis.priors.inference import INFERENCE
@@ -40,12 +40,14 @@ def held_press(
     noise_level: float = 3e3,
     charge: float = CHARGE,
     growth: float = 0.0,
+    vented: bool = False,
 ) -> HeldChambers:
     """Record four cycles of a press whose frame gives and whose valves shut for twelve seconds of each.
 
     A_A dx + V_A kappa dp_A = -q - e p_A and -A_B dx + V_B kappa dp_B = q, x as the frame gives; check valves keep both
     chambers at the pressure `charge` at least. `gain` is that of the sensor of p_B, `loads` the load of each cycle,
     `noise_level` the standard deviation of the sensors' noise [Pa], `growth` the piston leak's from `since` to the end.
+    A `vented` side B is open to the tank.
     """
     random, count = np.random.default_rng(seed), round(4 * CYCLE * RATE)
     t = np.arange(count) / RATE
@@ -71,7 +73,7 @@ def held_press(
             into_A = -flow - lost * a
             a, b = (
                 max(a + give_AA * into_A + give_AB * flow, charge),
-                max(b + give_BA * into_A + give_BB * flow, charge),
+                charge if vented else max(b + give_BA * into_A + give_BB * flow, charge),
             )
         p_A[k], p_B[k] = a, b
         x[k] = middle + (a * AREA_A - b * AREA_B) / FRAME
@@ -116,6 +118,14 @@ def test_a_rod_seal_takes_from_one_side_alone(charge: float, noise_level: float)
     leaks = held_press(outside=SEAL, noise_level=noise_level, charge=charge).leaks
     assert leaks.outside_A == pytest.approx(SEAL, rel=0.35)
     assert max(leaks.piston, leaks.outside_B) < 0.05 * SEAL
+
+
+def test_a_side_that_is_open_to_the_tank_leaves_the_piston_possible() -> None:
+    """A loses oil in any case; B tells nothing, at the pressure of a tank."""
+    chambers = held_press(piston=SEAL, vented=True, charge=0.0)
+    assert 0.05 < chambers.piston_leak.probability < 0.95
+    assert chambers.piston_leak.fit.value == pytest.approx(SEAL, rel=0.35)
+    assert held_press(piston=SEAL, charge=CHARGE).piston_fit.refilled != BOTH
 
 
 def test_a_leak_that_begins_within_the_recording_is_dated_by_the_holds() -> None:

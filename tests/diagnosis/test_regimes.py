@@ -318,6 +318,28 @@ def test_healthy_recordings_tell_the_sign_of_the_flow() -> None:
     assert mirrored.shut is not None and not np.array_equal(mirrored.shut.blocks.gram, recorded.shut.blocks.gram)
 
 
+def test_the_sense_of_a_flow_is_that_of_the_force_on_both_areas() -> None:
+    """A lift throttles its rod side: p_A - p_B falls while it goes up, but the force of the pressures rises."""
+    rig = load_rig("single-rod-eha")
+    area_A, area_B = rig.cylinder.A_A, rig.cylinder.A_B
+    random, t = np.random.default_rng(5), np.arange(round(90.0 * RATE)) / RATE
+    way = np.sign(np.sin(0.5 * t))
+    x = np.cumsum(0.02 * way) / RATE
+    throttled = 5e5 + 3e6 * np.maximum(way, 0.0)
+    force = 2e4 + 400.0 * way
+    p_A = (force + area_B * throttled) / area_A
+    assert np.corrcoef(p_A - throttled, way)[0, 1] < 0.0 < np.corrcoef(force, way)[0, 1]
+    channels = {
+        "p_A": p_A + 2e3 * random.standard_normal(len(t)),
+        "p_B": throttled + 2e3 * random.standard_normal(len(t)),
+        "x": x + 1e-6 * random.standard_normal(len(t)),
+        "q_pump": 0.02 * way * area_A,
+    }
+    recording = Recording(t, channels, {name: CHANNEL_UNITS[name] for name in channels}, RATE)
+    recorded = recorded_blocks(recording, rig)
+    assert recorded is not None and recorded.sign_log_odds[0] > 1.0
+
+
 def test_the_healthy_sign_counts_no_more_than_a_sensor_that_was_rewired() -> None:
     rewired = INFERENCE.sense.rewired
     summaries = [{"sign_log_odds": np.array([12.0])}] * 9

@@ -7,7 +7,7 @@ import pytest
 
 from sealscope.diagnosis.commissioned.healthy_file import check_summary
 from sealscope.diagnosis.inference.changes.motion_fit import fit_difference
-from sealscope.diagnosis.inference.comparison.oil import predict_thinning
+from sealscope.diagnosis.inference.comparison.oil import oil_hypotheses, predict_thinning
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums, Resistance
 from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
 from sealscope.diagnosis.priors.inference import INFERENCE
@@ -81,6 +81,19 @@ def test_thinner_oil_leaks_more() -> None:
     """With the prior exponent, and a friction that stays."""
     thinning = predicted_oil((1e5, 2e5), (1e5, 2e5), (1e5, 1e5))
     assert thinning[-1] == pytest.approx(INFERENCE.oil.per_drop * np.log(2.0), rel=0.05)
+
+
+def test_a_judged_drop_may_have_another_cause_than_the_oil() -> None:
+    """With the prior probability each hypothesis has a twin in which the judged drop tells nothing, the others do."""
+    fit = np.array(Resistance(friction=1e5, friction_error=1e3, drop=2e6, drop_error=2e4, top_speed=0.1))
+    sums = RecordingSums(np.zeros((1, 2, 2)), 3e-4, 5e6, 1.7e9, resistance=fit)
+    swollen = sums._replace(resistance=fit * [1.0, 1.0, 2.0, 1.0, 1.0])
+    oils = oil_hypotheses([sums, sums, swollen])
+    mute = [oil for oil in oils if oil.thinning[-1] == 0.0 and oil.slope_deviation > 0.0]
+    told = [oil for oil in oils if oil.thinning[-1] < 0.0]
+    odds = sum(np.exp(oil.log_probability) for oil in mute) / sum(np.exp(oil.log_probability) for oil in told)
+    assert odds == pytest.approx(INFERENCE.oil.drop_misleads / (1.0 - INFERENCE.oil.drop_misleads), rel=1e-6)
+    assert all(oil.variances[-1] > 10.0 * oil.variances[0] for oil in mute)
 
 
 def test_what_friction_gains_the_drop_loses() -> None:

@@ -84,6 +84,14 @@ def test_a_machine_under_a_load_that_swings_passes(
     assert find_implausibility(recording if names is None else recording.only(names)) is None
 
 
+def test_a_constant_load_is_a_signal() -> None:
+    """Pressures that hold a load vary less than their sensors' noise; their difference is not zero."""
+    noise = 5e4 * np.random.default_rng(7).standard_normal((2, N))
+    recording = machine()
+    held = put(recording, p_A=3e6 + noise[0] + 2e3 * np.sin(recording.t), p_B=4e5 + noise[1])
+    assert find_implausibility(held) is None
+
+
 GARBAGE: dict[str, tuple[Callable[[Recording], Recording], str]] = {
     "noise": (lambda r: put(r, p_A=3e5 + 5e4 * RANDOM.standard_normal(N)), "p_A - p_B is noise"),
     "one chamber of noise": (lambda r: put(r, p_A=3e5 + RANDOM.standard_normal(N)).only(["u", "p_A"]), "p_A is noise"),
