@@ -92,6 +92,16 @@ def test_one_scale_of_the_pressures_explains_sizes_that_agree(
     assert (leak_probability(*changes) > 0.9) != is_scale
 
 
+def test_a_scale_of_the_pressures_is_described_whatever_shows_it() -> None:
+    """No other sensor fault changes the leakage, so that its words are those of this one."""
+    keys = ("volumes: leak", "levels: friction", "noise: noise of the pressures")
+    changes = [scaled(key, -0.7) for key in keys]
+    for first in changes:
+        judge = Observed("volume balance", (first, *(other for other in changes if other is not first)))
+        event = Case(judge, judge.observables, HealthyNull(), 0.01).other_event
+        assert event is not None and event.description == EVENTS["gain of the pressures"].description
+
+
 def test_a_leak_alone_is_no_scale_of_the_pressures() -> None:
     assert leak_probability(scaled("volumes: leak", -0.7)) == pytest.approx(leak_probability(LEAK), abs=0.02)
 

@@ -174,7 +174,7 @@ class Case:
         """
         named_events = [event for event in load_events() if event.cause and event.name not in LEAK_EVENTS]
         candidates_of = {
-            observable: [event for event in named_events if event.affects(observable)]
+            observable: [event for event in named_events if event.changes(observable)]
             for observable in self.observables
         }
         # observables with the same distribution in healthy recordings (`null_key`) count as one test
@@ -211,7 +211,7 @@ class Case:
     def _describe(self, cause: str, data_kind: str) -> str:
         """Describe in words the most probable event with a given cause that changes a kind of data."""
         tests = [observable for observable in self.observables if observable.data == data_kind]
-        events = [event for event in load_events() if event.cause == cause and any(map(event.affects, tests))]
+        events = [event for event in load_events() if event.cause == cause and any(map(event.changes, tests))]
 
         def probability(event: Event) -> float:
             return probability_of(self.explanations, event.name, data_kind=data_kind)

@@ -37,6 +37,10 @@ class Event:
         """Return True if the patterns `scaled` state that the event changes an observable by a factor on pressures."""
         return _matches(f"{observable.data}: {observable.name}", self.scaled)
 
+    def changes(self, observable: Observable) -> bool:
+        """Return True if the event changes an observable, by any amount (`affects`) or by a factor (`scales`)."""
+        return self.affects(observable) or self.scales(observable)
+
     def may_disturb(self, observable: Observable) -> bool:
         """Return True if the patterns `disturbed` state that the event may change an observable as a side effect."""
         return _matches(f"{observable.data}: {observable.name}", self.disturbed)
