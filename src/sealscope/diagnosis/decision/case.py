@@ -188,6 +188,8 @@ class Case:
             singles = {event.cause: (event.cause,) for event in candidates_of[observable] if event.cause}
             groups = {name: causes for name, causes in joint_causes().items() if singles.keys() & set(causes)}
             for name, causes in (singles | groups).items():
+                if not all(self._events_of(cause, observable.data) for cause in causes):
+                    continue  # a cause that changes other data only, beside one that changes these
                 probability = self._probability_of_causes(causes, observable.data)
                 if probability is not None:
                     description = " or ".join(self._describe(cause, observable.data) for cause in causes)
@@ -210,13 +212,16 @@ class Case:
 
     def _describe(self, cause: str, data_kind: str) -> str:
         """Describe in words the most probable event with a given cause that changes a kind of data."""
-        tests = [observable for observable in self.observables if observable.data == data_kind]
-        events = [event for event in load_events() if event.cause == cause and any(map(event.changes, tests))]
 
         def probability(event: Event) -> float:
             return probability_of(self.explanations, event.name, data_kind=data_kind)
 
-        return max(events, key=probability).description
+        return max(self._events_of(cause, data_kind), key=probability).description
+
+    def _events_of(self, cause: str, data_kind: str) -> list[Event]:
+        """Return the events with a given cause that change a kind of data (`Observable.data`)."""
+        tests = [observable for observable in self.observables if observable.data == data_kind]
+        return [event for event in load_events() if event.cause == cause and any(map(event.changes, tests))]
 
 
 def _leak_tests(case: Case, leak: LeakMeasure) -> tuple[LeakTest, ...]:

@@ -173,7 +173,7 @@ def _rivals_text(case: Case, alarm: LeakTest) -> str:
         onset = None if case.leak is None or case.leak.step is None else case.leak.step.onset()
         return "" if onset is None else text_of("doubt", "regime", seconds=onset.value)
     clearest = max(
-        (observable for observable in case.observables if event.affects(observable)),
+        (observable for observable in case.observables if event.changes(observable)),
         key=lambda observable: observable.score,
         default=None,
     )
