@@ -106,7 +106,7 @@ def test_a_cause_beside_is_not_named_of_data_that_it_does_not_change() -> None:
     """The noise stepped as well: no `external leak or sensor fault` of a residual that no sensor fault explains."""
     changes = (LEAK, observable("volumes: external leak A", 1e-12), NOISE)
     event = Case(Observed("volume balance", changes), changes, HealthyNull(), 0.01).other_event
-    assert event is None or event.cause == "sensor fault" and event.observable is NOISE
+    assert event is None or (event.cause == "sensor fault" and event.observable is NOISE)
 
 
 def test_a_leak_alone_is_no_scale_of_the_pressures() -> None:
