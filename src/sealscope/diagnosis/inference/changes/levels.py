@@ -215,11 +215,11 @@ def pattern_tests(time: Array, values: Array) -> tuple[LevelChange, ...]:
     if changes and len(time) >= MIN_BLOCKS + 2:
         onset = max(changes, key=lambda change: change.rank).onset
         near_onset = np.argsort(np.abs(time - onset), kind="stable")[:2]
-        settled = _test_patterns(np.delete(time, near_onset), np.delete(values, near_onset, axis=0))
+        reduced_tests = _test_patterns(np.delete(time, near_onset), np.delete(values, near_onset, axis=0))
         changes = [
-            test._replace(rank=settled_test.rank)
-            for test, settled_test in zip(tests, settled, strict=True)
-            if test is not None and settled_test is not None
+            test._replace(rank=reduced_test.rank)
+            for test, reduced_test in zip(tests, reduced_tests, strict=True)
+            if test is not None and reduced_test is not None
         ]
     return tuple(sorted(changes, key=lambda change: -change.rank))
 
