@@ -206,6 +206,7 @@ class BlockStream:
         - Oil leaks from high to low pressure.
         - The force of the pressures on the piston correlates with the flow into A, since friction dissipates energy. A
           constant load also does work in strokes that do not return; its mean, weighted by abs(flow), is subtracted.
+          p_A - p_B instead of the force counts as much: throttles at the rod side change the one, loads the other.
         - The position x grows with the flow into A. A negative correlation does not count, since x may be reversed.
         """
         odds_by_balance = []
@@ -215,9 +216,9 @@ class BlockStream:
             leak_z = _leak_z_score(values.T @ values, columns, len(values))
             log_odds = _sign_log_odds(leak_z, other_cause=INFERENCE.sense.leak)
             if (flow := np.abs(left)).any():
-                load = _load_pressure(values, columns, balance.area_ratio)
-                work_z = _z_score((load - np.average(load, weights=flow)) * left)
-                log_odds += _sign_log_odds(work_z, other_cause=INFERENCE.sense.work)
+                loads = [_load_pressure(values, columns, area_ratio) for area_ratio in (1.0, balance.area_ratio)]
+                work_z = [_z_score((load - np.average(load, weights=flow)) * left) for load in loads]
+                log_odds += float(np.mean([_sign_log_odds(z, other_cause=INFERENCE.sense.work) for z in work_z]))
             motion_z = _z_score(motion * left)
             if motion_z > 0.0:  # else either x or the flow may be reversed
                 log_odds += _sign_log_odds(motion_z, other_cause=INFERENCE.sense.sides)
