@@ -102,19 +102,20 @@ def find_leak_step(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Informa
     return min(tests, key=lambda test: (test.chance, -test.score), default=None)
 
 
-def older_log_weights(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Information) -> Array:
+def older_log_ratios(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Information) -> Array:
     """Compute how well a leak that was there before the recording explains the changes of the leakage within it.
 
     Unless its flow is laminar, its apparent conductance changes with the pressure. The result has, for each exponent of
-    `EXPONENTS`, the log likelihood ratio of such a leak to none (`constant_log_ratio`) plus the log prior of the
-    exponent. `leak`: likelihood of the leak's coefficient in the blocks.
+    `EXPONENTS`, the log likelihood ratio of such a leak to none (`constant_log_ratio`). `leak`: likelihood of the
+    leak's coefficient in the blocks.
     """
     shapes = apparent_conductances(blocks, columns)
-    log_ratios = [
-        constant_log_ratio(leak, shapes[exponent] / max(float(shapes[exponent].mean()), _TINY))
-        for exponent in EXPONENTS
-    ]
-    return np.asarray(log_ratios + np.log(law_priors()))
+    return np.array(
+        [
+            constant_log_ratio(leak, shapes[exponent] / max(float(shapes[exponent].mean()), _TINY))
+            for exponent in EXPONENTS
+        ]
+    )
 
 
 def estimate_bend_flows(blocks: Blocks, columns: Sequence[ColumnRoles], noise: float) -> list[Flow | None]:
@@ -138,17 +139,16 @@ def estimate_bend_flows(blocks: Blocks, columns: Sequence[ColumnRoles], noise: f
     return [None if factor is None else Flow(coefficient * factor, factor / math.sqrt(precision)) for factor in factors]
 
 
-def estimate_older_flow(log_weights: Array, rise_flows: Sequence[Flow], bend_flows: Sequence[Flow | None]) -> Flow:
+def estimate_older_flow(log_ratios: Array, rise_flows: Sequence[Flow], bend_flows: Sequence[Flow | None]) -> Flow:
     """Estimate the mean flow [m^3/s] of a leak that was there before the recording, averaged over its exponents.
 
-    `log_weights`: those of `older_log_weights`, which tell whether the flow is laminar, but hardly the exponents below
+    `log_ratios`: those of `older_log_ratios`, which tell whether the flow is laminar, but hardly the exponents below
     1 from each other; `rise_flows`, `bend_flows`: for each exponent the flow by the rise over healthy recordings, and
     by its bend over the pressure (`estimate_bend_flows`). The two are averaged with their precisions.
     """
-    log_priors = np.log(law_priors())
-    log_ratio = float((log_weights - log_priors).max())
+    log_ratio = float(log_ratios.max())
     weights, flows = list[float](), list[Flow]()
-    for log_prior, by_rise, by_bend in zip(log_priors, rise_flows, bend_flows, strict=True):
+    for log_prior, by_rise, by_bend in zip(np.log(law_priors()), rise_flows, bend_flows, strict=True):
         flow, weight = by_rise, float(log_prior)
         if by_bend is not None:
             variances = np.maximum(np.square([by_rise.deviation, by_bend.deviation]), _TINY)

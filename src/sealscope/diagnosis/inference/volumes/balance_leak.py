@@ -23,7 +23,7 @@ from sealscope.diagnosis.inference.leak_law import (
     estimate_step_flow,
     law_priors,
     mixture_flow,
-    older_log_weights,
+    older_log_ratios,
 )
 from sealscope.diagnosis.inference.observable import Flow, LeakRise, Remark
 from sealscope.diagnosis.inference.onset import BOUND_PROBABILITY, UPPER_95, WITHIN_95, Interval, StepTest, fit_history
@@ -367,10 +367,11 @@ class BalanceLeak:
         leaks = None if self._hold_rise is None or chambers is None else chambers.leaks_since(step.onset().value)
         sums = balance.recording_sums._replace(held=leaks)
         rise_after = None if leaks is None else held_rise(sums, self.healthy)
-        older = older_log_weights(balance.running_blocks, balance.columns, balance.leak)
-        # both with the prior probability of the leak's law
-        onset_log_ratio = 0.5 * step.score + float(np.log(step.law.share) - np.logaddexp.reduce(older))
-        older_log_ratio, older_flow = self._compare_older_leak(older, step.noise[False], motion_rise)
+        older_ratios = older_log_ratios(balance.running_blocks, balance.columns, balance.leak)
+        # mean over the laws by their priors; the step's law counts with its prior as well
+        mean_log_ratio = float(np.logaddexp.reduce(older_ratios + np.log(law_priors())))
+        onset_log_ratio = 0.5 * step.score + float(np.log(step.law.share)) - mean_log_ratio
+        older_log_ratio, older_flow = self._compare_older_leak(older_ratios, step.noise[False], motion_rise)
         if rise_after is None:
             fraction = balance.compared_leak.fraction_after(step.onset().value)
             mean_rise = step.fitted.size * fraction  # mean over the recording
@@ -381,10 +382,10 @@ class BalanceLeak:
         step_log_ratio = whole_rise.log_ratio(step.fitted.size, log_deviation)
         return LeakRise(total_rise, step_log_ratio, onset_log_ratio, older_log_ratio, older_flow)
 
-    def _compare_older_leak(self, log_weights: Array, noise: float, motion_rise: Rise) -> tuple[float, Flow | None]:
+    def _compare_older_leak(self, log_ratios: Array, noise: float, motion_rise: Rise) -> tuple[float, Flow | None]:
         """Compute `older_log_ratio` and `older_flow` of `LeakRise`, for a leak that was there before the recording.
 
-        `log_weights`: those of `older_log_weights`; `noise`: as in `estimate_bend_flows`; `motion_rise`: rise over
+        `log_ratios`: those of `older_log_ratios`; `noise`: as in `estimate_bend_flows`; `motion_rise`: rise over
         healthy recordings in the whole recording. The flow is None if holds measure it, which do so better.
         """
         balance, total_rise = self.balance, self.rise
@@ -397,12 +398,12 @@ class BalanceLeak:
         if not rises:
             return 0.0, None
         log_deviation: float = INFERENCE.held_oil.agrees
-        log_ratios = [total_rise.log_ratio(rise, log_deviation) if rise > 0.0 else -np.inf for rise in rises]
-        log_ratio = float(np.logaddexp.reduce(log_ratios) - np.log(len(rises)))
+        rise_log_ratios = [total_rise.log_ratio(rise, log_deviation) if rise > 0.0 else -np.inf for rise in rises]
+        log_ratio = float(np.logaddexp.reduce(rise_log_ratios) - np.log(len(rises)))
         if self._hold_rise is not None:
             return log_ratio, None
         rise_flows = [Flow(motion_rise.value * unit, deviation * unit) for unit in units]
-        return log_ratio, self._add_law_uncertainty(estimate_older_flow(log_weights, rise_flows, bend_flows))
+        return log_ratio, self._add_law_uncertainty(estimate_older_flow(log_ratios, rise_flows, bend_flows))
 
     @property
     def lpm_per_flow(self) -> float | None:

@@ -396,8 +396,8 @@ class HeldChambers:
         once, with and without check valves that refill a side (`_refill_log_prior`). `exponent`: as in `LeakLaw`.
         """
         grid, fits = self._offset_grid, list[tuple[float, PistonFit]]()
-        options = [NEITHER, self._refillable_sides, BOTH]
-        for refilled in (NEITHER, *(sides for sides in options[1:] if self._closed_share(sides) < 1.0)):
+        ever_refilled = [sides for sides in (self._refillable_sides, BOTH) if self._closed_share(sides) < 1.0]
+        for refilled in (NEITHER, *ever_refilled):
             posteriors = [self._find_onset(float(offset), refilled, exponent)[0] for offset in grid]
             best = int(np.argmax(posteriors))
             refined = np.linspace(grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)], N_REFINED)
