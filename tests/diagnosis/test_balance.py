@@ -110,6 +110,37 @@ def test_swapped_sides_and_reversed_encoders_change_nothing(load: float) -> None
         same(test, judged(changed(recording, **changes))[0], rel=2e-3)
 
 
+def test_a_position_that_is_late_is_late_whatever_its_sign() -> None:
+    recording = leaking()
+    late = round(0.02 * recording.rate)  # samples
+
+    def delay(sign: float) -> float:
+        moved = changed(recording, x=lambda c: sign * np.concatenate([np.full(late, c["x"][0]), c["x"][:-late]]))
+        balance = VolumeBalance(RIG).balance(moved)
+        assert balance is not None and balance.position_delay is not None
+        return balance.position_delay.value
+
+    assert delay(1.0) == pytest.approx(0.02, abs=0.004)
+    assert delay(-1.0) == pytest.approx(delay(1.0), rel=1e-3)
+
+
+def test_clipped_peaks_of_a_pressure_still_drive_the_leak() -> None:
+    """They lose their rows, but the mean pressure hardly changes."""
+    recording = leaking(load=2e5)
+    side = max(("p_A", "p_B"), key=lambda name: float(recording[name].mean()))  # that of the load
+    highest = np.quantile(recording[side], 0.8)
+    clipped = changed(recording, **{side: lambda c: np.minimum(c[side], highest)})
+    whole, left = judged(recording)[1], judged(clipped)[1]
+    assert left.rows.sum() < 0.8 * whole.rows.sum()
+    assert left.pressure_weights == pytest.approx(whole.pressure_weights)
+    mean_pressures = [
+        np.average(blocks.mean_pressure(0.0), weights=blocks.pressure_weights) for blocks in (whole, left)
+    ]
+    recorded = np.abs(clipped["p_A"] - clipped["p_B"]).mean()
+    assert mean_pressures[1] == pytest.approx(recorded, rel=0.03)
+    assert 0.9 * mean_pressures[0] < mean_pressures[1] <= mean_pressures[0]
+
+
 def test_a_press_whose_pump_moves_more_oil_outward_than_back_is_wired_as_it_is() -> None:
     """The rod takes no oil back, and the press presses only at the end: its strokes do no work against the mean load.
 

@@ -309,3 +309,20 @@ def test_a_leak_from_the_start_explains_changes_with_the_pressure() -> None:
     assert constant_log_ratio(information, np.ones(40)) == 0.0
     reversed_flow = information._replace(vector=-information.vector)
     assert constant_log_ratio(reversed_flow, shape) == 0.0
+
+
+def test_a_turbulent_part_of_the_healthy_leakage_is_no_step_but_a_leak_beside_it_is() -> None:
+    """Where the pressure falls for good, the conductance of an orifice rises, as by a leak that begins."""
+    random = np.random.default_rng(5)
+    shape = 1.0 + step(30, 27.0)
+    values = 10.0 + 3.0 * shape + 0.3 * random.standard_normal(30)
+
+    def chance(values: np.ndarray, turbulent: bool) -> float:
+        information = Information(SPACING * (np.arange(30) + 0.5), np.eye(30), values, slope=1.0, walk=1.0)
+        return judged(information._replace(disturbance=4.0, shape=shape) if turbulent else information).chance
+
+    assert chance(values, turbulent=False) < 1e-4
+    assert chance(values, turbulent=True) > 0.01
+    assert chance(values + 3.0 * step(30, 60.0), turbulent=True) < 1e-4
+    # a part that is larger than believed is not explained away
+    assert chance(values + 100.0 * shape, turbulent=True) < 1e-3

@@ -69,6 +69,15 @@ from ..refusals import refusal
             "t;Druck A [bar];Druck B [bar];Temp 1 [°C];Temp 2 [°C];motor temperature [°C]",
             {"t": "t", "p_A": "Druck A [bar]", "p_B": "Druck B [bar]"},
         ),
+        # a drive follows the speed that is set, but a measured speed is better
+        (
+            "t;PA_bar;PB_bar;n_cmd_rpm",
+            {"t": "t", "p_A": "PA_bar[bar]", "p_B": "PB_bar[bar]", "omega": "n_cmd_rpm[rpm]"},
+        ),
+        (
+            "t;PA_bar;PB_bar;n_cmd_rpm;n_act_rpm",
+            {"t": "t", "p_A": "PA_bar[bar]", "p_B": "PB_bar[bar]", "omega": "n_act_rpm[rpm]"},
+        ),
         ("t;PG_1;PG_2;PG_tank", {"p_A": "PG_1", "p_B": "PG_2", "t": "t"}),
         (
             "s;pump pressure 1 [psi];pump pressure 2 [psi];Pressure A (psi);Pressure B (psi)",

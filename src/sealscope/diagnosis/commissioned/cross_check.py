@@ -5,7 +5,7 @@ Called by `commission`: if a recording is judged leaking, either it or the other
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 
 from sealscope.diagnosis.healthy import SummarisedRecording
@@ -26,17 +26,23 @@ def cross_check(
     """Diagnose each healthy recording against all others, and leave out those that seem to leak.
 
     `judge(recording, reference)` diagnoses a recording against the healthy recordings `reference`. No recording is left
-    out with `keep`, or if at least half of them seem to leak, as there is then no healthy majority. Fewer than
-    `MIN_RECORDINGS` recordings are not judged. Returns the remaining recordings, and the reason for each recording left
-    out. If a remaining recording shows a leak or another event, its problems (`about["wrong"]`) state it.
+    out with `keep`, or if at least half of them seem to leak, as there is then no healthy majority. Nor is one in which
+    a leak seems to begin that no later recording shows (`_has_healed`). Fewer than `MIN_RECORDINGS` recordings are not
+    judged. Returns the remaining recordings, and the reason for each recording left out. If a remaining recording shows
+    a leak or another event, its problems (`about["wrong"]`) state it.
     """
     problems, leaking = dict[str, str](), dict[str, str]()  # texts by the name of the recording's file
+    begins_within = set[str]()  # names of the files in which a leak seems to begin
     for recording in healthy if len(healthy) >= MIN_RECORDINGS else ():
         diagnosis = judge(recording, tuple(other for other in healthy if other is not recording))
         if diagnosis.verdict == LEAK or diagnosis.cause is not None:
             problems[recording.file] = f"{diagnosis.summary} {BY_OTHERS}: {diagnosis.reason}"
         if diagnosis.verdict == LEAK:
             leaking[recording.file] = f"{recording.file}: {problems[recording.file]}"
+            if diagnosis.onset_s is not None:
+                begins_within.add(recording.file)
+    healed = [file for file in begins_within if _has_healed(file, healthy, leaking)]
+    leaking = {file: text for file, text in leaking.items() if file not in healed}
     if keep or 2 * len(leaking) >= len(healthy):
         leaking = {}
     remaining = [recording for recording in healthy if recording.file not in leaking]
@@ -45,3 +51,15 @@ def cross_check(
             wrong = [*recording.about.get("wrong", ()), problems[recording.file]]
             remaining[k] = replace(recording, about={**recording.about, "wrong": wrong})
     return tuple(remaining), tuple(leaking.values())
+
+
+def _has_healed(file: str, healthy: Sequence[SummarisedRecording], leaking: Collection[str]) -> bool:
+    """Return True if recordings were made after that of the `file`, and none of them is among the `leaking` files.
+
+    A worn seal does not heal. What looks like the begin of a leak is then a peculiarity of the healthy machine.
+    """
+    start_s = next(recording.start_s for recording in healthy if recording.file == file)
+    if start_s is None:
+        return False
+    later = [recording.file for recording in healthy if recording.start_s is not None and recording.start_s > start_s]
+    return bool(later) and not any(name in leaking for name in later)

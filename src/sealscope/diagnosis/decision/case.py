@@ -154,8 +154,9 @@ class Case:
     def leak_flow(self, alarm: LeakTest) -> Flow | None:
         """Return the mean flow of the leak that raised an `alarm`; None if it is unknown.
 
-        That of a step within the recording is the step's flow if the leak began there. If it was there before, changes
-        with the pressure show its flow, together with the rise over healthy recordings.
+        For an alarm by comparison with healthy recordings it follows from the rise over them. For an alarm by a step
+        within the recording it is the step's flow, or that of an older leak if this explains the step
+        (`has_onset_within`) and its flow is known.
         """
         leak = self.leak
         if leak is None:
@@ -189,7 +190,7 @@ class Case:
             groups = {name: causes for name, causes in joint_causes().items() if singles.keys() & set(causes)}
             for name, causes in (singles | groups).items():
                 if not all(self._events_of(cause, observable.data) for cause in causes):
-                    continue  # a cause that changes other data only, beside one that changes these
+                    continue  # one of the group's causes cannot change this kind of data
                 probability = self._probability_of_causes(causes, observable.data)
                 if probability is not None:
                     description = " or ".join(self._describe(cause, observable.data) for cause in causes)

@@ -20,9 +20,9 @@ class Event:
     cause: str | None  # heading under which a verdict names the event, None if a verdict never does
     probability: float  # prior probability that it begins within a recording
     affected: tuple[str, ...]  # patterns "data: name" of the observables that it changes
-    scaled: tuple[str, ...]  # patterns of those that it changes by the factor on both pressures
+    scaled: tuple[str, ...]  # patterns of those that it changes by multiplying both pressures by a common factor
     disturbed: tuple[str, ...]  # patterns of those that it may change as a side effect
-    description: str  # what it changes in the words of a reason, such as "the external leakage on side A"
+    description: str  # phrase for what it changes, used in a verdict's reason: "the external leakage on side A"
 
     @property
     def is_sized(self) -> bool:
@@ -34,11 +34,11 @@ class Event:
         return _matches(f"{observable.data}: {observable.name}", self.affected)
 
     def scales(self, observable: Observable) -> bool:
-        """Return True if the patterns `scaled` state that the event changes an observable by a factor on pressures."""
+        """Return True if the event changes an observable by a common scale of both pressures (patterns `scaled`)."""
         return _matches(f"{observable.data}: {observable.name}", self.scaled)
 
     def changes(self, observable: Observable) -> bool:
-        """Return True if the event changes an observable, by any amount (`affects`) or by a factor (`scales`)."""
+        """Return True if the event changes an observable freely (`affects`) or by a common scale (`scales`)."""
         return self.affects(observable) or self.scales(observable)
 
     def may_disturb(self, observable: Observable) -> bool:

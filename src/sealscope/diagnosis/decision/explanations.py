@@ -162,8 +162,8 @@ def _possible_gains(
 
     `factors` are observables with the log Bayes factors of a change. The first mapping is for an onset within the
     recording. A leak gets a second one if `rise` is given, for an onset before the recording: such a leak explains the
-    leakage above that of healthy recordings (the rise). A third one is for an older leak that is not laminar: changes
-    with the pressure show its size, which must then agree with the rise.
+    leakage above that of healthy recordings (the rise). A third one is for an older leak that is not laminar: how its
+    flow changes with the pressure shows its size, which must then agree with the rise.
     """
     gains = _gains_at_onset(event, factors)
     if rise is None or event.name not in LEAK_EVENTS:
@@ -173,7 +173,7 @@ def _possible_gains(
     if not volume_gain > 0.0:
         return [gains, older_gains]
     gains[RISE] = rise.step_log_ratio  # a leak that began within the recording explains the rise by its step
-    # healthy recordings calibrate the step only, so that its factor is the largest
+    # healthy recordings calibrate the step's factor only, which therefore limits that of an older leak
     bending_gains = {RISE: rise.older_log_ratio, VOLUMES: min(older_leak_gain(volume_gain, rise), volume_gain)}
     return [gains, older_gains, bending_gains]
 
@@ -181,8 +181,9 @@ def _possible_gains(
 def older_leak_gain(step_gain: float, rise: LeakRise) -> float:
     """Compute the log Bayes factor, for changes of the leakage within a recording, of a leak that was there before.
 
-    `step_gain`: that of a leak that begins within the recording, of which the log likelihood ratio of both is
-    subtracted (`LeakRise.onset_log_ratio`). Models describe the data only approximately (`_correct_for_misfit`).
+    `step_gain`: that of a leak that begins within the recording. The log likelihood ratio of this leak to the older one
+    (`LeakRise.onset_log_ratio`) is subtracted, reduced for the models' misfit as all factors are
+    (`_correct_for_misfit`).
     """
     misfit_divisor = 1.0 + 2.0 * DECISION.explanation.misfit * step_gain
     return max(step_gain - rise.onset_log_ratio / misfit_divisor, 0.0)
@@ -191,9 +192,10 @@ def older_leak_gain(step_gain: float, rise: LeakRise) -> float:
 def _gains_at_onset(event: Event, factors: Sequence[tuple[Observable, float]]) -> dict[str, float]:
     """Compute the log Bayes factors (at least 0) of an event that begins within the recording, by kind of data.
 
-    `factors` are test results (observables) with the log Bayes factors of a change. To these the log odds are added
-    that follow from the prior on the event's size. Of the observables that the event affects, the one with the largest
-    factor gives the time of the event; others count if they may have changed then. Side effects on other kinds of data
+    `factors` are test results (observables) with the log Bayes factors of a change. The log odds from the prior on the
+    event's size are added to them. The event changes observables by any amount, or by a common scale of both pressures,
+    on which these must agree (`_agree_on_scale`). Of these observables, the one with the largest factor gives the time
+    of the event; others count if they may have changed then. Side effects on other kinds of data
     count only if an affected observable supports the event. Their factors are limited to the largest one of the
     affected observables: a much clearer side effect has another cause.
     """
@@ -218,12 +220,12 @@ def _gains_at_onset(event: Event, factors: Sequence[tuple[Observable, float]]) -
 
 
 def _agree_on_scale(factors: Sequence[tuple[Observable, float]]) -> list[tuple[Observable, float]]:
-    """Reduce the log Bayes factors of changes that one scale of both pressures explains less well than they require.
+    """Reduce the log Bayes factors of changes by how badly a common scale of both pressures explains them.
 
-    An observable states the logarithm v of the scale that would cause its change. If k is the logarithm of the scale,
-    its log factor is reduced by ((v - k) / s)^2 / 2, to 0 at least. Its deviation s includes the error of such a law,
-    `explanation.scale` in `priors.toml`. Of all v, k is the one that explains most. Observables without a stated scale
-    are left out.
+    Each observable states the logarithm v of the scale that would cause its change. If k is the logarithm of the common
+    scale, the log factor is reduced by ((v - k) / s)^2 / 2, to 0 at least. The standard deviation s includes
+    `explanation.scale` of `priors.toml`, the error of a law that relates the change to the scale. k is the one of the v
+    with the largest sum of reduced factors. Observables without a stated scale are left out.
     """
     best: list[tuple[Observable, float]] = []
     best_sum, misfit = 0.0, DECISION.explanation.scale

@@ -66,7 +66,10 @@ def reason_of(case: Case, evidence: Evidence, alarm: LeakTest | None, bound: flo
 
 
 def _leak_text(case: Case, evidence: Evidence, alarm: LeakTest | None) -> str:
-    """Describe in words a leak that the test `alarm` detected, or the rarest change if leakage is not measured."""
+    """Describe in words a leak that the test `alarm` detected, or the rarest change if leakage is not measured.
+
+    Without an alarm, the level of the total leakage shows the leak, compared with the limit of a healthy machine.
+    """
     if case.leak is None:
         rarest = case.rarest_observable
         if rarest.data == "plug-in":

@@ -109,7 +109,8 @@ def _observe(detector: Detector, recording: Recording, baseline: Sequence[Health
     if lack is None and baseline:
         reasons = [_unusable_baseline(detector, entry) for entry in baseline]
         baseline = tuple(entry for entry, reason in zip(baseline, reasons, strict=True) if reason is None)
-        lack = None if baseline else f"no baseline recording can be used: {reasons[0]}"
+        if not baseline:  # the recording itself may lack what the healthy ones lack
+            lack = detector.observe(recording).lack or f"no baseline recording can be used: {reasons[0]}"
     if lack is not None:
         return Observed(detector.name, lack=lack)
     return validate_report(detector.observe(recording, baseline), detector.name)

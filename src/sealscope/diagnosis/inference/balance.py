@@ -63,6 +63,8 @@ NEGLIGIBLE_OFFSET = 3.0
 READ = ("u", "theta", "omega", "q_pump", "x", "p_1", "p_2", "p_A", "p_B")
 #: Name of a signal that is 1 in holes (long gaps of missing samples that were filled in), else 0; absent without holes.
 HOLE = "hole"
+#: Name of p_A - p_B as recorded, among the samples of a recording in which pressures are clipped.
+CLIPPED_DIFFERENCE = "p_A - p_B, clipped"
 #: Number of samples whose increments are computed together, so that they stay in the processor's cache.
 BATCH_SAMPLES = 8192
 
@@ -205,8 +207,8 @@ class BlockStream:
 
         - Oil leaks from high to low pressure.
         - The force of the pressures on the piston correlates with the flow into A, since friction dissipates energy. A
-          constant load also does work in strokes that do not return; its mean, weighted by abs(flow), is subtracted.
-          p_A - p_B instead of the force counts as much: throttles at the rod side change the one, loads the other.
+          constant load does work as well unless the piston returns; its mean, weighted by abs(flow), is subtracted. The
+          log odds are averaged with those of p_A - p_B, which throttles at the rod side distort, but loads less.
         - The position x grows with the flow into A. A negative correlation does not count, since x may be reversed.
         """
         odds_by_balance = []
@@ -303,7 +305,9 @@ class BlockStream:
             is_whole &= weak_rows.whole
             rows.append(weak_rows.values)
         in_blocks = slice(start - begin, start - begin + (end - first) * length)  # ends with the last block
-        pressure = (piece["p_A"] - piece["p_B"])[in_blocks].reshape(-1, length)
+        # a clipped pressure is closer to the true one than the mean of the other samples is
+        difference = piece[CLIPPED_DIFFERENCE] if CLIPPED_DIFFERENCE in piece else piece["p_A"] - piece["p_B"]
+        pressure = difference[in_blocks].reshape(-1, length)
         flow = np.abs(lefts[0][in_blocks].reshape(-1, length)) * self._rate  # volume per interval times rate [m^3/s]
         is_known = np.isfinite(flow)
         mean_flow = np.where(is_known, flow, 0.0).sum(axis=1) / np.maximum(is_known.sum(axis=1), 1)
@@ -327,8 +331,8 @@ def _z_score(products: Array) -> float:
 def _load_pressure(rows: Array, columns: ColumnRoles, area_ratio: float) -> Array:
     """Compute p_A - `area_ratio` p_B in each row (r,) of a regression, i.e. the pressures' force over the area of A.
 
-    `area_ratio`: area of the piston on side B over that on side A. It is p_A - p_B in a balance without the columns of
-    both pressures, those of the external leaks.
+    `area_ratio`: area of the piston on side B over that on side A. The columns of the external leaks hold p_A and -p_B.
+    A balance that lacks one of them gives its leak's column, p_A - p_B.
     """
     names = [f"external leak {side}" for side in "AB"]
     if area_ratio == 1.0 or not set(names) <= set(columns.names):
@@ -409,9 +413,10 @@ def bridged_samples(recording: Recording, names: Collection[str]) -> dict[str, A
     """Return the samples (n,) of the channels `names`, with NaN where a pressure is clipped.
 
     Holes, i.e. long gaps of missing samples, keep the values with which the recording fills them in. If there are
-    holes, the additional entry `HOLE` is 1 there and 0 elsewhere.
+    holes, the additional entry `HOLE` is 1 there and 0 elsewhere. If pressures are clipped, the additional entry
+    `CLIPPED_DIFFERENCE` is p_A - p_B of the values as recorded.
     """
-    samples = {}
+    samples, is_clipped = {}, False
     is_hole = flag_holes(recording)
     if is_hole.any():
         samples[HOLE] = is_hole.astype(float)
@@ -420,6 +425,9 @@ def bridged_samples(recording: Recording, names: Collection[str]) -> dict[str, A
             # rails: values at which the pressure transducer clips
             rails = [rail.value for rail in find_rails(values[np.isfinite(values)])] if name.startswith("p_") else []
             samples[name] = np.where(np.isin(values, rails), np.nan, values) if rails else values
+            is_clipped |= bool(rails)
+    if is_clipped and {"p_A", "p_B"} <= samples.keys():
+        samples[CLIPPED_DIFFERENCE] = recording["p_A"] - recording["p_B"]
     return samples
 
 

@@ -120,26 +120,35 @@ class Blocks:
         """
         return np.asarray(self.flow >= INFERENCE.rest.moves * self.moving_flow)
 
+    @property
+    def pressure_weights(self) -> Array:
+        """Weights (K,) of the blocks in a mean over time of a function of p_A - p_B: 1, or about 0 where it is missing.
+
+        A pressure is known in more samples than rows use, for example where a sensor is clipped.
+        """
+        return np.where((self.pressures != 0.0).any(axis=1), 1.0, 1e-9)  # positive, so that a mean exists
+
     def merge(self, max_blocks: int = MAX_BLOCKS) -> Blocks:
         """Merge neighbouring blocks in groups of equal size, so that at most `max_blocks` blocks remain.
 
-        The last group may be smaller. Gram matrices and numbers of rows are added, flow and pressures averaged with the
-        numbers of rows as weights; `zero` is that of a group's first block.
+        The last group may be smaller. Gram matrices and numbers of rows are added, flow is averaged with the numbers of
+        rows as weights, and pressures with `pressure_weights`; `zero` is that of a group's first block.
         """
         group_size = -(-len(self) // max_blocks)  # rounded up
         if group_size <= 1:
             return self
         first = np.arange(0, len(self), group_size)
         end = np.append(first[1:], len(self))
-        rows = np.add.reduceat(self.rows, first)
-        weights = self.rows / np.maximum(np.repeat(rows, end - first), 1.0)
+        rows, sizes = np.add.reduceat(self.rows, first), end - first
+        weights = self.rows / np.maximum(np.repeat(rows, sizes), 1.0)
+        pressure_weights = self.pressure_weights / np.repeat(np.add.reduceat(self.pressure_weights, first), sizes)
         return Blocks(
             start=self.start[first],
             end=self.end[end - 1],
             gram=np.add.reduceat(self.gram, first, axis=0),
             rows=rows,
             flow=np.add.reduceat(self.flow * weights, first),
-            pressures=np.add.reduceat(self.pressures * weights[:, None], first, axis=0),
+            pressures=np.add.reduceat(self.pressures * pressure_weights[:, None], first, axis=0),
             zero=self.zero[first],
         )
 
@@ -169,8 +178,7 @@ class Blocks:
         squares = squares[squares[:, names.index(term)] > 0.0].sum(axis=0)  # equations that contain the term
         ratio = squares[names.index(term)] / max(squares[names.index(LEAK)], np.finfo(float).tiny)
         mean_squares = ((self.pressures - self.zero[:, None]) ** 2).mean(axis=1)  # mean of (p_A - p_B)^2 in each block
-        weights = np.maximum(self.rows, 1e-9)  # positive, so that the mean over the blocks exists
-        return float(np.sqrt(np.average(mean_squares, weights=weights) * ratio))
+        return float(np.sqrt(np.average(mean_squares, weights=self.pressure_weights) * ratio))
 
     @classmethod
     def join(cls, parts: Sequence[Blocks]) -> Blocks:

@@ -83,6 +83,23 @@ def law_priors() -> Array:
     return np.array([laminar, *[(1.0 - laminar) / n_others] * n_others])
 
 
+def with_turbulence(leak: Information, blocks: Blocks, columns: Sequence[ColumnRoles]) -> Information:
+    """Allow for a turbulent part of the healthy leakage, which changes its conductance with the pressure.
+
+    The part flows as through an orifice. Its conductance has in each block the shape of `apparent_conductances`, with
+    the mean 1, times a factor that is constant in the recording. The prior standard deviation of this factor is the
+    fraction `healthy.turbulent` (`priors.toml`) of the leakage. `leak`: likelihood of the conductance in the blocks.
+    """
+    shape = apparent_conductances(blocks, columns)[0.5]
+    weights = np.maximum(leak.precision.sum(axis=0), 0.0)  # information of each block
+    total_weight = float(leak.precision.sum())
+    mean_shape = float(weights @ shape) / max(float(weights.sum()), _TINY)
+    if not (mean_shape > 0.0 and total_weight > 0.0):
+        return leak
+    conductance = abs(float(leak.vector.sum())) / total_weight
+    return leak._replace(disturbance=INFERENCE.healthy.turbulent * conductance, shape=shape / mean_shape)
+
+
 def find_leak_step(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Information) -> StepTest | None:
     """Test for a leak that begins within a recording, with a flow proportional to a power of |p_A - p_B|.
 
@@ -119,22 +136,22 @@ def older_log_ratios(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Infor
 
 
 def estimate_bend_flows(blocks: Blocks, columns: Sequence[ColumnRoles], noise: float) -> list[Flow | None]:
-    """Estimate the mean flow [m^3/s] of a leak that was there before the recording, from its bend over the pressure.
+    """Estimate the mean flow [m^3/s] of a leak that was there before the recording, from its curvature over pressure.
 
     The healthy leakage is laminar and does not bend. To the second order, c |dp|^e bends as an orifice with the
     coefficient a does if their second derivatives agree, e (e - 1) c |dp|^e = -a |dp|^(1/2) / 4, so that
 
         flow = a |dp|^(1/2) / (4 e (1 - e)).
 
-    The result has a flow for each exponent of `EXPONENTS`, None for laminar flow or if a is unknown. `noise`: variance
-    of the coefficients over the one that the rows of the balance state.
+    The result has a flow for each exponent of `EXPONENTS`, None for laminar flow or if a is unknown. `noise`: factor by
+    which the variance of the coefficients exceeds the one that follows from the residuals of the balance.
     """
     bend = information(blocks, columns, columns[0].names.index(ORIFICE))
     precision = float(bend.precision.sum()) / noise
     if not precision > 0.0:
         return [None] * len(EXPONENTS)
     coefficient = float(bend.vector.sum()) / noise / precision
-    root = float(blocks.rows @ blocks.mean_root()) / max(float(blocks.rows.sum()), _TINY)
+    root = float(np.average(blocks.mean_root(), weights=blocks.pressure_weights))
     factors = [None if exponent == 1.0 else root / (4.0 * exponent * (1.0 - exponent)) for exponent in EXPONENTS]
     return [None if factor is None else Flow(coefficient * factor, factor / math.sqrt(precision)) for factor in factors]
 
@@ -142,11 +159,12 @@ def estimate_bend_flows(blocks: Blocks, columns: Sequence[ColumnRoles], noise: f
 def estimate_older_flow(log_ratios: Array, rise_flows: Sequence[Flow], bend_flows: Sequence[Flow | None]) -> Flow:
     """Estimate the mean flow [m^3/s] of a leak that was there before the recording, averaged over its exponents.
 
-    `log_ratios`: those of `older_log_ratios`, which tell whether the flow is laminar, but hardly the exponents below
-    1 from each other; `rise_flows`, `bend_flows`: for each exponent the flow by the rise over healthy recordings, and
-    by its bend over the pressure (`estimate_bend_flows`). The two are averaged with their precisions.
+    The exponents e are those of the law flow ~ |dp|^e. Each has a flow by the rise over healthy recordings
+    (`rise_flows`) and, unless e = 1, one by the bend over the pressure (`bend_flows` of `estimate_bend_flows`). The two
+    are averaged with their precisions, and the weight of e includes the density with which they agree. `log_ratios` are
+    those of `older_log_ratios`.
     """
-    log_ratio = float(log_ratios.max())
+    log_ratio = float(log_ratios.max())  # of any e < 1: the data tell these from e = 1, but hardly from each other
     weights, flows = list[float](), list[Flow]()
     for log_prior, by_rise, by_bend in zip(np.log(law_priors()), rise_flows, bend_flows, strict=True):
         flow, weight = by_rise, float(log_prior)
@@ -187,15 +205,15 @@ def estimate_step_flow(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Inf
     """
     onsets = np.flatnonzero(test.weights > NEGLIGIBLE * test.weights.max())
     positions = _onset_positions(leak, test)[onsets]
-    rows = np.maximum(blocks.rows, 1e-9)
-    n_rows_after = np.maximum(rows @ step_shapes(len(blocks), positions), _TINY)
+    weights = blocks.pressure_weights
+    weight_after = np.maximum(weights @ step_shapes(len(blocks), positions), _TINY)
     shapes, unit_flows = apparent_conductances(blocks, columns), law_flows(blocks)
     log_weights, flows, standard_errors = [], [], []  # lists of arrays (o,), for each growth and exponent
     for growth, probability in growth_priors():
         steps = step_shapes(len(blocks), positions, growth)  # (K, o)
         for exponent in EXPONENTS:
             likelihood, size, deviation = step_sizes(leak, onsets, shapes[exponent], growth)
-            unit = (rows * unit_flows[exponent]) @ steps / n_rows_after  # mean flow of a step of 1 after its onset
+            unit = (weights * unit_flows[exponent]) @ steps / weight_after  # mean flow of a step of 1 after its onset
             log_weights.append(np.log(probability) + likelihood)
             flows.append(size * unit)
             standard_errors.append(deviation * unit)

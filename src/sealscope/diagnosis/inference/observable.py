@@ -116,15 +116,16 @@ class Remark(NamedTuple):
 
 
 class LeakRise(NamedTuple):
-    """Leakage of a recording above that of healthy recordings (`rise`), and its agreement with a step.
+    """Leakage of a recording above that of healthy recordings (`rise`), and two explanations of it.
 
-    - `step_log_ratio`: log likelihood ratio, for the estimated rise, of a step of the leakage that was found within the
-      recording to no rise. It is positive if the rise agrees with the step.
-    - `onset_log_ratio`: log likelihood ratio, for the changes of the leakage within the recording, of this step to a
-      leak that was there before; infinite if an older leak explains none of them.
-    - `older_log_ratio`: log likelihood ratio, for the estimated rise, of such an older leak, as large as those changes
-      show it, to no rise.
-    - `older_flow`: mean flow of the older leak, None if only the rise tells it.
+    The first is a leak that began within the recording, as a step of the leakage shows. The second is an older leak, as
+    large as the changes of the leakage with the pressure show.
+
+    - `step_log_ratio`: log of p(rise | the leak began within the recording) / p(rise | no leak).
+    - `onset_log_ratio`: log of p(changes within the recording | the leak began there) / p(changes | older leak);
+      infinite if an older leak explains none of these changes.
+    - `older_log_ratio`: log of p(rise | older leak) / p(rise | no leak).
+    - `older_flow`: mean flow of the older leak, None if it follows from the rise alone.
     """
 
     rise: Rise

@@ -8,9 +8,9 @@ whitened estimates:
     g = F a + w + delta s(onset),    z = Lambda^(-1/2) eta ~ N(Lambda^(1/2) g, kappa I),    cov w = kappa q min(k, l),
 
 where kappa is the inflation of the noise by the correlation of the rows, and kappa q the variance of the walk in a
-block. F is projected out. (q, kappa) are estimated with the step and without it; one eigenproblem serves all onsets and
-all q. The score is twice the logarithm of the likelihood ratio, for steps > 0. If the onset lies within a block, that
-block shows a fraction of the step.
+block. F is projected out, and so is a further change of known shape, if a healthy machine may show one. (q, kappa) are
+estimated with the step and without it; one eigenproblem serves all onsets and all q. The score is twice the logarithm
+of the likelihood ratio, for steps > 0. If the onset lies within a block, that block shows a fraction of the step.
 
 The probability of the score in a healthy machine follows from geometry, without a simulation. For a known q the
 whitened z is uniform on a sphere in n = K - 2 dimensions, and steps over all onsets form a curve of length L on it. The
@@ -81,7 +81,8 @@ class Information(NamedTuple):
 
     - `level`: standard deviation of the coefficient before the first block;
     - `slope`: standard deviation of a linear change over all blocks;
-    - `walk`: scale of a half-Cauchy prior on the standard deviation that a random walk reaches over all blocks.
+    - `walk`: scale of a half-Cauchy prior on the standard deviation that a random walk reaches over all blocks;
+    - `disturbance`: standard deviation of the factor of `shape` (K,), a further change that a healthy machine shows.
     """
 
     time: Array
@@ -90,6 +91,8 @@ class Information(NamedTuple):
     level: float = float("inf")
     slope: float = float("inf")
     walk: float = float("inf")
+    disturbance: float = float("inf")
+    shape: Array | None = None
 
     def fraction_after(self, onset: float) -> float:
         """Compute the fraction of the coefficient's information that lies in the blocks after `onset` [s], 0 to 1."""
@@ -319,7 +322,11 @@ def step_test(information: Information, signs: Sequence[float] = (1.0,), shape: 
 
 
 def step_tests(information: Information, signs: Sequence[float], shape: Array | None = None) -> list[StepTest]:
-    """Test a coefficient for a step of each sign, 1 up or -1 down (`step_test`); empty if too few blocks reveal it."""
+    """Test a coefficient for a step of each sign, 1 up or -1 down (`step_test`).
+
+    `shape` (K,): relative size of the step in each block, None if it is constant. The result is empty if too few blocks
+    determine the coefficient. A step down is tested as a step up of the coefficient with the opposite sign.
+    """
     whitened = _whiten_blocks(information)
     if whitened is None:
         return []
@@ -335,14 +342,15 @@ def constant_log_ratio(information: Information, shape: Array) -> float:
 
     Such a leak adds to the coefficient a constant times `shape` (K,), its apparent coefficient in each block, which
     varies with the pressure unless its flow is laminar. The result is the log likelihood ratio of the best positive
-    constant to none, for the likeliest random walk of each; at least 0, and 0 if `shape` is as good as constant.
+    constant to no such leak, each with the random walk that fits best. It is at least 0, and 0 if `shape` hardly
+    varies.
     """
     whitened = _whiten_blocks(information)
     if whitened is None:
         return 0.0
     whitening, z, _ = whitened
     n_prior_blocks = whitening.transform.shape[1] - len(shape)  # 1 with a prior on the level before the recording
-    steps = whitening.transform_steps(np.array([float(n_prior_blocks)]), shape)
+    steps = whitening.transform_steps(np.array([float(n_prior_blocks)]), shape)  # a step at the first block
     if not (steps**2).sum() > RANK_TOLERANCE * float((whitening.transform**2).sum() * (shape**2).max()):
         return 0.0
     fits, n = _fit_steps(z, steps, whitening.eigen), len(z)
@@ -438,10 +446,11 @@ def step_shapes(count: int, positions: Array, growth: float = 0.0) -> Array:
 class _Whitening(NamedTuple):
     """Matrices that whiten the estimates of a coefficient in K blocks, from their precision and priors only.
 
-    The whitened values z (n,) have independent noise of variance 1. The level and slope are projected out.
+    The whitened values z (n,) have independent noise of variance 1. Level, slope and a further change of known shape
+    are projected out.
 
     - `root` (r,), `vectors` (K, r): square roots of the non-zero eigenvalues of the precision, and their eigenvectors;
-    - `complement` (n, r + s): directions orthogonal to level and slope; s = 1 with a prior on the slope;
+    - `complement` (n, r + s): directions orthogonal to these changes, of which s have a prior;
     - `basis`, `eigen` (n, n), (n,): eigenvectors of the random walk's covariance, and its eigenvalues times `unit`;
     - `transform` (n, K): matrix from the coefficient in K blocks to z;
     - `unit`: scale at which walk and noise change z equally on average;
@@ -462,7 +471,7 @@ class _Whitening(NamedTuple):
     def whiten(self, vector: Array) -> Array:
         """Transform the `vector` (K,) of `Information`, precision times estimates, to n independent values z."""
         z = (self.vectors.T @ vector) / self.root
-        z = np.append(z, np.zeros(self.complement.shape[1] - len(z)))  # a prior on the slope is one more estimate, 0
+        z = np.append(z, np.zeros(self.complement.shape[1] - len(z)))  # a prior is one more estimate, 0
         return np.asarray(self.basis.T @ (self.complement @ z))
 
     def transform_steps(self, positions: Array, shape: Array | None = None, growth: float = 0.0) -> Array:
@@ -487,10 +496,14 @@ def _whiten_blocks(information: Information) -> tuple[_Whitening, Array, Array] 
     time, precision, vector = _prepend_level_prior(information)
     if not np.isfinite(precision).all():
         return None
-    if np.array_equal(precision, np.eye(len(time))):  # the matrices of this frequent case are cached
-        whitening = _unit_whitening(len(time), information.slope, information.walk)
+    slope, walk, shape = information.slope, information.walk, information.shape
+    if shape is not None:
+        shape = np.append(np.zeros(len(time) - len(shape)), shape)  # a prior on the level is one more block
+        whitening = _build_whitening(precision, slope, walk, shape, information.disturbance)
+    elif np.array_equal(precision, np.eye(len(time))):  # the matrices of this frequent case are cached
+        whitening = _unit_whitening(len(time), slope, walk)
     else:
-        whitening = _build_whitening(precision, information.slope, information.walk)
+        whitening = _build_whitening(precision, slope, walk)
     if whitening is None:
         return None
     return whitening, whitening.whiten(vector), _onset_times(time, whitening.positions)
@@ -502,10 +515,13 @@ def _unit_whitening(count: int, slope: float, walk: float) -> _Whitening | None:
     return _build_whitening(np.eye(count), slope, walk)
 
 
-def _build_whitening(precision: Array, slope: float, walk: float) -> _Whitening | None:
+def _build_whitening(
+    precision: Array, slope: float, walk: float, shape: Array | None = None, disturbance: float = float("inf")
+) -> _Whitening | None:
     """Build the matrices that whiten K blocks with a given precision (K, K); None if too few blocks have information.
 
-    `slope`, `walk`: scales of the priors on the linear change and on the random walk over all blocks (`Information`).
+    `slope`, `walk`, `disturbance`: scales of the priors on the linear change, on the random walk over all blocks, and
+    on the factor of a further change of the given `shape` (K,), if any (`Information`).
     """
     count = len(precision)
     # z = Lambda^(-1/2) eta, restricted to the eigenvectors with information
@@ -516,12 +532,18 @@ def _build_whitening(precision: Array, slope: float, walk: float) -> _Whitening 
     root = np.sqrt(values[is_informative])
     design = (vectors[:, is_informative] * root).T  # matrix from the coefficient in all blocks to z
     index = np.arange(count)
-    fixed = design @ np.column_stack([np.ones(count), (index - index.mean()) / count])  # level and slope
-    if np.isfinite(slope):  # the prior on the slope is one more estimate
-        fixed = np.vstack([fixed, [0.0, 1.0 / slope]])
-        design = np.vstack([design, np.zeros(count)])
-    # the columns of the orthogonal matrix after the first two are orthogonal to level and slope
-    complement = np.linalg.qr(fixed, mode="complete")[0][:, 2:].T
+    changes = [np.ones(count), (index - index.mean()) / count]  # level and slope
+    scales = [np.inf, slope]
+    if shape is not None:
+        changes.append(shape)
+        scales.append(disturbance)
+    fixed = design @ np.column_stack(changes)
+    for k, scale in enumerate(scales):
+        if np.isfinite(scale):  # a prior is one more estimate
+            fixed = np.vstack([fixed, np.eye(len(scales))[k] / scale])
+            design = np.vstack([design, np.zeros(count)])
+    # the columns of the orthogonal matrix after the first ones are orthogonal to these changes
+    complement = np.linalg.qr(fixed, mode="complete")[0][:, len(scales) :].T
     transform = complement @ design
     # covariance of a walk with steps of variance 1, which is min(k, l) for blocks k and l counted from 1
     covariance = transform @ (np.minimum.outer(index, index) + 1.0) @ transform.T
@@ -548,7 +570,7 @@ def _build_whitening(precision: Array, slope: float, walk: float) -> _Whitening 
 
 def _prepend_level_prior(information: Information) -> tuple[Array, Array, Array]:
     """Return `time`, `precision` and `vector`, with a known prior on the level added as a block before the first."""
-    time, precision, vector, level, _, _ = information
+    time, precision, vector, level = information[:4]
     if not np.isfinite(level) or len(time) < MIN_BLOCKS:
         return time, precision, vector
     with_prior = np.zeros((len(time) + 1, len(time) + 1))

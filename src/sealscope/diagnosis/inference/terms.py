@@ -500,20 +500,20 @@ def equations(rig: Rig, channels: frozenset[str]) -> tuple[Equation, ...]:
     left, source = pump_volume(rig, channels), flow_source(channels)
     if left is None or not {"x", *_PRESSURES} <= channels:
         return ()
-    # an angle has no offset of speed, so that a constant flow is external leakage, not a sensor error
+    # a speed computed from an angle has no offset, so that a constant residual flow is external leakage
     bias = _BIAS._replace(cause="external leak", drift="outside") if "theta" in channels else _BIAS
     terms = [bias if term is _BIAS else term for term in _CYLINDER]
     if source == "u":
         terms.insert(0, _START)
     if source == "q_pump":  # a meter is downstream of the filling loss
         terms.remove(_SPEED_LOSS)
-    # both chambers count alike, but on a single rod only the loaded chamber counts
+    # the air is half in either chamber; on a single rod it is in the one that carries the load
     single_rod = rig.cylinder.single_rod
     air = _free_air_term(rig, weight_A=lambda s: _interval_means(s.carried_by_A) if single_rod else 0.5)
     area_ratio = rig.cylinder.A_B / rig.cylinder.A_A
     equation = Equation(CYLINDER, left, tuple(terms), by_command=source == "u", area_ratio=area_ratio)
     balance = _insert_before_leaks(equation, air)
-    return (_select_recorded_terms(balance, channels | {START}),)  # START is derived, not recorded
+    return (_select_recorded_terms(balance, channels | {START}),)  # START is derived from the command
 
 
 #: Leaks in a balance without a piston in motion: to the outside, and past piston and pump.

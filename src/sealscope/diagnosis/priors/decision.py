@@ -35,12 +35,12 @@ class ExplanationPriors(PriorTable):
 
     heading: float  # allowed probability of naming another event by mistake, over that of a false leak
     leak: float  # probability from which a change is called a leak
-    named: float  # probability from which a cause other than a leak is named, of all causes of the change
-    happened: float  # probability from which such a cause is named, of all causes of the change and chance
+    named: float  # probability, among all causes of the change, from which a cause other than a leak is named
+    happened: float  # the same if chance is an alternative as well
     sure: float  # a leak is excluded if its probability is below 1 - `sure`
     combined: float  # smallest logarithm of the Bayes factor with which an event is combined with others
     misfit: float  # smallest relative error with which a term of the model is assumed to describe the data
-    scale: float  # relative error of a common factor on the pressures, as leakage, friction and noise state it
+    scale: float  # relative error of a common factor on both pressures, as computed from leakage, friction or noise
 
 
 class WorthPriors(PriorTable):

@@ -69,20 +69,20 @@ class ConditionPriors(PriorTable):
 
 
 class OilPriors(PriorTable):
-    """Effect of the oil's temperature (per kelvin in 1/K) and viscosity on the leakage of a healthy machine."""
+    """Effect of the oil's temperature (`per_kelvin` in 1/K) and viscosity on the leakage of a healthy machine."""
 
     warmest: float  # largest conductance, with the warmest oil, over the smallest
     # relative increase of a leak per kelvin, and its standard deviation
     per_kelvin: float
     per_kelvin_deviation: float
-    shift: float  # [h] time in which the oil warms by the largest difference
+    shift: float  # [h] time in which the oil warms from its coldest to its warmest
     # a leak is inversely proportional to this power of the viscous pressure drop; its standard deviation
     per_drop: float
     per_drop_deviation: float
-    # standard deviations of the logarithm of the friction between days, of the same seals, and of seals that wear
+    # standard deviations of the logarithm of the friction from day to day, of the same seals, and of seals that wear
     friction_session: float
     friction_changes: float
-    drop_tells: float  # probability that a change of this drop is due to the oil, not to load and speed
+    drop_tells: float  # probability that a change of the viscous drop is due to the oil, not to load and speed
     drop_misleads: float  # probability that something else than the oil changed the drop of the judged recording alone
 
 
@@ -148,10 +148,10 @@ class HeldOilPriors(PriorTable):
     sides: float
     sides_deviation: float
     sides_told: float  # probability that the pressures tell which side carries, whatever the offsets of the sensors
-    unlike: float  # largest ratio of the two piston areas
+    unlike: float  # largest plausible ratio of the two piston areas
     right: float  # probability that the holds are right about a leak's flow if they disagree with the whole recording
     agrees: float  # standard deviation of the logarithm of the ratio of the conductances from holds and whole recording
-    rare: float  # p-value of a rise of the leakage in the holds, below which it gives the flow of the leak
+    rare: float  # p-value of a rise of the leakage in the holds, below which they give the flow of the leak
     settles: float  # [s] time in which valves shut
     before: float  # [s] time before a hold in which the flow shows the leakage of the pump
     pump_session: float  # relative standard deviation of this leakage between sessions with the same oil
@@ -163,8 +163,8 @@ class HeldOilPriors(PriorTable):
     from_start: float  # fraction of the leaks that exist from the start of a recording
     gain: float  # relative difference between the gains of two pressure sensors
     charge: float  # relative margin above the charge pressure from which no check valve feeds a side
-    tank: float  # back pressure of a line to the tank, a standard deviation
-    resolved: float  # margin in addition, below which a sensor does not tell a pressure from the charge pressure
+    tank: float  # standard deviation of the gauge pressure in a line to the tank
+    resolved: float  # further margin, within which a sensor cannot tell a pressure from the charge pressure
     steady: float  # [s] time over which a pressure is averaged before it is compared with the charge pressure
     # volume fraction of free air in the oil, and the standard deviation of its logarithm
     air: float
@@ -186,10 +186,11 @@ class ZeroPriors(PriorTable):
 
 
 class HealthyPriors(PriorTable):
-    """Standard deviations [m^3/(s Pa)] of the leakage conductances of a healthy machine."""
+    """Standard deviations of the leakage conductances of a healthy machine, in m^3/(s Pa) or as a fraction."""
 
     outside: float  # leakage to the outside
     piston: float  # leakage past the piston
+    turbulent: float  # part of the leakage that flows as through an orifice, as a fraction
 
 
 class HeldPriors(PriorTable):

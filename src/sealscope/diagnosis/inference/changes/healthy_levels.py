@@ -77,8 +77,8 @@ class HealthyLevels:
     def compare(self, recording: Recording, baseline: Sequence[Healthy]) -> Iterator[Observable]:
         """Compare friction, spectra and drifts of the pressures with those of the healthy recordings in `baseline`.
 
-        Drifts are those in motion and those of the lowest readings. A quantity that is missing in the recording or in
-        too many healthy ones has no test.
+        There are two kinds of drift, of the mean pressures during motion and of the lowest readings. A quantity that is
+        missing in the recording or in too many healthy ones has no test.
         """
         judged = self.learn(recording)
         if judged is None:
@@ -179,7 +179,7 @@ def _compare_drifts(judged: Summary, healthy: Sequence[Summary], duration: float
     )
     if drift_A is None or drift_B is None or difference is None:
         return
-    for drift in (drift_A, drift_B):  # a load drifts faster than the offset of a sensor
+    for drift in (drift_A, drift_B):  # a drift that is fast for the zero of a sensor is rather one of the load
         yield replace(drift, advantage=-size_penalty(CHANGES.zero_drift, drift.size / duration, above=True))
     chance = drift_A.chance * drift_B.chance / max(difference.chance, TINY)
     score = max(drift_A.score + drift_B.score - difference.score, 0.0)

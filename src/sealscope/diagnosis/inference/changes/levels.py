@@ -234,10 +234,10 @@ def _test_patterns(time: Array, values: Array) -> list[LevelChange | None]:
     changes = list[LevelChange | None]()
     for name, bases in (*PATTERNS, *scales):
         tests = [_test_pattern(name, np.array(rows) @ whitening.T, values @ whitening.T, time) for rows in bases]
-        # of several bases of one pattern the lowest rank counts
+        # a pattern with several bases must be supported by each of them, so that the lowest rank counts
         change = min((test for test in tests if test is not None), key=lambda test: test.rank, default=None)
         if change is not None:
-            # only a fall of the sum of both levels can be a loss of oil
+            # a loss of oil (CHARGE) lowers the sum of both levels; if they rise, the supply feeds both chambers
             after = time > change.onset
             is_falling = after.any() and not after.all() and sum_of_levels[after].mean() <= sum_of_levels[~after].mean()
             if name == CHARGE and not is_falling:
@@ -267,12 +267,12 @@ def _pressure_scale(before: Array, after: Array) -> LogScale | None:
 def _whitening_matrix(values: Array) -> Array:
     """Compute the matrix (c, 4) that transforms pressure levels to c numbers with independent errors of equal variance.
 
-    The matrix W is a root of the inverse of S, W' W = S^-1, where S is the scatter of the differences between
-    neighbouring blocks. They follow a multivariate t distribution, so that the large differences at a step hardly
-    count. S is its likeliest value (K. L. Lange et al., J. Am. Statist. Assoc. 84 (1989) 881). `values` (K, 4):
+    The matrix W is a root of the inverse of S, W' W = S^-1. S is the maximum-likelihood estimate of the scatter matrix
+    of the differences between neighbouring blocks, under a multivariate t distribution, so that the large differences
+    at a step have little weight (K. L. Lange et al., J. Am. Statist. Assoc. 84 (1989) 881). `values` (K, 4):
     `PressureLevels.values`; c of its columns are not constant.
     """
-    varying = np.flatnonzero(np.ptp(values, axis=0) > 0.0)  # half differences are constant without a motion
+    varying = np.flatnonzero(np.ptp(values, axis=0) > 0.0)  # a machine that never moves has constant levels
     differences = np.diff(values[:, varying], axis=0)
     deviations = np.sqrt((differences**2).mean(axis=0))
     differences = differences / deviations
@@ -292,6 +292,9 @@ def _test_pattern(name: str, rows: Array, whitened: Array, time: Array) -> Level
 
     `rows` (m, c): vectors that span the subspace; `whitened` (K, c): levels in K blocks, both multiplied by the
     `_whitening_matrix`; `time` (K,): times of the blocks [s]. Return None if a direction cannot be tested.
+
+    The score counts only the directions of the pattern, each with its own variance. For the rank, by which patterns
+    are compared, all directions have one variance in common.
     """
     basis, triangle = np.linalg.qr(rows.T)
     # orthonormal directions, without those of vectors that depend on earlier ones
@@ -315,7 +318,7 @@ def _test_pattern(name: str, rows: Array, whitened: Array, time: Array) -> Level
     log_ratio = float(log_ratios[best])
     # a pattern describes the levels only approximately
     rank = 2.0 * log_ratio / (1.0 + 2.0 * _PRIORS.misfit * log_ratio) - (n_directions - 1) * math.log(n_blocks)
-    # sum_j F_j over the directions of the pattern, each with its own variance
+    # sum over the pattern's directions of F = variance without a step / variance with it - 1
     gains = np.log1p((variance_without[:n_directions, None] / variance - 1.0).sum(axis=0))
     score = n_blocks * float(gains.max())
     chance = 2.0 * n_directions * min(test.law.chance(score) for test in tests[:n_directions])  # up or down in each

@@ -85,7 +85,7 @@ def sensor_observables(tests: Iterable[tuple[str, StepTest]]) -> Iterator[Observ
     """
     for name, test in tests:
         observable = Observable.from_test(name, name.split()[0], test, n_tests=2.0)
-        if name == NOISE:  # the sum of the logarithms of two variances, i.e. four times that of a scale
+        if name == NOISE:  # log variance of p_A + that of p_B: a scale k of both adds 2 log(k) to each
             scale = LogScale(0.25 * observable.size, 0.25 * test.fitted.deviation)
             observable = replace(observable, pressure_scale=scale)
         yield observable
@@ -100,9 +100,9 @@ def level_observables(changes: Sequence[LevelChange]) -> Iterator[Observable]:
 
     `changes`: a test for each pattern, the combination of levels that a cause changes, with the highest rank first. The
     rank (`LevelChange`) becomes the score. The first is the best of n patterns, so that its p-value is n chance_1
-    (Bonferroni). That of change k is min(1, n chance_1 exp(rank_1 - rank_k)).
-    Half of the exponent is the log Bayes factor of change 1 over change k (Schwarz's approximation), the other half a
-    prior against patterns that need further coefficients. The interval of an onset is one block to either side.
+    (Bonferroni). That of change k is min(1, n chance_1 exp(rank_1 - rank_k)). This factor is the square of the Bayes
+    factor of change 1 over change k (Schwarz's approximation): once as evidence, and once as a prior against a pattern
+    that leaves part of the change to another cause. The interval of an onset is one block to either side.
     """
     for change in changes:
         onset = Interval(change.onset, change.onset - change.block, change.onset + change.block)

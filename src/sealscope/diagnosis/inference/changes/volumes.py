@@ -75,11 +75,11 @@ def volume_observables(
     - `blocks`: blocks of the recording after removal of the sensor offset of p_A - p_B, for tests of laminar leaks.
     - `plain`: its blocks with the pressures as recorded, for all other tests.
     - `balances`, `columns`: the equations, and the roles of their columns.
-    - `oil_loss`: tests for an external leak by the oil that the accumulator lost, by the name of the term.
-    - `volume_ratio`: measured over assumed ratio of piston area to pump displacement.
+    - `oil_loss`: for each external leak, by the name of its term, a step test of the oil that the accumulator lost.
+    - `volume_ratio`: ratio of piston area to pump displacement as measured, over that assumed.
     - `charge`: trend of the charge pressure, None if it is unknown.
-    - `flow_scale`: true flow over the flow of the balance.
-    - `with_orifice`: false to omit the test of an orifice's flow: with few blocks it resembles a change of scale.
+    - `flow_scale`: true flow over the flow that the balance gives with the assumed sizes.
+    - `with_orifice`: false to omit the test of an orifice's flow, which few blocks cannot tell from a scale of motion.
     """
     centred, recorded = (series.merge(max_blocks=INFERENCE.blocks.coarse) for series in (blocks, plain))
     # a laminar leak is tested without the sensor offset, so an improbable offset counts against the leak

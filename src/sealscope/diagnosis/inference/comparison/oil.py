@@ -64,20 +64,22 @@ def oil_hypotheses(recordings: Sequence[RecordingSums]) -> list[OilHypothesis]:
 
 
 def _oils_by_drop(recordings: Sequence[RecordingSums], unknown_deviation: float) -> list[OilHypothesis]:
-    """List the hypotheses on the oil that follow from the viscous drop of the motion in `recordings`, the judged last.
+    """List the hypotheses on the oil that follow from the viscous drop of the motion.
 
-    The resistance to the motion at the top speed v, friction + drop v, is known well. Friction and viscous drop are
-    known less well, since friction varies with speed and load. There are two hypotheses:
+    `recordings`: the healthy ones, then the judged one. The resistance to the motion at the top speed v, friction +
+    drop v, is known well. Friction and viscous drop are known less well, since friction varies with speed and load.
+    There are two hypotheses:
 
     - Friction changed, as if seals wore, and the drop is the fitted one.
     - Friction was what it is in the healthy recordings, and drop = (resistance at v - healthy friction) / v.
 
-    Their probabilities follow from the judged friction and from the n healthy drops. Splitting the resistance wrongly
-    makes these drops scatter more. With an unknown scatter, their density is proportional to S^(-(n - 1) / 2), where S
-    is the sum of the squares of their logarithms about the mean and of their relative errors.
+    Their probabilities, with the sum `oil.drop_tells` of `priors.toml`, follow from the judged friction and from the n
+    healthy drops. Splitting the resistance wrongly makes these drops scatter more. With an unknown scatter, their
+    density is proportional to S^(-(n - 1) / 2), where S is the sum of two kinds of squares: of the logarithms of the
+    drops about their mean, and of the relative errors of the drops.
 
-    In each there is a small probability, `oil.drop_misleads` of `priors.toml`, that something else, such as a swollen
-    seal, changed the judged drop, which then tells nothing of the oil.
+    Either has a small probability, `oil.drop_misleads`, that something other than the oil, such as a swollen seal,
+    changed the judged drop.
 
     A drop below its standard error is replaced by this error. A recording without a drop gets the mean drop, and the
     error of unknown oil: `unknown_deviation`, the standard deviation of the logarithm of the leakage. The list is empty
@@ -101,28 +103,30 @@ def _oils_by_drop(recordings: Sequence[RecordingSums], unknown_deviation: float)
         # prior deviations of this change under the two hypotheses: friction changed, or did not
         deviations = np.array([prior.friction_changes, prior.friction_session])
         log_densities = -0.5 * (change / deviations) ** 2 - np.log(deviations)
-    shown_drops = np.maximum(drops, drop_error)  # (hypotheses, n + 1)
-    healthy_logs = np.log(shown_drops[:, healthy])
+    drops_by_hypothesis = np.maximum(drops, drop_error)  # (hypotheses, n + 1)
+    healthy_logs = np.log(drops_by_hypothesis[:, healthy])
     squares = (healthy_logs - healthy_logs.mean(axis=1, keepdims=True)) ** 2
-    squares += (drop_error[healthy] / shown_drops[:, healthy]) ** 2
+    squares += (drop_error[healthy] / drops_by_hypothesis[:, healthy]) ** 2
     log_densities = log_densities - 0.5 * (len(healthy) - 1) * np.log(squares.sum(axis=1))
     log_probabilities = np.log(prior.drop_tells) + log_densities - np.logaddexp.reduce(log_densities)
     variance, oils = unknown_deviation**2, list[OilHypothesis]()
-    for shown, mean, log_probability in zip(
-        shown_drops, healthy_logs.mean(axis=1).tolist(), log_probabilities.tolist(), strict=True
+    for positive_drops, mean, log_probability in zip(
+        drops_by_hypothesis, healthy_logs.mean(axis=1).tolist(), log_probabilities.tolist(), strict=True
     ):
-        error_variance = (prior.per_drop * drop_error / shown) ** 2
+        error_variance = (prior.per_drop * drop_error / positive_drops) ** 2
         slope_deviation = prior.per_drop_deviation / prior.per_drop
         is_judged = np.arange(len(recordings)) == len(recordings) - 1
-        for tells, probability in (
+        for is_informative, probability in (
             (is_known, 1.0 - prior.drop_misleads),
             (is_known & ~is_judged, prior.drop_misleads),
         ):
             # variance of the true drop over that of the measured one
-            reliability = np.where(tells, variance / (variance + error_variance), 0.0)
+            reliability = np.where(is_informative, variance / (variance + error_variance), 0.0)
             oils.append(
                 OilHypothesis(
-                    thinning=-prior.per_drop * reliability * np.where(tells, np.log(shown) - mean, 0.0),
+                    thinning=-prior.per_drop
+                    * reliability
+                    * np.where(is_informative, np.log(positive_drops) - mean, 0.0),
                     variances=(1.0 - reliability) * variance,
                     log_probability=log_probability + float(np.log(probability)),
                     slope_deviation=slope_deviation,

@@ -52,10 +52,9 @@ class RecordingSums(NamedTuple):
     def from_blocks(
         cls, blocks: Blocks, columns: Sequence[ColumnRoles], start_s: float | None = None, oil_degC: float | None = None
     ) -> RecordingSums:
-        """Summarise a recording; means of flow and pressure are weighted by the number of equations, `Blocks.rows`."""
-        weights = np.maximum(blocks.rows, 1e-9)  # positive, so that the means exist
-        flow = float(np.average(blocks.flow, weights=weights))
-        pressure = float(np.average(blocks.mean_pressure(), weights=weights))
+        """Summarise a recording; the mean flow is weighted by the number of equations, `Blocks.rows`."""
+        flow = float(np.average(blocks.flow, weights=np.maximum(blocks.rows, 1e-9)))  # positive, so that a mean exists
+        pressure = float(np.average(blocks.mean_pressure(), weights=blocks.pressure_weights))
         return cls(eliminate_unshared(sum_blocks(blocks, columns), columns), flow, pressure, start_s, oil_degC)
 
     @property

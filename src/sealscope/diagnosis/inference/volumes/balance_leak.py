@@ -271,7 +271,9 @@ class BalanceLeak:
         if fit is None:
             return [(laminar_flow, 0.0)] * len(EXPONENTS)
         # an orifice with the coefficient 1 / `regression` looks like a laminar leak with the coefficient 1
-        orifice_flow = balance.mean_of_blocks(balance.blocks.mean_root()) / fit.regression
+        orifice_flow = (
+            balance.mean_of_blocks(balance.blocks.mean_root(), balance.blocks.pressure_weights) / fit.regression
+        )
         log_ratio = INFERENCE.size.readings * fit.log_ratio
         fractions = 2.0 * (1.0 - np.array(EXPONENTS))
         return [
@@ -352,11 +354,11 @@ class BalanceLeak:
 
     @cached_property
     def step_rise(self) -> LeakRise | None:
-        """Leakage above that of healthy recordings, and the evidence that a step within the recording caused it.
+        """Leakage above that of healthy recordings, and the evidence for its causes (`LeakRise`).
 
-        The evidence (`step_log_ratio`) is the log likelihood ratio of two hypotheses: a rise as large as the step would
-        cause, and no rise. If shut valves hold the load after the step's onset, these holds show the whole step;
-        otherwise the mean over the recording shows a part of it. None without healthy recordings.
+        The causes are a leak that began within the recording, as the step shows, and an older leak. If shut valves hold
+        the load after the step's onset, `step_log_ratio` compares the rise in these holds with the whole step, else the
+        mean rise with the part of the step that the mean contains. None without healthy recordings.
         """
         step, total_rise, motion_rise = self.step, self.rise, self._motion_rise
         if total_rise is None:
@@ -368,7 +370,7 @@ class BalanceLeak:
         sums = balance.recording_sums._replace(held=leaks)
         rise_after = None if leaks is None else held_rise(sums, self.healthy)
         older_ratios = older_log_ratios(balance.running_blocks, balance.columns, balance.leak)
-        # mean over the laws by their priors; the step's law counts with its prior as well
+        # an older leak has a mean likelihood over the laws by their priors; the step's law gets its prior too
         mean_log_ratio = float(np.logaddexp.reduce(older_ratios + np.log(law_priors())))
         onset_log_ratio = 0.5 * step.score + float(np.log(step.law.share)) - mean_log_ratio
         older_log_ratio, older_flow = self._compare_older_leak(older_ratios, step.noise[False], motion_rise)
@@ -386,7 +388,8 @@ class BalanceLeak:
         """Compute `older_log_ratio` and `older_flow` of `LeakRise`, for a leak that was there before the recording.
 
         `log_ratios`: those of `older_log_ratios`; `noise`: as in `estimate_bend_flows`; `motion_rise`: rise over
-        healthy recordings in the whole recording. The flow is None if holds measure it, which do so better.
+        healthy recordings, from the whole recording. The flow is None if holds measured the leakage, which is more
+        accurate.
         """
         balance, total_rise = self.balance, self.rise
         assert total_rise is not None
@@ -397,7 +400,7 @@ class BalanceLeak:
         rises = [flow.value / unit for flow, unit in zip(bend_flows, units, strict=True) if flow is not None]
         if not rises:
             return 0.0, None
-        log_deviation: float = INFERENCE.held_oil.agrees
+        log_deviation: float = INFERENCE.held_oil.agrees  # standard deviation of log(total rise / expected rise)
         rise_log_ratios = [total_rise.log_ratio(rise, log_deviation) if rise > 0.0 else -np.inf for rise in rises]
         log_ratio = float(np.logaddexp.reduce(rise_log_ratios) - np.log(len(rises)))
         if self._hold_rise is not None:
@@ -440,9 +443,9 @@ class BalanceLeak:
         """Return the total leakage of pump and piston, with its interval and the limit for a healthy machine.
 
         The flow is not stated behind a servo valve, since the valve's edges leak as well, nor if it may exceed that of
-        the pump. `detectable_flow`: flow [m^3/s], by the assumed sizes, of the smallest leak that would be detected if
-        it began within the recording; None if that was not tested. The result states it as `findable_lpm` and
-        `findable_share`.
+        the pump. `detectable_flow`: flow [m^3/s] of the smallest leak that would be detected if it began within the
+        recording, computed with the assumed piston area and displacement; None if that was not tested. The result
+        states it as `findable_lpm` and `findable_share`.
         """
         balance = self.balance
         size, pressure, pump_flow = balance.size, balance.mean_pressure(), balance.mean_flow

@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 
 #: Reason for having no balance; the key is True if the position is recorded.
 _NO_BALANCE = {
-    True: "too short for a balance, or the piston is not held: {:.3g} s",
+    True: "finds no time in which the piston is held under a constant command u, for long enough, in {:.3g} s",
     False: "no loop brings the piston back or holds it under a pressure difference, for long enough in {:.3g} s, so "
     "that what leaks moves it: record its position x",
 }
@@ -261,7 +261,12 @@ class VolumeBalance:
         balance = self.balance(recording, odds, is_locked=is_locked, sign_log_odds=sign_log_odds)
         has_flow, has_position = flow_source(recording.channels) is not None, "x" in recording
         if balance is None and (has_flow or not has_position):
-            return Observed(self.name, lack=_NO_BALANCE[has_position].format(recording.duration))
+            lack = _NO_BALANCE[has_position].format(recording.duration)
+            if equations(self.rig, channels):
+                lack = f"finds the recording too short, {recording.duration:.3g} s"
+            elif has_position:
+                lack += f"; it needs {self.rig.circuit.needed_channels}"
+            return Observed(self.name, lack=lack)
         # without a pump (`terms.locked`), valves hold the load if the command is recorded; otherwise it must creep in
         # the healthy recordings, since a control loop would replace the leakage
         is_held = has_flow or _sum_log_odds(summaries, "creep_odds") > 0.0

@@ -32,7 +32,7 @@ from sealscope.diagnosis.inference.circuit.holds.hold import (
 from sealscope.diagnosis.inference.circuit.holds.oil import CylinderSides
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
 from sealscope.diagnosis.inference.differences import Estimate
-from sealscope.diagnosis.inference.leak_law import find_leak_step
+from sealscope.diagnosis.inference.leak_law import find_leak_step, with_turbulence
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.inference.onset import (
     MIN_BLOCKS,
@@ -138,10 +138,10 @@ class RecordedBalance:
         """
         return self.blocks[self._first_motion :]
 
-    @cached_property
+    @property
     def leak(self) -> Information:
         """Likelihood of the leak's conductance in each of `running_blocks` (`onset.Information`)."""
-        return information(self.running_blocks, self.columns, self.columns[0].leak)
+        return self._leak_and_test[0]
 
     @cached_property
     def compared_leak(self) -> Information:
@@ -152,10 +152,24 @@ class RecordedBalance:
         roles = self.columns[0]
         return information(self.running_blocks, self.columns, roles.leak, left_out=roles.hold_leak)
 
-    @cached_property
+    @property
     def test(self) -> StepTest | None:
         """Test for a leak that begins within the recording; None if too few blocks have information."""
-        return find_leak_step(self.running_blocks, self.columns, self.leak)
+        return self._leak_and_test[1]
+
+    @cached_property
+    def _leak_and_test(self) -> tuple[Information, StepTest | None]:
+        """Likelihood of the leak's conductance in each of `running_blocks`, and the test for a step of it.
+
+        The healthy leakage may be laminar, or turbulent in part (`with_turbulence`). The chance of the step is the
+        larger one of the two, since nobody knows which healthy machine it is.
+        """
+        laminar = information(self.running_blocks, self.columns, self.columns[0].leak)
+        candidates = [
+            (leak, find_leak_step(self.running_blocks, self.columns, leak))
+            for leak in (laminar, with_turbulence(laminar, self.running_blocks, self.columns))
+        ]
+        return max(candidates, key=lambda candidate: 1.0 if candidate[1] is None else candidate[1].chance)
 
     @cached_property
     def observables(self) -> tuple[Observable, ...]:
@@ -404,11 +418,11 @@ class RecordedBalance:
             return None
         area = self._loaded_area.measured
         value, deviation = estimate_weighted_mean(self.blocks, roles, {roles.names.index(LAG): 1.0})
-        return Estimate(value / area, deviation / area) if area > 0.0 else None
+        return Estimate(self._loaded_area.sign * value / area, deviation / area) if area > 0.0 else None
 
     def mean_pressure(self, since: float = -np.inf) -> float:
         """Compute the mean of abs(p_A - p_B) [Pa] from the time `since` [s] on, without the sensor offset."""
-        return self.mean_of_blocks(self.blocks.mean_pressure(self.pressure_offset), since)
+        return self.mean_of_blocks(self.blocks.mean_pressure(self.pressure_offset), self.blocks.pressure_weights, since)
 
     def outside_unit_flows(self) -> dict[str, float]:
         """Compute the flow [m^3/s] of each external leak with a conductance of 1 m^3/(s Pa), by the name of its term.
@@ -426,17 +440,16 @@ class RecordedBalance:
     def mean_flow(self) -> float:
         """Mean magnitude of the pump's flow [m^3/s]; if `is_creep`, of the flow that the piston displaces."""
         if not self.is_creep:
-            return self.mean_of_blocks(self.blocks.flow)
+            return self.mean_of_blocks(self.blocks.flow, np.maximum(self.blocks.rows, 1e-9))
         area = max(self.rig.cylinder.A_A, self.rig.cylinder.A_B)
         return area * float(np.nanmean(np.abs(np.diff(self.recording["x"])))) * self.recording.rate
 
-    def mean_of_blocks(self, values: Array, since: float = -np.inf) -> float:
-        """Average `values` (K,) over the blocks after `since` [s] (at least the last), weighted by `Blocks.rows`."""
+    def mean_of_blocks(self, values: Array, weights: Array, since: float = -np.inf) -> float:
+        """Average `values` (K,) with positive `weights` (K,) over the blocks after `since` [s], at least the last."""
         is_after = self.blocks.time >= since
         if not is_after.any():
             is_after[-1] = True
-        min_weight = 1e-9  # the sum of the weights must not be zero
-        return float(np.average(values[is_after], weights=np.maximum(self.blocks.rows[is_after], min_weight)))
+        return float(np.average(values[is_after], weights=weights[is_after]))
 
     @cached_property
     def size(self) -> Size:
@@ -491,9 +504,10 @@ class RecordedBalance:
         squares = np.einsum("kii->i", self.blocks.gram[:, 0])[motion]  # sums over all blocks
         weights = squares / max(float(squares.sum()), np.finfo(float).tiny)
         value, deviation = estimate_weighted_mean(self.blocks, roles, dict(zip(motion, weights, strict=True)))
-        value, half_width = abs(value), WITHIN_95 * deviation  # the coefficients are negative if x is reversed
+        sign = -1 if value < 0.0 else 1
+        value, half_width = abs(value), WITHIN_95 * deviation
         assumed = [cylinder.A_A if roles.names[k].endswith("A carries") else cylinder.A_B for k in motion]
-        return _Area(value, value - half_width, value + half_width, float(weights @ assumed))
+        return _Area(value, value - half_width, value + half_width, float(weights @ assumed), sign)
 
     @cached_property
     def conductance(self) -> Interval:
@@ -560,10 +574,12 @@ def log_area_ratio(measured: float, loaded_share: float, *, is_larger: bool) -> 
 class _Area(NamedTuple):
     """Piston area of the loaded side [m^2]: as `measured` by the volume balance, and as `assumed` in the rig's file.
 
-    The measurement uses the assumed displacement or a flow meter. `low`, `high`: 95 % interval of the measured area.
+    The measurement uses the assumed displacement or a flow meter. `low`, `high`: 95 % interval of the measured area;
+    `sign`: -1 if the position or the flow is recorded with the opposite sign, which makes the coefficients negative.
     """
 
     measured: float
     low: float
     high: float
     assumed: float
+    sign: int

@@ -48,9 +48,10 @@ def rival_rises(
     each rival that can be compared. If external leaks can be measured while shut valves hold the load (`held_rivals`),
     they are compared only there.
 
-    `volume_ratio`: measured over assumed ratio of the piston's area to the pump's displacement, by which volumes of air
-    scale; `unit_flows`: flow [m^3/s] of an external leak with a conductance of 1 m^3/(s Pa), by the name of its term. A
-    leak without an entry is assumed to be driven by the mean of abs(p_A - p_B) in the judged recording.
+    `volume_ratio`: ratio of the piston's area to the pump's displacement as measured, over that assumed; prior volumes
+    of air are multiplied by it. `unit_flows`: flow [m^3/s] of an external leak with a conductance of 1 m^3/(s Pa), by
+    the name of its term. A leak without an entry is assumed to be driven by the mean of abs(p_A - p_B) in the judged
+    recording.
     """
     names = columns[0].names
     hold_rivals = held_rivals(judged, healthy, unit_flows)

@@ -84,8 +84,9 @@ def proposed_map(labels: Sequence[Label]) -> dict[str, str]:
             columns = [column for column in columns if column[1].kind == "command"]
         if channel == "T_oil":  # prefer the temperature that names the oil
             columns = [column for column in columns if _split_words(column[0].name) & _KIND["oil"]] or columns
-        if len(columns) > 1:  # prefer measured to computed columns
-            columns = [column for column in columns if not _split_words(column[0].name) & _KIND["made"]]
+        if len(columns) > 1:  # prefer measured columns to computed ones, and to a speed that is only set
+            unmeasured = _KIND["made"] | _KIND["wanted"] if channel == "omega" else _KIND["made"]
+            columns = [column for column in columns if not _split_words(column[0].name) & unmeasured]
         if len(columns) == 1 and channel.casefold() not in channel_names:
             label, guess = columns[0]
             result[channel] = label.whole + (f"[{guess.unit}]" if guess.unit not in (None, label.unit) else "")
@@ -235,11 +236,11 @@ def _guess_meaning(label: Label, head_side: str = "") -> _Guess | None:
     if unit is not None and same_dimension(unit, "m^3/s"):
         kind = "leak" if words & _MEASURED["leak"] else "flow"
         return _Guess(kind, side, unit) if words & _MEASURED[kind] else None
-    # a command may be called `setpoint`, a measured quantity may not
-    is_measured_quantity = any(words & _MEASURED[kind] for kind in ("pressure", "position", "speed", "angle"))
-    if words & _KIND["other"] or (words & _KIND["wanted"] and is_measured_quantity):
-        return None
     is_rotation = unit is not None and (unit in WORDS["rotation_units"] or same_dimension(unit, "rad/s"))
+    # a command may be called `setpoint`, a measured quantity may not; a drive follows the speed that is set
+    is_measured_quantity = any(words & _MEASURED[kind] for kind in ("pressure", "position", "speed", "angle"))
+    if words & _KIND["other"] or (words & _KIND["wanted"] and is_measured_quantity and not is_rotation):
+        return None
     if is_rotation and words & (_MEASURED["speed"] | _KIND["motor"]):
         return _Guess("speed", side, "rpm" if unit in WORDS["rotation_units"] else unit)
     if unit is not None and "s" in words and same_dimension(unit, "m"):  # the path in German books
