@@ -64,6 +64,14 @@ def test_bore_and_rod_are_as_good_as_areas(call, tmp_path):
     assert pytest.approx((ring, ring), rel=1e-5) == (load_rig(path).cylinder.A_A, load_rig(path).cylinder.A_B)
 
 
+def test_a_rod_on_both_sides_needs_one_area(call, tmp_path):
+    path = tmp_path / "hip.toml"
+    words = ("--area-A", "620", "--double-rod", "--stroke", "100", "--displacement", "0.9")
+    assert call("rigs", "new", "hip", *words, "-o", path).status == 0
+    cylinder = load_rig(path).cylinder
+    assert cylinder.A_A == cylinder.A_B == pytest.approx(620e-6)
+
+
 @pytest.mark.parametrize(
     ("words", "rule"),
     [

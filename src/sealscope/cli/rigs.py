@@ -63,7 +63,8 @@ def new(
         areas = piston_areas(bore_m, rod_m, double_rod=double_rod)
     else:
         m2_A = _parse_size(area_A, "m^2", "mm^2", "--area-A", "Piston area on side A")
-        areas = m2_A, _parse_size(area_B, "m^2", "mm^2", "--area-B", "... on side B")
+        is_same = double_rod and area_B is None  # both sides have the rod
+        areas = m2_A, m2_A if is_same else _parse_size(area_B, "m^2", "mm^2", "--area-B", "... on side B")
     length = _parse_size(stroke, "m", "mm", "--stroke", "Stroke")
     if kind == "pump":
         volume = _parse_size(displacement, "m^3/rev", "cm^3/rev", "--displacement", "Displacement of the pump")

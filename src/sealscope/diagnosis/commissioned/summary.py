@@ -112,7 +112,8 @@ class MachineSummary:
             half = f"{factor * n_healthy} healthy recordings instead of {n_healthy}"
             half += ", of as many more days" if are_dated else ""
         power = f"{100.0 * _PRIORS.power:g} % of the time"
-        return [("smallest leak", f"the next recording shows {self.smallest} ({power})"), ("half of that", half)]
+        smallest = f"the next recording with such oil, loads and speeds shows {self.smallest} ({power})"
+        return [("smallest leak", smallest), ("half of that", half)]
 
 
 def _describe_rig(rig: Rig | None) -> str:

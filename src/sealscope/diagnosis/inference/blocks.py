@@ -390,7 +390,7 @@ def information(blocks: Blocks, columns: Sequence[ColumnRoles], test: int, left_
     The nuisance columns are those of the other coefficients. N is the diagonal matrix of the tested column's sums of
     squares in each block, n contains its products with the left side, and C those with the nuisance columns. G is the
     Gram matrix of the nuisance columns and b their products with the left side. P / s^2 is the prior precision of their
-    coefficients, and mu the prior mean.
+    coefficients, and mu the prior mean. The errors of the oil's expansion (`_expansion_errors`) are then added.
     """
     count = len(blocks)
     precision, vector = np.zeros((count, count)), np.zeros(count)
@@ -400,9 +400,30 @@ def information(blocks: Blocks, columns: Sequence[ColumnRoles], test: int, left_
         right_sides = np.column_stack([normal.coupling.T, normal.moment + fit.prior_moment])
         solution = solve(normal.gram + np.diag(fit.prior_precision), right_sides)
         schur = (np.diag(normal.energy) - normal.coupling @ solution[:, :-1]) / fit.variance
+        moment = (normal.tested_moment - normal.coupling @ solution[:, -1]) / fit.variance
+        # (S^-1 + E)^-1 = (I + S E)^-1 S, without the inverse of the precision S, which may not exist
+        widening = np.linalg.inv(np.eye(count) + schur * _expansion_errors(fit, roles) ** 2)
+        schur = widening @ schur
         precision += 0.5 * (schur + schur.T)
-        vector += (normal.tested_moment - normal.coupling @ solution[:, -1]) / fit.variance
+        vector += widening @ moment
     return Information(blocks.time, precision, vector, level=columns[0].leak_deviation(test, blocks))
+
+
+def _expansion_errors(fit: _EquationFit, roles: ColumnRoles) -> Array:
+    """Compute the standard error (K,) of the tested coefficient in each block by the expansion of the oil.
+
+    The volume by which the oil and its air expand is known to within a fraction, `blocks.expansion` of `priors.toml`:
+    the terms of the compliance hardly describe air at low pressures. The error is this fraction of the coefficient that
+    would explain the fitted volume in the block. It is small where pressures rise and fall again, and large where they
+    only relax.
+    """
+    n_polynomials = fit.polynomials.shape[1]
+    is_compliance = np.repeat([k in roles.compliance for k in fit.nuisance], n_polynomials)
+    coupling = fit.normal.coupling[:, : len(is_compliance)][:, is_compliance]  # without the sensor offset, the last
+    explained = coupling @ fit.coefficients[: len(is_compliance)][is_compliance]
+    has_energy = fit.normal.energy > 0.0
+    coefficient = np.where(has_energy, explained, 0.0) / np.where(has_energy, fit.normal.energy, 1.0)
+    return np.asarray(INFERENCE.blocks.expansion * coefficient)
 
 
 def _drift_polynomials(blocks: Blocks) -> tuple[Array, float]:
