@@ -200,9 +200,9 @@ def fit_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
 def hypotheses_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Tabulate how well the fitted rig, changed as each hypothesis says, agrees with the measured data sheet.
 
-    For some wavelet details of each chamber the columns are the geometric mean of simulated over measured leak-free
-    RMS, the geometric mean change of the simulated RMS with the leak [%], and the number of tests in which the
-    simulated and the measured change have the same sign. The first row is the measured sheet itself.
+    For each chamber the columns are the ratio of simulated to measured leak-free RMS (geometric mean over the tests;
+    details d3 and d4), the change of the simulated RMS by the leak [%] (likewise; d2 to d4), and the number of tests in
+    which simulated and measured change have the same sign (d3 and d4). The first row is the measured sheet itself.
     """
     assert context.sheet is not None  # the item needs the measured data sheet
     sheet = context.sheet

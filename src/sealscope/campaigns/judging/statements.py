@@ -59,7 +59,11 @@ def onset_errors(verdicts: Verdicts, onset_s: float, confidence: float) -> Itera
 
 
 def flow_errors(verdicts: Verdicts, confidence: float) -> Iterator[StatedErrors]:
-    """Yield the errors of the leak flows [L/min] that detectors estimate, for each detector and planned mean flow."""
+    """Yield the errors of the leak flows [L/min] that detectors state, by detector and planned mean flow (`size`).
+
+    `confidence`: probability with which a stated interval should contain the true flow. Recordings without a statement
+    are left out.
+    """
     for name, records in verdicts.items():
         for size, group in group_by(records, attrgetter("size")).items():
             estimates = [

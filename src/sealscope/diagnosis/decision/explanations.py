@@ -179,11 +179,11 @@ def _possible_gains(
 
 
 def older_leak_gain(step_gain: float, rise: LeakRise) -> float:
-    """Compute the log Bayes factor, for changes of the leakage within a recording, of a leak that was there before.
+    """Compute how well a leak that is older than the recording explains the changes of the leakage within it.
 
-    `step_gain`: that of a leak that begins within the recording. The log likelihood ratio of this leak to the older one
-    (`LeakRise.onset_log_ratio`) is subtracted, reduced for the models' misfit as all factors are
-    (`_correct_for_misfit`).
+    The result is a log Bayes factor of at least 0: that of a leak that begins within the recording, `step_gain`, minus
+    the log likelihood ratio of this leak to the older one (`LeakRise.onset_log_ratio`), which is reduced for the
+    models' misfit as all factors are (`_correct_for_misfit`).
     """
     misfit_divisor = 1.0 + 2.0 * DECISION.explanation.misfit * step_gain
     return max(step_gain - rise.onset_log_ratio / misfit_divisor, 0.0)

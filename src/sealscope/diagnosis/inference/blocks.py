@@ -596,7 +596,8 @@ def _shift_offset(gram: Array, roles: ColumnRoles, test: int, coefficients: Arra
 
     `gram` (K, m, m): Gram matrices of K blocks; `test`: column of a pressure times the sampling interval dt, from which
     `offset` [Pa] dt is subtracted; `coefficients` (K,): its coefficient g in each block. The appended, last column -g
-    dt is the derivative of the volume balance by the offset. Without flow offset the column is zero.
+    dt is the derivative of the volume balance with respect to the offset. In a balance without the column dt, that of a
+    flow offset, nothing is corrected, and the appended column is zero.
     """
     size = gram.shape[1]
     transform = np.zeros((len(gram), size, size + 1))

@@ -124,7 +124,7 @@ class Diagnosis(Evidence):
 
     @property
     def limit_lpm(self) -> float | None:
-        """Repair limit as a flow past the piston [L/min]; None for a creep speed without a stated piston area."""
+        """Repair limit as a flow past the piston [L/min]; None for a creep speed if the piston area is unknown."""
         area = self.machine.area if self.machine is not None and self.machine.area_stated else None
         return self.limit.flow_lpm(area)
 

@@ -206,9 +206,9 @@ def pattern_tests(time: Array, values: Array) -> tuple[LevelChange, ...]:
     A pattern (`PATTERNS`) is the combination of levels that one cause changes, such as friction or a sensor's offset.
     Those that cannot be tested are left out. `time` (K,), `values` (K, 4): times [s] and levels of `PressureLevels`.
 
-    A step takes time, so that the levels of the block in which it begins are those of neither before nor after it.
-    Without the blocks on both sides of the most likely onset the patterns are compared again: these ranks count. The
-    p-values are those of all blocks.
+    A step takes time, so that the block in which it begins shows neither the old nor the new levels. The tests are
+    therefore repeated without the two blocks nearest to the most likely onset, and the order follows the ranks of this
+    second pass. The p-values are those of the first pass, with all blocks.
     """
     tests = _test_patterns(time, values)
     changes = [test for test in tests if test is not None]

@@ -124,9 +124,10 @@ def _sum_products(values: Any, begin: int, end: int, weights: Any, gram: Any) ->
 
 @large_law
 def _eliminate_fast(gram: Any, column_order: Any, n_fast: int, reduced: Any) -> None:
-    """Eliminate the coefficients that are free in each block (fast) from the Gram matrix `gram` (m, m) of one block.
+    """Eliminate the fast coefficients, which each block fits separately, from the Gram matrix `gram` (m, m) of a block.
 
-    `reduced` (c, c) receives the result. `column_order`: its columns' indices in `gram`, the `n_fast` fast ones first.
+    `reduced` (c, c) receives the result. `column_order` (c,): the columns of `gram` that are copied to `reduced`, in
+    this order, the `n_fast` fast ones first.
     """
     for i in range(len(column_order)):
         for j in range(len(column_order)):

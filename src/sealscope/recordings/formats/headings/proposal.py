@@ -265,7 +265,10 @@ def is_current_or_fraction(unit: str) -> bool:
 
 
 def _guess_at_valve(label: Label, kind: str) -> _Guess | None:
-    """Guess whether a column is a pressure on the side `kind` of a valve, "before" or "behind"; None if it is not."""
+    """Guess whether a column is the pressure upstream (`kind` "before") or downstream ("behind") of a valve.
+
+    Return None if it is not, or if its name says that it is a set point.
+    """
     name, unit = _find_name_and_unit(label)
     words = _split_words(name)
     if unit is None or not same_dimension(unit, "Pa") or not words & _KIND[kind] or words & _KIND["wanted"]:
