@@ -35,7 +35,7 @@ from sealscope.diagnosis.inference.rows.row_weights import (
     block_gram_matrices,
 )
 from sealscope.diagnosis.inference.rows.weak_form import OVERLAP
-from sealscope.diagnosis.inference.terms import BIAS, HOLDING, LEAK, MOVING_BIAS, TURNING, Equation
+from sealscope.diagnosis.inference.terms import AIR, BIAS, HOLDING, LEAK, MOVING_BIAS, TURNING, Equation
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
@@ -402,7 +402,9 @@ def information(blocks: Blocks, columns: Sequence[ColumnRoles], test: int, left_
         schur = (np.diag(normal.energy) - normal.coupling @ solution[:, :-1]) / fit.variance
         moment = (normal.tested_moment - normal.coupling @ solution[:, -1]) / fit.variance
         # (S^-1 + E)^-1 = (I + S E)^-1 S, without the inverse of the precision S, which may not exist
-        widening = np.linalg.inv(np.eye(count) + schur * _expansion_errors(fit, roles) ** 2)
+        is_air = test < roles.left and roles.names[test] == AIR  # its coefficient describes the expansion itself
+        errors = np.zeros(count) if is_air else _expansion_errors(fit, roles)
+        widening = np.linalg.inv(np.eye(count) + schur * errors**2)
         schur = widening @ schur
         precision += 0.5 * (schur + schur.T)
         vector += widening @ moment
