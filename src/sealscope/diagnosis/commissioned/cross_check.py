@@ -56,7 +56,7 @@ def cross_check(
 def _has_healed(file: str, healthy: Sequence[SummarisedRecording], leaking: Collection[str]) -> bool:
     """Return True if recordings were made after that of the `file`, and none of them is among the `leaking` files.
 
-    A worn seal does not heal. What looks like the begin of a leak is then a peculiarity of the healthy machine.
+    Since a worn seal does not heal, the apparent onset of a leak is then a peculiarity of the healthy machine.
     """
     start_s = next(recording.start_s for recording in healthy if recording.file == file)
     if start_s is None:

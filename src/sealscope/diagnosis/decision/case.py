@@ -129,7 +129,8 @@ class Case:
     def alarms(self) -> tuple[LeakTest, ...]:
         """Tests whose p-value is below their allowed false-alarm probability.
 
-        They have the order of `tests`, WITHIN first, which is reversed if the leak seems older than the recording.
+        The test for a leak that begins within the recording (WITHIN) comes first, or last if the leak seems older than
+        the recording, so that the first alarm is the one that fits the leak best.
         """
         alarms = [test for test in self.tests if test.chance < test.probability]
         return tuple(alarms if self.has_onset_within else reversed(alarms))

@@ -201,10 +201,10 @@ def _findable_step(case: Case) -> float | None:
 
 
 def _add_tests(case: Case, evidence: Evidence, judging: LeakTest | None) -> Evidence:
-    """Add to `evidence` figures of the judging detector's report, and the results of its tests.
+    """Add to `evidence` name, share and leakage ratio from the report that the verdict rests on, and its tests.
 
-    Score, threshold and p-value are those of the test `judging`. If it is None, no results are added. If there are
-    several tests, `parts` lists the results of each.
+    Score, threshold and p-value are those of the deciding test, `judging`; if it is None, nothing of tests is added. If
+    there are several tests, `parts` has an entry for each.
     """
     judge = case.judge
     evidence = replace(evidence, detector=judge.provider, share=judge.share, judged_until=judge.judged_until)

@@ -34,7 +34,7 @@ class Event:
         return _matches(f"{observable.data}: {observable.name}", self.affected)
 
     def scales(self, observable: Observable) -> bool:
-        """Return True if the event changes an observable by a common scale of both pressures (patterns `scaled`)."""
+        """Return True if the event changes an observable by multiplying both pressures by one factor (`scaled`)."""
         return _matches(f"{observable.data}: {observable.name}", self.scaled)
 
     def changes(self, observable: Observable) -> bool:

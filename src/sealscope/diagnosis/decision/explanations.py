@@ -162,8 +162,9 @@ def _possible_gains(
 
     `factors` are observables with the log Bayes factors of a change. The first mapping is for an onset within the
     recording. A leak gets a second one if `rise` is given, for an onset before the recording: such a leak explains the
-    leakage above that of healthy recordings (the rise). A third one is for an older leak that is not laminar: how its
-    flow changes with the pressure shows its size, which must then agree with the rise.
+    leakage above that of healthy recordings (the rise). If the volume balance supports a step, a third one is
+    for an older leak that is not laminar: how its flow changes with the pressure shows its size, which must then agree
+    with the rise.
     """
     gains = _gains_at_onset(event, factors)
     if rise is None or event.name not in LEAK_EVENTS:
@@ -173,7 +174,7 @@ def _possible_gains(
     if not volume_gain > 0.0:
         return [gains, older_gains]
     gains[RISE] = rise.step_log_ratio  # a leak that began within the recording explains the rise by its step
-    # healthy recordings calibrate the step's factor only, which therefore limits that of an older leak
+    # the factor of an older leak may not exceed the step's, as healthy recordings calibrated only the latter
     bending_gains = {RISE: rise.older_log_ratio, VOLUMES: min(older_leak_gain(volume_gain, rise), volume_gain)}
     return [gains, older_gains, bending_gains]
 

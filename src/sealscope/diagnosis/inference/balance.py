@@ -206,9 +206,10 @@ class BlockStream:
         odds are the sum over three symptoms of correct wiring, each with a z score (`_sign_log_odds`):
 
         - Oil leaks from high to low pressure.
-        - The force of the pressures on the piston correlates with the flow into A, since friction dissipates energy. A
-          constant load does work as well unless the piston returns; its mean, weighted by abs(flow), is subtracted. The
-          log odds are averaged with those of p_A - p_B, which throttles at the rod side distort, but loads less.
+        - The force of the pressures on the piston correlates with the flow into A, since friction dissipates energy.
+          The mean, weighted by abs(flow), is subtracted, since a constant load also correlates with a motion in one
+          direction. The log odds are averaged with those of p_A - p_B, which a load disturbs less than the force, but
+          throttling on the rod side more.
         - The position x grows with the flow into A. A negative correlation does not count, since x may be reversed.
         """
         odds_by_balance = []

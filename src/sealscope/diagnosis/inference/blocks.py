@@ -122,9 +122,9 @@ class Blocks:
 
     @property
     def pressure_weights(self) -> Array:
-        """Weights (K,) of the blocks in a mean over time of a function of p_A - p_B: 1, or about 0 where it is missing.
+        """Weights (K,) for averaging a function of p_A - p_B over the blocks: 1, or nearly 0 for a block without it.
 
-        A pressure is known in more samples than rows use, for example where a sensor is clipped.
+        Numbers of rows would be wrong weights: rows with a clipped sample are dropped, though it is roughly known.
         """
         return np.where((self.pressures != 0.0).any(axis=1), 1.0, 1e-9)  # positive, so that a mean exists
 
@@ -412,12 +412,11 @@ def information(blocks: Blocks, columns: Sequence[ColumnRoles], test: int, left_
 
 
 def _expansion_errors(fit: _EquationFit, roles: ColumnRoles) -> Array:
-    """Compute the standard error (K,) of the tested coefficient in each block by the expansion of the oil.
+    """Compute for each of K blocks the error of the tested coefficient by the imperfect model of the oil's expansion.
 
-    The volume by which the oil and its air expand is known to within a fraction, `blocks.expansion` of `priors.toml`:
-    the terms of the compliance hardly describe air at low pressures. The error is this fraction of the coefficient that
-    would explain the fitted volume in the block. It is small where pressures rise and fall again, and large where they
-    only relax.
+    It is the fitted volume of expansion, converted to the equivalent value of this coefficient, times the relative
+    error `blocks.expansion` of `priors.toml`: the terms of the compliance hardly describe air at low pressures. The
+    error is small where pressures rise and fall again, and large where they only relax.
     """
     n_polynomials = fit.polynomials.shape[1]
     is_compliance = np.repeat([k in roles.compliance for k in fit.nuisance], n_polynomials)

@@ -84,11 +84,11 @@ def law_priors() -> Array:
 
 
 def with_turbulence(leak: Information, blocks: Blocks, columns: Sequence[ColumnRoles]) -> Information:
-    """Allow for a turbulent part of the healthy leakage, which changes its conductance with the pressure.
+    """Return `leak`, the likelihood of the conductance, with a prior for a turbulent part of the healthy leakage.
 
-    The part flows as through an orifice. Its conductance has in each block the shape of `apparent_conductances`, with
-    the mean 1, times a factor that is constant in the recording. The prior standard deviation of this factor is the
-    fraction `healthy.turbulent` (`priors.toml`) of the leakage. `leak`: likelihood of the conductance in the blocks.
+    This part flows as through an orifice, so that the apparent conductance varies with the pressure like `shape` (of
+    `apparent_conductances`, with the mean 1) times an unknown constant, whose prior standard deviation is the fraction
+    `healthy.turbulent` (`priors.toml`) of the leakage.
     """
     shape = apparent_conductances(blocks, columns)[0.5]
     weights = np.maximum(leak.precision.sum(axis=0), 0.0)  # information of each block
@@ -159,10 +159,10 @@ def estimate_bend_flows(blocks: Blocks, columns: Sequence[ColumnRoles], noise: f
 def estimate_older_flow(log_ratios: Array, rise_flows: Sequence[Flow], bend_flows: Sequence[Flow | None]) -> Flow:
     """Estimate the mean flow [m^3/s] of a leak that was there before the recording, averaged over its exponents.
 
-    The exponents e are those of the law flow ~ |dp|^e. Each has a flow by the rise over healthy recordings
-    (`rise_flows`) and, unless e = 1, one by the bend over the pressure (`bend_flows` of `estimate_bend_flows`). The two
-    are averaged with their precisions, and the weight of e includes the density with which they agree. `log_ratios` are
-    those of `older_log_ratios`.
+    For each exponent e of the law flow ~ |dp|^e the flow is estimated from the rise over healthy recordings
+    (`rise_flows`) and, for e < 1, also from the curvature over pressure (`bend_flows` of `estimate_bend_flows`). The
+    two are averaged with their precisions, and the weight of e contains the probability density of their difference.
+    `log_ratios` are those of `older_log_ratios`.
     """
     log_ratio = float(log_ratios.max())  # of any e < 1: the data tell these from e = 1, but hardly from each other
     weights, flows = list[float](), list[Flow]()

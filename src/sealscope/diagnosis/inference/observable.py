@@ -118,8 +118,8 @@ class Remark(NamedTuple):
 class LeakRise(NamedTuple):
     """Leakage of a recording above that of healthy recordings (`rise`), and two explanations of it.
 
-    The first is a leak that began within the recording, as a step of the leakage shows. The second is an older leak, as
-    large as the changes of the leakage with the pressure show.
+    Either a leak began within the recording, with the size of the step found in it, or a leak was there before, with
+    the size that follows from how the leakage varies with the pressure.
 
     - `step_log_ratio`: log of p(rise | the leak began within the recording) / p(rise | no leak).
     - `onset_log_ratio`: log of p(changes within the recording | the leak began there) / p(changes | older leak);

@@ -132,11 +132,11 @@ class StepTest:
         Onsets that were tried, counted in blocks, and as times [s]. A prior on the level counts as one block before the
         first.
     likelihood : array of float, shape (o,)
-        Log likelihood of a step at each onset, with fitted size and walk.
+        Log likelihood of a step at each onset, with fitted size and random walk.
     size, deviation : array of float, shape (o,)
-        Step at each onset and its standard error, with the walk fitted without a step.
+        Step at each onset and its standard error, with the walk's variance as fitted without a step.
     fitted : FittedStep
-        Step at the best onset and its standard error, with the walk fitted together with it.
+        Step at the best onset and its standard error, with the walk's variance as fitted together with it.
     walk, noise : tuple of two floats
         Variance q of the walk and variance kappa of the noise, each without a step and with the best one.
     law : NullLaw
@@ -450,10 +450,10 @@ class _Whitening(NamedTuple):
     are projected out.
 
     - `root` (r,), `vectors` (K, r): square roots of the non-zero eigenvalues of the precision, and their eigenvectors;
-    - `complement` (n, r + s): directions orthogonal to these changes, of which s have a prior;
+    - `complement` (n, r + s): directions orthogonal to these changes; s of these have a finite prior, a column each;
     - `basis`, `eigen` (n, n), (n,): eigenvectors of the random walk's covariance, and its eigenvalues times `unit`;
     - `transform` (n, K): matrix from the coefficient in K blocks to z;
-    - `unit`: scale at which walk and noise change z equally on average;
+    - `unit`: variance of the walk's steps at which it adds on average as much to z as the noise;
     - `positions` (o,): possible onsets, counted in blocks;
     - `walk_log_priors` (w,): log prior of each variance in `WALKS`.
     """
@@ -524,7 +524,7 @@ def _build_whitening(
     on the factor of a further change of the given `shape` (K,), if any (`Information`).
     """
     count = len(precision)
-    # z = Lambda^(-1/2) eta, restricted to the eigenvectors with information
+    # z = Lambda^(-1/2) eta of the module, restricted to the eigenvectors of the precision Lambda with information
     values, vectors = np.linalg.eigh(precision)
     is_informative = values > RANK_TOLERANCE * max(float(values[-1]), 0.0)
     if count < MIN_BLOCKS or np.count_nonzero(is_informative) < MIN_BLOCKS:
@@ -542,7 +542,7 @@ def _build_whitening(
         if np.isfinite(scale):  # a prior is one more estimate
             fixed = np.vstack([fixed, np.eye(len(scales))[k] / scale])
             design = np.vstack([design, np.zeros(count)])
-    # the columns of the orthogonal matrix after the first ones are orthogonal to these changes
+    # the remaining columns of the full Q span the complement of level, slope and shape
     complement = np.linalg.qr(fixed, mode="complete")[0][:, len(scales) :].T
     transform = complement @ design
     # covariance of a walk with steps of variance 1, which is min(k, l) for blocks k and l counted from 1

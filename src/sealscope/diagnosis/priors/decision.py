@@ -31,12 +31,12 @@ class QuestionPriors(PriorTable):
 
 
 class ExplanationPriors(PriorTable):
-    """Probabilities from which a leak is stated, excluded, or replaced by another explanation."""
+    """Thresholds on the probability of an explanation, above which a verdict states it, and errors of explanations."""
 
     heading: float  # allowed probability of naming another event by mistake, over that of a false leak
     leak: float  # probability from which a change is called a leak
     named: float  # probability, among all causes of the change, from which a cause other than a leak is named
-    happened: float  # the same if chance is an alternative as well
+    happened: float  # as `named`, where the change may also be pure chance
     sure: float  # a leak is excluded if its probability is below 1 - `sure`
     combined: float  # smallest logarithm of the Bayes factor with which an event is combined with others
     misfit: float  # smallest relative error with which a term of the model is assumed to describe the data

@@ -80,7 +80,7 @@ class OilPriors(PriorTable):
     # a leak is inversely proportional to this power of the viscous pressure drop; its standard deviation
     per_drop: float
     per_drop_deviation: float
-    # standard deviations of the logarithm of the friction from day to day, of the same seals, and of seals that wear
+    # standard deviations of the logarithm of the friction between sessions, with the same seals and with worn ones
     friction_session: float
     friction_changes: float
     drop_tells: float  # probability that a change of the viscous drop is due to the oil, not to load and speed
@@ -136,7 +136,7 @@ class SensePriors(PriorTable):
 
 
 class HeldOilPriors(PriorTable):
-    """Oil [Pa, 1/Pa] that is enclosed in the sides of a cylinder while shut valves hold it; such a time is a hold."""
+    """Holds, i.e. times in which shut valves enclose the oil in both sides of a cylinder (in Pa and 1/Pa)."""
 
     # relative compression per pressure, and the standard deviation of its logarithm
     compressibility: float

@@ -225,7 +225,10 @@ def pattern_tests(time: Array, values: Array) -> tuple[LevelChange, ...]:
 
 
 def _test_patterns(time: Array, values: Array) -> list[LevelChange | None]:
-    """Test pressure levels for a step in each pattern (`pattern_tests`); None for a pattern that cannot be tested."""
+    """Test pressure levels for a step in each pattern (`pattern_tests`); None for a pattern that cannot be tested.
+
+    A pattern has one or more bases, i.e. alternative sets of vectors that span the changes of the four levels.
+    """
     whitening = _whitening_matrix(values)
     mean = values.mean(axis=0)
     sum_of_levels = values[:, :2].sum(axis=1)
@@ -249,10 +252,10 @@ def _test_patterns(time: Array, values: Array) -> list[LevelChange | None]:
 
 
 def _pressure_scale(before: Array, after: Array) -> LogScale | None:
-    """Compute the scale of both pressures that would change the friction from the blocks `before` to those `after`.
+    """Compute the factor on both pressures that would explain the change of the friction between two groups of blocks.
 
     `before`, `after` (k, 4) [Pa]: `PressureLevels.values`. The friction shows in the difference of half_A and half_B.
-    Return None if it is not known in two blocks of each, or has no positive mean.
+    Return None if a group has fewer than two blocks, or no positive mean of the friction.
     """
     frictions = [values @ (HALF_A - HALF_B) for values in (before, after)]
     if min(len(friction) for friction in frictions) < 2:

@@ -100,9 +100,9 @@ def level_observables(changes: Sequence[LevelChange]) -> Iterator[Observable]:
 
     `changes`: a test for each pattern, the combination of levels that a cause changes, with the highest rank first. The
     rank (`LevelChange`) becomes the score. The first is the best of n patterns, so that its p-value is n chance_1
-    (Bonferroni). That of change k is min(1, n chance_1 exp(rank_1 - rank_k)). This factor is the square of the Bayes
-    factor of change 1 over change k (Schwarz's approximation): once as evidence, and once as a prior against a pattern
-    that leaves part of the change to another cause. The interval of an onset is one block to either side.
+    (Bonferroni). That of change k is min(1, n chance_1 exp(rank_1 - rank_k)). The Bayes factor of change 1 over
+    change k (Schwarz's approximation) counts twice, once as evidence and once as a prior, because a pattern that
+    explains only part of the change needs a second cause. The interval of an onset is one block to either side.
     """
     for change in changes:
         onset = Interval(change.onset, change.onset - change.block, change.onset + change.block)

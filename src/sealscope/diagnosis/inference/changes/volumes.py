@@ -79,7 +79,7 @@ def volume_observables(
     - `volume_ratio`: ratio of piston area to pump displacement as measured, over that assumed.
     - `charge`: trend of the charge pressure, None if it is unknown.
     - `flow_scale`: true flow over the flow that the balance gives with the assumed sizes.
-    - `with_orifice`: false to omit the test of an orifice's flow, which few blocks cannot tell from a scale of motion.
+    - `with_orifice`: false with few blocks, in which an orifice's flow looks like a change of the motion's scale.
     """
     centred, recorded = (series.merge(max_blocks=INFERENCE.blocks.coarse) for series in (blocks, plain))
     # a laminar leak is tested without the sensor offset, so an improbable offset counts against the leak

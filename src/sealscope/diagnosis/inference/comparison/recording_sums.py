@@ -52,7 +52,10 @@ class RecordingSums(NamedTuple):
     def from_blocks(
         cls, blocks: Blocks, columns: Sequence[ColumnRoles], start_s: float | None = None, oil_degC: float | None = None
     ) -> RecordingSums:
-        """Summarise a recording; the mean flow is weighted by the number of equations, `Blocks.rows`."""
+        """Summarise a recording by the sum of its Gram matrices, its mean flow and its mean pressure difference.
+
+        Columns that recordings do not share are eliminated. The flow is weighted by the numbers of rows, `Blocks.rows`.
+        """
         flow = float(np.average(blocks.flow, weights=np.maximum(blocks.rows, 1e-9)))  # positive, so that a mean exists
         pressure = float(np.average(blocks.mean_pressure(), weights=blocks.pressure_weights))
         return cls(eliminate_unshared(sum_blocks(blocks, columns), columns), flow, pressure, start_s, oil_degC)

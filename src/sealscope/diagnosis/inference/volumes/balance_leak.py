@@ -370,7 +370,7 @@ class BalanceLeak:
         sums = balance.recording_sums._replace(held=leaks)
         rise_after = None if leaks is None else held_rise(sums, self.healthy)
         older_ratios = older_log_ratios(balance.running_blocks, balance.columns, balance.leak)
-        # an older leak has a mean likelihood over the laws by their priors; the step's law gets its prior too
+        # the likelihood of an older leak is averaged over the laws; that of the step has the prior of its law
         mean_log_ratio = float(np.logaddexp.reduce(older_ratios + np.log(law_priors())))
         onset_log_ratio = 0.5 * step.score + float(np.log(step.law.share)) - mean_log_ratio
         older_log_ratio, older_flow = self._compare_older_leak(older_ratios, step.noise[False], motion_rise)
@@ -387,9 +387,9 @@ class BalanceLeak:
     def _compare_older_leak(self, log_ratios: Array, noise: float, motion_rise: Rise) -> tuple[float, Flow | None]:
         """Compute `older_log_ratio` and `older_flow` of `LeakRise`, for a leak that was there before the recording.
 
-        `log_ratios`: those of `older_log_ratios`; `noise`: as in `estimate_bend_flows`; `motion_rise`: rise over
-        healthy recordings, from the whole recording. The flow is None if holds measured the leakage, which is more
-        accurate.
+        The size that follows from the curvature over pressure is compared with the rise over healthy recordings.
+        `log_ratios`: those of `older_log_ratios`; `noise`: as in `estimate_bend_flows`; `motion_rise`: that rise,
+        without the holds. The flow is None if there are holds, which measure it more accurately.
         """
         balance, total_rise = self.balance, self.rise
         assert total_rise is not None

@@ -267,8 +267,8 @@ class VolumeBalance:
             elif has_position:
                 lack += f"; it needs {self.rig.circuit.needed_channels}"
             return Observed(self.name, lack=lack)
-        # without a pump (`terms.locked`), valves hold the load if the command is recorded; otherwise it must creep in
-        # the healthy recordings, since a control loop would replace the leakage
+        # without a flow (`terms.locked`), creep shows the leakage only if no loop controls the position: the command is
+        # recorded, or the load creeps in the healthy recordings as well
         is_held = has_flow or _sum_log_odds(summaries, "creep_odds") > 0.0
         if balance is None or (balance.is_creep and not is_held):
             return Observed(self.name, lack=_NO_CREEP.format(self.rig.circuit.needed_channels))

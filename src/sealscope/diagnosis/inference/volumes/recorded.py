@@ -161,8 +161,8 @@ class RecordedBalance:
     def _leak_and_test(self) -> tuple[Information, StepTest | None]:
         """Likelihood of the leak's conductance in each of `running_blocks`, and the test for a step of it.
 
-        The healthy leakage may be laminar, or turbulent in part (`with_turbulence`). The chance of the step is the
-        larger one of the two, since nobody knows which healthy machine it is.
+        The healthy leakage may be laminar, or turbulent in part (`with_turbulence`). Both are tested, and the one with
+        the larger p-value is returned, since it is unknown which of them holds for this machine.
         """
         laminar = information(self.running_blocks, self.columns, self.columns[0].leak)
         candidates = [

@@ -137,11 +137,11 @@ class HeldChambers:
         return area_A > area_B, area_B > area_A
 
     def _refill_log_prior(self, refilled: tuple[bool, bool]) -> float:
-        """Compute the log prior of the sides that are refilled, relative to that of no refilling.
+        """Compute the log prior of the sides whose pressure check valves keep, relative to that of no such side.
 
-        Check valves may refill the side that loses oil. If both sides keep their pressure, the other one gives the oil
-        that it gains to the tank. The charge pressure is then that of the tank's line, a gauge pressure that is normal
-        with the standard deviation `held_oil.tank` (`priors.toml`).
+        If both sides keep their pressure, the one that gains oil must drain to the tank. The charge pressure is then
+        that of a tank line, whose gauge pressure has a normal prior with the mean 0 and the standard deviation
+        `held_oil.tank` (`priors.toml`).
         """
         back_pressure: float = INFERENCE.held_oil.tank
         return -0.5 * ((self.charge - P_ATM) / back_pressure) ** 2 if refilled == BOTH else 0.0
@@ -396,7 +396,7 @@ class HeldChambers:
         once, with and without check valves that refill a side (`_refill_log_prior`). `exponent`: as in `LeakLaw`.
         """
         grid, fits = self._offset_grid, list[tuple[float, PistonFit]]()
-        # sides that keep their pressure during some of the readings, if they are refilled at all
+        # only sides that a check valve would feed during some of the readings
         ever_refilled = [sides for sides in (self._refillable_sides, BOTH) if self._closed_share(sides) < 1.0]
         for refilled in (NEITHER, *ever_refilled):
             posteriors = [self._find_onset(float(offset), refilled, exponent)[0] for offset in grid]
@@ -454,7 +454,7 @@ class HeldChambers:
         posteriors = self._onset_posteriors(self._unit_piston_leak(offset, refilled, LeakLaw(exponent)))
         index = int(posteriors.argmax())
         log_posterior = float(posteriors[index]) - 0.5 * self._offset_cost(offset) + self._refill_log_prior(refilled)
-        # readings during a refill have no residual, which lowers the variance by the closed share without any evidence
+        # readings during a refill have no residual; without this correction the smaller variance would be evidence
         log_posterior += 0.5 * self.n_readings * float(np.log(self._closed_share(refilled)))
         return log_posterior, PistonFit(float(self.onsets[index]), offset, refilled)
 
