@@ -80,11 +80,14 @@ def oracle(values: np.ndarray, seconds: float = 3.0) -> tuple[np.ndarray, np.nda
         coefficients = np.linalg.lstsq(design, target, rcond=None)[0]
         weight = (target - design @ coefficients) @ target
         variance = weight / len(flat)
-    covariance = (np.linalg.inv(design.T @ design) * OVERLAP * variance)[-count:, -count:]
-    # the volumes of compliance (STROKE) and air (OIL) are known to within a fraction in each block
-    expansion = (drifting[:, :6] @ coefficients[:6]).reshape(count, each)
-    tested = values[..., TESTED]
-    errors = INFERENCE.blocks.expansion * (tested * expansion).sum(axis=1) / (tested**2).sum(axis=1)
+    covariance = np.linalg.inv(design.T @ design) * OVERLAP * variance
+    # the volumes of compliance (STROKE) and air (OIL) are known to within a fraction in each block; the square of what
+    # they explain, less what errors of the fit add to it
+    products = np.einsum("br,brc->bc", values[..., TESTED], drifting.reshape(count, each, -1))[:, :6]
+    squares = (products @ coefficients[:6]) ** 2 - np.einsum("bc,cd,bd->b", products, covariance[:6, :6], products)
+    energies = (values[..., TESTED] ** 2).sum(axis=1)
+    errors = INFERENCE.blocks.expansion * np.sqrt(np.maximum(squares, 0.0)) / energies
+    covariance = covariance[-count:, -count:]
     return coefficients[-count:], covariance + np.diag(errors**2)
 
 

@@ -109,8 +109,10 @@ def _observe(detector: Detector, recording: Recording, baseline: Sequence[Health
     if lack is None and baseline:
         reasons = [_unusable_baseline(detector, entry) for entry in baseline]
         baseline = tuple(entry for entry, reason in zip(baseline, reasons, strict=True) if reason is None)
-        if not baseline:  # the recording itself may lack what the healthy ones lack
-            lack = detector.observe(recording).lack or f"no baseline recording can be used: {reasons[0]}"
+        if not baseline:
+            lack = f"no baseline recording can be used: {reasons[0]}"
+            if detector.name == VOLUME_BALANCE:  # which says what the recording itself lacks, as the healthy ones do
+                lack = detector.observe(recording).lack or lack
     if lack is not None:
         return Observed(detector.name, lack=lack)
     return validate_report(detector.observe(recording, baseline), detector.name)

@@ -419,12 +419,17 @@ def _expansion_errors(fit: _EquationFit, roles: ColumnRoles) -> Array:
     error is small where pressures rise and fall again, and large where they only relax.
     """
     n_polynomials = fit.polynomials.shape[1]
-    is_compliance = np.repeat([k in roles.compliance for k in fit.nuisance], n_polynomials)
-    coupling = fit.normal.coupling[:, : len(is_compliance)][:, is_compliance]  # without the sensor offset, the last
-    explained = coupling @ fit.coefficients[: len(is_compliance)][is_compliance]
+    is_compliance = np.repeat(
+        [*(k in roles.compliance for k in fit.nuisance), False], n_polynomials
+    )  # last: the offset
+    coupling = np.where(is_compliance, fit.normal.coupling, 0.0)
+    gram, _, _ = fit.normal.eliminate_tested()
+    covariances = solve(gram + np.diag(fit.prior_precision), coupling.T) * fit.variance
+    # square of the sum of products of the tested column and the volume, without the part by errors of the fit
+    squares = (coupling @ fit.coefficients) ** 2 - np.einsum("kc,ck->k", coupling, covariances)
     has_energy = fit.normal.energy > 0.0
-    coefficient = np.where(has_energy, explained, 0.0) / np.where(has_energy, fit.normal.energy, 1.0)
-    return np.asarray(INFERENCE.blocks.expansion * coefficient)
+    volumes = np.where(has_energy, np.sqrt(np.maximum(squares, 0.0)), 0.0)
+    return np.asarray(INFERENCE.blocks.expansion * volumes / np.where(has_energy, fit.normal.energy, 1.0))
 
 
 def _drift_polynomials(blocks: Blocks) -> tuple[Array, float]:
