@@ -98,9 +98,9 @@ class RigChoice(NamedTuple):
     @classmethod
     def from_rig(cls, rig: Rig) -> RigChoice:
         """Choose the equations and solver of a rig's FMU, always with load and external leakage, which are inputs."""
-        # open_circuit: external leakage; pushed: load; (True,): present
+        # switches of external leakage (open_circuit) and load (pushed): on
         numbers = rig_numbers(rig)._replace(open_circuit=(True,), pushed=(True,))
-        laws = tuple(numbers)[len(NUMBERS) :]  # without the numbers before the choices of equations
+        laws = tuple(numbers)[len(NUMBERS) :]  # only the entries that choose equations, after the numbers
         exponent, literal_metering = throttle_readings(rig)
         implicit = choose_method(rig, "auto") == "imex"
         return cls(laws, exponent, literal_metering, implicit=implicit, euler=rig.motor.integrator == "euler")

@@ -180,12 +180,12 @@ class Rig(Part):
             )
 
     def _check_lines(self) -> None:
-        """Raise ValueError unless shut-off valves, filters and viscosities fit together.
+        """Raise ValueError unless shut-off valves and filters fit the lines, and the viscosities each other.
 
         Valves and filters need a line; clogging and a bypass need a filter; the oil must be thinner when warm.
         """
         line, oil = self.line, self.fluid
-        # `absent`: value of a parameter that describes no valve or filter
+        # `absent`: the value that means that there is no such valve or filter
         for name, absent in (("open_A", 1.0), ("open_B", 1.0), ("R_A", 0.0), ("R_B", 0.0)):
             if getattr(line, name) != absent and line.orifices == "absent":
                 raise ValueError(

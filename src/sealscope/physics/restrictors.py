@@ -36,7 +36,10 @@ _series_coefficient = law(series_coefficient)
 
 @law
 def compiled_series_coefficient(c: float, c_line: float, opening: float) -> float:
-    """Compute `series_coefficient` in compiled code; a fully open valve gives exactly `c`."""
+    """Compute the flow coefficient of a throttle `c` in series with a shut-off valve, for compiled code.
+
+    The arguments are those of `series_coefficient`. A fully open valve gives exactly `c`.
+    """
     return c if opening >= 1.0 else _series_coefficient(c, c_line, opening)
 
 

@@ -352,7 +352,7 @@ def format_unused_columns(diagnosis: Diagnosis) -> str | None:
     if not diagnosis.unused:
         return None
     lines = " ".join(f"--map '{suggest_map_entry(Label.parse(name))}'" for name in diagnosis.unused[:4])
-    return f"{join_names(diagnosis.unused)}: recorded, and used for no channel; if they are: {lines}"
+    return f"{join_names(diagnosis.unused)}: recorded, and used for no channel; if they are channels: {lines}"
 
 
 def short_text(diagnosis: Diagnosis, *, width: int = WIDTH) -> str:

@@ -166,15 +166,16 @@ def command_or_target(text: str) -> Command | Position:
 def _read_force(path: str, words: str) -> Force:
     """Read a load from a CSV file with the column ``F [N]`` and one of ``t [s]``, ``x [m]``, ``v [m/s]``, in any unit.
 
-    The load is linear between the rows and constant beyond them. If there is a column of times, columns of x and v are
-    ignored, and the first time becomes t = 0. Raises InputError for any other table.
+    The load is linear between the rows and constant beyond them; `words` describe it in the result. If there is a
+    column of times, columns of x and v are ignored, and the first time becomes t = 0. Raises InputError for any other
+    table.
     """
     with open_regular(path, "a recorded load") as file:
         first_line = file.readline(4096).decode("utf-8-sig", "replace")
         headings = [re.fullmatch(r"\s*(\w+)\s*\[([^\]]+)\]\s*", cell) for cell in first_line.split(",")]
         indices = {match[1]: k for k, match in enumerate(headings) if match}
         units = {match[1]: match[2] for match in headings if match}
-        arguments = [name for name in ("t", "x", "v") if name in units]  # columns over which F may be stated
+        arguments = [name for name in ("t", "x", "v") if name in units]  # columns on which F may depend
         if "F" not in units or not arguments or arguments == ["x", "v"]:
             raise InputError(
                 "a recorded load must have the columns t [s] and F [N], or F [N] with one of x [m] and v [m/s], got "

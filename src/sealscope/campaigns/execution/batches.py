@@ -66,13 +66,13 @@ def check_plan(plan: SimulatedPlan, cases: Sequence[CampaignCase]) -> None:
     for name in plan.detectors:
         if parse_detector_name(name).scorer is None:
             raise refusal(
-                f"detectors of the RMS on both sides of the onset alone, got {name!r}, which needs whole recordings"
+                f"detectors that need only the RMS before and after the onset, got {name!r}, which needs the recording"
             )
     if plan.keep_recordings:
         raise refusal("keep_recordings = false, got true")
     if np.diff(scored_bounds(plan)).min() < 1:
-        lengths = f"{plan.duration_s:g} s with {plan.onset_s:g} s"
-        raise refusal(f"records with details on both sides of the onset, got {lengths}")
+        lengths = f"a duration of {plan.duration_s:g} s and an onset at {plan.onset_s:g} s"
+        raise refusal(f"details before and after the onset, got {lengths}")
     for group in plan.records:
         if group.law == "mixture":
             raise refusal("leaks of one law each, got a mixture")

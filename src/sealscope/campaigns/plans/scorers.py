@@ -127,7 +127,7 @@ class Scorer:
 
     @property
     def description(self) -> str:
-        """Description of the score in words, such as "the RMS of d3 of p_A fell over the record, ..."."""
+        """Description of the score in words, such as "the RMS of d3 of p_A fell over the record, as its logarithm"."""
         text = " and ".join(
             f"the RMS of {quantity} of {chamber} {direction}" for quantity, chamber, direction in self.conditions
         )

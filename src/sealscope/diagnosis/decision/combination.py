@@ -72,11 +72,12 @@ def combine(decisions: Sequence[Evidence], refusal: str | None) -> Evidence:
 
 
 def _explain_undecided(ranked: Sequence[Evidence], usable: Sequence[Evidence]) -> Evidence:
-    """Make the verdict `cannot tell` with a reason, from the decisions of detectors if none of them decides.
+    """Make the verdict `cannot tell` with a reason, for a recording on which no detector decides.
 
-    `ranked` are all decisions by rank, and `usable` those of detectors that could use the recording. The reason is that
-    of the first usable detector. For the change of RMS it is preceded by the reason why the volume balance cannot be
-    used. If no detector is usable, it is the reason of the last built-in one, which needs the fewest channels.
+    `ranked` are the decisions of all detectors by rank, and `usable` those of detectors that could use the recording.
+    The reason is that of the first usable detector; if this is the change of RMS, the reason why the volume balance
+    cannot be used comes first. If no detector is usable, it is the reason of the last built-in detector by rank, which
+    needs the fewest channels.
     """
     if usable:
         undecided = usable[0]

@@ -592,9 +592,10 @@ def _longest_hold(samples: Mapping[str, Array], rate: float, balance: Equation) 
 def _find_rest_limits(samples: Mapping[str, Array], rate: float, balance: Equation) -> RestLimits:
     """Compute the flow of the pump and the speed of the piston below which they count as resting.
 
-    With a flow meter only the flow is judged, and the limit of the piston's speed is minus infinity: if little oil
-    enters the cylinder, the valves are closed, and a moving piston only creeps because of a leak. `samples`: arrays by
-    channel name at the `rate` [Hz]; `balance`: volume balance, whose left side is the flow of the pump or of the meter.
+    If a flow meter is recorded, rest is judged by the flow alone, and the limit of the piston's speed is minus
+    infinity: if little oil enters the cylinder, the valves are closed, and a piston that moves creeps by a leak.
+    `samples`: arrays by channel name at the `rate` [Hz]; `balance`: volume balance, whose left side is the flow of the
+    pump or of the meter.
     """
     signals = Signals(samples, rate)
     if flow_source(samples) == "q_pump":

@@ -410,10 +410,10 @@ class _StepFits(NamedTuple):
 
 
 def _fit_steps(z: Array, steps: Array, eigen: Array) -> _StepFits:
-    """Fit a step up by least squares at each of o onsets, for each variance of the random walk in `WALKS`.
+    """Fit an upward step of a coefficient at each of o onsets, for each variance of the random walk in `WALKS`.
 
     `z` (n,): whitened values of the coefficient; `steps` (n, o): whitened unit steps; `eigen` (n,): eigenvalues of the
-    walk's covariance (`_Whitening`). Only steps up count: a step down does not reduce the residual.
+    walk's covariance (`_Whitening`). The fit is by weighted least squares; the size of a step down is set to 0.
     """
     weight = 1.0 / (1.0 + WALKS[:, None] * eigen)
     total = np.maximum((weight * z**2).sum(axis=1), np.finfo(float).tiny)
@@ -422,11 +422,12 @@ def _fit_steps(z: Array, steps: Array, eigen: Array) -> _StepFits:
 
 
 def _residual_squares(total: Array, moments: Array, energies: Array) -> Array:
-    """Compute the sums of squares (w, o) that remain of whitened values after the fit of a step up.
+    """Compute the residual sums of squares (w, o) after the fit of a step up to the whitened values.
 
-    `total` (w,): sums of squares before the fit; `moments`, `energies` (w, o): products of the steps with the values
-    and with themselves. A negative moment would give a step down, which is not fitted: it counts as 0. The result is at
-    least 1e-12 of `total`, since its logarithm is used.
+    The axes are w variances of the random walk and o onsets of the step. `total` (w,): sums of squares before the fit;
+    `moments`, `energies` (w, o): products of the steps with the values and with themselves. A negative moment would
+    give a step down, which is not fitted: it counts as 0. The result is at least 1e-12 of `total`, since its logarithm
+    is used.
     """
     return np.asarray(np.maximum(total[:, None] - np.maximum(moments, 0.0) ** 2 / energies, 1e-12 * total[:, None]))
 
@@ -518,10 +519,11 @@ def _unit_whitening(count: int, slope: float, walk: float) -> _Whitening | None:
 def _build_whitening(
     precision: Array, slope: float, walk: float, shape: Array | None = None, disturbance: float = float("inf")
 ) -> _Whitening | None:
-    """Build the matrices that whiten K blocks with a given precision (K, K); None if too few blocks have information.
+    """Build the matrices that turn the estimates of a coefficient in K blocks into independent values.
 
-    `slope`, `walk`, `disturbance`: scales of the priors on the linear change, on the random walk over all blocks, and
-    on the factor of a further change of the given `shape` (K,), if any (`Information`).
+    The values do not depend on level and slope of the coefficient, nor on a multiple of `shape` (K,), if it is given.
+    `precision` (K, K): that of the estimates; `slope`, `walk`, `disturbance`: scales of the priors on the slope, on the
+    random walk over all blocks, and on the multiple (`Information`). Return None if too few blocks have information.
     """
     count = len(precision)
     # z = Lambda^(-1/2) eta of the module, restricted to the eigenvectors of the precision Lambda with information

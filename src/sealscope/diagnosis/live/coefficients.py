@@ -71,7 +71,7 @@ class Coefficients(NamedTuple):
 
 
 def coefficient_shapes(n: int) -> tuple[tuple[int, ...], ...]:
-    """Return the shapes of the arrays of a `Coefficients` with n nuisances: sums, values, ..., block, matrix."""
+    """Return the shapes of the arrays of a `Coefficients` with n nuisances, in the order of its fields."""
     return (n + 2, n + 2), (n,), (n,), (6,), (n + 2, n + 2), (n, n + 3)
 
 

@@ -108,10 +108,10 @@ class LiveLeak:
         """Return None for any leak `flow`: for a running machine no leak is stated relative to the pump's flow."""
 
     def total(self, detectable_flow: float | None) -> None:
-        """Return None for any `detectable_flow`: each block's estimate already states the total leakage."""
+        """Return None: the estimates of the blocks already state the total leakage (`detectable_flow` is not used)."""
 
     def history(self, onset_s: float | None) -> None:
-        """Return None for any `onset_s`: the estimates of the blocks already state the leakage over time."""
+        """Return None: the estimates of the blocks already state the leakage over time (`onset_s` is not used)."""
 
 
 def decide_on_stream(leak: LiveLeak | None, false_alarm_probability: float, lack: str = "") -> Evidence:

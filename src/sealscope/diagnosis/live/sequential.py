@@ -280,8 +280,9 @@ class StepDetector:
     def noise(self) -> float:
         """Ratio of the actual to the predicted variance of the innovations (a Kalman filter's prediction errors).
 
-        It is averaged over the blocks with fading memory, together with `step.stated` (`priors.toml`) imagined blocks
-        of the ratio 1. The filter's random walk gains a tenth of the first estimate's variance in each block.
+        It is averaged over the blocks with exponential forgetting and with a prior that is worth `step.stated`
+        (`priors.toml`) blocks of the ratio 1. Of the filters it is the one whose random walk has, in each block, a
+        tenth of the first estimate's variance.
         """
         walk = 3  # index of this walk, 0.1, in `WALKS`
         return float((self._squares[walk, 0] + _PRIORS.stated) / (self._count + _PRIORS.stated))

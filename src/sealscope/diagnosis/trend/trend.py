@@ -403,10 +403,11 @@ def _convert_levels(trend: Trend) -> tuple[Levels, float]:
 
 
 def _allowed_rise(trend: Trend, trend_units_per_level: float) -> float | None:
-    """Convert the repair limit to the trend's unit; None if it cannot be converted.
+    """Return by how much the trend may rise before a repair is due, in the trend's unit; None if it is unknown.
 
-    `trend_units_per_level` is the factor from a recording's level, a conductance [m^3/(s Pa)], to the trend's unit. A
-    creep speed corresponds to the conductance (speed times piston area) / (median pressure difference).
+    It is the repair limit of the trend, a flow or a creep speed. A flow needs a trend in L/min, i.e. one with a
+    reference pressure. A creep speed corresponds to the conductance (speed times piston area) / (median pressure
+    difference), which `trend_units_per_level` converts from m^3/(s Pa) to the trend's unit.
     """
     compared = [trend.points[k] for k in trend.rows]
     if trend.repair.kind == "flow" and trend.pressure is not None:

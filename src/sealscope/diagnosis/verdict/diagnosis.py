@@ -228,7 +228,7 @@ class Diagnosis(Evidence):
         return self.onset_s is None and step_test is not None and not _is_usual(step_test)
 
     def _find_test(self, name: str) -> Evidence | None:
-        """Find the evidence of the test called `name` by the deciding detector; None if it made no such test."""
+        """Find the evidence of a test of the deciding detector by the test's `name`; None if there is no such test."""
         tests = self.parts[0].parts if self.parts else ()  # the deciding detector is the first
         return next((test for test in tests if test.detector == name), None)
 

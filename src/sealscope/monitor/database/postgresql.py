@@ -51,7 +51,7 @@ def limit_answers(engine: Engine) -> None:
             return super().wait(self._with_time_limit(gen), *arguments, **options)
 
         def _with_time_limit(self, gen: Generator[Any, Any, Any]) -> Generator[Any, Any, Any]:
-            """Run psycopg's generator `gen`; end the connection by OperationalError if an answer takes too long.
+            """Run psycopg's generator `gen`; close the connection by an OperationalError if an answer takes too long.
 
             Psycopg resumes this generator several times a second; `ready` is false while there is no answer.
             """

@@ -411,7 +411,8 @@ class SetRun:
 
         A group of runs fills a vector register. If segments of time are defined (`bounds`), the pressures are sampled
         after each chunk as the sensors read them, and the squares of their wavelet details are added to the sums of the
-        segments. `add_progress` is called after each chunk with the fraction of all the work of the set that it was.
+        segments. `add_progress` is called after each chunk with its share of the whole set's work. A cell is a
+        piece of time whose inputs are one entry of `table`.
         """
         from sealscope.physics.vector.runs import advance_lanes_imex, advance_lanes_rk4
         from sealscope.signals.streams import DetailStream

@@ -161,8 +161,9 @@ def _throttle_claim(evidence: ClaimEvidence) -> Claim:
 def _agreement_claim(evidence: ClaimEvidence) -> Claim:
     """Judge claim 6.1.4: simulation and measurement agree.
 
-    For d1 to d4 of each chamber, the geometric mean of simulated over measured leak-free RMS must be from 1/1.25 to
-    1.25. In at least 39 of the 41 tests, both RMS of d3 of p_A must change with the leak in the same direction.
+    For each chamber and each wavelet detail d1 to d4, the ratio of simulated to measured RMS without leak, averaged
+    geometrically over the tests, must be from 1/1.25 to 1.25. In at least 39 of the 41 tests, the leak must change the
+    RMS of d3 of p_A in the same direction in both. Without measured values (`measured_sheet`) nothing is judged.
     """
     measured, leak = evidence.measured_sheet, evidence.leak_sheet
     if measured is None:

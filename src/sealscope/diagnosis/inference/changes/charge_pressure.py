@@ -215,7 +215,8 @@ def _envelope_error(time: Array, residual: Array) -> float:
     """Compute the standard error [Pa/s] of a lower envelope's slope from its scatter between n parts of a recording.
 
     The standard error of the robust fit misses this scatter, since a part that lies off the envelope gets low weights.
-    With the quantile r_k (`BEGIN`) of the residuals in part k, and the mean time t_k of the part,
+    `residual`: pressure minus the fitted envelope. With its quantile r_k in part k, at the level `BEGIN` from which the
+    robust fit begins, and the mean time t_k of the part,
 
         error^2 = (sum (r_k - mean of r)^2 / (n - 2)) / sum (t_k - mean of t)^2.
     """

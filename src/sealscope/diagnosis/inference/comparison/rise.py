@@ -80,7 +80,10 @@ class Rise(NamedTuple):
     share: float = 1.0
 
     def share_alarms(self, share: float) -> Rise:
-        """Return this rise with only the fraction `share` of the allowed false alarms, which divides its p-value."""
+        """Return a copy that may cause only the fraction `share` of the allowed false alarms, as one of several tests.
+
+        The p-value is divided by `share` (weighted Bonferroni correction).
+        """
         return self._replace(share=share)
 
     def widen(self, variance: float) -> Rise:

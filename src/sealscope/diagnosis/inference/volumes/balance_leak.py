@@ -385,11 +385,12 @@ class BalanceLeak:
         return LeakRise(total_rise, step_log_ratio, onset_log_ratio, older_log_ratio, older_flow)
 
     def _compare_older_leak(self, log_ratios: Array, noise: float, motion_rise: Rise) -> tuple[float, Flow | None]:
-        """Compute `older_log_ratio` and `older_flow` of `LeakRise`, for a leak that was there before the recording.
+        """Test whether a leak older than the recording explains the rise of the leakage above healthy recordings.
 
-        The size that follows from the curvature over pressure is compared with the rise over healthy recordings.
-        `log_ratios`: those of `older_log_ratios`; `noise`: as in `estimate_bend_flows`; `motion_rise`: that rise,
-        without the holds. The flow is None if there are holds, which measure it more accurately.
+        The leak's size, estimated from how its flow bends over the pressure, should agree with the rise. The result is
+        the log likelihood ratio of this agreement to no rise, and the flow, None if holds measure it better: the fields
+        `older_log_ratio` and `older_flow` of `LeakRise`. `log_ratios`: those of `older_log_ratios`; `noise`: as in
+        `estimate_bend_flows`; `motion_rise`: the rise from the motion alone.
         """
         balance, total_rise = self.balance, self.rise
         assert total_rise is not None

@@ -251,6 +251,6 @@ def volume_figure(context: Context, item: Item) -> tuple[Figure, ...]:
 
 
 def measured_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
-    """Tabulate the figures of chapter 4 that show only measured curves, and the simulated figure that replaces each."""
+    """Tabulate the figures of chapter 4 that show measured curves without numbers, and the simulated figure instead."""
     rows = ((*row, "cannot be reproduced: no numbers are given") for row in load_texts("cases.toml")["measured"])
     return (item.table(rows, format_note("measured-only")),)

@@ -407,7 +407,10 @@ class HeldChambers:
 
     @cached_property
     def law_fits(self) -> list[LawFit]:
-        """Fits of a leak past the piston for each exponent of `EXPONENTS` and each growth of `growth_priors`."""
+        """Fits of a leak past the piston for each law (exponent of `EXPONENTS`) and growth after its onset.
+
+        The weight of a fit is its likelihood times the priors of law and growth (`law_priors`, `growth_priors`).
+        """
         fits = []
         for growth, growth_prior in growth_priors():
             for (exponent, conditions), law_prior in zip(self.piston_fits.items(), law_priors(), strict=True):
