@@ -403,7 +403,7 @@ def _convert_levels(trend: Trend) -> tuple[Levels, float]:
 
 
 def _allowed_rise(trend: Trend, trend_units_per_level: float) -> float | None:
-    """Return by how much the trend may rise before a repair is due, in the trend's unit; None if it is unknown.
+    """Compute the rise of the trend from which a repair is due, in the trend's unit; None if it is unknown.
 
     It is the repair limit of the trend, a flow or a creep speed. A flow needs a trend in L/min, i.e. one with a
     reference pressure. A creep speed corresponds to the conductance (speed times piston area) / (median pressure
