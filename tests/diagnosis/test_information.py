@@ -95,7 +95,7 @@ def oracle(values: np.ndarray, seconds: float = 3.0) -> tuple[np.ndarray, np.nda
 def test_elimination_equals_dense_least_squares(count: int, noise: float) -> None:
     values = recorded(count, noise=noise)
     estimate, covariance = oracle(values)
-    made = information(blocks(values), (columns(),), TESTED)
+    made = information(blocks(values), (columns(),), TESTED, with_expansion=True)
     size = np.sqrt(np.diag(covariance))
     np.testing.assert_allclose(np.linalg.solve(made.precision, made.vector), estimate, atol=0.02 * size.min())
     np.testing.assert_allclose(np.linalg.inv(made.precision), covariance, atol=0.02 * float(covariance.max()))

@@ -35,7 +35,7 @@ from sealscope.diagnosis.inference.rows.row_weights import (
     block_gram_matrices,
 )
 from sealscope.diagnosis.inference.rows.weak_form import OVERLAP
-from sealscope.diagnosis.inference.terms import AIR, BIAS, HOLDING, LEAK, MOVING_BIAS, TURNING, Equation
+from sealscope.diagnosis.inference.terms import BIAS, HOLDING, LEAK, MOVING_BIAS, TURNING, Equation
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
@@ -376,7 +376,13 @@ def _positive_definite_solver() -> Callable[[Array, Array], tuple[Array, Array, 
     return dposv  # type: ignore[no-any-return]
 
 
-def information(blocks: Blocks, columns: Sequence[ColumnRoles], test: int, left_out: int | None = None) -> Information:
+def information(
+    blocks: Blocks,
+    columns: Sequence[ColumnRoles],
+    test: int,
+    left_out: int | None = None,
+    with_expansion: bool = False,
+) -> Information:
     """Compute the joint likelihood of one coefficient's values in all blocks, with the other coefficients eliminated.
 
     For a leak the result also contains the prior standard deviation of the coefficient in a healthy machine (`level`).
@@ -390,7 +396,7 @@ def information(blocks: Blocks, columns: Sequence[ColumnRoles], test: int, left_
     The nuisance columns are those of the other coefficients. N is the diagonal matrix of the tested column's sums of
     squares in each block, n contains its products with the left side, and C those with the nuisance columns. G is the
     Gram matrix of the nuisance columns and b their products with the left side. P / s^2 is the prior precision of their
-    coefficients, and mu the prior mean. The errors of the oil's expansion (`_expansion_errors`) are then added.
+    coefficients, and mu the prior mean. `with_expansion` adds the errors of the oil's expansion (`_expansion_errors`).
     """
     count = len(blocks)
     precision, vector = np.zeros((count, count)), np.zeros(count)
@@ -401,13 +407,12 @@ def information(blocks: Blocks, columns: Sequence[ColumnRoles], test: int, left_
         solution = solve(normal.gram + np.diag(fit.prior_precision), right_sides)
         schur = (np.diag(normal.energy) - normal.coupling @ solution[:, :-1]) / fit.variance
         moment = (normal.tested_moment - normal.coupling @ solution[:, -1]) / fit.variance
-        # (S^-1 + E)^-1 = (I + S E)^-1 S, without the inverse of the precision S, which may not exist
-        is_air = test < roles.left and roles.names[test] == AIR  # its coefficient describes the expansion itself
-        errors = np.zeros(count) if is_air else _expansion_errors(fit, roles)
-        widening = np.linalg.inv(np.eye(count) + schur * errors**2)
-        schur = widening @ schur
+        if with_expansion:
+            # (S^-1 + E)^-1 = (I + S E)^-1 S, without the inverse of the precision S, which may not exist
+            widening = np.linalg.inv(np.eye(count) + schur * _expansion_errors(fit, roles) ** 2)
+            schur, moment = widening @ schur, widening @ moment
         precision += 0.5 * (schur + schur.T)
-        vector += widening @ moment
+        vector += moment
     return Information(blocks.time, precision, vector, level=columns[0].leak_deviation(test, blocks))
 
 

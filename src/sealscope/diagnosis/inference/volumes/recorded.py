@@ -164,7 +164,7 @@ class RecordedBalance:
         The healthy leakage may be laminar, or turbulent in part (`with_turbulence`). Both are tested, and the one with
         the larger p-value is returned, since it is unknown which of them holds for this machine.
         """
-        laminar = information(self.running_blocks, self.columns, self.columns[0].leak)
+        laminar = information(self.running_blocks, self.columns, self.columns[0].leak, with_expansion=True)
         candidates = [
             (leak, find_leak_step(self.running_blocks, self.columns, leak))
             for leak in (laminar, with_turbulence(laminar, self.running_blocks, self.columns))
