@@ -162,9 +162,9 @@ def _possible_gains(
 
     `factors` are observables with the log Bayes factors of a change. The first mapping is for an onset within the
     recording. A leak gets a second one if `rise` is given, for an onset before the recording: such a leak explains the
-    leakage above that of healthy recordings (the rise). If the volume balance supports a step, a third one is
-    for an older leak that is not laminar: how its flow changes with the pressure shows its size, which must then agree
-    with the rise.
+    leakage above that of healthy recordings (the rise). If the volume balance supports a step, a third one is for an
+    older leak that is not laminar: how its flow changes with the pressure shows its size, which must then agree with
+    the rise.
     """
     gains = _gains_at_onset(event, factors)
     if rise is None or event.name not in LEAK_EVENTS:
@@ -196,9 +196,9 @@ def _gains_at_onset(event: Event, factors: Sequence[tuple[Observable, float]]) -
     `factors` are test results (observables) with the log Bayes factors of a change. The log odds from the prior on the
     event's size are added to them. The event changes observables by any amount, or by a common scale of both pressures,
     on which these must agree (`_agree_on_scale`). Of these observables, the one with the largest factor gives the time
-    of the event; others count if they may have changed then. Side effects on other kinds of data
-    count only if an affected observable supports the event. Their factors are limited to the largest one of the
-    affected observables: a much clearer side effect has another cause.
+    of the event; others count if they may have changed then. Side effects on other kinds of data count only if an
+    affected observable supports the event. Their factors are limited to the largest one of the affected observables: a
+    much clearer side effect has another cause.
     """
     affected = [(observable, gain) for observable, gain in factors if event.affects(observable)]
     affected += _agree_on_scale([(observable, gain) for observable, gain in factors if event.scales(observable)])

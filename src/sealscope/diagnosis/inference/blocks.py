@@ -124,7 +124,8 @@ class Blocks:
     def pressure_weights(self) -> Array:
         """Weights (K,) for averaging a function of p_A - p_B over the blocks: 1, or nearly 0 for a block without it.
 
-        Numbers of rows would be wrong weights: rows with a clipped sample are dropped, though it is roughly known.
+        The numbers of rows would be wrong weights: a row with a clipped pressure is dropped, though the pressure is
+        roughly known.
         """
         return np.where((self.pressures != 0.0).any(axis=1), 1.0, 1e-9)  # positive, so that a mean exists
 

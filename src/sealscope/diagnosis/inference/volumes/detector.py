@@ -261,12 +261,10 @@ class VolumeBalance:
         balance = self.balance(recording, odds, is_locked=is_locked, sign_log_odds=sign_log_odds)
         has_flow, has_position = flow_source(recording.channels) is not None, "x" in recording
         if balance is None and (has_flow or not has_position):
-            lack = _NO_BALANCE[has_position].format(recording.duration)
             if equations(self.rig, channels):
-                lack = f"finds the recording too short, {recording.duration:.3g} s"
-            elif has_position:
-                lack += f"; it needs {self.rig.circuit.needed_channels}"
-            return Observed(self.name, lack=lack)
+                return Observed(self.name, lack=f"finds the recording too short, {recording.duration:.3g} s")
+            needed = f"; it needs {self.rig.circuit.needed_channels}" if has_position else ""
+            return Observed(self.name, lack=_NO_BALANCE[has_position].format(recording.duration) + needed)
         # without a flow (`terms.locked`), creep shows the leakage only if no loop controls the position: the command is
         # recorded, or the load creeps in the healthy recordings as well
         is_held = has_flow or _sum_log_odds(summaries, "creep_odds") > 0.0
