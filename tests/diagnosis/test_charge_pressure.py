@@ -81,6 +81,16 @@ def test_a_drift_of_one_pressure_is_one_of_its_sensor(side: str) -> None:
     assert rarest(record(**zero, seed=22)) == f"drift of low p_{side}"
 
 
+def test_a_chamber_that_is_low_on_no_healthy_day_does_not_hide_a_fall() -> None:
+    """The drive is switched off and the load comes to rest, where the accumulator is empty already."""
+    healthy = [other._replace(low_A=np.nan, low_A_error=np.nan) for other in HEALTHY]
+    judged = drifts(record(fall=1000.0, seed=27))
+    alone = {change.name: change for change in compare_low_drifts(judged._replace(low_A=np.nan), healthy)}
+    both = {change.name: change for change in compare_low_drifts(judged._replace(low_A=-50.0), healthy)}
+    assert both[FALL].chance == alone[FALL].chance < 1e-3
+    assert "drift of low p_A" not in both
+
+
 def test_a_healthy_recording_shows_no_drift_and_a_rise_is_no_loss_of_oil() -> None:
     healthy = compare_low_drifts(drifts(record(seed=23)), HEALTHY)
     assert min(change.chance for change in healthy) > 0.01

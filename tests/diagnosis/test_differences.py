@@ -96,3 +96,31 @@ def test_days_that_differ_by_more_than_their_errors_make_an_imprecise_day_unrema
     assert believed is not None and doubted is not None and precise is not None
     assert doubted.chance > 30.0 * believed.chance
     assert precise.chance < 0.01
+
+
+def test_errors_that_healthy_recordings_show_to_be_too_large_hide_no_change() -> None:
+    """Healthy values agree to a fiftieth of their errors: the errors contain what all recordings have in common."""
+    healthy = [Estimate(value, 5.0) for value in (*HEALTHY, 1.02, 0.98)]
+    believed, doubted = (
+        compare_estimates("a", "b", Estimate(2.0, 5.0), healthy, PriorScatter(0.05, 1.0, deflation=deflation))
+        for deflation in (1.0, 100.0)
+    )
+    assert believed is not None and doubted is not None
+    assert believed.chance > 0.5
+    assert doubted.chance < 0.01
+
+
+@pytest.mark.parametrize("excess", few([1.0, 5.0, 20.0], 2, SLOW))
+def test_chances_hold_for_errors_that_may_be_too_large(excess: float) -> None:
+    random, chances = np.random.default_rng(3), []
+    for _ in range(500):
+        errors = 10.0 ** random.uniform(-1.0, 0.0, 8)
+        values = random.normal(0.0, errors / excess)
+        healthy = [Estimate(*pair) for pair in zip(values[1:], errors[1:], strict=True)]
+        observable = compare_estimates(
+            "a", "b", Estimate(values[0], errors[0]), healthy, PriorScatter(0.005, 1.0, deflation=20.0)
+        )
+        assert observable is not None
+        chances.append(observable.chance)
+    for level in (0.1, 0.01):
+        assert np.sum(np.array(chances) < level) <= 2.0 * binom.ppf(0.999, len(chances), level)

@@ -252,11 +252,11 @@ def test_a_hold_with_a_missing_sample_and_one_that_is_short_are_left_out() -> No
     t: Array = np.arange(3000) / RATE
     p = np.full(3000, 1e6)
     x = np.full(3000, 0.1)
-    rests = ((t > 2.0) & (t < 6.0)) | ((t > 10.0) & (t < 10.5)) | ((t > 15.0) & (t < 20.0))
+    rests = ((t > 2.0) & (t < 4.0)) | ((t > 10.0) & (t < 10.7)) | ((t > 15.0) & (t < 20.0))
     holds = find_locked_holds((t, p, p, x), rests[1:], RATE)
     assert [round(float(hold.t[0])) for hold in holds] == [2, 15]
     p = p.copy()
-    p[400] = np.nan
+    p[250] = np.nan
     assert len(find_locked_holds((t, p, x, x), rests[1:], RATE)) == 1
 
 

@@ -69,7 +69,7 @@ def test_lists_in_place_of_numbers(tmp_path: Path) -> None:
         data = file.create_dataset("p_A", (4,), h5py.vlen_dtype(np.float64))
         data.attrs["units"] = "Pa"
         data[0] = np.zeros(9)
-    assert refused(path) == "p_A must hold numbers, got lists or references (FILE)"
+    assert refused(path) == "p_A must hold texts or numbers, got lists or references (FILE)"
 
 
 def test_texts_of_any_length_are_read(tmp_path: Path) -> None:

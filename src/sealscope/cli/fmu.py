@@ -22,7 +22,7 @@ _SENSOR = (
 
 
 def fmu(
-    output: Annotated[Path, Option("--output", "-o", help="Unit to write (.fmu).")],
+    output: Annotated[Path, Option("--output", "-o", help="FMU file to write (.fmu).")],
     rig: RigOption = "thesis",
     overrides: SetOption = None,
     version: Annotated[int, Option("--fmi", help="Version of the interface, 2 or 3.")] = 2,
@@ -44,7 +44,7 @@ def fmu(
     options: dict[str, Any] = {"rig": load_rig_with(rig, overrides), "fmi": version, "platforms": platforms or None}
     if sensor is None:
         if rate is not None:
-            raise InputError("--rate is of a soft sensor, got it without --sensor")
+            raise InputError("--rate is the sampling rate of a soft sensor and needs --sensor")
         max_step = None if step is None else parse_quantity(step, "s", name="step")
         max_error = ERROR if error is None else parse_quantity(error, "Pa", name="error")
         variables = write_fmu(output, **options, error=max_error, step=max_step)
@@ -53,7 +53,7 @@ def fmu(
     else:
         for name, value in (("--step", step), ("--error", error)):
             if value is not None:
-                raise InputError(f"{name} is of a rig's solver, got it with --sensor")
+                raise InputError(f"{name} is for the solver of a rig, and not allowed with --sensor")
         rate_hz = 500.0 if rate is None else parse_quantity(rate, "Hz", name="rate")
         variables = write_sensor_fmu(output, **options, sensor=sensor, rate=rate_hz)  # type: ignore[arg-type]
         timing = f"samples at {rate_hz:g} Hz"

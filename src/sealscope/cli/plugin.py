@@ -22,17 +22,19 @@ plugin = Typer(name="plugin", help=_HELP, callback=lambda: None)
 def new(
     name: Annotated[str, Argument(help="Name of the detector in plain words, e.g. 'stroke time'.")],
     folder: Annotated[
-        Path | None, Option("--output", "-o", help="Folder to make; by default the name with dashes.")
+        Path | None, Option("--output", "-o", help="New folder for the package; by default the name with dashes.")
     ] = None,
 ) -> None:
     """Write a package with a detector of your own: code that runs, its tests, and a campaign plan to evaluate it."""
     from sealscope.storage.folders import make_folder
 
     if not re.fullmatch(r"[a-z][a-z0-9]*( [a-z0-9]+){0,5}", name) or len(name) > 60:
-        raise InputError(f"a detector's name must be plain words of a-z and 0-9, as 'stroke time', got {name[:60]!r}")
+        raise InputError(
+            f"a detector's name must be 1 to 6 words of a-z and 0-9, such as 'stroke time', got {name[:60]!r}"
+        )
     module = name.replace(" ", "_")
     if keyword.iskeyword(module):
-        raise InputError(f"a detector's name must be no word of Python's, got {name!r}")
+        raise InputError(f"a detector's name must not be a Python keyword, got {name!r}")
     # text for each placeholder in the templates
     values = {"words": name, "dashed": name.replace(" ", "-"), "module": module, "cls": name.title().replace(" ", "")}
     target_folder = folder or Path(values["dashed"])

@@ -169,7 +169,11 @@ def build_functions(choice: RigChoice) -> dict[str, Callable[..., Any]]:
 
         @law
         def step(z: Any, h: float, t: float, a: Any, b: Any, p: Any) -> Any:
-            """Compute the state at t + h [s] from the state z at t [s], with inputs a + b s at time s, parameters p."""
+            """Advance the state z from the time t to t + h [s] by the implicit-explicit method of Runge and Kutta.
+
+            Each input is a + b tau at the time tau [s]: command u, conductances G and orifices C of leaks, load F. `p`:
+            parameters.
+            """
             u, G = _at_imex_nodes(a[_U], b[_U], t, h), _at_imex_nodes(a[_G], b[_G], t, h)
             C, F = _at_imex_nodes(a[_C], b[_C], t, h), _at_imex_nodes(a[_F], b[_F], t, h)
             return imex_step(z, h, u, G, C, F, p)
@@ -178,7 +182,11 @@ def build_functions(choice: RigChoice) -> dict[str, Callable[..., Any]]:
 
         @law
         def step(z: Any, h: float, t: float, a: Any, b: Any, p: Any) -> Any:
-            """Compute the state at t + h [s] from the state z at t [s], with inputs a + b s at time s, parameters p."""
+            """Advance the state z from the time t to t + h [s] by the explicit method of Runge and Kutta.
+
+            Each input is a + b tau at the time tau [s]: command u, conductances G and orifices C of leaks, load F. `p`:
+            parameters.
+            """
             u, G = _at_rk4_nodes(a[_U], b[_U], t, h), _at_rk4_nodes(a[_G], b[_G], t, h)
             C, F = _at_rk4_nodes(a[_C], b[_C], t, h), _at_rk4_nodes(a[_F], b[_F], t, h)
             return rk4_step(z, h, u, G, C, F, p, euler)

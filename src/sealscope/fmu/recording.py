@@ -123,16 +123,21 @@ def record_fmu(
 
 
 def _check_experiment(experiment: Experiment) -> None:
-    """Raise InputError for an experiment with a target, a fault or drift of the machine, or a leak stated as a flow."""
+    """Raise InputError for an experiment that an FMU cannot run.
+
+    These have a position target, a fault or drift of the machine, or a leak that is stated as a flow.
+    """
     if experiment.target is not None:
         raise InputError(f"an FMU must have a command, not a target, got {experiment.command}")
     if experiment.effects():
-        raise InputError("of faults and drifts an FMU can have those of sensors only: the machine is its own")
+        raise InputError(
+            "an experiment with an FMU may have faults and drifts of sensors only: the FMU contains the machine"
+        )
     for leak in experiment.leaks:
         if leak.coefficient is None:
             raise InputError(
-                f"an FMU's leak must be a conductance, 'G = 6e-13 from 20 s' or 'C = 2e-10', got {leak}: its flow "
-                "follows from the FMU"
+                f"an FMU's leak must be a conductance, 'G = 6e-13 from 20 s' or 'C = 2e-10', got {leak}: the FMU "
+                "computes its flow"
             )
 
 

@@ -275,7 +275,8 @@ class AlarmJudge:
     def _set_alarm(self, alarm: Alarm) -> Alarm:
         """Store a changed alarm as the open alarm, or forget it if it is closed or invalid; return the changed alarm.
 
-        An alarm whose cause has ended stays open until a person has seen it.
+        An alarm whose cause has ended stays open until a person has seen it. `over_s` becomes the time of the last
+        update at which an alarm was no longer active.
         """
         if not alarm.active:  # the cause has ended, or the alarm is closed or invalid
             self.over_s = alarm.updated_s

@@ -332,7 +332,10 @@ def _lower_load(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
 
 
 def store(array: Any, row: int, value: Any) -> None:
-    """Write lanes to one row of an array, indexed as in `load`, in compiled code that `_lower_store` builds."""
+    """Write lanes, a vector of numbers, to one row of a C-ordered array, in compiled code that `_lower_store` builds.
+
+    Only compiled code can call it, not Python. `array`, `row`: as in `load`; `value`: the lanes.
+    """
 
 
 def _stored_type(arg_types: Any) -> Any:

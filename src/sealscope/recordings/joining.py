@@ -32,8 +32,9 @@ _TWELVE_HOURS = re.compile(
 def start_seconds(recording: Recording, file: str = "") -> float | None:
     """Find the time of a recording's first sample [s since 1970]; None if it is not known.
 
-    The time of t = 0 is the entry `start` of the provenance, else the date in the file's name, which the provenance or
-    else `file` states. Dates and times are taken as UTC; a date without a time of day means midnight.
+    The time of t = 0 is the entry `start` of the provenance. Without this entry it is the date in the file's name: the
+    entry `file` of the provenance, or the argument `file` if that entry is missing, too. Dates and times are taken as
+    UTC; a date without a time of day means midnight.
     """
     start = parse_epoch(str(recording.provenance.get("start", "")))
     if start is None:

@@ -269,7 +269,8 @@ def draw(
     """Encode the lines of all charts for the script of the page, and draw a still picture of each chart.
 
     Long channels are divided into groups of successive samples, of which only minimum and maximum are drawn, so that
-    peaks are preserved. `chambers`: wavelet details with the times of their RMS windows; `marks`: further moments.
+    peaks are preserved; around the onset, or else around the middle of the recording, all samples are drawn.
+    `chambers`: wavelet details with the times of their RMS windows; `marks`: moments to mark besides the onset.
     """
     middle = float(recording.t[len(recording) // 2])
     near = diagnosis.onset_s if diagnosis.onset_s is not None and isfinite(diagnosis.onset_s) else middle

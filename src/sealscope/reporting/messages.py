@@ -268,7 +268,11 @@ def _format_percent(fraction: float | None) -> str:
 
 
 def how_sure(diagnosis: Diagnosis) -> str:
-    """Format the evidence: odds that a healthy recording looks like this one, score, threshold, false-alarm rate."""
+    """Format the evidence: odds that a healthy recording looks like this one, score, threshold, false-alarm rate.
+
+    For example "1 in 2000; score 5.1, over the threshold of 3.2 of volume balance; ...". If an alarm has another cause
+    than a leak, the text names the cause to which odds and score refer.
+    """
     if diagnosis.score is None or diagnosis.threshold is None:
         return say("how_sure.no_score")
     odds, found_cause = diagnosis.odds, cause(diagnosis)

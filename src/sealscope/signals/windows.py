@@ -183,9 +183,10 @@ def _piece_sums(x: Array, piece: int) -> Array:
 
 
 def _rms_of_pieces(sums: Array, size: int, step: int) -> Array:
-    """Compute the RMS of each complete window of a series, (..., windows).
+    """Compute the RMS (..., windows) of each complete window of `size` samples; one begins every `step` samples.
 
-    `sums` (..., pieces): sums of squares of consecutive pieces of gcd(size, step) samples, which are added in order.
+    `sums` (..., pieces): sums of squares of consecutive pieces of gcd(size, step) samples. Those of a window are added
+    in their order, so that rounding does not depend on how the series is divided into blocks.
     """
     piece = math.gcd(size, step)
     pieces_per_window, pieces_per_step = size // piece, step // piece

@@ -31,9 +31,12 @@ def _quantity_validator(unit: str) -> BeforeValidator:
 
 
 def _validate_file_name(name: str) -> str:
-    """Return a file name; raise ValueError unless it has at most 80 letters, digits, '-', '_', '.' and no '.' first."""
+    """Return a file name unchanged; raise ValueError if it is not a valid one.
+
+    A valid name has at most `_MAX_NAME_LENGTH` letters, digits, '-', '_' and '.', and does not start with '.'.
+    """
     if not all(c.isalnum() or c in "-_." for c in name) or name.startswith(".") or len(name) > _MAX_NAME_LENGTH:
-        raise ValueError(f"must be of at most {_MAX_NAME_LENGTH} letters, digits, '-', '_' and '.'")
+        raise ValueError(f"must be of at most {_MAX_NAME_LENGTH} letters, digits, '-', '_' and '.', no '.' first")
     return name
 
 

@@ -152,9 +152,10 @@ def _check_sums(summary: Any) -> Any:
 
 
 def _check_levels(summary: Any) -> Any:
-    """Return a summary of wavelet details if its `levels` (5 per chamber,) and `duty` (4,) are valid; else ValueError.
+    """Return a summary of wavelet details unchanged; raise ValueError if its arrays are not valid.
 
-    They are logarithms, below 750 in magnitude, as in `RmsBlocks`.
+    `levels` (5 per chamber,) are logarithms of the RMS of the details, and `duty` (4,) those of the quantities `DUTY`.
+    All are finite and below `_MAX_LOGARITHM` in magnitude.
     """
     expected = (len(QUANTITIES) * len(summary.chambers),)
     if not summary.chambers or summary.levels.shape != expected or summary.duty.shape != (len(DUTY),):

@@ -191,7 +191,11 @@ def _bound_and_limit(case: Case, bound: float) -> tuple[float, float]:
 
 
 def _findable_step(case: Case) -> float | None:
-    """Compute the mean flow [m^3/s] of the smallest detectable step of a leak; None if no step is tested."""
+    """Compute the mean flow [m^3/s] of the smallest step of a leak that its test would call a leak.
+
+    The test has its own part of the false-alarm probability, which is converted to a p-value before calibration by the
+    healthy recordings. None if no step is tested.
+    """
     test = next((test for test in case.tests if test.name == WITHIN), None)
     if test is None or case.leak is None or case.leak.step is None:
         return None

@@ -101,7 +101,7 @@ def _observe(detector: Detector, recording: Recording, baseline: Sequence[Health
 
     The report is empty and states the reason if the pressures cannot be trusted (`distrust`), if the detector cannot
     use the recording, or if it can use none of the given baseline recordings. Without a baseline, the reason may also
-    be a pressure that does not move for some time, except for the volume balance, which needs no motion.
+    be a chamber pressure that is constant for some time, except for a detector that works at rest (`_AT_REST`).
     """
     lack = unusable_reason(detector, recording) or distrust
     if lack is None and not baseline and detector.name not in _AT_REST:
@@ -111,7 +111,7 @@ def _observe(detector: Detector, recording: Recording, baseline: Sequence[Health
         baseline = tuple(entry for entry, reason in zip(baseline, reasons, strict=True) if reason is None)
         if not baseline:
             lack = f"no baseline recording can be used: {reasons[0]}"
-            if detector.name == VOLUME_BALANCE:  # which says what the recording itself lacks, as the healthy ones do
+            if detector.name == VOLUME_BALANCE:  # without a baseline it states what the recording itself lacks
                 lack = detector.observe(recording).lack or lack
     if lack is not None:
         return Observed(detector.name, lack=lack)

@@ -465,7 +465,8 @@ def _hold_missing(values: Array) -> Array:
 def min_samples_for_step(rate: float) -> int:
     """Compute the minimum number of samples, at a `rate` [Hz], to test for a leak that begins within a recording.
 
-    These are `MIN_BLOCKS` blocks of minimum length, and the samples over which the last test functions extend.
+    These are `MIN_BLOCKS` blocks of minimum length, and the samples by which the test functions that begin in the last
+    block reach beyond it. A test function begins at each multiple of the stride, and is `SPAN` strides long.
     """
     stride = stride_samples(rate)
     block = max(SPAN, round(MIN_BLOCK_TIME / STRIDE)) * stride  # [samples]
@@ -562,7 +563,7 @@ def recorded_blocks(recording: Recording, rig: Rig) -> RecordedBlocks | None:
     columns = ColumnRoles(stream_balances[0])
 
     odds = shut_odds(recorded, columns) if may_shut else 0.0
-    has_holds = may_shut and _longest_hold(samples, recording.rate, balances[0]) >= INFERENCE.held_oil.shortest
+    has_holds = may_shut and _longest_hold(samples, recording.rate, balances[0]) >= INFERENCE.rest.lasting
 
     def compute_regime_blocks(offset: float, shut: bool) -> Blocks:
         """Compute the blocks after subtracting `offset` [Pa] from p_A - p_B, for open or `shut` valves at rest."""

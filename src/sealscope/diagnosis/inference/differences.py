@@ -10,9 +10,10 @@ Five values that agree to a thousandth thus show that a sixth differs by a few t
 
 *With a prior on the scatter* (`compare_estimates`): each value y_i has an error e_i and varies about an unknown mean
 mu by the scatter s, y_i ~ N(mu, s^2 + (k e_i)^2). s^2 has a scaled inverse chi-square prior, with the weight of m
-recordings whose scatter is s_0. The errors may be too small by a factor k >= 1; k is 1, or has a log-uniform prior.
-With k > 1, imprecise values such as those of a day with few strokes may differ by more. On a grid of s and k, with the
-weights w_i = 1/(s^2 + (k e_i)^2) and W = sum w_i,
+recordings whose scatter is s_0. The errors may be too small or too large by a factor k, which is 1 or has a log-uniform
+prior. With k > 1, imprecise values such as those of a day with few strokes may differ by more; with k < 1, the errors
+also contain what all recordings of the machine have in common. On a grid of s and k, with the weights
+w_i = 1/(s^2 + (k e_i)^2) and W = sum w_i,
 
     p(s, k | y) ~ p(s) p(k) W^(-1/2) prod_i w_i^(1/2) exp(-w_i (y_i - mean)^2 / 2),    mean = sum w_i y_i / W,
 
@@ -39,7 +40,7 @@ NODES = 64
 MAX_RATIO = 100.0
 #: ... and at least to this multiple of the standard deviation of the healthy values.
 MAX_RATIO_TO_VALUES = 10.0
-#: Number of grid points of the factor by which errors are too small.
+#: Number of grid points of the factor by which errors are too small or too large.
 INFLATIONS = 9
 #: Smallest positive number that is divided by.
 TINY = float(np.finfo(float).tiny)
@@ -56,12 +57,14 @@ class PriorScatter(NamedTuple):
     """Prior on the scatter of a quantity between recordings of one machine.
 
     `deviation`: expected standard deviation of the quantity; `recordings`: number of recordings that would tell as much
-    about the scatter as this prior; `inflation`: largest common factor by which the errors may be too small.
+    about the scatter as this prior; `inflation`, `deflation`: largest common factors by which the errors may be too
+    small, and too large.
     """
 
     deviation: float
     recordings: float
     inflation: float = 1.0
+    deflation: float = 1.0
 
 
 def compare_with_healthy(
@@ -138,9 +141,10 @@ def compare_estimates(
         return None
     values, errors = np.array(healthy, dtype=float).T
     max_ratio = max(MAX_RATIO, MAX_RATIO_TO_VALUES * float(values.std()) / prior.deviation)
-    # grids of the scatter over its prior deviation, and of the factor by which the errors are too small
+    # grids of the scatter over its prior deviation, and of the factor by which the errors are too small or too large
     ratios = np.exp(np.linspace(-np.log(MAX_RATIO), np.log(max_ratio), NODES))
-    inflations = np.geomspace(1.0, prior.inflation, INFLATIONS) if prior.inflation > 1.0 else np.ones(1)
+    is_exact = prior.inflation == prior.deflation == 1.0
+    inflations = np.ones(1) if is_exact else np.geomspace(1.0 / prior.deflation, prior.inflation, INFLATIONS)
     ratios, inflations = (grid.ravel() for grid in np.meshgrid(ratios, inflations))
     scatter = prior.deviation * ratios  # scatter s at each point of the joint grid
     weights = 1.0 / (scatter[:, None] ** 2 + (inflations[:, None] * errors) ** 2)  # (grid points, n)

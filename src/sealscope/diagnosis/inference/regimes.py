@@ -42,16 +42,16 @@ MIN_STATE_BLOCKS = 2
 def apply_regime(blocks: Blocks, roles: ColumnRoles, shut: bool, *, has_holds: bool, is_certain: bool) -> Blocks:
     """Convert blocks to the volume balance for valves that are open, or `shut`, while the pump rests.
 
-    `roles`: roles of the columns of `blocks`, among them those of `terms.with_rests`.
+    `roles`: roles of the columns of `blocks`, among them the columns `STATES` that `terms.with_rests` adds.
 
-    - Open valves: these columns are dropped from the Gram matrices.
+    - Open valves: the columns `STATES` are dropped from the Gram matrices.
     - Shut valves: the flow offset in motion replaces the flow offset of all times (`terms.shut_at_rest`). The column
       `HOLDING`, the leakage of a pump that holds the load, remains only if some hold lasts for seconds (`has_holds`)
       and the pump is off at other times; otherwise it becomes zero. If all holds are short and the pump is off at other
-      times, they are those of a press that builds up its pressure, connected to its pump. Provided that valves are
-      certainly shut at rest (`is_certain`), these holds count as motion: they are first added to the column `TURNING`.
+      times, the machine is a press whose pump builds up the pressure through open valves. If valves are certainly shut
+      at rest (`is_certain`), its holds count as motion, and are first added to the column `TURNING`.
     """
-    names = (*roles.names, "left")
+    names = (*roles.names, "left")  # the last column is the left side of the balance
     if not shut:
         columns = [k for k, name in enumerate(names) if name not in STATES]
         return replace(blocks, gram=np.asarray(blocks.gram[..., columns, :][..., columns]))

@@ -214,17 +214,18 @@ class LiveBalance:
     def _take_block(self, block: Blocks) -> BlockResult:
         """Estimate the leakage conductance in a block, or store the block until the coefficients can be fitted.
 
-        The first `LEARNED` blocks are stored, and the last of them gives the conductances of all. The others give a
-        `NotJudged`, as do blocks with missing values or at standstill. After `N_WAKING` successive blocks that move far
-        more than usual, the coefficients are learned anew.
+        Blocks without missing values are kept, the last `WINDOW` of them, to fit the coefficients of the balance.
+        Learning begins with the first block that moves: the first `LEARNED` - 1 blocks give a `NotJudged`, and the next
+        one the conductances of all `LEARNED`. Blocks with missing values, or before the first motion, give a
+        `NotJudged`, too. After `N_WAKING` successive blocks that move far more than usual, learning begins again.
         """
         _, end = self._sample_times(block)
         if not block.rows[0]:
             return NotJudged.with_count(end, "missing values")
         packed = block.pack()
         self._stored = packed if self._stored is None else Blocks.join([self._stored, packed])[-WINDOW:]
-        if self._precision > 0.0:
-            # if this block moves and the usual ones stood still, its relative motion is above 1/STANDSTILL
+        if self._precision > 0.0:  # the coefficients are known
+            # if the usual blocks stood still and this one moves, its relative motion is above 1/STANDSTILL
             self._moving = self._moving + 1 if self._relative_motion(block) > 1.0 / STANDSTILL else 0
             if self._moving >= N_WAKING:
                 self.relearn()

@@ -194,9 +194,10 @@ def find_level_rise(
 def level_before_leak(leak: WatchedLeak, t: float) -> HealthyLevel:
     """Return the conductance before a leak began, and its range at time `t` [s] if only the oil's warmth had changed.
 
-    The range, `low` to `high` of the result, is from 1/r to r times the conductance, where r = warmest^(h / shift). h
-    is the time since the onset [h], but at most `shift`. By the table `oil` of `priors.toml`, warming of the oil raises
-    a conductance at most by the factor `warmest`, within the time `shift` [h].
+    With the conductance G before the leak, the result's `low` is G/r and its `high` is r max(G, 0), where r =
+    warmest^(tau/shift) and tau is the time since the onset, at most `shift`. By the table `oil` of `priors.toml`,
+    warming of the oil raises a conductance at most by the factor `warmest`, within the time `shift` [h]. A negative
+    estimate is an error about a true conductance of 0, and so warmer oil raises it to 0 at most.
     """
     oil, before = INFERENCE.oil, leak.conductance_before
     hours = max(0.0, t - leak.onset_s) / 3600.0

@@ -81,6 +81,7 @@ class ChargePriors(PriorTable):
     seconds: float  # [s] averaging time
     scatter: float  # standard deviation of the drift between days
     recordings: float  # the prior on the scatter weighs as much as this number of recordings
+    deflation: float  # largest factor by which the standard errors of the drifts may be too large
     unlike: float  # fraction of the recordings in which the charge pressure changes for another cause
 
 

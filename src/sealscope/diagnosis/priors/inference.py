@@ -212,6 +212,7 @@ class RestPriors(PriorTable):
     averaged: float  # [s] time over which the flow is averaged
     least: float  # [s] shortest rest
     share: float  # largest averaged flow at rest
+    lasting: float  # [s] shortest time for which a pump that turns slowly is taken to hold a load
     holding: float  # mean flow of a pump that holds a load
     moves: float  # smallest mean flow of the pump in a block that counts as motion, and smallest flow by a flow meter
     shut: float  # leakage at rest over that in motion if valves cut the pump off, a standard deviation

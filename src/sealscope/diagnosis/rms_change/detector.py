@@ -95,12 +95,12 @@ def observe_within(blocks: RmsBlocks, rate: float, unused: tuple[str, ...] = ())
 
     The more significant of a step up and a step down is reported for each detail. Their common onset is estimated from
     the sum of the log likelihoods of the judged details (d2 to d4) whose step has a p-value below 0.5. `rate` is the
-    sampling rate [Hz], and `unused` are columns of the log that are no channel. If most blocks say nothing about a
-    detail, the report only says so.
+    sampling rate [Hz]; `unused`, for the report, are the names of columns that are not used as channels. If most blocks
+    say nothing about a detail, the report only says so.
     """
     changes = dict[str, tuple[StepTest, float]]()  # by detail: the more significant test, and the change of the log RMS
     judged_steps, bounds = list[StepTest](), list[float]()
-    likelihoods, weights = change_information(blocks)  # changes of the ringing; fractions of energy that is not noise
+    likelihoods, weights = change_information(blocks)  # of the log RMS; fractions of energy that is not noise
     for name, likelihood, weight in zip(blocks.names, likelihoods, weights, strict=True):
         steps = step_tests(likelihood, signs=(1.0, -1.0))
         if not steps:

@@ -89,11 +89,12 @@ def estimate_rises(
     `log_rms` (5 per chamber,) and `duty` (4,), the features `DUTY`, are those of the judged recording, `healthy` (n, 5
     per chamber) and `healthy_duty` (n, 4) those of the leak-free ones. `times` (n + 1,) are the start times [s], with
     that of the judged recording at the end; None if unknown. Returns the change of each wavelet quantity, and the
-    fractions of energy that are not noise, (5 per chamber,).
+    fractions of energy that are not noise in the leak-free recordings, (5 per chamber,). g is the log RMS without its
+    noise (`subtract_noise`) over this fraction.
 
     The model is the sum of a common mean, an effect of the duty, independent scatter, and an Ornstein-Uhlenbeck process
-    over time, independent between sessions, which are separated by pauses. Its variance is stated in `priors.toml`
-    (`recordings.session`), and its rate is unknown.
+    over time, independent between sessions, which are separated by pauses. Its standard deviation is stated in
+    `priors.toml` (`recordings.session`); the likelihood is averaged over a prior on its rate (`walk`).
     """
     prior, walk, n = RMS_PRIORS.recordings, RMS_PRIORS.walk, len(healthy)
     exponent_sd = np.array([getattr(RMS_PRIORS.duty, name) for name in DUTY])

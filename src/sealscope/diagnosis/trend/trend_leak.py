@@ -89,11 +89,12 @@ def decide_trend(
 ) -> Evidence:
     """Decide from the comparable recordings since the last repair whether the leakage of a machine has increased.
 
-    `points` are in the order of time, and `episode` is the period with its test. `trend_units_per_level` is the factor
-    from `LeakReading.level` to the unit of the trend, `pressure` the pressure difference at which L/min are stated
-    [Pa], None for the unit %, and `interval` the median time between two recordings [days]. The allowed probability of
-    a false alarm is `interval` divided by `years`, the mean time between false alarms. With fewer than three recordings
-    the verdict is `cannot tell`.
+    `points` are in the order of time; `episode` is the result of `find_episodes` for them. `trend_units_per_level` is
+    the factor from `LeakReading.level` to the unit of the trend; `pressure` [Pa] is the pressure difference for which a
+    trend in L/min is stated, None for a trend in %; `interval` [days] is the median time between two recordings. Points
+    of the basis `ringing` are judged by the change of the ringing, without an estimate of the leakage. The allowed
+    probability of a false alarm is `interval` divided by `years`, the mean time between false alarms. With fewer than
+    three recordings the verdict is `cannot tell`.
     """
     wear = episode.wear
     # `interval` over the mean time until a healthy machine scores as high, exp(log_days); > 0 even if that underflows

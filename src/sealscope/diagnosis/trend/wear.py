@@ -502,8 +502,9 @@ def find_episodes(
     """Divide a series of recordings at repairs, and test and estimate the leakage in each period between them.
 
     `years` is the mean time to a false alarm. The first `n_healthy` recordings are known to be healthy.
-    `allowed_rise` is the rise at which a repair is due, None if there is no limit. After a repair, a fall of the level
-    (`_find_repair`), the level is estimated anew, with the scatter before the repair as prior.
+    `allowed_rise`, in the unit of the levels, is the rise at which a repair is due, None if there is no limit. A repair
+    shows as a fall of the level (`_find_repair`). After it a new period begins, whose first recording is taken as
+    healthy; of the earlier periods only the scatter is kept, as prior.
     """
     days = years * DAYS_PER_YEAR
     begin, episodes = 0, list[Episode]()
@@ -513,10 +514,11 @@ def find_episodes(
         alarm, end = rise.find_alarm(days), _find_repair(remaining, rise, n_healthy, days)
         if alarm is not None and alarm >= end:  # an alarm after the repair belongs to the next episode
             alarm = None
-        change_begin = None if alarm is None else int(rise.begin[end - 1])  # by all recordings of the period
+        change_begin = None if alarm is None else int(rise.begin[end - 1])  # as all of the period show
         wear = estimate_wear(remaining.select(slice(0, end)), allowed_rise, change_begin)
         alarm_row, log_days = None if alarm is None else begin + alarm, float(rise.log_R[:end].max())
-        # each period but the first begins with a repair, a fall of the level
+        # `log_R`: logarithm of the mean time [days] until a healthy machine scores as high; each period but the first
+        # begins with a repair, a fall of the level
         episodes.append(Episode(begin, begin + end, alarm_row, log_days, wear, fell=bool(episodes)))
         # n recordings (`end`) add n - 1 degrees of freedom to the knowledge of the scatter
         prior = ScatterPrior(wear.scatter, levels.prior.freedom + min(end - 1, _MAX_FREEDOM))

@@ -269,7 +269,8 @@ def _parse_number(values: Mapping[str, Any], name: str) -> float:
 def _parse_channel(values: Any, name: str, units: Mapping[str, Any]) -> np.ndarray[Any, Any]:
     """Convert the list or typed array of a channel to an array (n,) in SI units; raise RefusedMessage if it is neither.
 
-    A slow channel may be a single number; infinite values are refused. `units`: unit by channel.
+    A slow channel may be a single number. None in a list, a missing sample, becomes NaN; infinite values are refused.
+    `units`: unit by channel.
     """
     if name in SLOW and isinstance(values, (int, float)) and not isinstance(values, bool):
         values = [values]  # a slow channel may be a single number
@@ -284,7 +285,7 @@ def _parse_channel(values: Any, name: str, units: Mapping[str, Any]) -> np.ndarr
             raise ValueError
     except (TypeError, ValueError, OverflowError):
         rule = f"channel {name} must be a list of finite numbers"
-        raise RefusedMessage(NO_SAMPLES, f"{rule}, or an array of whole numbers of its type") from None
+        raise RefusedMessage(NO_SAMPLES, f"{rule}, or a typed array whose bytes divide into its numbers") from None
     return np.asarray(convert_to_si(array, units.get(name), name))
 
 

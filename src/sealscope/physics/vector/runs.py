@@ -99,8 +99,9 @@ _rk4_inputs, _imex_inputs = _build_inputs_law(3), _build_inputs_law(6)
 def _add_output(z: State, leak: Leak, t: float, totals: Totals, q: RigNumbers) -> Totals:
     """Add the solver's output at time `t` [s] to the totals of a group of runs; return the new totals.
 
-    The totals are sums and extremes of each run, which `N_TOTALS` lists. `z`: states of the runs; `leak`: numbers of
-    their leaks (`LEAK_ROWS`), the last two of them G and C of the leak whose flow is summed; `q`: the rigs' numbers.
+    The totals are listed at `N_TOTALS`. `z`: states of the runs; `leak`: parameters of their leaks, listed at
+    `LEAK_ROWS`, of which the last two are conductance G and orifice C of the leak past the piston; `q`: parameters of
+    the rigs.
     """
     flow_sum, opening_sum, max_travel, min_pressure, diverged = totals
     opening = leak_opening(leak, t)

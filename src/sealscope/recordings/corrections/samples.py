@@ -55,9 +55,10 @@ def correct_samples(recording: Recording) -> CorrectedSamples:
     3. spikes, and samples that repeat the previous one;
     4. uneven sampling times;
     5. speeds without a sign;
-    6. gaps, and incomplete rows at the ends, which are cut off.
+    6. gaps, which are interpolated or bridged, and incomplete rows at the ends, which are cut off.
 
-    Steps 3, 5 and 6 are reported as findings.
+    Steps 3 to 6 are reported as findings. Channels without any value are left out, except chamber pressures. A chamber
+    pressure that is stuck in more than `MAX_STUCK_FRACTION` of the rows stays as it is, and is named as unusable.
     """
     part, findings = remove_dropouts(remove_impossible(recording)), list[Finding]()
     is_frozen = flag_frozen_rows(part)

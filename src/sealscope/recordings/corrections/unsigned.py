@@ -144,7 +144,11 @@ def _fit_signs(recording: Recording, speed: Array, magnitude: Array) -> Array:
 
 
 def _noise_variance(speed: Array, rate: float) -> float:
-    """Estimate the noise variance [(m/s)^2] of a piston speed (n,) by a median, which motion hardly changes."""
+    """Estimate the noise variance [(m/s)^2] of a piston speed (n,).
+
+    It is half the median of the locally averaged squared differences of samples that are 2 `half` (`_PRIORS`) seconds
+    apart. Motion changes only some of these averages, and hardly their median. 0 for a shorter recording.
+    """
     n_lag = max(1, round(2.0 * _PRIORS.half * rate))
     steps = speed[n_lag:] - speed[:-n_lag]
     return 0.5 * float(np.median(_average_nearby(steps**2, rate))) if steps.size else 0.0

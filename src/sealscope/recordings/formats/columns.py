@@ -300,9 +300,11 @@ def _find_embedded_name(labels: Sequence[Label], channel: str) -> int | None:
 
 
 def _find_time(labels: Sequence[Label]) -> int | None:
-    """Find the time column by its name, first `t`, then other usual names; None if there is none.
+    """Find the index of the time column; None if there is none.
 
-    Of several columns with one name, the first with a unit is preferred. Raises InputError if several are called `t`.
+    It is a column named `t`, else one with another usual name (`WORDS["time"]`, in this order), else one that `is_time`
+    accepts and that is not named as a date. Of several columns with one name, the first with a unit is preferred.
+    Raises InputError if several are called `t`.
     """
     if (exact := next((i for i, label in enumerate(labels) if label.name == "t"), None)) is not None:
         _find_column(labels, "t", "t")  # raises if there are several

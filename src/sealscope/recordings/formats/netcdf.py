@@ -143,14 +143,14 @@ def _read_values(data: Any, name: str, file_size: int) -> NDArray[Any]:
 def _read_texts(data: Any, name: str, file_size: int) -> list[str]:
     """Read the data set `name` of texts (n,), in chunks if the lengths of the texts vary.
 
-    Chunks bound the memory, as many cells may refer to the same text, which may be as long as the file. Raises
-    InputError for too many or too long texts, and for other types.
+    Chunks bound the memory, as many cells may refer to the same text, which may be as long as the file of `file_size`
+    [bytes]. Raises InputError for too many or too long texts, and for cells that are lists or references.
     """
     import h5py
 
     check_texts(data.size, data.dtype.itemsize, name)
     if data.dtype.kind == "O" and h5py.check_string_dtype(data.dtype) is None:
-        raise InputError(f"{name} must hold numbers, got lists or references")
+        raise InputError(f"{name} must hold texts or numbers, got lists or references")
     if data.dtype.kind != "O":
         return [_decode_text(cell) or "" for cell in data[...]]
     n_texts = min(max(_CHUNK_BYTES // file_size, 1), _CHUNK_TEXTS)

@@ -461,10 +461,11 @@ class _Log:
         return block
 
     def _is_stamped(self, cells: Sequence[str], rows: Sequence[Sequence[str]]) -> bool:
-        """Test whether the time column contains date stamps, as its first cell in the log shows.
+        """Return True if the time column contains dates or times of day as text, False if it contains numbers.
 
-        `cells`: cells of the time column in `rows`. The first cell that is not missing sets `has_stamps` for the whole
-        log, and `has_date`: True if the stamps are times of day, and the cell in the date column is a date.
+        `cells`: cells of the time column in `rows`. The first cell that is not missing decides for the whole log, and
+        sets `has_stamps`, and `has_date`: True if the stamps are times of day, and the cell in the date column is a
+        date.
         """
         index = next((i for i, cell in enumerate(cells) if not is_missing(cell)), None)
         if self.has_stamps is None and index is not None:
@@ -589,9 +590,11 @@ def _iter_line_blocks(
 ) -> Iterator[tuple[int, bytes, int, bool]]:
     """Yield a text file in blocks of lines: (number of the first line, bytes, end, is_cut).
 
-    The bytes before index `end` are complete lines; the others come again in the next block. Only the last block may
-    have an incomplete last line, without a line end: then `is_cut` is True, and `end` is the block's length. `n_bytes`:
-    number of bytes to read next. Raises InputError for binary data, and for a line that is too long.
+    The bytes before index `end` are complete lines; the others come again in the next block. Lines end at a newline; in
+    a one-byte encoding, those of a block without any newline end at a carriage return. Only the last block may have an
+    incomplete last line, without a line end: then `is_cut` is True, and `end` is the block's length. `encoding`: for
+    UTF-16 with its byte order; `place`: name of the file in errors; `n_bytes`: number of bytes to read next. Raises
+    InputError for binary data, and for a line that is too long.
     """
     character_bytes = 2 if encoding.startswith("utf-16") else 1
     newline = "\n".encode(encoding if character_bytes == 2 else "ascii")

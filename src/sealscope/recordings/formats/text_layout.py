@@ -217,7 +217,8 @@ def _parse_heading(
 def _parse_keyed_rows(rows: Sequence[Sequence[str]]) -> tuple[list[Label], int] | None:
     """Parse heading rows, the lowest first, that begin with the keys `Name`, `Unit` or similar; None for other rows.
 
-    Returns (labels of the columns, number of rows).
+    Returns the labels of the columns, and the number of heading rows. The first column, which has no unit, is named by
+    its key (`Name`), or by the lowest row if that has a single cell.
     """
     keys = [row[0].strip().rstrip(":").casefold() for row in rows]
     name_row = next((i for i, key in enumerate(keys) if key in WORDS["row"]["name"] and _used_width(rows[i]) > 1), None)

@@ -210,7 +210,10 @@ def build_cells(members: Sequence[Member], n_out: int, rate: float) -> Cells:
 
 
 def with_leak_coefficient(experiment: Experiment, coefficient: float) -> Experiment:
-    """Replace the size of an experiment's leak by a leakage coefficient; without a leak, return it unchanged."""
+    """Return an experiment with its first leak only, of the given leakage coefficient; unchanged without a leak.
+
+    The `coefficient` [m^3/(s Pa), or m^3/(s Pa^0.5) for an orifice] replaces a mean flow as the leak's size.
+    """
     if not experiment.leaks:
         return experiment
     return replace(experiment, leaks=(replace(experiment.leaks[0], mean=None, coefficient=coefficient),))
@@ -462,9 +465,10 @@ class SetRun:
             add_progress((stop - start) / self.n_outputs * (b - a) / self.n_groups)
 
     def _inputs_at_nodes(self, start: int, stop: int) -> Array:
-        """Compute the command waveform and the load [N], if any, at the times (nodes) within the steps of a chunk.
+        """Compute the command's waveform [V] and the load [N], if any, at the solver's nodes in all steps of a chunk.
 
-        Returns (steps, nodes), or (steps, 2 nodes) with the load last, for the outputs start <= output < stop.
+        The nodes are times within a step; the chunk has the outputs start <= output < stop. The result has a row for
+        each step: the waveform at the nodes, followed by the load at the nodes if there is one.
         """
         t = np.arange(start * self.steps_per_output, stop * self.steps_per_output, dtype=np.float64) * self.step
         times = t[:, None] + self.nodes

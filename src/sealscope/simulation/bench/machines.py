@@ -69,11 +69,12 @@ class BenchMachine:
 def centred_start(rig: Rig, command: Command | Position | str, duration: float) -> float:
     """Estimate the start position [m] from which the piston's travel under a command is centred at mid-stroke.
 
-    `duration` [s] of the command. With a position target, the result is its first value. It is limited to the stroke.
+    `duration` [s]: length of the command. With a position target, the result is the target's first value. Every result
+    is limited to the stroke.
 
-    The piston moves with the pump's flow, A v = q_b omega/(2 pi), and the motor is taken as unloaded and without
-    inertia in its PI loop: (k_p + C_e) omega = k_p omega_d + K_i I, dI/dt = omega_d - omega (eqs. 4.2-4.5). Behind a
-    servo valve the piston moves with the valve's flow without load.
+    The piston moves with the pump's flow, A v = q_b omega/(2 pi). The motor is taken as unloaded and without inertia,
+    with its PI controller of the speed: (k_p + C_e) omega = k_p omega_d + K_i I, dI/dt = omega_d - omega (thesis, eqs.
+    4.2-4.5). Behind a servo valve the piston moves with the valve's flow without load.
     """
     command = parse_command(command) if isinstance(command, str) else command
     motor, cylinder = rig.motor, rig.cylinder
@@ -161,9 +162,10 @@ def draw(
 ) -> BenchMachine:
     """Draw a healthy machine like `rig` at random from a profile; equal seeds give equal machines.
 
-    `profile`: a profile, its name or its file; `duration` [s]: length of the recording, over which the parameters
-    drift; `family`: one of the profile's families of machines, "" for none. Raises InputError for a seed below 0, a
-    duration that is not positive and finite, or an unknown rig, profile or family.
+    Drawn are uncertain parameters and their drifts, and the duty: command and its amplitude, throttles, load and
+    controller. `profile`: a profile, its name or its file; `duration` [s]: length of the recording, over which the
+    parameters drift; `family`: one of the profile's families of machines, "" for none. Raises InputError for a seed
+    below 0, a duration that is not positive and finite, or an unknown rig, profile or family.
     """
     from sealscope.parameters import load_rig
 

@@ -31,7 +31,13 @@ from sealscope.diagnosis.inference.changes.motion_fit import (
     solve_weighted,
     stack_equations,
 )
-from sealscope.diagnosis.inference.differences import Estimate, PriorScatter, compare_estimates, size_penalty
+from sealscope.diagnosis.inference.differences import (
+    MIN_HEALTHY,
+    Estimate,
+    PriorScatter,
+    compare_estimates,
+    size_penalty,
+)
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.inference.terms import find_rests
 from sealscope.diagnosis.priors.changes import CHANGES
@@ -124,13 +130,14 @@ class ChargeTrend(NamedTuple):
     def loss_support(self, flow: float, onset: float) -> float:
         """Compute twice the log likelihood ratio of a loss of oil to no loss, by the fall of the charge pressure.
 
-        A constant loss `flow` [m^3/s] since `onset` [s] empties an accumulator with the gas volume V. A straight line
-        fitted to the pressure over the whole recording then falls at the rate
+        A constant loss `flow` = q [m^3/s] since `onset` [s] empties an accumulator with the gas volume V at the charge
+        pressure p. A straight line fitted to the pressure over the whole recording then falls at the rate
 
-            fall = (pressure flow / V) (1 - f)^2 (1 + 2 f),
+            fall = (p q / V) (1 - f)^2 (1 + 2 f),
 
-        where f is the fraction of the recording before the onset. The likelihood is averaged over a log-normal prior on
-        V. A measured fall may also have another cause, with a small probability.
+        where f is the fraction of the recording before the onset, and V is divided by the exponent of the gas. The
+        likelihood is averaged over a log-normal prior on V. A measured fall may also have another cause, with a small
+        probability.
         """
         prior, z = CHANGES.accumulator, np.linspace(-3.0, 3.0, N_VOLUMES)  # log V in standard deviations
         weights = np.exp(-0.5 * z**2) / np.exp(-0.5 * z**2).sum()
@@ -236,15 +243,20 @@ def compare_low_drifts(judged: LowDrifts, healthy: Sequence[LowDrifts]) -> Itera
         chance = min(1, chance of the weighted mean of both drifts / chance of their difference).
     """
     prior = CHANGES.charge
-    scatter = PriorScatter(deviation=prior.scatter, recordings=prior.recordings)
-    drifts = judged.known_drifts
-    known = {side: [other.known_drifts[side] for other in healthy if side in other.known_drifts] for side in drifts}
+    scatter = PriorScatter(deviation=prior.scatter, recordings=prior.recordings, deflation=prior.deflation)
+    known = {
+        side: [other.known_drifts[side] for other in healthy if side in other.known_drifts]
+        for side in judged.known_drifts
+    }
+    drifts = {side: drift for side, drift in judged.known_drifts.items() if len(known[side]) >= MIN_HEALTHY}
+    if not drifts:
+        return
     for side, drift in drifts.items():
         change = compare_estimates(LOW.format(side), DRIFT, drift, known[side], scatter)
         if change is not None:
             yield replace(change, advantage=-size_penalty(CHANGES.zero_drift, change.size))
-    # variance of each side's drift, including the variance between the healthy recordings (0 if there are none)
-    healthy_var = {side: float(np.var([drift.value for drift in known[side]] or [0.0])) for side in drifts}
+    # variance of each side's drift, including the variance between the healthy recordings
+    healthy_var = {side: float(np.var([drift.value for drift in known[side]])) for side in drifts}
     variances = {side: prior.scatter**2 + drift.deviation**2 + healthy_var[side] for side, drift in drifts.items()}
     falls = [mean for other in healthy if (mean := _mean_fall(other, variances)) is not None]
     judged_fall = _mean_fall(judged, variances)

@@ -38,11 +38,13 @@ def duty_tests(recording: Recording) -> list[StepTest]:
     """Test the amplitudes of command and motion for a step, a sudden lasting change (`amplitude_step_tests`).
 
     A change of what the machine is commanded to do (its duty) changes both amplitudes alike; a leak changes only one.
+    The recording is divided into `BLOCKS` blocks of equal length, or with a position and a periodic motion into blocks
+    of whole cycles.
     """
     length, cycle = len(recording) // BLOCKS, find_cycle(recording)
     if "x" in recording and cycle is not None:
-        # Blocks have whole cycles only with a position. Without it, command and motion are both the drive's, so that a
-        # leak, which changes the drive's motion within a cycle, could change both.
+        # Without a position, command and motion are both those of the drive. A leak may change both alike within a
+        # cycle, and would look like another duty in blocks of whole cycles.
         cycle_samples = cycle * recording.rate
         length = round(max(1, math.ceil(length / cycle_samples)) * cycle_samples)
     time, blocks = _split_blocks(recording, length)

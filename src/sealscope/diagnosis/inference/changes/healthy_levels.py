@@ -134,12 +134,16 @@ def _log_frictions(
 ) -> tuple[Estimate | None, list[Estimate]]:
     """Compute the logarithm of the friction in the judged recording and in the healthy ones, with standard errors.
 
-    `key`, `error_key`: keys of friction and standard error [Pa] in the summaries. The usual sign of the friction
-    depends on the motion's channel; the sum of friction / error over the healthy recordings has this sign. As friction
-    resists the motion, healthy frictions of the other sign show that the errors are too small. Let the excess of a
-    healthy recording be abs(friction) / error if the sign is wrong, else 0. All errors are multiplied by the upper
-    quartile of the excesses, but at least by 1. A friction is usable if it has the usual sign and exceeds its error;
-    otherwise the judged one is None, and a healthy one is left out.
+    `key`, `error_key`: keys of friction and standard error [Pa] in the summaries.
+
+    - The sign that stands for friction against the motion depends on which channel measured the motion. It is the sign
+      of the sum of friction / error over the healthy recordings.
+    - A healthy friction of the other sign is an error. All errors are therefore multiplied by max(1, q), where q is the
+      upper quartile of abs(friction) / error over the healthy recordings, counted as 0 where the sign is right.
+    - The standard error of a logarithm is error / friction and `healthy.friction_error` (`priors.toml`), added in
+      quadrature.
+    - A friction is usable if it has the right sign and exceeds its error; otherwise the judged one is None, and a
+      healthy one is left out.
     """
     known = [summary for summary in healthy if {key, error_key} <= set(summary)]
     if not known or not {key, error_key} <= set(judged):

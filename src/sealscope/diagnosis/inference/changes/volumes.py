@@ -232,11 +232,11 @@ def _accumulator_support(balance_test: StepTest, accumulator_test: StepTest) -> 
 
 
 def _insert_fitted_motion(blocks: Blocks, columns: Sequence[ColumnRoles], index: int) -> Blocks:
-    """Replace column `index` of the Gram matrices by the volume of the piston's motion; return the new blocks.
+    """Replace the regressor `index` of the Gram matrices by the volume of the piston's motion; return the new blocks.
 
-    This volume is the sum of the columns of motion, each times its coefficient fitted to the whole recording. If the
-    scale of position or speed changes by the fraction s, the coefficient of the new column changes by s. `columns`:
-    roles of the columns of each equation.
+    This volume is the sum of the regressors of motion, which are nuisance terms, each times its coefficient fitted to
+    the whole recording. A change of the sensor's scale of position or speed by the fraction s changes the coefficient
+    of the new regressor by s. `columns`: roles of the regressors of each equation.
     """
     gram = blocks.gram.copy()
     for equation, (roles, total) in enumerate(zip(columns, sum_blocks(blocks, columns), strict=True)):

@@ -108,10 +108,11 @@ def residual_products(
     """Compute the residual of a recording under the coefficients fitted to reference recordings.
 
     `gram`, `reference` (m, m): Gram matrices of the recording and of the sum of the reference recordings; `roles`:
-    roles of their columns. Returns the products (m,) of the residual with each column, and last with itself; the
-    indices of the c columns whose coefficients may differ between recordings; and the precisions (c,) of the priors on
-    these differences. `has_leak`: true if the coefficient of the leak is among the c coefficients, with the prior
-    `between.pump` (`priors.toml`).
+    roles of their columns. Returns the products (m,) of the residual with each column, and in place of the left side,
+    the last column, with itself; the indices of the c columns whose coefficients may differ between recordings; and the
+    precisions (c,) of the priors on these differences. Columns that may differ without limit (infinite
+    `between_deviation`) are not fitted. `has_leak`: true if the coefficient of the leak is among the c coefficients,
+    with the prior of the pump's leakage, `between.pump` (`priors.toml`).
     """
     compared = [k for k in roles.compared if k == roles.leak or np.isfinite(roles.between_deviation[k])]
     coefficients = np.zeros(len(gram))

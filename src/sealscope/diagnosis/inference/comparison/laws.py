@@ -32,9 +32,11 @@ def compare_laws(
 ) -> LawFit | None:
     """Compare how well a turbulent leak through an orifice and a laminar leak explain a recording's excess flow.
 
-    Each leak is fitted to the residual of the recording `judged` under the coefficients of the healthy recordings,
-    `baseline`. Return None if the volume balance has no column of an orifice, if the recording has no information on
-    one of the two leaks, or if their columns are not positively correlated.
+    Each leak is fitted to the residual that remains if the coefficients of the healthy recordings, `baseline`, predict
+    the recording `judged`. The result has the laminar coefficient that fits an orifice leak with the coefficient 1, and
+    the log likelihood ratio of an orifice to a laminar leak for one residual. `columns`: roles of the columns of each
+    volume balance; all balances are fitted together. Return None if the volume balance has no column of an orifice, if
+    the recording has no information on one of the two leaks, or if their columns are not positively correlated.
     """
     if any(ORIFICE not in roles.names for roles in columns):
         return None

@@ -419,7 +419,11 @@ class Follower:
         return fit, prior
 
     def update(self, block: Recording) -> Block:
-        """Advance the filter by the next block of samples, and return its sums for a joint fit of all blocks."""
+        """Fit the parameters to the next block of samples, and return the block's sums for a joint fit of all blocks.
+
+        The prior of the fit is the estimate from the earlier blocks. Updates all attributes of the filter except
+        `machine`, `priors`, `sense` and `variance`.
+        """
         segment = self.next_segment(block)
         fit, prior = self._fit_block(segment, block.duration)
         chi_squared = fit.cost(self.variance, prior)

@@ -257,13 +257,15 @@ class BalanceLeak:
     def _rise_laws(self) -> list[tuple[float, float]]:
         """Weigh the laws of a leak's flow, such as laminar, by their fit to the rise over healthy recordings.
 
-        Returns for each law its mean flow for a fitted laminar coefficient of 1, and its log weight. A law with an
-        exponent e of `EXPONENTS` lies the fraction f = 2 (1 - e) of the way from laminar to orifice flow:
+        Returns for each law its mean flow and its log weight. The flow is that of a leak to which the fit of a laminar
+        leak gives a conductance of 1, and has the unit Pa of a flow per conductance. A law with an exponent e of
+        `EXPONENTS` lies the fraction f = 2 (1 - e) of the way from laminar to orifice flow:
 
             flow = laminar^(1 - f) orifice^f,    log weight = log prior + f N L,
 
         where L is the log likelihood ratio of an orifice to a laminar leak for one residual, and N = `size.readings`
-        (`priors.toml`) the number of independent residuals. If L is unknown, all laws have the laminar flow.
+        (`priors.toml`) the number of independent residuals. If L is unknown, all laws have the laminar flow and
+        the log weight 0.
         """
         balance = self.balance
         laminar_flow = balance.mean_pressure()
@@ -516,11 +518,12 @@ class BalanceLeak:
 
 
 def _flow_mixture(rise: Rise, value: float, *, unit: float, weight: float, oil_deviation: float = 0.0) -> Mixture:
-    """Compute the distribution of a leak's mean flow [m^3/s] from the rise of its coefficient.
+    """Compute the distribution of a leak's mean flow [m^3/s] from the rise of its coefficient over healthy recordings.
 
-    Its weights sum to `weight`, as it is a part of a larger mixture. `rise`: rise over healthy recordings, of which
-    only the distribution of the error is used; `value`: estimate of the rise, a negative one counting as 0; `unit`:
-    mean flow [m^3/s] for a coefficient of 1; `oil_deviation`: standard deviation of the coefficient by uncertain oil.
+    It is a mixture of normal distributions whose weights sum to `weight`, as a part of a larger mixture. `value`:
+    estimated rise, a negative one counting as 0; `rise`: gives the distribution of the error of this estimate; `unit`:
+    mean flow [m^3/s] for a coefficient of 1; `oil_deviation`: standard deviation of the coefficient that uncertain
+    properties of the oil cause.
     """
     # the true rise is `value` minus an error that is distributed as a healthy recording's rise
     weights, deviations, centres = rise.mixture or Mixture(np.ones(1), np.array([rise.deviation]), np.zeros(1))

@@ -183,21 +183,25 @@ class RecordedBalance:
 
     @property
     def volume_ratio(self) -> float:
-        """Measured over assumed ratio of the piston's area to the pump's displacement; 1 if it is not measured."""
-        ratio = self.size.ratio
+        """Factor by which the measured ratio of area to displacement exceeds the assumed one; 1 if not measured."""
+        ratio = self.size.ratio  # its inverse
         return 1.0 if ratio is None else 1.0 / max(ratio.value, np.finfo(float).tiny)
 
     @cached_property
     def recording_sums(self) -> RecordingSums:
-        """Summary of the recording for comparison with other recordings."""
+        """Summary of the recording for comparison with others.
+
+        It has sums of its Gram matrices, oil temperature and start time. Where they are known, it also has the leaks
+        seen in holds, the pump's leakage in holds, and the friction and line drop of the motion (`fit_difference`).
+        """
         start_s, oil_degC = start_seconds(self.recording), oil_temperature(self.recording)
         sums = RecordingSums.from_blocks(self.blocks, self.columns, start_s, oil_degC)
         if self.is_creep:
-            sums = sums._replace(flow=self.mean_flow)  # no pump's flow is known
+            sums = sums._replace(flow=self.mean_flow)  # a test of creep records no flow of a pump
         hold_leaks = None if self.chambers is None else np.array(self.chambers.leaks)
         pump_leakage = None if self.held_pump_leakage is None else np.array(self.held_pump_leakage)
         fit = fit_difference(self.recording)
-        is_determined = fit is not None and min(fit.friction_error, fit.drop_error) > 0.0  # 0 is no plausible error
+        is_determined = fit is not None and min(fit.friction_error, fit.drop_error) > 0.0  # 0: without information
         resistance = np.array(fit) if is_determined else None
         return sums._replace(held=hold_leaks, held_pump=pump_leakage, resistance=resistance)
 

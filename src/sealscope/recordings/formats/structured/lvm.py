@@ -87,7 +87,13 @@ def read_lvm(path: Path, request: Request) -> RecordingFields:
 
 
 def _iter_packets(lines: Iterator[tuple[int, str]], delimiter: str, decimal: str, place: str) -> Iterator[_Packet]:
-    """Yield the packets in numbered `lines` of a LabVIEW file; a packet gets its rows after it is yielded."""
+    """Yield the packets (segments of a measurement) of a LabVIEW file.
+
+    `lines`: numbers and texts of the lines after the header of the file. A packet has a header that begins with
+    `Channels` and ends with an end mark, a line with the names of the columns, and lines of samples. It is yielded when
+    its names are known; its rows are complete when the next packet is yielded, or at the end. `delimiter` separates the
+    cells, `decimal` is the decimal mark; `place` names the file in errors.
+    """
     header: dict[str, list[str]] = {}
     packet: _Packet | None = None
     in_header = True

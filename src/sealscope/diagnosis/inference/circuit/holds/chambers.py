@@ -199,12 +199,13 @@ class HeldChambers:
     def pressure_difference(self, t: Array, difference: Array, offset: float) -> Array:
         """Subtract the sensor offset from p_A - p_B = `difference` (n,) [Pa] at times `t` (n,) [s] of the recording.
 
-        Outside of holds this is the `offset` [Pa] of the recording. In a hold it is the offset of the hold
-        (`LockedHold.offset_in_hold`), so that pressures which a leak has equalised differ by 0.
+        Outside of holds the sensor offset is the `offset` [Pa] of the recording. From the start of a hold to the end of
+        its rest it is the offset of the hold (`LockedHold.offset_in_hold`). Pressures that a leak has equalised then
+        differ by 0.
         """
         prior, offsets = INFERENCE.held_oil, np.full(len(t), offset)
         for hold in self.holds:
-            # including the end of the rest, in which the valves open
+            # `hold.t` leaves out the end of the rest, in which the valves open and over which the flow was averaged
             begin, end = hold.t[0], hold.t[-1] + prior.settles + INFERENCE.rest.averaged
             offsets[(t >= begin) & (t <= end)] = hold.offset_in_hold(offset)[0]
         return np.asarray(difference - offsets)
