@@ -292,6 +292,41 @@ def test_the_onset_is_stated_where_a_hold_was_tight_before(size: float) -> None:
         assert onset.high - onset.low < CYCLE
 
 
+def test_a_leak_that_begins_between_holds_may_have_begun_at_any_time_between_them() -> None:
+    """It shows where the next hold begins, and an onset right after that fits as well."""
+    for since in (16.2, 23.8):
+        onset = held_press(piston=20.0 * SEAL, since=since).piston_onset
+        assert onset is not None
+        assert onset.low <= since <= onset.high
+
+
+@pytest.mark.parametrize("since", few([27.0, 33.0, 46.0], 1))
+def test_the_growth_of_a_leak_moves_no_onset(since: float) -> None:
+    """A leak that triples shows most after the hold in which it begins; one that stays the same would begin later."""
+    chambers = held_press(piston=0.3 * SEAL, since=since, growth=INFERENCE.growth.most)
+    onset = chambers.piston_onset
+    assert onset is not None
+    assert onset.low <= since <= onset.high
+    best = max(chambers.law_fits, key=lambda fit: fit.log_weight)
+    assert best.law.growth > 0.5 * INFERENCE.growth.most
+    assert best.law.onset == pytest.approx(since, abs=2.0)
+
+
+def test_volumes_lost_to_a_growing_leak_are_those_of_each_onset_by_itself() -> None:
+    chambers = held_press(piston=0.3 * SEAL)
+    leak = chambers._unit_piston_leak(0.0)
+    columns = chambers._growing_leak_columns(leak, 1.5)
+    for index in (0, 3, len(chambers.onsets) // 2, len(chambers.onsets) - 1):
+        law = LeakLaw(1.0, 1.5, float(chambers.onsets[index]))
+        flows = [
+            flow * law.growth_factor(hold.t, chambers.end)
+            for flow, hold in zip(leak.flows, chambers.holds, strict=True)
+        ]
+        expected = chambers._leak_columns(leak._replace(flows=flows), np.array([law.onset]))[:, 0]
+        # the kink at the onset lies between two samples
+        assert columns[:, index] == pytest.approx(expected, rel=1e-3, abs=1e-3 * np.abs(expected).max())
+
+
 @pytest.mark.parametrize("seed", few([0, 1, 2, 3, 4], 2))
 def test_the_least_squares_of_each_onset_are_those_within_the_limits_of_the_oil(seed: int) -> None:
     """A slow oracle solves the same problem, with no negative leak, dead volume, air or compressibility."""

@@ -322,13 +322,25 @@ class HeldChambers:
         One onset within each hold is the time at which p_A - p_B changes most, since a large leak equalises the
         pressures at once.
         """
-        onsets = [self.begin]
+        lows, highs = self._onset_ranges
+        return np.sort(np.concatenate([0.5 * (lows + highs), [hold.steepest_time() for hold in self.holds]]))
+
+    @cached_property
+    def _onset_ranges(self) -> tuple[Array, Array]:
+        """First and last time [s] for which each evenly spaced possible onset stands, (o,) each.
+
+        The beginning of the recording, and each onset within a hold, stand for themselves; one between two holds stands
+        for all times between them.
+        """
+        lows, highs = [self.begin], [self.begin]
         for k, hold in enumerate(self.holds):
             if k > 0:
-                onsets.append(0.5 * (self.holds[k - 1].t[-1] + hold.t[0]))
-            evenly_spaced = np.linspace(hold.t[0], hold.t[-1], N_ONSETS + 2)[1:-1]
-            onsets += [*np.sort(np.append(evenly_spaced, hold.steepest_time()))]
-        return np.array(onsets)
+                lows.append(float(self.holds[k - 1].t[-1]))
+                highs.append(float(hold.t[0]))
+            within = np.linspace(hold.t[0], hold.t[-1], N_ONSETS + 2)[1:-1].tolist()
+            lows += within
+            highs += within
+        return np.array(lows), np.array(highs)
 
     @cached_property
     def _onset_log_priors(self) -> Array:
@@ -356,20 +368,38 @@ class HeldChambers:
                 columns.append(hold.centre(readings, is_A))
         return np.vstack(columns)
 
-    def _onset_posteriors(self, leak: UnitLeak) -> Array:
+    def _onset_posteriors(self, leak: UnitLeak, growth: float = 0.0) -> Array:
         """Compute the log posterior probability of each possible onset of a leak (`onsets`), shape (o,).
 
         The result is log prior - N/2 log(residual sum of squares), up to a constant, for N independent readings and a
         coefficient >= 0, with the properties of the oil eliminated. The variance of the readings weights the priors of
-        the properties: at first the variance without a leak, then the variance with the most probable onset.
+        the properties: at first the variance without a leak, then the variance with the most probable onset. `growth`:
+        as in `LeakLaw`.
         """
         regression = self._regressions[leak.refilled]
         variance, n_rows = self._fits_without_leak[leak.refilled].variance, len(regression.displaced)
-        columns = self._leak_columns(leak, self.onsets)
+        columns = self._growing_leak_columns(leak, growth)
         for _ in range(2):
             squares = residual_squares(regression, columns, variance) + regression.misfit_variance * n_rows
             variance = float(squares.min()) / n_rows
         return np.asarray(self._onset_log_priors - 0.5 * self.n_readings * np.log(squares))
+
+    def _growing_leak_columns(self, leak: UnitLeak, growth: float) -> Array:
+        """Compute the volume lost up to each of r readings (`_leak_columns`) for each of `onsets` of a leak that grows.
+
+        With the relative growth g from the onset s to the end e of the recording, the flow u of the leak becomes
+
+            (1 + g (t - s)/(e - s)) u = (1 - g s/(e - s)) u + g/(e - s) t u.
+
+        The result has the shape (r, o).
+        """
+        columns = self._leak_columns(leak, self.onsets)
+        if not growth:
+            return columns
+        times_flow = [flow * hold.t for flow, hold in zip(leak.flows, self.holds, strict=True)]
+        rates = growth / np.maximum(self.end - self.onsets, np.finfo(float).tiny)  # growth per second
+        growing = self._leak_columns(leak._replace(flows=times_flow), self.onsets)
+        return np.asarray((1.0 - rates * self.onsets) * columns + rates * growing)
 
     @cached_property
     def _offset_grid(self) -> Array:
@@ -407,18 +437,34 @@ class HeldChambers:
         return max(fits, key=lambda fit: fit[0])[1]  # with the highest posterior
 
     @cached_property
+    def _law_onsets(self) -> dict[tuple[float, float], Array]:
+        """Log posteriors (o,) of all `onsets` by the law of a leak past the piston: its exponent and its growth.
+
+        Each includes the priors of law and growth. Sensor offset and refilled sides are those of `piston_fits`.
+        """
+        posteriors = dict[tuple[float, float], Array]()
+        for (exponent, conditions), law_prior in zip(self.piston_fits.items(), law_priors(), strict=True):
+            leak = self._unit_piston_leak(conditions.offset, conditions.refilled, LeakLaw(exponent))
+            for growth, growth_prior in growth_priors():
+                log_prior = float(np.log(law_prior * growth_prior))
+                posteriors[exponent, growth] = log_prior + self._onset_posteriors(leak, growth)
+        return posteriors
+
+    @cached_property
     def law_fits(self) -> list[LawFit]:
         """Fits of a leak past the piston for each law (exponent of `EXPONENTS`) and growth after its onset.
 
-        The weight of a fit is its likelihood times the priors of law and growth (`law_priors`, `growth_priors`).
+        Each has its own most probable onset. The weight of a fit is its likelihood times the priors of law and growth
+        (`law_priors`, `growth_priors`).
         """
         fits = []
         for growth, growth_prior in growth_priors():
             for (exponent, conditions), law_prior in zip(self.piston_fits.items(), law_priors(), strict=True):
-                law = LeakLaw(exponent, growth, conditions.onset)
-                fit = self.fit_piston_leak(conditions, law)
+                onset = float(self.onsets[int(self._law_onsets[exponent, growth].argmax())])
+                law, law_conditions = LeakLaw(exponent, growth, onset), conditions._replace(onset=onset)
+                fit = self.fit_piston_leak(law_conditions, law)
                 log_weight = fit.log_likelihood + float(np.log(growth_prior * law_prior))
-                fits.append(LawFit(law, conditions, fit, log_weight))
+                fits.append(LawFit(law, law_conditions, fit, log_weight))
         return fits
 
     def _fit_growing_leak(self, leak: UnitLeak, onset: float) -> LeakFit:
@@ -545,13 +591,15 @@ class HeldChambers:
     def piston_onset(self) -> Interval | None:
         """Onset of the leak past the piston [s] with its 95 % interval; None if it may have begun before the holds.
 
-        The interval is widened to the next possible onsets (`onsets`) on either side.
+        It is averaged over the laws of the leak. The interval is widened on either side to the next of the evenly
+        spaced onsets within holds, or to the whole time between two holds.
         """
-        fit = self.piston_fit
-        posteriors = self._onset_posteriors(self._unit_piston_leak(fit.offset, fit.refilled))
+        posteriors = np.logaddexp.reduce(list(self._law_onsets.values()))
         weights = np.exp(posteriors - posteriors.max())
         first, best, last = np.searchsorted(np.cumsum(weights) / weights.sum(), [0.5 * TAIL, 0.5, 1.0 - 0.5 * TAIL])
         if first < 2:  # the onset may be the beginning of the recording or the first one within a hold
             return None
-        ends = np.append(self.onsets, self.end)
-        return Interval(float(self.onsets[best]), float(ends[first - 1]), float(ends[last + 1]))
+        lows, highs = self._onset_ranges
+        low = lows[lows < self.onsets[first]][-1]
+        high = min(highs[highs > self.onsets[last]], default=self.end)
+        return Interval(float(self.onsets[best]), float(low), float(high))
